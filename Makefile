@@ -1,0 +1,40 @@
+# Two commands from a fresh clone: `make demo` and `make test`. Everything lands in .venv and out.
+
+export OMP_NUM_THREADS = 1
+export OPENBLAS_NUM_THREADS = 1
+
+BIN := .venv/bin
+STAMP := .venv/.stamp
+
+.DEFAULT_GOAL := help
+.PHONY: help env demo test lint bench clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' Makefile
+
+env: $(STAMP) ## make .venv with everything needed (redone when pyproject.toml changes)
+
+$(STAMP): pyproject.toml tools/make-env
+	@sh tools/make-env .venv
+	@touch $@
+
+demo: $(STAMP) ## run the paper's forward scene into out/
+	@$(BIN)/softgrasp simulate demos/scenes/paper_forward.toml --out out
+
+lint: $(STAMP) ## ruff, mypy and the import contracts
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint ## lint, then the tests on 1, 2 and 3 ranks
+	$(BIN)/python -m pytest -q
+	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q
+	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q
+
+bench: $(STAMP) ## print the table of costs of the forward run
+	$(BIN)/python -m study.bench_forward
+
+clean: ## remove .venv, out and caches
+	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache
+	find fem reduction lqr study tests demos -name __pycache__ -type d -prune -exec rm -rf {} +

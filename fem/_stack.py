@@ -1,0 +1,17 @@
+"""Load the solver stack in the one order that works.
+
+Threads are fixed before numpy is imported (two ranks with two BLAS threads each are 10 to 200 times slower on two
+cores), and MPI is initialised before any compiled module. The PyPI wheel does the latter in ``dolfinx_solver``; a
+cluster's own DOLFINx has no such module and needs ``mpi4py.MPI`` only.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+importlib.import_module("dolfinx_solver" if importlib.util.find_spec("dolfinx_solver") else "mpi4py.MPI")

@@ -1,0 +1,109 @@
+"""What moves the hand in a step: a table, or forces with the tissue pulling back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from fem.midpoint import TissueMidpoint, TissueState
+from fem.motion import HandTable
+from fem.petsc import Array, total
+from fem.system import BlockSystem
+
+Force = Callable[[int, float, Array, Array], Array]
+"""u = force(step, t_mid [s], q_s, v_s) [N, N m], hand state at the start of the step."""
+
+
+class Drive(Protocol):
+    """Solves the midpoint equation of one step for tissue and hand."""
+
+    q: Array
+    v: Array
+
+    def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
+        """Leave w and load of step n in ``midpoint``; fill row n + 1 of ``q`` and ``v``. Collective."""
+
+
+class TableDrive:
+    """Hand known beforehand: load l = -G (a - g + alpha v) with alpha only when damping drags in space."""
+
+    def __init__(self, system: BlockSystem, table: HandTable) -> None:
+        self.q, self.v = table.q, table.v
+        c = table.a.copy()
+        if system.gravity is not None:
+            c -= system.gravity
+        if system.damping.in_space:
+            c += system.damping.alpha * (table.v[1:] + table.v[:-1]) / 2
+        self.G, self.c = system.G, -c
+
+    def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
+        """One product with the n_s columns of G and one solve. Collective."""
+        np.dot(self.G, self.c[n], out=midpoint.load_array)
+        midpoint.solve_midpoint()
+
+
+class ForceDrive:
+    """Hand driven by a force; with two-way coupling the Schur complement of the tissue acts on it.
+
+    Two-way, with x = S^{-1}(h), Y = S^{-1} G, c = kappa a + alpha v - g and kappa = 1 + alpha dt/2 (alpha = 0 unless
+    damping drags in space), w = x - Y c and
+
+        (M_hand + kappa (M_rigid - theta G'Y)) a = u + weight - M_rigid c_0 - G'(theta (x - Y c_0) - s v),
+
+    c_0 = alpha v - g, theta = s^2 + alpha s.
+    """
+
+    def __init__(
+        self, system: BlockSystem, force: Force, midpoint: TissueMidpoint, steps: int, q0: Array, v0: Array
+    ) -> None:
+        n_s = system.layout.n_s
+        self.system, self.force, self.dt = system, force, midpoint.dt
+        self.q, self.v = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s))
+        self.q[0], self.v[0] = q0, v0
+        self.g = np.zeros(n_s) if system.gravity is None else system.gravity
+        self.weight = system.M_hand @ self.g if system.hand_weight else np.zeros(n_s)
+        self.alpha = system.damping.alpha if system.damping.in_space else 0.0
+        self.kappa = 1 + self.alpha * self.dt / 2
+        s = midpoint.s
+        self.theta = s * s + self.alpha * s
+        self.lhs = system.M_hand
+        if system.two_way:
+            self.Y = self._responses(midpoint)
+            GY = total(system.layout.comm, system.G.T @ self.Y)
+            self.GY = (GY + GY.T) / 2
+            self.lhs = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
+        self.inverse = np.linalg.inv(self.lhs)
+
+    def _responses(self, midpoint: TissueMidpoint) -> Array:
+        Y = np.empty(self.system.G.shape, order="F")
+        for j in range(Y.shape[1]):
+            midpoint.r.array_w[:] = self.system.G[:, j]
+            midpoint.solver.solve(midpoint.r, midpoint.w)
+            Y[:, j] = midpoint.w.array_r
+        return Y
+
+    def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
+        """One solve, and with two-way coupling two small reductions. Collective."""
+        q, v = self.q[n], self.v[n]
+        u = self.force(n, (n + 0.5) * self.dt, q, v) + self.weight
+        c0 = self.alpha * v - self.g
+        if not self.system.two_way:
+            a = self.inverse @ u
+            c = self.kappa * a + c0
+            np.dot(self.system.G, -c, out=midpoint.load_array)
+            midpoint.solve_midpoint()
+        else:
+            G, layout = self.system.G, self.system.layout
+            midpoint.solver.solve(midpoint.h, midpoint.w)
+            x = midpoint.w.array_w
+            relative = self.theta * x - midpoint.s * state.array[layout.n_local :]
+            pull = total(layout.comm, G.T @ relative) - self.theta * (self.GY @ c0)
+            a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
+            c = self.kappa * a + c0
+            x -= self.Y @ c
+            np.dot(G, -c, out=midpoint.load_array)
+            midpoint.r.waxpy(1.0, midpoint.load, midpoint.h)
+        self.v[n + 1] = v + self.dt * a
+        self.q[n + 1] = q + self.dt * (v + self.v[n + 1]) / 2

@@ -1,0 +1,61 @@
+"""Errors that a user meets, and how all ranks agree on them.
+
+Every message is one sentence that names the file, key or value and says what would be right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mpi4py import MPI
+
+
+class SoftgraspError(Exception):
+    """Base of all errors that end a command with one sentence and a non-zero status."""
+
+
+class SceneError(SoftgraspError):
+    """A scene key is missing, unknown, ill-typed or physically meaningless."""
+
+
+class MeshError(SoftgraspError):
+    """A mesh cannot be read or cannot carry the model."""
+
+
+class SolverError(SoftgraspError):
+    """A linear solve failed or missed its tolerance."""
+
+
+class ResourceError(SoftgraspError):
+    """The run would not fit in memory or on disk."""
+
+
+class CheckpointError(SoftgraspError):
+    """A restart file is missing, damaged or belongs to another run."""
+
+
+class Interrupted(SoftgraspError):
+    """The user stopped the run; the message names the restart file."""
+
+
+@contextmanager
+def agree(comm: MPI.Intracomm) -> Iterator[None]:
+    """Run a block that may fail on some ranks only; then raise on all of them.
+
+    The exception of the lowest failing rank is raised on every rank, so no rank waits in a collective call that
+    the others never reach. The block itself must not communicate.
+
+    Collective.
+
+    Raises:
+        Exception: the exception of the lowest failing rank.
+    """
+    caught: Exception | None = None
+    try:
+        yield
+    except Exception as error:
+        caught = error
+    failures = [e for e in comm.allgather(caught) if e is not None]
+    if failures:
+        raise failures[0] from caught

@@ -1,0 +1,62 @@
+"""Where the unknowns live: the hand on every rank, the tissue distributed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from fem.petsc import Array
+
+
+@dataclass(frozen=True)
+class BlockLayout:
+    """Sizes and ownership of q = [q_s; q_e].
+
+    Attributes:
+        comm: communicator of the tissue blocks.
+        dimension: space dimension d.
+        n_s: hand degrees of freedom (replicated on every rank).
+        n_e: tissue degrees of freedom, global.
+        n_local: tissue degrees of freedom owned by this rank.
+        start: global number of the first one.
+        nodes: coordinates [m] of the owned free nodes, shape (n_local / d, d).
+        reference: the hand's reference point [m], shape (d,).
+    """
+
+    comm: MPI.Intracomm
+    dimension: int
+    n_s: int
+    n_e: int
+    n_local: int
+    start: int
+    nodes: Array
+    reference: Array
+
+    @property
+    def states(self) -> int:
+        """Length 2n of the first-order state [q_s, v_s, q_e, v_e]."""
+        return 2 * (self.n_s + self.n_e)
+
+    def nearest_node(self, point: Array) -> tuple[int, int, Array]:
+        """Free node nearest to a point: owning rank, its first local dof there, its coordinates.
+
+        Ties go to the lexicographically smallest coordinates, so that every rank count picks the same node.
+        Collective.
+        """
+        best: tuple[float, tuple[float, ...], int, int] | None = None
+        if len(self.nodes):
+            distance = np.linalg.norm(self.nodes - point, axis=1)
+            # nodes at equal distance differ by rounding only: compare on a grid of 1e-9 of the distance scale
+            key = np.round(distance, 9)
+            candidates = np.flatnonzero(key == key.min())
+            first = min(candidates, key=lambda i: tuple(np.round(self.nodes[i], 9)))
+            best = (
+                float(key[first]),
+                tuple(np.round(self.nodes[first], 9).tolist()),
+                self.comm.rank,
+                int(first) * self.dimension,
+            )
+        found = min(b for b in self.comm.allgather(best) if b is not None)
+        return found[2], found[3], np.array(found[1])

@@ -1,0 +1,117 @@
+"""Outputs y of a scene: displacement of a node, mean over a region, or the hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fem.errors import SceneError
+from fem.petsc import Array, total
+from fem.system import BlockSystem
+
+if TYPE_CHECKING:
+    from fem.scene import Scene
+
+
+@dataclass(frozen=True)
+class Output:
+    """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m].
+
+    Attributes:
+        name: label in tables and files.
+        size: number of components.
+        dofs: local tissue dofs that enter, shape (k, size); empty on ranks that own none.
+        weight: every listed dof enters with this factor.
+        C_s: rigid part, (size, n_s), on every rank.
+        point: coordinates [m] of the node, or of the centre of the region.
+    """
+
+    name: str
+    size: int
+    dofs: np.ndarray
+    weight: float
+    C_s: Array
+    point: tuple[float, ...] = ()
+
+    def local(self, z: Array) -> Array:
+        """This rank's share of C_e z. Not collective."""
+        return np.asarray(self.weight * z[self.dofs].sum(axis=0))
+
+
+def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
+    """Outputs of the scene; without any, the free node farthest from the hand. Collective.
+
+    Raises:
+        SceneError: a node lies outside the body or a region holds no node.
+    """
+    wanted = scene.control.outputs if scene.control is not None else []
+    if not wanted:
+        return (_node(system, "tip", _farthest(system)),)
+    result = []
+    for i, output in enumerate(wanted):
+        name = output.name or f"y{i + 1}"
+        if output.kind == "hand":
+            n_s = system.layout.n_s
+            result.append(Output(name, n_s, np.zeros((0, n_s), int), 0.0, np.eye(n_s)))
+        elif output.kind == "region":
+            result.append(_region(system, name, np.asarray(output.box, dtype=float), i))
+        else:
+            _inside(system, output.point or [], i)
+            result.append(_node(system, name, np.asarray(output.point, dtype=float)))
+    return tuple(result)
+
+
+def _node(system: BlockSystem, name: str, point: Array) -> Output:
+    layout = system.layout
+    d = layout.dimension
+    rank, first, where = layout.nearest_node(point)
+    mine = layout.comm.rank == rank
+    dofs = np.arange(first, first + d)[None, :] if mine else np.zeros((0, d), int)
+    C_s = layout.comm.bcast(system.T[first : first + d].copy() if mine else None, root=rank)
+    return Output(name, d, dofs, 1.0, C_s, tuple(where.tolist()))
+
+
+def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
+    layout = system.layout
+    d = layout.dimension
+    inside = np.flatnonzero(((layout.nodes >= box[0]) & (layout.nodes <= box[1])).all(axis=1))
+    dofs = inside[:, None] * d + np.arange(d)
+    count = int(total(layout.comm, np.array([float(len(inside))]))[0])
+    if count == 0:
+        raise SceneError(
+            f"control.outputs[{i}].box = {box.tolist()} holds no free node of the body; move or enlarge it"
+        )
+    C_s = total(layout.comm, system.T[dofs].sum(axis=0) if len(dofs) else np.zeros((d, layout.n_s))) / count
+    return Output(name, d, dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()))
+
+
+def _bounds(system: BlockSystem) -> tuple[Array, Array]:
+    layout = system.layout
+    big = np.full((1, layout.dimension), np.inf)
+    nodes = layout.nodes
+    lows = layout.comm.allgather(np.vstack([nodes, big]).min(axis=0))
+    highs = layout.comm.allgather(np.vstack([nodes, -big]).max(axis=0))
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+def _inside(system: BlockSystem, point: list[float], i: int) -> None:
+    low, high = _bounds(system)
+    p = np.asarray(point, dtype=float)
+    slack = 0.05 * float((high - low).max())  # free nodes end one cell short of the contact zone
+    if (p < low - slack).any() or (p > high + slack).any():
+        raise SceneError(
+            f"control.outputs[{i}].point = {list(point)} lies outside the body, which spans "
+            f"{np.round(low, 6).tolist()} to {np.round(high, 6).tolist()} m"
+        )
+
+
+def _farthest(system: BlockSystem) -> Array:
+    layout = system.layout
+    best = (-1.0, ())
+    if len(layout.nodes):
+        distance = np.round(np.linalg.norm(layout.nodes - layout.reference, axis=1), 9)
+        far = np.flatnonzero(distance == distance.max())
+        best = (float(distance.max()), min(tuple(layout.nodes[j].tolist()) for j in far))
+    return np.asarray(max(layout.comm.allgather(best))[1], dtype=float)

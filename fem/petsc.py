@@ -1,0 +1,65 @@
+"""The few PETSc helpers that every package shares (no DOLFINx here)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc as PETSc
+
+from fem import _stack as _stack
+
+Array = NDArray[np.float64]
+SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
+
+
+@contextmanager
+def petsc_options(prefix: str, entries: dict[str, object]) -> Iterator[None]:
+    """Set prefixed options for a ``setFromOptions`` call and remove them again: the database is global."""
+    database = PETSc.Options(prefix)
+    for key, value in entries.items():
+        database[key] = value
+    try:
+        yield
+    finally:
+        for key in entries:
+            database.delValue(key)
+
+
+def total(comm: MPI.Intracomm, local: Array) -> Array:
+    """Sum of a small array over the ranks. Collective."""
+    local = np.ascontiguousarray(local, dtype=np.float64)
+    result = np.empty_like(local)
+    comm.Allreduce(local, result)
+    return result
+
+
+def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
+    """Return sum_i a_i A_i for matrices of one pattern, as a new matrix. Collective."""
+    factor, first = terms[0]
+    result = first.copy()
+    result.scale(factor)
+    for factor, term in terms[1:]:
+        result.axpy(factor, term, SAME)
+    return result
+
+
+def times_columns(A: PETSc.Mat, X: Array) -> Array:
+    """Return the local rows of A X for a few dense columns, shape (n_local, k). Collective."""
+    x, y = A.createVecs()
+    result = np.empty((y.getLocalSize(), X.shape[1]), order="F")
+    for j in range(X.shape[1]):
+        x.array_w[:] = X[:, j]
+        A.mult(x, y)
+        result[:, j] = y.array_r
+    x.destroy()
+    y.destroy()
+    return result
+
+
+def matrix_bytes(A: PETSc.Mat) -> float:
+    """Memory of a matrix over all ranks [byte]. Collective."""
+    return float(A.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["memory"])

@@ -1,0 +1,91 @@
+"""Numbers of a run as files: result.json, trajectories as CSV, the resolved scene."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import resource
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from fem.build import Model
+from fem.run import Trajectory
+from fem.scene_file import resolved_toml, scene_hash
+
+
+def package_version() -> str:
+    """Version of the installed distribution, or "source" in a bare checkout."""
+    try:
+        return version("softgrasp")
+    except PackageNotFoundError:
+        return "source"
+
+
+def peak_memory_mb(comm: MPI.Intracomm) -> float:
+    """Largest resident memory so far, summed over the ranks [MiB]. Collective."""
+    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+
+
+def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
+    """The keys of ``result.json``. Collective."""
+    layout, comm = model.system.layout, model.system.layout.comm
+    steps = model.scene.time.steps
+    seconds = run.seconds
+    mesh = model.space.mesh.mesh
+    cells = mesh.topology.index_map(model.space.mesh.dimension).size_global
+    return {
+        "command": "simulate",
+        "scene": model.scene.name,
+        "scene_hash": scene_hash(model.scene),
+        "version": package_version(),
+        "ranks": comm.size,
+        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        "n_s": layout.n_s,
+        "n_e": layout.n_e,
+        "states": layout.states,
+        "cells": int(cells),
+        "steps": steps,
+        "dt": model.scene.time_end / steps,
+        "solver": {"name": run.solver[0], "reason": run.solver[1]},
+        "residual_first": run.residuals[0],
+        "residual_last": run.residuals[1],
+        "hand_final": run.q_s[-1].tolist(),
+        "output_names": list(run.output_names),
+        "output_final": run.outputs[-1].tolist(),
+        "energy_drift": run.energy_drift,
+        "time": {
+            **{key: value for key, value in seconds.items() if key != "steps"},
+            "steps": seconds["steps"],
+            "per_step": seconds["steps"] / max(steps - 1, 1),
+        },
+        "memory_peak_mb": peak_memory_mb(comm),
+        "forms": len(model.inventory.forms),
+        "operators": model.inventory.operators,
+    }
+
+
+def write_results(directory: Path, model: Model, run: Trajectory, result: dict[str, Any]) -> list[Path]:
+    """Write result.json, trajectory.csv and scene.toml. Rank 0 only."""
+    directory.mkdir(parents=True, exist_ok=True)
+    table = directory / "trajectory.csv"
+    n_s = run.q_s.shape[1]
+    header = [
+        "t [s]",
+        *(f"hand_{i + 1}" for i in range(n_s)),
+        *(f"hand_velocity_{i + 1}" for i in range(n_s)),
+    ]
+    rows = np.column_stack([run.times, run.q_s, run.v_s, run.outputs])
+    with table.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*header, *run.output_names])
+        writer.writerows([f"{x:.17g}" for x in row] for row in rows)
+    scene = directory / "scene.toml"
+    scene.write_text(resolved_toml(model.scene))
+    path = directory / "result.json"
+    path.write_text(json.dumps(result, indent=2) + "\n")
+    return [path, table, scene]

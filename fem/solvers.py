@@ -1,0 +1,152 @@
+"""One linear solver for S w = r, chosen by size, factored once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fem.errors import SolverError
+from fem.layout import BlockLayout
+from fem.petsc import PETSc, petsc_options
+
+SolverName = Literal["cholesky", "mumps", "cg"]
+
+# Where each road ends on two ranks and 24 GiB: PETSc Cholesky (nested dissection) is fastest per solve in 2D but its
+# 3D factorisation is 20 times slower than that of MUMPS; beyond the last limits the factor itself no longer fits.
+CHOLESKY_LIMIT = {2: 200_000, 3: 4_000}
+DIRECT_LIMIT = {2: 4_000_000, 3: 300_000}
+# A backward stable solve leaves about eps * growth; 1e-8 flags a singular or indefinite matrix, which PETSc does not.
+DIRECT_RESIDUAL = 1e-8
+
+
+def choose_solver(layout: BlockLayout, wanted: str = "auto") -> tuple[SolverName, str]:
+    """The solver for a size, with the reason in words. Not collective."""
+    n, d = layout.n_e, layout.dimension
+    if wanted != "auto":
+        return wanted, "asked for by the scene"  # type: ignore[return-value]
+    if n <= CHOLESKY_LIMIT[d]:
+        return "cholesky", f"n_e = {n} <= {CHOLESKY_LIMIT[d]} in {d}D: fastest per solve"
+    if n <= DIRECT_LIMIT[d]:
+        return "mumps", f"n_e = {n} <= {DIRECT_LIMIT[d]} in {d}D: the factor fits and factors fast"
+    return "cg", f"n_e = {n} > {DIRECT_LIMIT[d]} in {d}D: the factor would not fit"
+
+
+@dataclass(frozen=True)
+class TissueSolver:
+    """A factored (or preconditioned) symmetric positive definite matrix of the tissue block.
+
+    Attributes:
+        name: cholesky, mumps or cg.
+        ksp: the PETSc solver.
+        S: the matrix.
+        tolerance: relative residual that :meth:`check` accepts.
+    """
+
+    name: SolverName
+    ksp: PETSc.KSP
+    S: PETSc.Mat
+    tolerance: float
+
+    def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        """Solve S w = r.
+
+        Collective. Raises :class:`SolverError` when the iteration does not converge.
+        """
+        self.ksp.solve(r, w)
+        if self.ksp.getConvergedReason() < 0:
+            raise SolverError(
+                f"{self.name}: no convergence after {self.ksp.getIterationNumber()} iterations "
+                f"(PETSc reason {self.ksp.getConvergedReason()}); choose time.solver = 'mumps' or a larger time.rtol"
+            )
+
+    def residual(self, r: PETSc.Vec, w: PETSc.Vec) -> float:
+        """Relative residual |S w - r| / |r|. Collective."""
+        y = self.S.createVecLeft()
+        self.S.mult(w, y)
+        y.axpy(-1.0, r)
+        scale = r.norm()
+        value = y.norm() / scale if scale > 0 else y.norm()
+        y.destroy()
+        return float(value)
+
+    def check(self, r: PETSc.Vec, w: PETSc.Vec, where: str) -> float:
+        """Raise unless S w = r holds to the tolerance: direct solvers do not tell. Collective."""
+        value = self.residual(r, w)
+        if not np.isfinite(value) or value > self.tolerance:
+            raise SolverError(
+                f"{self.name}: relative residual {value:.1e} at {where} exceeds {self.tolerance:.0e}; "
+                "the matrix is singular, indefinite or badly scaled: check material, mesh and contact zone"
+            )
+        return value
+
+    def destroy(self) -> None:
+        """Free solver and matrix. Collective."""
+        self.ksp.destroy()
+        self.S.destroy()
+
+
+def make_solver(S: PETSc.Mat, name: SolverName, layout: BlockLayout, prefix: str, rtol: float = 1e-10) -> TissueSolver:
+    """Factor S (or set up CG with GAMG). Collective.
+
+    Raises:
+        SolverError: the factorisation fails.
+    """
+    ksp = PETSc.KSP().create(S.comm)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setOperators(S)
+    S.setOption(PETSc.Mat.Option.SPD, True)
+    if name == "cg":
+        _set_up_cg(ksp, S, layout, prefix, rtol)
+    else:
+        _set_up_direct(ksp, name, prefix)
+    try:
+        ksp.setUp()
+    except PETSc.Error as error:
+        raise SolverError(
+            f"{name}: the factorisation of the tissue matrix (n_e = {layout.n_e}) failed (PETSc error {error.ierr}); "
+            "check material and mesh, or try time.solver = 'mumps'"
+        ) from error
+    if ksp.getPC().getFailedReason():
+        raise SolverError(f"{name}: set-up failed (reason {ksp.getPC().getFailedReason()}); the matrix is not definite")
+    return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol))
+
+
+def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str) -> None:
+    ksp.setType("preonly")
+    pc = ksp.getPC()
+    if name == "mumps":
+        pc.setType("cholesky")
+        pc.setFactorSolverType("mumps")
+    elif ksp.comm.size == 1:
+        pc.setType("cholesky")
+        pc.setFactorOrdering("nd")
+    else:
+        # every rank holds the whole factor: no messages in the triangular solves
+        inner = {
+            "pc_type": "redundant",
+            "redundant_ksp_type": "preonly",
+            "redundant_pc_type": "cholesky",
+            "redundant_pc_factor_mat_ordering_type": "nd",
+        }
+        with petsc_options(prefix, dict(inner)):
+            ksp.setFromOptions()
+
+
+def _set_up_cg(ksp: PETSc.KSP, S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> None:
+    d = layout.dimension
+    coordinates = PETSc.Vec().createWithArray(
+        layout.nodes.ravel().copy(), size=(layout.n_local, layout.n_e), bsize=d, comm=layout.comm
+    )
+    # the submatrix does not inherit it, and without rigid modes GAMG needs twice the iterations
+    near = PETSc.NullSpace().createRigidBody(coordinates)
+    S.setNearNullSpace(near)
+    near.destroy()
+    ksp.setType("cg")
+    # the preconditioned norm would stop at a true residual 1e3 times larger
+    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=500)
+    ksp.getPC().setType("gamg")
+    with petsc_options(prefix, {"pc_gamg_threshold": 0.01, "mg_levels_ksp_type": "chebyshev"}):
+        ksp.setFromOptions()

@@ -1,0 +1,172 @@
+"""The coupled block system in the hand's frame, and the paper's blocks it comes from.
+
+With the displacement relative to the rigid motion of the hand, z = q_e - T q_s, the stiffness acts on z alone because
+K_ee T + K_es = 0, and the only coupling is the inertia G = M_es + M_ee T:
+
+    M_ee z'' + D_ee z' + K_ee z = -G (a_s - g) [- alpha G v_s]      tissue
+    M_ss a_s [+ G' z'' + M_rigid (a_s - g)] = u                     hand ([...] two-way only)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fem.layout import BlockLayout
+from fem.petsc import Array, PETSc, combine, times_columns, total
+
+
+@dataclass(frozen=True)
+class Component:
+    """One affine component A of the finite element matrix, in the blocks of hand and tissue.
+
+    Attributes:
+        ee: A on the free nodes, distributed (n_e, n_e).
+        es: A R on the free nodes, local rows (n_local, n_s).
+        ss: R' A R, (n_s, n_s), the same on every rank.
+    """
+
+    ee: PETSc.Mat
+    es: Array
+    ss: Array
+
+
+@dataclass(frozen=True)
+class LayerBlocks:
+    """Affine components of one layer: K = mu K_mu + lambda K_lambda, M = rho M_1."""
+
+    name: str
+    K_mu: Component
+    K_lambda: Component
+    M_1: Component
+
+
+@dataclass(frozen=True)
+class LayerMaterial:
+    """Lame constants [Pa], density [kg/m^3] and Kelvin-Voigt time [s] of one layer."""
+
+    lam: float
+    mu: float
+    rho: float
+    beta: float = 0.0
+
+
+@dataclass(frozen=True)
+class Damping:
+    """D = alpha M + beta K on the tissue; ``matrix`` replaces beta K when layers differ.
+
+    ``in_space`` is true when alpha drags the rigid motion too.
+    """
+
+    alpha: float = 0.0
+    beta: float = 0.0
+    in_space: bool = False
+    matrix: PETSc.Mat | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether any damping acts."""
+        return self.alpha > 0 or self.beta > 0 or self.matrix is not None
+
+
+@dataclass(frozen=True)
+class BlockSystem:
+    """All operators of one scene. Matrices are distributed over ``layout.comm``, small arrays replicated.
+
+    Attributes:
+        layout: sizes and ownership.
+        layers: affine components and the materials they carry.
+        materials: one per layer.
+        M_ee, K_ee: tissue mass and stiffness (n_e, n_e).
+        T: rigid modes of the hand at the free nodes, local rows (n_local, n_s).
+        G: M_es + M_ee T, local rows (n_local, n_s).
+        M_hand: hand mass matrix (n_s, n_s) [kg, kg m^2].
+        M_rigid: inertia of the tissue moved rigidly with the hand (n_s, n_s).
+        damping: tissue damping.
+        gravity: acceleration of free fall in the hand's degrees of freedom (n_s,), or None.
+        hand_weight: gravity acts on the hand's own mass too.
+        two_way: the hand feels the tissue.
+    """
+
+    layout: BlockLayout
+    layers: tuple[LayerBlocks, ...]
+    materials: tuple[LayerMaterial, ...]
+    M_ee: PETSc.Mat
+    K_ee: PETSc.Mat
+    T: Array
+    G: Array
+    M_hand: Array
+    M_rigid: Array
+    damping: Damping
+    gravity: Array | None = None
+    hand_weight: bool = False
+    two_way: bool = False
+
+    @property
+    def M_es(self) -> Array:
+        """The paper's M_es, local rows (n_local, n_s)."""
+        return sum_dense([(m.rho, layer.M_1.es) for layer, m in zip(self.layers, self.materials, strict=True)])
+
+    @property
+    def K_es(self) -> Array:
+        """The paper's K_es, local rows (n_local, n_s)."""
+        return sum_dense(
+            [
+                term
+                for layer, m in zip(self.layers, self.materials, strict=True)
+                for term in ((m.mu, layer.K_mu.es), (m.lam, layer.K_lambda.es))
+            ]
+        )
+
+    def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
+        """The same scene with other lambda, mu, rho: a few axpy, no assembly. Collective."""
+        M_ee, K_ee = tissue_matrices(self.layers, materials)
+        G, M_rigid = coupling(self.layers, materials, self.T)
+        damping = replace(self.damping, matrix=layered_viscosity(self.layers, materials))
+        return replace(self, materials=materials, M_ee=M_ee, K_ee=K_ee, G=G, M_rigid=M_rigid, damping=damping)
+
+
+def sum_dense(terms: list[tuple[float, Array]]) -> Array:
+    """Return sum_i a_i X_i of small dense arrays as a new Fortran-ordered array."""
+    result = np.zeros(terms[0][1].shape, order="F")
+    for factor, term in terms:
+        result += factor * term
+    return result
+
+
+def tissue_matrices(
+    layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]
+) -> tuple[PETSc.Mat, PETSc.Mat]:
+    """M_ee = sum rho M_1 and K_ee = sum mu K_mu + lambda K_lambda over the layers. Collective."""
+    pairs = list(zip(layers, materials, strict=True))
+    M = combine([(m.rho, layer.M_1.ee) for layer, m in pairs])
+    K = combine([t for layer, m in pairs for t in ((m.mu, layer.K_mu.ee), (m.lam, layer.K_lambda.ee))])
+    for A in (M, K):
+        A.setOption(PETSc.Mat.Option.SPD, True)
+    return M, K
+
+
+def layered_viscosity(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> PETSc.Mat | None:
+    """D_ee = sum beta_k K_k when the layers differ in beta; None when one number says it. Collective."""
+    if len({m.beta for m in materials}) == 1:
+        return None
+    return combine(
+        [
+            term
+            for layer, m in zip(layers, materials, strict=True)
+            for term in ((m.beta * m.mu, layer.K_mu.ee), (m.beta * m.lam, layer.K_lambda.ee))
+        ]
+    )
+
+
+def coupling(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...], T: Array) -> tuple[Array, Array]:
+    """Return G = M_es + M_ee T, local rows, and M_rigid = [R; T]' M_h [R; T]. Collective."""
+    G = np.zeros(T.shape, order="F")
+    rigid = np.zeros((T.shape[1], T.shape[1]))
+    for layer, material in zip(layers, materials, strict=True):
+        part = layer.M_1.es + times_columns(layer.M_1.ee, T)
+        comm = layer.M_1.ee.comm.tompi4py()
+        rigid += material.rho * (layer.M_1.ss + total(comm, T.T @ part + layer.M_1.es.T @ T))
+        G += material.rho * part
+    return G, (rigid + rigid.T) / 2

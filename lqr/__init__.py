@@ -1,0 +1,1 @@
+"""Linear-quadratic regulator: Lyapunov and Riccati solvers, feedback; imports reduction, never DOLFINx."""

@@ -1,0 +1,1 @@
+"""Reduced bases and reduced models; imports fem only, knows matrices and vectors but no DOLFINx."""

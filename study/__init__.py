@@ -1,0 +1,1 @@
+"""Across the packages: command line, pictures, reports, accuracy against time."""

@@ -1,0 +1,245 @@
+"""Does this installation work: solver stack, MPI launcher, threads, compiler, cache; a cure for each fault.
+
+Needs neither DOLFINx nor MPI to be imported, so that it can say that they are missing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
+LAUNCH_LIMIT = 30.0  # [s] for two ranks that only say how many they are
+SAY_SIZE = "import fem, sys; from mpi4py import MPI; sys.stdout.write(f'{MPI.COMM_WORLD.size}\\n')"
+MPI_FAMILIES = {
+    "MPICH": ("hydra", "mpich"),
+    "Open MPI": ("open mpi", "openrte", "open-mpi"),
+    "Intel MPI": ("intel(r) mpi",),
+}
+INSTALL = "Install the solver stack with `pip install 'softgrasp[solver]'` or load the cluster's DOLFINx module."
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the diagnosis.
+
+    Attributes:
+        name: what was looked at.
+        ok: whether it will work.
+        value: what was found.
+        cure: one sentence on what to do; empty when ok.
+    """
+
+    name: str
+    ok: bool
+    value: str
+    cure: str = ""
+
+
+def check_python() -> Check:
+    """Python 3.12 or newer. Not collective."""
+    ok = sys.version_info >= (3, 12)
+    return Check("Python", ok, sys.version.split()[0], "" if ok else "Use Python 3.12 or newer.")
+
+
+def check_dolfinx() -> Check:
+    """DOLFINx 0.11. Not collective."""
+    version = str(importlib.import_module("dolfinx").__version__)
+    ok = version.startswith("0.11.")
+    return Check("DOLFINx", ok, version, "" if ok else "softgrasp is written for DOLFINx 0.11; install that version.")
+
+
+def check_petsc() -> Check:
+    """PETSc with real double scalars. Not collective."""
+    importlib.import_module("fem")  # MPI before petsc4py
+    petsc = importlib.import_module("petsc4py.PETSc")
+    np = importlib.import_module("numpy")
+    scalar, integer = np.dtype(petsc.ScalarType), np.dtype(petsc.IntType)
+    version = ".".join(str(part) for part in petsc.Sys.getVersion())
+    value = f"{version}, scalar {scalar.name}, {8 * integer.itemsize}-bit int"
+    ok = scalar == np.float64
+    return Check("PETSc", ok, value, "" if ok else "Use a PETSc that was built with real double scalars.")
+
+
+def check_slepc() -> Check:
+    """SLEPc. Not collective."""
+    importlib.import_module("fem")
+    version = importlib.import_module("slepc4py.SLEPc").Sys.getVersion()
+    return Check("SLEPc", True, ".".join(str(part) for part in version))
+
+
+def find_mpiexec() -> str | None:
+    """The launcher beside this Python, else the first on PATH. Not collective."""
+    beside = Path(sys.executable).parent / "mpiexec"
+    return str(beside) if os.access(beside, os.X_OK) else shutil.which("mpiexec")
+
+
+def family(text: str) -> str:
+    """Name the MPI family that a version text belongs to, or "unknown". Not collective."""
+    low = text.lower()
+    return next((name for name, words in MPI_FAMILIES.items() if any(word in low for word in words)), "unknown")
+
+
+def run_limited(command: list[str], limit: float) -> tuple[int | None, str]:
+    """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough.
+
+    Not collective.
+    """
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    ) as process:
+        try:
+            output, _ = process.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            output, _ = process.communicate()
+            return None, output
+    return process.returncode, output
+
+
+def check_launcher() -> Check:
+    """The mpiexec in use belongs to the MPI library of mpi4py. Not collective."""
+    linked = family(importlib.import_module("mpi4py.MPI").Get_library_version())
+    path = find_mpiexec()
+    if path is None:
+        return Check("mpiexec", False, "none", f"Put the mpiexec of {linked} on PATH, or `pip install mpich`.")
+    _, text = run_limited([path, "--version"], LAUNCH_LIMIT)
+    found = family(text)
+    # A launcher we cannot name (srun wrapper, vendor MPI) is judged by the launch alone.
+    if "unknown" in (found, linked) or found == linked:
+        return Check("mpiexec", True, f"{path} ({found}, library {linked})")
+    cure = f"This mpiexec is {found} but the library is {linked}: use the mpiexec of {linked} by its full path."
+    return Check("mpiexec", False, path, cure)
+
+
+def check_launch() -> Check:
+    """Two ranks really find each other. Not collective."""
+    name = "two ranks"
+    if any(variable in os.environ for variable in IN_MPI_JOB):
+        return Check(name, True, "Not tried: this is already an MPI job, run doctor without mpiexec to try it.")
+    path = find_mpiexec()
+    if path is None:
+        return Check(name, False, "no mpiexec", "Make an mpiexec available as said above.")
+    status, output = run_limited([path, "-n", "2", sys.executable, "-c", SAY_SIZE], LAUNCH_LIMIT)
+    if status is None:
+        return Check(name, False, f"no answer in {LAUNCH_LIMIT:g} s", f"Make `{path} -n 2 hostname` work first.")
+    sizes = output.split()
+    if status == 0 and sizes == ["2", "2"]:
+        return Check(name, True, "launched, found each other")
+    if status == 0 and sizes == ["1", "1"]:
+        cure = f"{path} belongs to another MPI: use the mpiexec beside {sys.executable} or the library's own."
+        return Check(name, False, "two single ranks instead of one job", cure)
+    last = output.strip().splitlines()[-1:] or ["no output"]
+    return Check(name, False, f"exit status {status}: {last[0]}", f"Use an mpiexec that can start {sys.executable}.")
+
+
+def check_threads() -> Check:
+    """One BLAS thread a rank. Not collective."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    value = ", ".join(f"{name}={os.environ.get(name, 'unset')}" for name in names)
+    ok = all(os.environ.get(name) == "1" for name in names)
+    cure = "" if ok else "Export OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1, more threads fight with the ranks."
+    return Check("threads", ok, value, cure)
+
+
+def check_compiler() -> Check:
+    """A C compiler with the headers of this Python, as the JIT of forms needs it. Not collective."""
+    words = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
+    path = shutil.which(words[0])
+    if path is None:
+        return Check("C compiler", False, "none", f"Install {words[0]} or set CC to a C compiler.")
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder, "probe.c")
+        source.write_text("#include <Python.h>\n")
+        include = f"-I{sysconfig.get_path('include')}"
+        target = str(Path(folder, "probe.o"))
+        status, _ = run_limited([path, *words[1:], include, "-c", str(source), "-o", target], LAUNCH_LIMIT)
+    if status != 0:
+        return Check("C compiler", False, path, "Install the headers of this Python (Debian, Ubuntu: python3-dev).")
+    return Check("C compiler", True, path)
+
+
+def check_cache() -> Check:
+    """The folder of compiled forms can be written. Not collective."""
+    importlib.import_module("fem")
+    folder = Path(importlib.import_module("dolfinx.jit").get_options()["cache_dir"])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        return Check("JIT cache", False, str(folder), "Set XDG_CACHE_HOME to a folder that you can write.")
+    return Check("JIT cache", True, str(folder))
+
+
+def check_adios2() -> Check:
+    """ADIOS2 inside DOLFINx, for VTX series. Not collective."""
+    importlib.import_module("fem")
+    ok = hasattr(importlib.import_module("dolfinx.io"), "VTXWriter")
+    cure = "" if ok else "Use a DOLFINx built with ADIOS2, or ask for XDMF output."
+    return Check("ADIOS2", ok, "VTX output" if ok else "missing", cure)
+
+
+def check_memory() -> Check:
+    """Memory that is free now, enough for the paper's scenes. Not collective."""
+    memory = psutil.virtual_memory()
+    value = f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
+    ok = memory.available > 2**30
+    return Check("memory", ok, value, "" if ok else "Free at least 1 GiB before a run.")
+
+
+CHECKS: tuple[tuple[str, Callable[[], Check]], ...] = (
+    ("Python", check_python),
+    ("DOLFINx", check_dolfinx),
+    ("PETSc", check_petsc),
+    ("SLEPc", check_slepc),
+    ("mpiexec", check_launcher),
+    ("two ranks", check_launch),
+    ("threads", check_threads),
+    ("C compiler", check_compiler),
+    ("JIT cache", check_cache),
+    ("ADIOS2", check_adios2),
+    ("memory", check_memory),
+)
+
+
+def checks() -> list[Check]:
+    """Look at everything; a look that fails is a finding, not an error.
+
+    Not collective: call on one rank.
+    """
+    found = []
+    for name, look in CHECKS:
+        try:
+            found.append(look())
+        except (ImportError, OSError, RuntimeError, AttributeError) as error:
+            text = str(error).splitlines() or [type(error).__name__]
+            found.append(Check(name, False, text[0], INSTALL))
+    return found
+
+
+def show(console: Console) -> bool:
+    """Write the diagnosis as a table; True when nothing needs a cure. Not collective: call on one rank."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("", "found", "cure"):
+        table.add_column(title, overflow="fold")
+    found = checks()
+    for check in found:
+        mark = "[green]ok[/]" if check.ok else "[red]no[/]"
+        table.add_row(f"{mark} {check.name}", check.value.replace("[", r"\["), check.cure.replace("[", r"\["))
+    console.print(table)
+    return all(check.ok for check in found)
