@@ -35,10 +35,6 @@ class Output:
     C_s: Array
     point: tuple[float, ...] = ()
 
-    def local(self, z: Array) -> Array:
-        """This rank's share of C_e z. Not collective."""
-        return np.asarray(self.weight * z[self.dofs].sum(axis=0))
-
 
 def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     """Outputs of the scene; without any, the free node farthest from the hand. Collective.

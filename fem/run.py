@@ -1,28 +1,51 @@
-"""PETSc TS runs the midpoint step, in segments: between them come progress, frames, checkpoints and interrupts."""
+"""PETSc TS runs the midpoint step, in segments; between them come progress, frames, checkpoints and interrupts."""
 
 from __future__ import annotations
 
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from fem.build import Model
+from fem.checkpoint import read_checkpoint, write_checkpoint
 from fem.drive import Drive, Force, ForceDrive, TableDrive
-from fem.errors import SolverError
-from fem.midpoint import TissueMidpoint, TissueState, state_on
+from fem.errors import Interrupted, SolverError
+from fem.midpoint import TissueMidpoint, TissueState
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
 from fem.petsc import Array, PETSc, total
-from fem.snapshots import Snapshots, memory_check, snapshot_steps
+from fem.snapshots import NoStore, Snapshots, make_store
 from fem.solvers import choose_solver, make_solver
 from fem.system import BlockSystem
 
-Observer = Callable[[int, "Run"], None]
-"""Called between segments with the step number just reached; collective, may raise to end the run."""
+Observer = Callable[["Run"], None]
+"""Called between segments and at every frame; collective, may raise to end the run."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How to run, apart from what the scene says.
+
+    Attributes:
+        directory: where checkpoints and streamed snapshots go.
+        resume: continue from the checkpoint in ``directory``.
+        until: stop after this step and leave a checkpoint; None runs to the end.
+        progress: called about five times a second.
+        frame: called at the start, at the end and at ``output.frames`` steps between.
+    """
+
+    directory: Path = Path("out")
+    resume: bool = False
+    until: int | None = None
+    progress: Observer | None = None
+    frame: Observer | None = None
 
 
 @dataclass(frozen=True)
@@ -60,33 +83,40 @@ class Run:
 
     Args:
         model: the model.
+        options: where files go, and whether to resume.
         force: feedback force on the hand; None takes the scene's motion.
     """
 
-    def __init__(self, model: Model, force: Force | None = None) -> None:
+    def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
         scene, system = model.scene, model.system
         self.model = model
         self.steps, self.end = scene.time.steps, scene.time_end
         self.dt = self.end / self.steps
         self.solver = choose_solver(system.layout, scene.time.solver)
-        self.stored = (
-            snapshot_steps(self.steps, scene.output.every) if scene.output.snapshots == "memory" else np.zeros(0, int)
-        )
-        memory_check(system, len(self.stored))
         with model.watch.stage("factor"):
             self.midpoint = TissueMidpoint(system, self.dt, self.solver[0], scene.time.rtol)
-        n = system.layout.n_local
-        self.work = state_on(np.zeros(2 * n), system)
-        self.Z = np.zeros((2 * n, len(self.stored)), order="F")
-        self.columns: dict[int, TissueState] = {
-            int(step): state_on(self.Z[:, j], system) for j, step in enumerate(self.stored)
-        }
-        self.state = self.columns.get(0, self.work)
+        self.store: NoStore = make_store(
+            system, scene.output.snapshots, self.steps, scene.output.every, options.directory, options.resume
+        )
+        self.state: TissueState = self.store.target(0)
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
+        self.recorders = self._recorders()
         self.drive: Drive = self._make_drive(force)
         self.reached = 0
-        self.peak_energy = 0.0
+        self.initial_energy = self.peak_energy = 0.0
+        self.residual_first = 0.0
+        self.seconds = 0.0
+
+    def _recorders(self) -> list[tuple[np.ndarray, Array]]:
+        """Local dofs and column block of every output that this rank has a share in."""
+        result, at = [], 0
+        for output in self.outputs:
+            if len(output.dofs):
+                dofs = output.dofs[0] if len(output.dofs) == 1 else output.dofs
+                result.append((dofs, self.local_outputs[:, at : at + output.size]))
+            at += output.size
+        return result
 
     def _make_drive(self, force: Force | None) -> Drive:
         scene, system = self.model.scene, self.model.system
@@ -103,22 +133,22 @@ class Run:
             u = u + system.M_hand @ system.gravity
         return TableDrive(system, driven_table(system.M_hand, u, self.dt, zero, zero))
 
-    def solveStep(self, ts: Any, t: float, x: Any) -> None:  # noqa: N802 (the name PETSc calls)
-        """One midpoint step; the step number, not the summed time, picks the load. Collective."""
+    def step(self, ts: Any) -> None:
+        """One midpoint step, called by TS; the step number, not a summed time, picks the load. Collective."""
         n = self.reached
         self.drive.solve(n, self.midpoint, self.state)
-        new = self.columns.get(n + 1, self.work)
+        new = self.store.target(n + 1)
         self.midpoint.advance(self.state, new)
         self.state = new
         self.reached = n + 1
         self.record(n + 1)
+        ts.setTime((n + 1) * self.dt)
 
     def record(self, n: int) -> None:
         """Store this rank's share of the outputs at step n. Not collective."""
-        row, at = self.local_outputs[n], 0
-        for output in self.outputs:
-            row[at : at + output.size] = output.local(self.state.array)
-            at += output.size
+        z = self.state.array
+        for dofs, share in self.recorders:
+            share[n] = z[dofs] if dofs.ndim == 1 else z[dofs].sum(axis=0)
 
     def start(self) -> None:
         """Initial state: at rest, or in equilibrium under gravity. Collective."""
@@ -140,6 +170,7 @@ class Run:
         if step <= self.reached:
             return
         ts.setMaxSteps(step)
+        begin = time.perf_counter()
         try:
             ts.solve(x)
         except PETSc.Error as error:
@@ -150,8 +181,9 @@ class Run:
             raise SolverError(
                 f"{self.solver[0]}: TS stopped at step {self.reached} of {step} (reason {ts.getConvergedReason()})"
             )
-        if self.state is not self.work:
-            self.work.array[:] = self.state.array  # the TS solution is current between segments
+        self.seconds += time.perf_counter() - begin
+        if self.state is not self.store.work:
+            self.store.work.array[:] = self.state.array  # the TS solution is current between segments
             x.stateIncrease()
         energy = self.midpoint.energy(self.state)
         if not np.isfinite(energy):
@@ -167,24 +199,16 @@ class Run:
         scale = max(self.peak_energy, abs(work), abs(lost))
         return abs(defect) / scale if scale > 0 else 0.0
 
-    def trajectory(self, residuals: tuple[float, float]) -> Trajectory:
+    def trajectory(self, residual_last: float) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
         system, outputs = self.model.system, self.outputs
         comm = system.layout.comm
-        y = total(comm, self.local_outputs)
+        y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
         y += self.drive.q @ np.vstack([o.C_s for o in outputs]).T
         names = tuple(f"{o.name}_{'xyz'[i] if o.size <= 3 else i + 1}" for o in outputs for i in range(o.size))
         times = self.end * np.arange(self.steps + 1) / self.steps
-        snapshots = None
-        if len(self.stored):
-            snapshots = Snapshots(
-                system.layout,
-                self.stored,
-                times[self.stored],
-                self.drive.q[self.stored].T.copy(),
-                self.drive.v[self.stored].T.copy(),
-                self.Z,
-            )
+        snapshots = self.store.finish(times, self.drive.q, self.drive.v)
+        seconds = {**self.model.watch.seconds, "steps": comm.allreduce(self.seconds, MPI.MAX)}
         return Trajectory(
             times=times,
             q_s=self.drive.q,
@@ -194,9 +218,9 @@ class Run:
             snapshots=snapshots,
             final=self.state.array.copy(),
             energy_drift=self.drift(),
-            residuals=residuals,
+            residuals=(self.residual_first, residual_last),
             solver=self.solver,
-            seconds=dict(self.model.watch.seconds),
+            seconds=seconds,
         )
 
 
@@ -226,39 +250,99 @@ def make_ts(run: Run) -> tuple[Any, Any]:
     ts.setTimeStep(run.dt)
     ts.setMaxTime(1e300)  # stepping by time would take one step too many or change the last one
     ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
-    x = PETSc.Vec().createWithArray(run.work.array, size=(2 * layout.n_local, 2 * layout.n_e), comm=layout.comm)
+    x = PETSc.Vec().createWithArray(run.store.work.array, size=(2 * layout.n_local, 2 * layout.n_e), comm=layout.comm)
     ts.setSolution(x)
     return ts, x
 
 
-def simulate(model: Model, observer: Observer | None = None, force: Force | None = None) -> Trajectory:
+@contextmanager
+def _interruptible() -> Iterator[list[bool]]:
+    """Turn the first Ctrl-C into a flag; a second one interrupts at once."""
+    flag: list[bool] = []
+
+    def note(number: int, frame: Any) -> None:
+        flag.append(True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    try:
+        previous = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not the main thread: leave signals alone
+        yield flag
+        return
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:
+    """Steps at which a segment must end, and those of them with a frame or a checkpoint."""
+    scene = run.model.scene
+    frames: set[int] = set()
+    if options.frame is not None:
+        frames = set(np.linspace(0, run.steps, min(scene.output.frames, run.steps) + 1).round().astype(int).tolist())
+    every = scene.output.checkpoint_every
+    checkpoints = set(range(every, run.steps, every)) if every else set()
+    last = run.steps if options.until is None else min(options.until, run.steps)
+    return sorted({s for s in frames | checkpoints if s < last} | {last}), frames, checkpoints
+
+
+def simulate(model: Model, options: RunOptions | None = None, force: Force | None = None) -> Trajectory:
     """Run a scene from its start to its end. Collective.
 
     Args:
         model: from :func:`fem.build.build`.
-        observer: called about five times a second and at the end.
+        options: files, resume and observers.
         force: feedback force on the hand instead of the scene's motion.
 
     Raises:
         SolverError: a solve failed or missed its tolerance.
         ResourceError: the snapshots do not fit.
+        CheckpointError: resume was asked for and no fitting restart file is there.
+        Interrupted: Ctrl-C or ``until``; the message names the restart file.
     """
-    run = Run(model, force)
-    run.start()
+    options = options or RunOptions()
+    run = Run(model, options, force)
     ts, x = make_ts(run)
-    comm: MPI.Intracomm = model.system.layout.comm
     try:
-        begin = time.perf_counter()
-        run.advance_to(ts, x, 1)
-        first = run.midpoint.residual()
-        chunk = comm.bcast(int(np.clip(0.2 / max(time.perf_counter() - begin, 1e-6), 1, 10_000)))
-        with model.watch.stage("steps"):
-            while run.reached < run.steps:
-                run.advance_to(ts, x, min(run.steps, run.reached + chunk))
-                if observer is not None:
-                    observer(run.reached, run)
-        last = run.midpoint.residual()
-        return run.trajectory((first, last))
+        if options.resume:
+            read_checkpoint(run, options.directory / "checkpoint")
+            ts.setStepNumber(run.reached)
+        else:
+            run.start()
+        with _interruptible() as stop:
+            _run_segments(run, ts, x, options, stop)
+        return run.trajectory(run.midpoint.residual())
     finally:
         ts.destroy()
         run.midpoint.destroy()
+
+
+def _run_segments(run: Run, ts: Any, x: Any, options: RunOptions, stop: list[bool]) -> None:
+    comm: MPI.Intracomm = run.model.system.layout.comm
+    boundaries, frames, checkpoints = _boundaries(run, options)
+    if options.frame is not None and run.reached == 0:
+        options.frame(run)
+    if run.reached == 0:
+        run.advance_to(ts, x, 1)
+        run.residual_first = run.midpoint.residual()
+    last, chunk = boundaries[-1], 1
+    while run.reached < last:
+        limit = next(b for b in boundaries if b > run.reached)
+        begin, before = time.perf_counter(), run.reached
+        run.advance_to(ts, x, min(limit, run.reached + chunk, run.store.limit(run.reached)))
+        pace = (time.perf_counter() - begin) / (run.reached - before)
+        run.store.flush(run.reached)
+        # rank 0 sets the pace, all agree whether somebody asked to stop
+        chunk = comm.bcast(int(np.clip(0.2 / max(pace, 1e-7), 1, 10_000)))
+        if options.frame is not None and run.reached in frames:
+            options.frame(run)
+        if options.progress is not None:
+            options.progress(run)
+        stopped = comm.allreduce(bool(stop), MPI.LOR)
+        if run.reached in checkpoints or stopped or (run.reached == last < run.steps):
+            manifest = write_checkpoint(run, options.directory / "checkpoint")
+            if stopped or run.reached == last:
+                raise Interrupted(
+                    f"stopped after step {run.reached} of {run.steps}; {manifest} lets --resume go on from there"
+                )

@@ -70,11 +70,13 @@ def simulate(
     out: Annotated[Path, typer.Option(help="folder for result.json, trajectories, pictures and fields")] = Path("out"),
     set_: Overrides = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
+    until: Annotated[int | None, typer.Option(help="stop after this step and leave a checkpoint", min=1)] = None,
 ) -> None:
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
     from study.simulate import run_simulate
 
-    run_simulate(scene, out, set_ or [], console(), quiet)
+    run_simulate(scene, out, set_ or [], console(), quiet, resume, until)
 
 
 def main() -> None:

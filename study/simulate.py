@@ -12,11 +12,19 @@ from rich.table import Table
 
 from fem.build import build
 from fem.results import simulate_result, write_results
-from fem.run import Run, simulate
+from fem.run import Run, RunOptions, simulate
 from fem.scene_file import load_scene_collective
 
 
-def run_simulate(path: Path, out: Path, overrides: list[str], console: Console, quiet: bool = False) -> dict[str, Any]:
+def run_simulate(
+    path: Path,
+    out: Path,
+    overrides: list[str],
+    console: Console,
+    quiet: bool = False,
+    resume: bool = False,
+    until: int | None = None,
+) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective.
 
     Raises:
@@ -38,10 +46,10 @@ def run_simulate(path: Path, out: Path, overrides: list[str], console: Console, 
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("steps", total=scene.time.steps)
 
-        def observer(step: int, _: Run) -> None:
-            bar.update(task, completed=step)
+        def progress(run: Run) -> None:
+            bar.update(task, completed=run.reached)
 
-        run = simulate(model, observer)
+        run = simulate(model, RunOptions(directory=out, resume=resume, until=until, progress=progress))
     result = simulate_result(model, run)
     if comm.rank == 0:
         files = write_results(out, model, run, result)

@@ -1,0 +1,128 @@
+"""Restart files: one HDF5 file a rank, and a manifest written last, so that a torn write is never read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import h5py
+import numpy as np
+
+from fem.errors import CheckpointError, agree
+from fem.scene_file import scene_hash
+
+if TYPE_CHECKING:
+    from fem.run import Run
+
+FORMAT = 1
+
+
+def _rank_file(directory: Path, step: int, rank: int) -> Path:
+    return directory / f"step{step}-rank{rank}.h5"
+
+
+def write_checkpoint(run: Run, directory: Path) -> Path:
+    """Write everything that a bitwise restart needs; older files are removed afterwards. Collective.
+
+    Returns:
+        The manifest file.
+
+    Raises:
+        CheckpointError: the folder cannot be written.
+    """
+    comm = run.model.system.layout.comm
+    manifest = directory / "checkpoint.json"
+    with agree(comm):
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            _write_rank(run, _rank_file(directory, run.reached, comm.rank))
+        except OSError as error:
+            raise CheckpointError(
+                f"{directory}: the restart file cannot be written ({error}); free the disk"
+            ) from error
+    if comm.rank == 0:
+        entry = {
+            "format": FORMAT,
+            "scene_hash": scene_hash(run.model.scene),
+            "ranks": comm.size,
+            "step": run.reached,
+            "steps": run.steps,
+        }
+        fresh = manifest.with_suffix(".new")
+        fresh.write_text(json.dumps(entry, indent=2) + "\n")
+        fresh.replace(manifest)
+        for old in directory.glob("step*-rank*.h5"):
+            if not old.name.startswith(f"step{run.reached}-"):
+                old.unlink(missing_ok=True)
+    comm.Barrier()
+    return manifest
+
+
+def _write_rank(run: Run, path: Path) -> None:
+    midpoint, n = run.midpoint, run.reached
+    with h5py.File(path, "w") as file:
+        file["state"] = run.state.array
+        file["h"] = midpoint.h.array_r
+        file["k"] = midpoint.k.array_r
+        file["hand_q"] = run.drive.q[: n + 1]
+        file["hand_v"] = run.drive.v[: n + 1]
+        file["outputs"] = run.local_outputs[: n + 1]
+        file["snapshots"] = run.store.kept(n)
+        file["energies"] = [midpoint.work, midpoint.dissipated, run.initial_energy, run.peak_energy]
+        file["residual_first"] = run.residual_first
+
+
+def read_checkpoint(run: Run, directory: Path) -> None:
+    """Put a run back where it was stopped. Collective.
+
+    Raises:
+        CheckpointError: no restart file, or one of another scene, rank count or format.
+    """
+    comm = run.model.system.layout.comm
+    with agree(comm):
+        entry = _manifest(run, directory)
+        path = _rank_file(directory, entry["step"], comm.rank)
+        try:
+            with h5py.File(path) as file:
+                _restore(run, file, entry["step"])
+        except (OSError, KeyError, ValueError, TypeError) as error:
+            raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
+    for vector in (run.state.z, run.state.v, run.midpoint.h, run.midpoint.k):
+        vector.stateIncrease()
+
+
+def _manifest(run: Run, directory: Path) -> dict[str, int]:
+    comm = run.model.system.layout.comm
+    manifest = directory / "checkpoint.json"
+    try:
+        entry: dict[str, int] = json.loads(manifest.read_text())
+    except FileNotFoundError:
+        raise CheckpointError(f"{manifest} does not exist; run once without --resume") from None
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{manifest} cannot be read ({error}); run again without --resume") from error
+    wanted = {"format": FORMAT, "scene_hash": scene_hash(run.model.scene), "ranks": comm.size, "steps": run.steps}
+    for key, value in wanted.items():
+        if entry.get(key) != value:
+            raise CheckpointError(
+                f"{manifest} was written with {key} = {entry.get(key)}, this run has {value}; "
+                "resume with the same scene and rank count, or run again without --resume"
+            )
+    return entry
+
+
+def _restore(run: Run, file: h5py.File, step: int) -> None:
+    n = step + 1
+    run.store.restore(np.asarray(file["snapshots"]), step)
+    run.state = run.store.target(step)
+    run.state.array[:] = file["state"][:]
+    run.midpoint.h.array_w[:] = file["h"][:]
+    run.midpoint.k.array_w[:] = file["k"][:]
+    run.drive.q[:n] = file["hand_q"][:]
+    run.drive.v[:n] = file["hand_v"][:]
+    run.local_outputs[:n] = file["outputs"][:]
+    energies = file["energies"][:]
+    run.midpoint.work, run.midpoint.dissipated = float(energies[0]), float(energies[1])
+    run.initial_energy, run.peak_energy = float(energies[2]), float(energies[3])
+    run.residual_first = float(file["residual_first"][()])
+    run.reached = step

@@ -1,0 +1,93 @@
+"""Restart, streamed snapshots, stops and refusals of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from fem.build import Model, build
+from fem.errors import CheckpointError, Interrupted, ResourceError
+from fem.run import RunOptions, simulate
+from fem.scene_file import load_scene
+
+SCENES = Path(__file__).parent.parent / "demos" / "scenes"
+
+
+def small(comm: MPI.Intracomm, *overrides: str, scene: str = "paper_forward") -> Model:
+    return build(load_scene(SCENES / f"{scene}.toml", ["tissue.cells=[4,8]", "time.steps=40", *overrides]), comm)
+
+
+@pytest.mark.parametrize("snapshots", ["memory", "hdf5", "none"])
+@pytest.mark.parametrize("scene", ["paper_forward", "paper_lqr"])
+def test_restart_is_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Path, snapshots: str, scene: str) -> None:
+    extra = (f'output.snapshots="{snapshots}"', "output.every=3")
+    whole = simulate(small(comm, *extra, scene=scene), RunOptions(directory=mpi_tmp_path / "whole"))
+    with pytest.raises(Interrupted, match="step 17 of 40"):
+        simulate(small(comm, *extra, scene=scene), RunOptions(directory=mpi_tmp_path / "parts", until=17))
+    rest = simulate(small(comm, *extra, scene=scene), RunOptions(directory=mpi_tmp_path / "parts", resume=True))
+    assert np.array_equal(whole.final, rest.final)
+    assert np.array_equal(whole.outputs, rest.outputs)
+    assert np.array_equal(whole.q_s, rest.q_s)
+    assert whole.energy_drift == rest.energy_drift
+    if whole.snapshots is not None and rest.snapshots is not None:
+        assert np.array_equal(whole.snapshots.Z, rest.snapshots.Z)
+
+
+@pytest.mark.parametrize("scene", ["paper_forward", "paper_lqr"])
+def test_two_way_force_restart_is_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Path, scene: str) -> None:
+    extra = ("effects.reaction=true", 'motion.drive="force"')
+    whole = simulate(small(comm, *extra, scene=scene))
+    with pytest.raises(Interrupted):
+        simulate(small(comm, *extra, scene=scene), RunOptions(directory=mpi_tmp_path, until=11))
+    rest = simulate(small(comm, *extra, scene=scene), RunOptions(directory=mpi_tmp_path, resume=True))
+    assert np.array_equal(whole.final, rest.final)
+    assert np.array_equal(whole.v_s, rest.v_s)
+
+
+def test_streamed_snapshots_equal_those_in_memory(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    memory = simulate(small(comm, "output.every=7")).snapshots
+    simulate(small(comm, "output.every=7", 'output.snapshots="hdf5"'), RunOptions(directory=mpi_tmp_path))
+    assert memory is not None
+    start, n = memory.layout.start, memory.layout.n_local
+    with h5py.File(mpi_tmp_path / "snapshots.h5") as file:
+        assert np.array_equal(file["steps"][:], np.arange(0, 41, 7))
+        assert np.array_equal(file["z"][:, start : start + n], memory.Z[:n].T)
+        assert np.array_equal(file["v"][:, start : start + n], memory.Z[n:].T)
+        assert np.array_equal(file["q_s"][:], memory.q_s.T)
+        assert np.array_equal(file["nodes"][start // 2 : (start + n) // 2], memory.layout.nodes)
+
+
+def test_resume_without_or_with_foreign_checkpoint(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="does not exist"):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
+    with pytest.raises(Interrupted):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, until=5))
+    with pytest.raises(CheckpointError, match="scene_hash"):
+        simulate(small(comm, "tissue.material.mu=51.0"), RunOptions(directory=mpi_tmp_path, resume=True))
+
+
+def test_damaged_checkpoint_is_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    with pytest.raises(Interrupted):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, until=5))
+    if comm.rank == comm.size - 1:  # damage one rank's file only: every rank must raise
+        (mpi_tmp_path / "checkpoint" / f"step5-rank{comm.rank}.h5").write_bytes(b"not HDF5")
+    comm.Barrier()
+    with pytest.raises(CheckpointError, match="damaged"):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
+
+
+def test_snapshots_that_cannot_fit_are_refused_before_the_run(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Tiny:
+        available = 1000
+
+    monkeypatch.setattr("fem.snapshots.psutil.virtual_memory", lambda: Tiny)
+    model = small(comm)
+    needed = 16 * model.system.layout.n_e * 41
+    with pytest.raises(ResourceError, match=f"need {needed} bytes"):
+        simulate(model)
