@@ -104,6 +104,7 @@ class Run:
         self.recorders = self._recorders()
         self.drive: Drive = self._make_drive(force)
         self.reached = 0
+        self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = 0.0
         self.seconds = 0.0
@@ -185,10 +186,13 @@ class Run:
         if self.state is not self.store.work:
             self.store.work.array[:] = self.state.array  # the TS solution is current between segments
             x.stateIncrease()
+
+    def watch_energy(self) -> None:
+        """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
         energy = self.midpoint.energy(self.state)
         if not np.isfinite(energy):
             raise SolverError(
-                f"{self.solver[0]}: the energy is not finite at step {step}; check material, dt and force"
+                f"{self.solver[0]}: the energy is not finite at step {self.reached}; check material, dt and force"
             )
         self.peak_energy = max(self.peak_energy, abs(energy))
 
@@ -276,7 +280,10 @@ def _interruptible() -> Iterator[list[bool]]:
 
 
 def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:
-    """Steps at which a segment must end, and those of them with a frame or a checkpoint."""
+    """Steps at which a segment must end, and those of them with a frame or a checkpoint.
+
+    Ten of them do not depend on the options: there the energy is sampled, the same in every run of a scene.
+    """
     scene = run.model.scene
     frames: set[int] = set()
     if options.frame is not None:
@@ -284,7 +291,7 @@ def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set
     every = scene.output.checkpoint_every
     checkpoints = set(range(every, run.steps, every)) if every else set()
     last = run.steps if options.until is None else min(options.until, run.steps)
-    return sorted({s for s in frames | checkpoints if s < last} | {last}), frames, checkpoints
+    return sorted({s for s in frames | checkpoints | run.milestones if s < last} | {last}), frames, checkpoints
 
 
 def simulate(model: Model, options: RunOptions | None = None, force: Force | None = None) -> Trajectory:
@@ -333,6 +340,8 @@ def _run_segments(run: Run, ts: Any, x: Any, options: RunOptions, stop: list[boo
         run.advance_to(ts, x, min(limit, run.reached + chunk, run.store.limit(run.reached)))
         pace = (time.perf_counter() - begin) / (run.reached - before)
         run.store.flush(run.reached)
+        if run.reached in run.milestones:
+            run.watch_energy()
         # rank 0 sets the pace, all agree whether somebody asked to stop
         chunk = comm.bcast(int(np.clip(0.2 / max(pace, 1e-7), 1, 10_000)))
         if options.frame is not None and run.reached in frames:

@@ -93,8 +93,9 @@ class MemoryStore(NoStore):
         free = layout.comm.bcast(psutil.virtual_memory().available)
         if needed > 0.8 * free:
             raise ResourceError(
-                f"output.snapshots: {len(self.steps)} columns of {2 * layout.n_e} doubles need {needed} bytes and {free} "
-                f"are free; set output.every = {every * int(np.ceil(needed / (0.5 * free)))} or output.snapshots = 'hdf5'"
+                f"output.snapshots: {len(self.steps)} columns of {2 * layout.n_e} doubles need {needed} bytes "
+                f"and {free} are free; set output.every = {every * int(np.ceil(needed / (0.5 * free)))} "
+                "or output.snapshots = 'hdf5'"
             )
         self.Z = np.zeros((2 * layout.n_local, len(self.steps)), order="F")
         self.columns = {int(s): state_on(self.Z[:, j], system) for j, s in enumerate(self.steps)}
@@ -138,8 +139,8 @@ class Hdf5Store(NoStore):
                 free = shutil.disk_usage(directory).free
                 if self.needed > 0.9 * free:
                     raise ResourceError(
-                        f"output.snapshots: {len(self.steps)} columns of {2 * layout.n_e} doubles need {self.needed} bytes "
-                        f"and {free} are free in {directory}; set output.every to a larger number"
+                        f"output.snapshots: {len(self.steps)} columns of {2 * layout.n_e} doubles need "
+                        f"{self.needed} bytes and {free} are free in {directory}; set output.every to a larger number"
                     )
         rows = 2 * layout.n_local
         fit = max(1, BUFFER_BYTES // max(8 * rows, 1))
