@@ -61,12 +61,15 @@ class TissueMidpoint:
         dt: step [s].
         solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
+        reproducible: same bits in every parallel run, see :func:`fem.solvers.make_solver`.
     """
 
-    def __init__(self, system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10) -> None:
+    def __init__(
+        self, system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: bool = False
+    ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
         self.solver: TissueSolver = make_solver(
-            midpoint_matrix(system, dt), solver, system.layout, "softgrasp_midpoint_", rtol
+            midpoint_matrix(system, dt), solver, system.layout, "softgrasp_midpoint_", rtol, reproducible
         )
         self.K = system.K_ee
         self.r, self.h, self.k, self.w, self.load = (system.K_ee.createVecLeft() for _ in range(5))

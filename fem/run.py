@@ -22,7 +22,8 @@ from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
 from fem.petsc import Array, PETSc, total
 from fem.snapshots import NoStore, Snapshots, make_store
-from fem.solvers import choose_solver, make_solver
+from fem.scene import Time
+from fem.solvers import SolverName, choose_solver, make_solver
 from fem.system import BlockSystem
 
 Observer = Callable[["Run"], None]
@@ -94,7 +95,7 @@ class Run:
         self.dt = self.end / self.steps
         self.solver = choose_solver(system.layout, scene.time.solver)
         with model.watch.stage("factor"):
-            self.midpoint = TissueMidpoint(system, self.dt, self.solver[0], scene.time.rtol)
+            self.midpoint = TissueMidpoint(system, self.dt, self.solver[0], scene.time.rtol, scene.time.reproducible)
         self.store: NoStore = make_store(
             system, scene.output.snapshots, self.steps, scene.output.every, options.directory, options.resume
         )
@@ -156,7 +157,7 @@ class Run:
         scene, system = self.model.scene, self.model.system
         if scene.time.start == "equilibrium" and system.gravity is not None:
             with self.model.watch.stage("equilibrium"):
-                self.state.z.array_w[:] = equilibrium(system, self.solver[0], scene.time.rtol)
+                self.state.z.array_w[:] = equilibrium(system, self.solver[0], scene.time)
         self.midpoint.start(self.state)
         self.record(0)
         self.initial_energy = self.midpoint.energy(self.state)
@@ -228,7 +229,7 @@ class Run:
         )
 
 
-def equilibrium(system: BlockSystem, solver: str, rtol: float) -> Array:
+def equilibrium(system: BlockSystem, solver: SolverName, time: Time) -> Array:
     """Static displacement relative to the hand, K_ee z = G g; local rows. Collective.
 
     Raises:
@@ -237,7 +238,7 @@ def equilibrium(system: BlockSystem, solver: str, rtol: float) -> Array:
     load = system.K_ee.createVecLeft()
     z = system.K_ee.createVecRight()
     load.array_w[:] = 0.0 if system.gravity is None else system.G @ system.gravity
-    static = make_solver(system.K_ee.copy(), solver, system.layout, "softgrasp_static_", rtol)  # type: ignore[arg-type]
+    static = make_solver(system.K_ee.copy(), solver, system.layout, "softgrasp_static_", time.rtol, time.reproducible)
     static.solve(load, z)
     static.check(load, z, "the static equilibrium")
     result = z.array_r.copy()

@@ -113,6 +113,9 @@ class Time(Model):
     )
     solver: Literal["auto", "cholesky", "mumps", "cg"] = Field("auto", description="linear solver [no unit]")
     rtol: Annotated[float, Field(gt=0, lt=1)] = Field(1e-10, description="relative tolerance [1], cg only")
+    reproducible: bool = Field(
+        False, description="MUMPS on every rank by itself: the same bits in every parallel run, but slower [no unit]"
+    )
 
 
 class ControlOutput(Model):

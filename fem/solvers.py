@@ -87,8 +87,19 @@ class TissueSolver:
         self.S.destroy()
 
 
-def make_solver(S: PETSc.Mat, name: SolverName, layout: BlockLayout, prefix: str, rtol: float = 1e-10) -> TissueSolver:
+def make_solver(
+    S: PETSc.Mat, name: SolverName, layout: BlockLayout, prefix: str, rtol: float = 1e-10, reproducible: bool = False
+) -> TissueSolver:
     """Factor S (or set up CG with GAMG). Collective.
+
+    Args:
+        S: symmetric positive definite, owned by the solver from here on.
+        name: cholesky (PETSc, every rank by itself), mumps (distributed) or cg (GAMG).
+        layout: sizes and node coordinates.
+        prefix: PETSc options prefix.
+        rtol: relative tolerance of cg.
+        reproducible: run MUMPS on every rank by itself; the distributed one adds in the order messages arrive, so
+            its last bits differ from run to run.
 
     Raises:
         SolverError: the factorisation fails.
@@ -100,7 +111,7 @@ def make_solver(S: PETSc.Mat, name: SolverName, layout: BlockLayout, prefix: str
     if name == "cg":
         _set_up_cg(ksp, S, layout, prefix, rtol)
     else:
-        _set_up_direct(ksp, name, prefix)
+        _set_up_direct(ksp, name, prefix, reproducible)
     try:
         ksp.setUp()
     except PETSc.Error as error:
@@ -113,10 +124,10 @@ def make_solver(S: PETSc.Mat, name: SolverName, layout: BlockLayout, prefix: str
     return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol))
 
 
-def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str) -> None:
+def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str, reproducible: bool) -> None:
     ksp.setType("preonly")
     pc = ksp.getPC()
-    if name == "mumps":
+    if name == "mumps" and (ksp.comm.size == 1 or not reproducible):
         pc.setType("cholesky")
         pc.setFactorSolverType("mumps")
     elif ksp.comm.size == 1:
@@ -128,8 +139,11 @@ def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str) -> None:
             "pc_type": "redundant",
             "redundant_ksp_type": "preonly",
             "redundant_pc_type": "cholesky",
-            "redundant_pc_factor_mat_ordering_type": "nd",
         }
+        if name == "mumps":
+            inner["redundant_pc_factor_mat_solver_type"] = "mumps"
+        else:
+            inner["redundant_pc_factor_mat_ordering_type"] = "nd"
         with petsc_options(prefix, dict(inner)):
             ksp.setFromOptions()
 

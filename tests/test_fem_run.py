@@ -48,6 +48,16 @@ def test_two_way_force_restart_is_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Pat
     assert np.array_equal(whole.v_s, rest.v_s)
 
 
+def test_reproducible_mumps_restarts_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    extra = ("tissue.cells=[5,5,10]", "time.steps=10", "time.reproducible=true", 'time.solver="mumps"')
+    whole = simulate(small(comm, *extra, scene="block_3d"))
+    with pytest.raises(Interrupted):
+        simulate(small(comm, *extra, scene="block_3d"), RunOptions(directory=mpi_tmp_path, until=4))
+    rest = simulate(small(comm, *extra, scene="block_3d"), RunOptions(directory=mpi_tmp_path, resume=True))
+    assert np.array_equal(whole.final, rest.final)
+    assert np.array_equal(whole.v_s, rest.v_s)
+
+
 def test_streamed_snapshots_equal_those_in_memory(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     memory = simulate(small(comm, "output.every=7")).snapshots
     simulate(small(comm, "output.every=7", 'output.snapshots="hdf5"'), RunOptions(directory=mpi_tmp_path))
