@@ -143,16 +143,31 @@ def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple
     layers = cells_of_layers(space.mesh, scene) if scene.tissue.layers else {"tissue": None}
     forms = _bilinear(space.V)
     inventory.forms += list(forms)
+    pattern = None
+    if len(layers) > 1:
+        # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
+        owned = np.arange(domain.topology.index_map(space.mesh.dimension).size_local, dtype=np.int32)
+        whole = ufl.Measure("dx", domain=domain, subdomain_data=[(1, owned)])(1)
+        pattern = dolfinx.fem.petsc.assemble_matrix(dolfinx.fem.form(forms["M_1"](whole)))
+        pattern.assemble()
+        pattern.zeroEntries()
     result = []
     for name, cells in layers.items():
         dx = ufl.dx(domain) if cells is None else ufl.Measure("dx", domain=domain, subdomain_data=[(1, cells)])(1)
         parts = {}
         for key, form in forms.items():
-            A = dolfinx.fem.petsc.assemble_matrix(dolfinx.fem.form(form(dx)))
+            compiled = dolfinx.fem.form(form(dx))
+            if pattern is None:
+                A = dolfinx.fem.petsc.assemble_matrix(compiled)
+            else:
+                A = pattern.copy()
+                dolfinx.fem.petsc.assemble_matrix(A, compiled)
             A.assemble()
             parts[key] = _component(space, A, scene.tissue.thickness)
             inventory.operators.append(f"{key}[{name}]")
         result.append(LayerBlocks(name, **parts))
+    if pattern is not None:
+        pattern.destroy()
     return tuple(result)
 
 

@@ -13,15 +13,15 @@ from mpi4py import MPI
 
 from fem.assembly import Discretisation, Inventory, assemble, discretise
 from fem.contact import rigid_modes
+from fem.effects.damping import operator as damping_operator
+from fem.effects.gravity import acceleration
+from fem.effects.rotation import hand_mass
 from fem.geometry import make_mesh
-from fem.petsc import Array
 from fem.system import (
     BlockSystem,
-    Damping,
     LayerBlocks,
     LayerMaterial,
     coupling,
-    layered_viscosity,
     tissue_matrices,
 )
 
@@ -78,18 +78,6 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
-def hand_mass(scene: Scene, d: int) -> Array:
-    """M_hand = blkdiag(m I, inertia) [kg, kg m^2]. Not collective."""
-    mass = scene.hand.mass * np.eye(d)
-    if not scene.effects.rotation:
-        return mass
-    inertia = np.atleast_1d(np.asarray(scene.hand.inertia, dtype=float))
-    if d == 3 and inertia.size == 1:
-        inertia = np.repeat(inertia, 3)
-    n = len(inertia)
-    return np.block([[mass, np.zeros((d, n))], [np.zeros((n, d)), np.diag(inertia)]])
-
-
 def build(scene: Scene, comm: MPI.Intracomm) -> Model:
     """Mesh, assemble and couple. Collective.
 
@@ -109,22 +97,9 @@ def build(scene: Scene, comm: MPI.Intracomm) -> Model:
         T = np.asfortranarray(rigid_modes(layout.nodes, layout.dimension, scene.effects.rotation, layout.reference))
         G, M_rigid = coupling(layers, materials, T)
         inventory.operators += ["T", "G"]
-        wanted = scene.effects.damping
-        damping = Damping()
-        if wanted is not None:
-            matrix = layered_viscosity(layers, materials)
-            damping = Damping(
-                alpha=wanted.alpha,
-                beta=materials[0].beta if matrix is None else 0.0,
-                in_space=wanted.drag == "space",
-                matrix=matrix,
-            )
-            if matrix is not None:
-                inventory.operators.append("D_ee")
-        gravity = None
-        if scene.effects.gravity is not None:
-            gravity = np.zeros(layout.n_s)
-            gravity[: layout.dimension] = scene.effects.gravity.g
+        damping = damping_operator(scene, layers, materials)
+        if damping.matrix is not None:
+            inventory.operators.append("D_ee")
         system = BlockSystem(
             layout=layout,
             layers=layers,
@@ -136,7 +111,7 @@ def build(scene: Scene, comm: MPI.Intracomm) -> Model:
             M_hand=hand_mass(scene, layout.dimension),
             M_rigid=M_rigid,
             damping=damping,
-            gravity=gravity,
+            gravity=acceleration(scene, layout.n_s),
             hand_weight=bool(scene.effects.gravity is not None and scene.effects.gravity.hand_weight),
             two_way=scene.effects.reaction,
         )

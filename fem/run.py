@@ -21,8 +21,8 @@ from fem.midpoint import TissueMidpoint, TissueState
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
 from fem.petsc import Array, PETSc, total
-from fem.snapshots import NoStore, Snapshots, make_store
 from fem.scene import Time
+from fem.snapshots import NoStore, Snapshots, make_store
 from fem.solvers import SolverName, choose_solver, make_solver
 from fem.system import BlockSystem
 
@@ -57,6 +57,7 @@ class Trajectory:
         times: time grid [s], shape (steps + 1,).
         q_s, v_s: hand, shape (steps + 1, n_s), on every rank.
         outputs: named outputs [m], shape (steps + 1, components), on every rank.
+        outputs_rigid: what the outputs would be if the tissue moved rigidly with the hand, same shape.
         output_names: one per component.
         snapshots: stored states, or None.
         final: local [z; v_z] at the end.
@@ -70,6 +71,7 @@ class Trajectory:
     q_s: Array
     v_s: Array
     outputs: Array
+    outputs_rigid: Array
     output_names: tuple[str, ...]
     snapshots: Snapshots | None
     final: Array
@@ -209,7 +211,8 @@ class Run:
         system, outputs = self.model.system, self.outputs
         comm = system.layout.comm
         y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
-        y += self.drive.q @ np.vstack([o.C_s for o in outputs]).T
+        rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
+        y += rigid
         names = tuple(f"{o.name}_{'xyz'[i] if o.size <= 3 else i + 1}" for o in outputs for i in range(o.size))
         times = self.end * np.arange(self.steps + 1) / self.steps
         snapshots = self.store.finish(times, self.drive.q, self.drive.v)
@@ -219,6 +222,7 @@ class Run:
             q_s=self.drive.q,
             v_s=self.drive.v,
             outputs=y,
+            outputs_rigid=rigid,
             output_names=names,
             snapshots=snapshots,
             final=self.state.array.copy(),

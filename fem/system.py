@@ -120,10 +120,11 @@ class BlockSystem:
         )
 
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
-        """The same scene with other lambda, mu, rho: a few axpy, no assembly. Collective."""
+        """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective."""
         M_ee, K_ee = tissue_matrices(self.layers, materials)
         G, M_rigid = coupling(self.layers, materials, self.T)
-        damping = replace(self.damping, matrix=layered_viscosity(self.layers, materials))
+        matrix = layered_viscosity(self.layers, materials)
+        damping = replace(self.damping, matrix=matrix, beta=materials[0].beta if matrix is None else 0.0)
         return replace(self, materials=materials, M_ee=M_ee, K_ee=K_ee, G=G, M_rigid=M_rigid, damping=damping)
 
 

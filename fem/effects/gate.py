@@ -1,0 +1,82 @@
+"""What every effect states about itself, and the numbers its gate is computed from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from fem.scene import Scene
+    from fem.system import LayerMaterial
+
+
+@dataclass(frozen=True)
+class Gate:
+    """A dimensionless number that says whether an effect matters.
+
+    Attributes:
+        number: its value, dimensionless.
+        symbol: how it is computed.
+        threshold: value above which the effect matters.
+        matters: the effect changes what this scene computes; for an effect that is off: it would.
+        sentence: the finding in words.
+    """
+
+    number: float
+    symbol: str
+    threshold: float
+    matters: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Scales of one scene; `fem.effects.measure` computes them.
+
+    Attributes:
+        scene: the scene.
+        dimension: 2 or 3.
+        length: largest extent of the tissue [m].
+        materials: one per layer that has cells.
+        tissue_mass: mass of the whole tissue [kg].
+        tissue_inertia: moments of inertia of the rigid tissue about the reference, one per rotation [kg m2].
+        omega: lowest angular frequencies of the clamped tissue [1/s], ascending; empty when not computed.
+        zeta: damping ratio of each of them [1].
+    """
+
+    scene: Scene
+    dimension: int
+    length: float
+    materials: tuple[LayerMaterial, ...]
+    tissue_mass: float
+    tissue_inertia: tuple[float, ...]
+    omega: tuple[float, ...]
+    zeta: tuple[float, ...]
+
+
+class Effect(Protocol):
+    """One unit of physics that a scene switches on.
+
+    Attributes:
+        name: its key.
+        term: what it adds to the equation.
+        cost: what it costs, one sentence.
+    """
+
+    name: str
+    term: str
+    cost: str
+
+    def active(self, scene: Scene) -> bool:
+        """Whether the scene has it on. Not collective."""
+
+    def operators(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the operators it allocates in this scene; empty when it is off. Not collective."""
+
+    def gate(self, problem: Problem) -> Gate:
+        """The dimensionless number that says whether it matters. Not collective."""
+
+
+def force_drives(scene: Scene) -> bool:
+    """Whether a force moves the hand: in the run itself, or in the control problem. Not collective."""
+    return scene.motion.drive == "force" or scene.control is not None

@@ -1,0 +1,55 @@
+"""Layers: parts of the tissue with a material of their own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fem.effects.gate import Gate, Problem
+from fem.materials import young_poisson
+
+if TYPE_CHECKING:
+    from fem.scene import Scene
+
+THRESHOLD = 1.05  # stiffness within 5 % is one material for any purpose here
+
+
+class Layers:
+    """K = sum_k mu_k K_mu,k + lambda_k K_lambda,k and M = sum_k rho_k M_1,k over the layers k."""
+
+    name = "layers"
+    term = "sums over the layers in M and K"
+    cost = "3 tissue matrices a layer, kept so that new materials need no assembly; nothing in a step."
+
+    def active(self, scene: Scene) -> bool:
+        """Whether the scene has layers. Not collective."""
+        return bool(scene.tissue.layers)
+
+    def operators(self, scene: Scene) -> tuple[str, ...]:
+        """The three components of each layer. Not collective."""
+        return tuple(f"{key}[{name}]" for name in scene.tissue.layers for key in ("K_mu", "K_lambda", "M_1"))
+
+    def gate(self, problem: Problem) -> Gate:
+        """Contrast max E / min E; layers of one stiffness still matter if another property differs.
+
+        Not collective.
+        """
+        materials = problem.materials
+        young, nu = zip(*(young_poisson(m.lam, m.mu) for m in materials), strict=True)
+        rho = [m.rho for m in materials]
+        number, symbol = max(young) / min(young), "max E / min E"
+        if not self.active(problem.scene):
+            return Gate(1.0, symbol, THRESHOLD, False, "One material.")
+        density = max(rho) / min(rho)
+        others = [
+            word
+            for word, differs in (
+                ("density", density > THRESHOLD),
+                ("Poisson's ratio", max(nu) - min(nu) > 0.01),
+                ("viscosity", len({m.beta for m in materials}) > 1),
+            )
+            if differs
+        ]
+        matters = number > THRESHOLD or bool(others)
+        sentence = f"The stiffest layer is {number:.3g} times as stiff as the softest"
+        sentence += f"; they also differ in {' and '.join(others)}." if others else "."
+        return Gate(number, symbol, THRESHOLD, matters, sentence)

@@ -1,0 +1,45 @@
+"""Reaction: the hand feels the tissue (two-way coupling)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fem.effects.gate import Gate, Problem, force_drives
+
+if TYPE_CHECKING:
+    from fem.scene import Scene
+
+THRESHOLD = 0.05  # the hand's acceleration under a given force changes by about this much
+
+
+class Reaction:
+    """The inertia of the tissue in the hand's equation; makes M and K symmetric."""
+
+    name = "reaction"
+    term = "M_r (q_s'' - g) + G' z'' in the hand's equation"
+    cost = (
+        "n_s extra solves before the run when a force drives the hand; n_s columns Y and two small reductions a step."
+    )
+
+    def active(self, scene: Scene) -> bool:
+        """Whether the scene has it on. Not collective."""
+        return scene.effects.reaction
+
+    def operators(self, scene: Scene) -> tuple[str, ...]:
+        """Y = S^-1 G, n_s columns, and its small product with G, when a force moves the hand. Not collective."""
+        return ("Y", "G'Y") if self.active(scene) and scene.motion.drive == "force" else ()
+
+    def gate(self, problem: Problem) -> Gate:
+        """Tissue mass over hand mass; matters only if a force moves the hand. Not collective."""
+        scene = problem.scene
+        number = problem.tissue_mass / scene.hand.mass
+        change = number / (1 + number)
+        on, felt = self.active(scene), force_drives(scene)
+        where = "" if scene.motion.drive == "force" else " in the control problem"
+        if felt and on:
+            sentence = f"The tissue takes about {change:.1%} off the acceleration that a force gives the hand{where}."
+        elif felt:
+            sentence = f"Off; it would take about {change:.1%} off the acceleration a force gives the hand{where}."
+        else:
+            sentence = "The motion of the hand is prescribed, so the reaction moves nothing."
+        return Gate(number, "tissue mass / hand mass", THRESHOLD, felt and number > THRESHOLD, sentence)

@@ -1,0 +1,312 @@
+"""What a scene solves, before it is solved: its equation, sizes, time scales and which effects matter."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
+
+from fem.build import build
+from fem.effects import EFFECTS, Gate
+from fem.effects.measure import measure
+from fem.materials import young_poisson
+from fem.modes import lowest_modes
+from fem.petsc import PETSc
+from fem.solvers import DIRECT_LIMIT, choose_solver
+from study.equation import Equation, equation
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from fem.build import Model
+    from fem.scene import Scene
+
+MODES = 6
+LOCKING = 0.49  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu)
+COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
+SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
+SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Numbers of unknowns and entities; ``states`` is 2n of the first-order system."""
+
+    n_s: int
+    n_e: int
+    states: int
+    cells: int
+    nodes: int
+    nonzeros: int
+    ranks: int
+
+
+@dataclass(frozen=True)
+class SolverPlan:
+    """Solver, reason and estimated memory of its factor over all ranks [byte] (0: no factor)."""
+
+    name: str
+    reason: str
+    factor_bytes: float
+
+
+@dataclass(frozen=True)
+class TimePlan:
+    """Step and end [s] against the first periods T_k = 2 pi / omega_k of the clamped tissue [s, 1/s]."""
+
+    steps: int
+    dt: float
+    end: float
+    omega: tuple[float, ...]
+    periods: tuple[float, ...]
+    omega_dt: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class EffectReport:
+    """One effect in this scene: `fem.effects` says what the entries mean."""
+
+    on: bool
+    term: str
+    operators: tuple[str, ...]
+    cost: str
+    gate: Gate
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """All that explain says.
+
+    Attributes:
+        name: of the scene.
+        equation: with exactly the terms of this scene.
+        sizes: unknowns and entities.
+        solver: choice and cost.
+        time: step against periods.
+        effects: by name.
+        poisson: Poisson's ratio of each material by layer name [1].
+        missing: effects that are off and would matter.
+        idle: effects that are on and do not matter.
+        warnings: one sentence each.
+        snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
+    """
+
+    name: str
+    equation: Equation
+    sizes: Sizes
+    solver: SolverPlan
+    time: TimePlan
+    effects: dict[str, EffectReport]
+    poisson: dict[str, float]
+    missing: tuple[str, ...]
+    idle: tuple[str, ...]
+    warnings: tuple[str, ...]
+    snapshot_columns: int
+    snapshot_bytes: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dicts, lists and numbers for JSON; what is not known is None. Not collective."""
+        result: dict[str, Any] = _plain(asdict(self))
+        return result
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def factor_bytes(name: str, n: int, dimension: int, ranks: int) -> float:
+    """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection. Not collective.
+
+    nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
+    (2D) and 5e2 to 2e5 (3D) unknowns; 12 byte an entry. The small solver keeps a copy on each rank.
+    """
+    if name == "cg" or n < 2:
+        return 0.0
+    row = 7.75 * np.log2(n) - 44 if dimension == 2 else 19.5 * n ** (1 / 3) - 85
+    return float(12 * n * np.clip(row, 1, (n + 1) / 2) * (ranks if name == "cholesky" else 1))
+
+
+def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
+    """Assemble a scene and say what it is. Collective.
+
+    Raises:
+        SceneError, MeshError: the scene cannot be built.
+        SolverError: its modes cannot be computed.
+    """
+    return explain_model(build(scene, comm))
+
+
+def explain_model(model: Model) -> Explanation:
+    """Say what a built model is. Collective.
+
+    Raises:
+        SolverError: its modes cannot be computed.
+    """
+    scene, system = model.scene, model.system
+    layout = system.layout
+    d, ranks = layout.dimension, layout.comm.size
+    name, reason = choose_solver(layout, scene.time.solver)
+    if layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
+        omega, Phi = lowest_modes(system, min(MODES, layout.n_e))
+    else:
+        omega, Phi = np.zeros(0), np.zeros((layout.n_local, 0))
+    problem = measure(model, omega, Phi)
+    reports = {
+        key: EffectReport(e.active(scene), e.term, e.operators(scene), e.cost, e.gate(problem))
+        for key, e in EFFECTS.items()
+    }
+    topology = model.space.mesh.mesh.topology
+    stored = scene.output.snapshots == "memory"
+    columns = scene.time.steps // scene.output.every + 1 if stored else 0
+    dt = scene.time_end / scene.time.steps
+    names = [blocks.name for blocks in system.layers]
+    poisson = {n: young_poisson(m.lam, m.mu)[1] for n, m in zip(names, system.materials, strict=True)}
+    return Explanation(
+        name=scene.name,
+        equation=equation(scene),
+        sizes=Sizes(
+            n_s=layout.n_s,
+            n_e=layout.n_e,
+            states=layout.states,
+            cells=topology.index_map(d).size_global,
+            nodes=model.space.V.dofmap.index_map.size_global,
+            nonzeros=int(system.K_ee.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]),
+            ranks=ranks,
+        ),
+        solver=SolverPlan(name, reason, factor_bytes(name, layout.n_e, d, ranks)),
+        time=TimePlan(
+            steps=scene.time.steps,
+            dt=dt,
+            end=scene.time_end,
+            omega=problem.omega,
+            periods=tuple((2 * np.pi / omega).tolist()),
+            omega_dt=tuple((omega * dt).tolist()),
+        ),
+        effects=reports,
+        poisson=poisson,
+        missing=tuple(key for key, r in reports.items() if not r.on and r.gate.matters),
+        idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
+        warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports)),
+        snapshot_columns=columns,
+        snapshot_bytes=16 * layout.n_e * columns,
+    )
+
+
+def _warnings(
+    scene: Scene, poisson: dict[str, float], omega: Any, dt: float, d: int, effects: dict[str, EffectReport]
+) -> list[str]:
+    found = []
+    for name, nu in poisson.items():
+        if nu > LOCKING + 1e-9 and scene.tissue.order == 1:
+            found.append(
+                f"nu = {nu:.4g} of {name} is above {LOCKING}: P1 locks and is far too stiff, use tissue.order = 2."
+            )
+    if len(omega) and omega[0] * dt / (2 * np.pi) > COARSE_STEP:
+        found.append(
+            f"dt is {omega[0] * dt / (2 * np.pi):.2g} of the first period, so even that mode is coarse in time: "
+            f"use at least {int(np.ceil(scene.time_end * omega[0] / (2 * np.pi * COARSE_STEP)))} steps."
+        )
+    gravity = effects["gravity"]
+    if gravity.on and gravity.gate.number > SMALL_STRAIN:
+        found.append(
+            f"rho g L / E = {gravity.gate.number:.2g} is above {SMALL_STRAIN}: linear elasticity assumes small strains."
+        )
+    if scene.effects.rotation:
+        angle = max(map(abs, (scene.motion.target or [])[d:]), default=0.0)
+        if angle > SMALL_ANGLE:
+            found.append(
+                f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."
+            )
+    return found
+
+
+def run_explain(scene: Scene, comm: MPI.Intracomm, console: Console) -> Explanation:
+    """Explain a scene; rank 0 writes it to the console. Collective.
+
+    Raises:
+        SceneError, MeshError, SolverError: as `explain`.
+    """
+    result = explain(scene, comm)
+    if comm.rank == 0:
+        render(result, console)
+    return result
+
+
+def render(result: Explanation, console: Console) -> None:
+    """Write an explanation; narrow terminals wrap. Not collective: call on one rank."""
+
+    def title(text: str) -> None:
+        console.print(f"\n[bold]{escape(text)}[/]")
+
+    def line(text: str, indent: int = 2) -> None:
+        console.print(Padding.indent(escape(text), indent), highlight=False)
+
+    console.print(f"[bold]{escape(result.name)}[/]")
+    title("Equation")
+    for row in result.equation.blocks:
+        line(_row(*row))
+    line("stepped as")
+    for row in result.equation.stepped:
+        line(_row(*row))
+    line("with")
+    for text in result.equation.where:
+        line(text, 4)
+    s, t = result.sizes, result.time
+    title("Sizes")
+    line(f"n_s = {s.n_s}, n_e = {s.n_e}, states 2n = {s.states}")
+    line(f"{s.cells} cells, {s.nodes} nodes, {s.nonzeros} non-zeros in K_ee, {s.ranks} rank(s)")
+    line("nu = " + ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items()))
+    title("Solver")
+    line(f"{result.solver.name}: {result.solver.reason}")
+    if result.solver.factor_bytes:
+        line(f"factor about {_size(result.solver.factor_bytes)} (estimate)")
+    line(f"snapshots: {result.snapshot_columns} columns, {_size(result.snapshot_bytes)}")
+    title("Time")
+    line(f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s")
+    if not t.omega:
+        line("first periods not computed: the factor would not fit")
+    for k, (T, phase) in enumerate(zip(t.periods, t.omega_dt, strict=True), 1):
+        line(f"T_{k} = {T:.4g} s, dt/T_{k} = {t.dt / T:.2g}, omega_{k} dt = {phase:.2g}")
+    title("Effects")
+    for name, e in result.effects.items():
+        gate = e.gate
+        verdict = "matters" if e.on else "would matter"
+        verdict = verdict if gate.matters else "does not matter" if e.on else "not needed"
+        line(f"{name}: {'on' if e.on else 'off'}, {verdict}")
+        line(f"{gate.symbol} = {gate.number:.3g} (threshold {gate.threshold:.3g})", 4)
+        line(gate.sentence, 4)
+        if e.on:
+            line(f"adds {e.term}; allocates {', '.join(e.operators) or 'nothing'}.", 4)
+            line(e.cost, 4)
+    if result.missing or result.idle or result.warnings:
+        title("Look at")
+    for name in result.missing:
+        line(f"{name} is off, but the scene seems to call for it.")
+    for name in result.idle:
+        line(f"{name} is on, but does not matter here.")
+    for text in result.warnings:
+        line(text)
+
+
+def _row(name: str, left: tuple[str, ...], right: tuple[str, ...]) -> str:
+    return f"{name}: {_sum(left)} = {_sum(right)}"
+
+
+def _sum(terms: tuple[str, ...]) -> str:
+    return " + ".join(terms).replace("+ - ", "- ")
+
+
+def _size(size: float) -> str:
+    for unit in ("byte", "KiB", "MiB"):
+        if size < 1024:
+            return f"{size:.3g} {unit}" if unit != "byte" else f"{size:.0f} byte"
+        size /= 1024
+    return f"{size:.3g} GiB"
