@@ -73,7 +73,9 @@ class TissueMidpoint:
         )
         self.K = system.K_ee
         self.r, self.h, self.k, self.w, self.load = (system.K_ee.createVecLeft() for _ in range(5))
+        # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
         self.load_array: Array = self.load.array_w
+        self.w_array, self.r_array, self.k_array = self.w.array_r, self.r.array_r, self.k.array_r
         damping = system.damping
         self.alpha, self.beta, self.D = damping.alpha, damping.beta, damping.matrix
         self.a = 2 * self.s / (self.s + self.alpha)
@@ -81,9 +83,11 @@ class TissueMidpoint:
         self._propagate = self._undamped
         if self.D is not None:
             self.k_old, self.y = self.k.duplicate(), self.k.duplicate()
+            self.y_array = self.y.array_r
             self._propagate = self._general
         elif damping.active:
             self.k_old = self.k.duplicate()
+            self.k_old_array = self.k_old.array_r
             self._propagate = self._proportional
         self.work = 0.0
         self.dissipated = 0.0
@@ -110,7 +114,7 @@ class TissueMidpoint:
             new.z.waxpy(2.0, w, old.z)
             old.v.copy(new.v)
             new.v.axpby(2 * self.s, -1.0, w)
-        self.work += 2.0 * float(np.dot(w.array_r, self.load_array))
+        self.work += 2.0 * float(np.dot(self.w_array, self.load_array))
         self._propagate(new)
 
     def _undamped(self, new: TissueState) -> None:
@@ -120,13 +124,14 @@ class TissueMidpoint:
 
     def _proportional(self, new: TissueState) -> None:
         self.k, self.k_old = self.k_old, self.k
+        self.k_array, self.k_old_array = self.k_old_array, self.k_array
         self.K.mult(new.z, self.k)
         self.h.axpby(self.a, -1.0, self.r)
         self.h.axpy(-1.0 - self.b, self.k)
         self.h.axpy(self.b - 1.0, self.k_old)
-        w = self.w.array_r
-        wKw = (np.dot(w, self.k.array_r) - np.dot(w, self.k_old.array_r)) / 2
-        wMw = (np.dot(w, self.r.array_r) - (1 + self.s * self.beta) * wKw) / (self.s * (self.s + self.alpha))
+        w = self.w_array
+        wKw = (np.dot(w, self.k_array) - np.dot(w, self.k_old_array)) / 2
+        wMw = (np.dot(w, self.r_array) - (1 + self.s * self.beta) * wKw) / (self.s * (self.s + self.alpha))
         self.dissipated += 2 * self.s * float(self.alpha * wMw + self.beta * wKw)
 
     def _general(self, new: TissueState) -> None:
@@ -137,17 +142,17 @@ class TissueMidpoint:
         self.h.axpy(-1.0, self.k)
         if self.D is not None:
             self.D.mult(self.w, self.y)
-        self.dissipated += 2 * self.s * float(np.dot(self.w.array_r, self.y.array_r))
+        self.dissipated += 2 * self.s * float(np.dot(self.w_array, self.y_array))
         if self.alpha:
             self.system.M_ee.mult(self.w, self.y)
-            self.dissipated += 2 * self.s * self.alpha * float(np.dot(self.w.array_r, self.y.array_r))
+            self.dissipated += 2 * self.s * self.alpha * float(np.dot(self.w_array, self.y_array))
 
     def energy(self, state: TissueState) -> float:
         """Energy (z' K z + v' M v) / 2 [J] from the carried vectors. Collective."""
-        n = len(self.w.array_r)
+        n = len(self.w_array)
         z, v = state.array[:n], state.array[n:]
-        momentum = (self.h.array_r + self.k.array_r) / self.s
-        local = np.array([np.dot(z, self.k.array_r), np.dot(v, momentum)])
+        momentum = (self.h.array_r + self.k_array) / self.s
+        local = np.array([np.dot(z, self.k_array), np.dot(v, momentum)])
         return float(total(self.system.layout.comm, local).sum()) / 2
 
     def balance(self) -> tuple[float, float]:
