@@ -14,7 +14,7 @@ import ufl
 from fem.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from fem.errors import MeshError, SceneError
 from fem.geometry import TissueMesh
-from fem.layout import BlockLayout
+from fem.layout import BlockLayout, bounding_box
 from fem.petsc import Array, PETSc, total
 from fem.system import Component, LayerBlocks
 
@@ -83,6 +83,8 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
     R[rows] = modes[rows]
     is_e = PETSc.IS().createBlock(d, (free + index_map.local_range[0]).astype(PETSc.IntType), comm=comm)
     n_local = len(free) * d
+    nodes = np.ascontiguousarray(X[free, :d])
+    low, high = bounding_box(comm, nodes)
     layout = BlockLayout(
         comm=comm,
         dimension=d,
@@ -90,8 +92,9 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
         n_e=n_e,
         n_local=n_local,
         start=int(comm.exscan(n_local) or 0),
-        nodes=np.ascontiguousarray(X[free, :d]),
+        nodes=nodes,
         reference=reference,
+        extent=float((high - low).max()) or 1.0,
     )
     return Discretisation(mesh, V, contact, free, is_e, R, layout)
 

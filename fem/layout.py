@@ -23,6 +23,7 @@ class BlockLayout:
         start: global number of the first one.
         nodes: coordinates [m] of the owned free nodes, shape (n_local / d, d).
         reference: the hand's reference point [m], shape (d,).
+        extent: longest side of the bounding box of the free nodes [m], the same on every rank.
     """
 
     comm: MPI.Intracomm
@@ -33,11 +34,20 @@ class BlockLayout:
     start: int
     nodes: Array
     reference: Array
+    extent: float = 1.0
 
     @property
     def states(self) -> int:
         """Length 2n of the first-order state [q_s, v_s, q_e, v_e]."""
         return 2 * (self.n_s + self.n_e)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates of the free nodes [m]. Collective."""
+        return bounding_box(self.comm, self.nodes)
+
+    def rounded(self, lengths: Array) -> Array:
+        """Lengths on a decimal grid of about 1e-9 of the body, so that rounding makes no difference. Not collective."""
+        return np.asarray(np.round(lengths, 9 - int(np.floor(np.log10(self.extent)))))
 
     def nearest_node(self, point: Array) -> tuple[int, int, Array]:
         """Free node nearest to a point: owning rank, its first local dof there, its coordinates.
@@ -48,15 +58,22 @@ class BlockLayout:
         best: tuple[float, tuple[float, ...], int, int] | None = None
         if len(self.nodes):
             distance = np.linalg.norm(self.nodes - point, axis=1)
-            # nodes at equal distance differ by rounding only: compare on a grid of 1e-9 of the distance scale
-            key = np.round(distance, 9)
+            key = self.rounded(distance)
             candidates = np.flatnonzero(key == key.min())
-            first = min(candidates, key=lambda i: tuple(np.round(self.nodes[i], 9)))
+            first = min(candidates, key=lambda i: tuple(self.rounded(self.nodes[i])))
             best = (
                 float(key[first]),
-                tuple(np.round(self.nodes[first], 9).tolist()),
+                tuple(self.rounded(self.nodes[first]).tolist()),
                 self.comm.rank,
                 int(first) * self.dimension,
             )
         found = min(b for b in self.comm.allgather(best) if b is not None)
         return found[2], found[3], np.array(found[1])
+
+
+def bounding_box(comm: MPI.Intracomm, nodes: Array) -> tuple[Array, Array]:
+    """Lowest and highest coordinates of distributed nodes. Collective."""
+    empty = np.full((1, nodes.shape[1]), np.inf)
+    lows = comm.allgather(np.vstack([nodes, empty]).min(axis=0))
+    highs = comm.allgather(np.vstack([nodes, -empty]).max(axis=0))
+    return np.min(lows, axis=0), np.max(highs, axis=0)

@@ -72,7 +72,10 @@ def _node(system: BlockSystem, name: str, point: Array) -> Output:
 def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
     layout = system.layout
     d = layout.dimension
-    inside = np.flatnonzero(((layout.nodes >= box[0]) & (layout.nodes <= box[1])).all(axis=1))
+    slack = 1e-9 * max(
+        layout.extent, float(np.abs(box).max())
+    )  # a node on the edge of the box is inside, rounded or not
+    inside = np.flatnonzero(((layout.nodes >= box[0] - slack) & (layout.nodes <= box[1] + slack)).all(axis=1))
     dofs = inside[:, None] * d + np.arange(d)
     count = int(total(layout.comm, np.array([float(len(inside))]))[0])
     if count == 0:
@@ -83,17 +86,8 @@ def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
     return Output(name, d, dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()))
 
 
-def _bounds(system: BlockSystem) -> tuple[Array, Array]:
-    layout = system.layout
-    big = np.full((1, layout.dimension), np.inf)
-    nodes = layout.nodes
-    lows = layout.comm.allgather(np.vstack([nodes, big]).min(axis=0))
-    highs = layout.comm.allgather(np.vstack([nodes, -big]).max(axis=0))
-    return np.min(lows, axis=0), np.max(highs, axis=0)
-
-
 def _inside(system: BlockSystem, point: list[float], i: int) -> None:
-    low, high = _bounds(system)
+    low, high = system.layout.bounds()
     p = np.asarray(point, dtype=float)
     slack = 0.05 * float((high - low).max())  # free nodes end one cell short of the contact zone
     if (p < low - slack).any() or (p > high + slack).any():
@@ -107,7 +101,7 @@ def _farthest(system: BlockSystem) -> Array:
     layout = system.layout
     best = (-1.0, ())
     if len(layout.nodes):
-        distance = np.round(np.linalg.norm(layout.nodes - layout.reference, axis=1), 9)
+        distance = layout.rounded(np.linalg.norm(layout.nodes - layout.reference, axis=1))
         far = np.flatnonzero(distance == distance.max())
-        best = (float(distance.max()), min(tuple(layout.nodes[j].tolist()) for j in far))
+        best = (float(distance.max()), min(tuple(layout.rounded(layout.nodes[j]).tolist()) for j in far))
     return np.asarray(max(layout.comm.allgather(best))[1], dtype=float)

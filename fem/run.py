@@ -21,7 +21,7 @@ from fem.midpoint import TissueMidpoint, TissueState
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
 from fem.petsc import Array, PETSc, total
-from fem.scene import Time
+from fem.scene import Scene, Time
 from fem.snapshots import NoStore, Snapshots, make_store
 from fem.solvers import SolverName, choose_solver, make_solver
 from fem.system import BlockSystem
@@ -264,6 +264,12 @@ def make_ts(run: Run) -> tuple[Any, Any]:
     return ts, x
 
 
+def frame_steps(scene: Scene) -> list[int]:
+    """Steps at which ``RunOptions.frame`` is called: ``output.frames`` intervals from start to end."""
+    steps = scene.time.steps
+    return np.linspace(0, steps, min(scene.output.frames, steps) + 1).round().astype(int).tolist()
+
+
 @contextmanager
 def _interruptible() -> Iterator[list[bool]]:
     """Turn the first Ctrl-C into a flag; a second one interrupts at once."""
@@ -292,7 +298,7 @@ def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set
     scene = run.model.scene
     frames: set[int] = set()
     if options.frame is not None:
-        frames = set(np.linspace(0, run.steps, min(scene.output.frames, run.steps) + 1).round().astype(int).tolist())
+        frames = set(frame_steps(scene))
     every = scene.output.checkpoint_every
     checkpoints = set(range(every, run.steps, every)) if every else set()
     last = run.steps if options.until is None else min(options.until, run.steps)

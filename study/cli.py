@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 from mpi4py import MPI
 from rich.console import Console
+from rich.text import Text
 
 from fem import _stack as _stack  # threads and MPI before anything numerical
 from fem.errors import SoftgraspError
@@ -65,18 +66,37 @@ def schema() -> None:
 
 
 @app.command()
+def explain(scene: SceneFile, set_: Overrides = None) -> None:
+    """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
+    from fem.scene_file import load_scene_collective
+    from study.explain import run_explain
+
+    run_explain(load_scene_collective(MPI.COMM_WORLD, scene, set_ or []), MPI.COMM_WORLD, console())
+
+
+@app.command()
 def simulate(
     scene: SceneFile,
     out: Annotated[Path, typer.Option(help="folder for result.json, trajectories, pictures and fields")] = Path("out"),
     set_: Overrides = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
+    no_pictures: Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")] = False,
     until: Annotated[int | None, typer.Option(help="stop after this step and leave a checkpoint", min=1)] = None,
 ) -> None:
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
     from study.simulate import run_simulate
 
-    run_simulate(scene, out, set_ or [], console(), quiet, resume, until)
+    run_simulate(
+        scene,
+        out,
+        set_ or [],
+        console(),
+        quiet=quiet,
+        resume=resume,
+        until=until,
+        pictures=not no_pictures,
+    )
 
 
 def main() -> None:
@@ -86,7 +106,7 @@ def main() -> None:
         app()
     except SoftgraspError as error:
         if comm.rank == 0:
-            Console(stderr=True, highlight=False).print(f"[red]error:[/red] {error}", soft_wrap=True, markup=True)
+            Console(stderr=True, highlight=False).print(Text(f"error: {error}"), soft_wrap=True)
         sys.exit(1)
     except (SystemExit, KeyboardInterrupt):
         raise

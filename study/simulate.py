@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,12 @@ from rich.table import Table
 from fem.build import build
 from fem.results import simulate_result, write_results
 from fem.run import Run, RunOptions, simulate
-from fem.scene_file import load_scene_collective
+from fem.scene import Scene
+from fem.scene_file import load_scene_collective, resolved_toml
+from study.frames import Frames
+from study.report import write_report
+
+Rows = list[tuple[str, str]]
 
 
 def run_simulate(
@@ -21,9 +27,11 @@ def run_simulate(
     out: Path,
     overrides: list[str],
     console: Console,
+    *,
     quiet: bool = False,
     resume: bool = False,
     until: int | None = None,
+    pictures: bool = True,
 ) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective.
 
@@ -32,50 +40,86 @@ def run_simulate(
     """
     comm = MPI.COMM_WORLD
     scene = load_scene_collective(comm, path, overrides)
-    console.print(f"[bold]{scene.name}[/bold]  {scene.description}")
+    console.print(f"[bold]{scene.name}[/bold]: {scene.description}", soft_wrap=True)
     model = build(scene, comm)
     layout = model.system.layout
     console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {comm.size} rank(s)")
-    columns = (
-        TextColumn("steps"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
+    frames = Frames(model, out, pictures)
+    columns = (TextColumn("steps"), BarColumn(), MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("steps", total=scene.time.steps)
 
         def progress(run: Run) -> None:
             bar.update(task, completed=run.reached)
 
-        run = simulate(model, RunOptions(directory=out, resume=resume, until=until, progress=progress))
+        run = simulate(model, RunOptions(directory=out, resume=resume, until=until, progress=progress, frame=frames))
+    files = frames.close()
     result = simulate_result(model, run)
     if comm.rank == 0:
-        files = write_results(out, model, run, result)
-        show(console, result)
+        begin = time.perf_counter()
+        files = write_results(out, model, run, result) + files + frames.draw(out, run)
+        rows = result_rows(result)
+        files.append(_report(out, scene, result, rows, path, overrides))
+        result["time"]["pictures"] = time.perf_counter() - begin
+        show(console, rows)
+        console.print("files:")
         for file in files:
             console.print(f"  {file}", soft_wrap=True)
     comm.Barrier()
     return result
 
 
-def show(console: Console, result: dict[str, Any]) -> None:
-    """The short table of a run."""
-    table = Table(box=None, show_header=False, pad_edge=False)
+def result_rows(result: dict[str, Any]) -> Rows:
+    """The short table of a run as label and text."""
     seconds = result["time"]
-    table.add_row("hand at the end", _numbers(result["hand_final"]))
-    for name, value in zip(result["output_names"], result["output_final"], strict=True):
-        table.add_row(name, f"{value:.6g}")
-    table.add_row("energy drift", f"{result['energy_drift']:.1e}")
-    table.add_row("residual, first and last", f"{result['residual_first']:.1e}, {result['residual_last']:.1e}")
-    table.add_row("solver", f"{result['solver']['name']} ({result['solver']['reason']})")
-    table.add_row("assembly", f"{seconds['assembly']:.3g} s")
-    table.add_row("factor", f"{seconds['factor']:.3g} s")
-    table.add_row("steps", f"{result['steps']} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.3g} us each")
-    table.add_row("memory, all ranks", f"{result['memory_peak_mb']:.0f} MiB")
+    rows = [("hand at the end", "(" + ", ".join(f"{v:.6g}" for v in result["hand_final"]) + ")")]
+    rows += [
+        (name, f"{value:.6g} m") for name, value in zip(result["output_names"], result["output_final"], strict=True)
+    ]
+    return [
+        *rows,
+        ("energy drift", f"{result['energy_drift']:.1e}"),
+        ("residual, first and last", f"{result['residual_first']:.1e}, {result['residual_last']:.1e}"),
+        ("solver", result["solver"]["name"]),
+        ("", result["solver"]["reason"]),
+        ("mesh, assembly, factor", f"{seconds['mesh']:.3g} s, {seconds['assembly']:.3g} s, {seconds['factor']:.3g} s"),
+        ("steps", f"{result['steps']} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.4g} us each"),
+        ("peak memory, all ranks", f"{result['memory_peak_mb']:.0f} MiB"),
+    ]
+
+
+def show(console: Console, rows: Rows) -> None:
+    """Print the short table."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for row in rows:
+        table.add_row(*row)
     console.print(table)
 
 
-def _numbers(values: list[float]) -> str:
-    return "(" + ", ".join(f"{v:.6g}" for v in values) + ")"
+def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: Path, overrides: list[str]) -> Path:
+    captions = {
+        "move.png": "The body at the start, in the middle and at the end of the move.",
+        "move.gif": "The move in real time.",
+        "traces.png": "Hand and outputs against time; below, the outputs relative to the hand.",
+    }
+    figures = [(out / name, text) for name, text in captions.items() if (out / name).exists()]
+    sizes = [
+        ("hand n_s", str(result["n_s"])),
+        ("tissue n_e", str(result["n_e"])),
+        ("states 2n", str(result["states"])),
+        ("cells", str(result["cells"])),
+        ("time step", f"{result['dt']:.6g} s"),
+    ]
+    about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", str(result["ranks"]))]
+    about.append(("scene hash", result["scene_hash"]))
+    launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
+    sets = "".join(f" --set '{o}'" for o in overrides)
+    return write_report(
+        out / "report.html",
+        title=scene.name,
+        subtitle=scene.description,
+        tables=[("Result", list(rows)), ("Size", list(sizes)), ("Made with", list(about))],
+        figures=figures,
+        scene=resolved_toml(scene),
+        reproduce=f"{launch}softgrasp simulate {path.name}{sets}",
+    )

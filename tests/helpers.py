@@ -46,11 +46,12 @@ LAYERS: dict[str, Any] = {
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Nested tables are merged, everything else replaced."""
+    """Nested tables are merged, everything else replaced; E and nu replace the Lame constants."""
     result = dict(base)
     for key, value in changes.items():
         old = result.get(key)
-        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+        both = isinstance(old, dict) and isinstance(value, dict) and "young" not in value
+        result[key] = merged(old, value) if both else value
     return result
 
 

@@ -1,0 +1,68 @@
+"""One look for all figures: sizes, fonts, colours that also work for colour-blind readers and in grey."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from cycler import cycler
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe and Ito
+HAND = "#2b2b2b"
+OUTLINE = "#555555"
+TARGET = ORANGE
+CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
+WIDTH = 6.3  # [inch], text width of A4
+DPI = 300
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Matplotlib settings for figures in print, restored afterwards."""
+    settings: Any = {
+        "font.family": "sans-serif",
+        "font.size": 9,
+        "axes.labelsize": 9,
+        "axes.titlesize": 9,
+        "legend.fontsize": 8.5,
+        "xtick.labelsize": 8.5,
+        "ytick.labelsize": 8.5,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.7,
+        "lines.linewidth": 1.4,
+        "legend.frameon": False,
+        "axes.prop_cycle": cycler(color=CYCLE),
+        "pdf.fonttype": 42,
+        "savefig.dpi": DPI,
+    }
+    with mpl.rc_context(settings):
+        yield
+
+
+def colour_map() -> Any:
+    """Light for small values, dark for large ones, so that the dark hand stands out against the held tissue."""
+    colours = mpl.colormaps["viridis_r"]([0.02 + 0.9 * i / 255 for i in range(256)])
+    return mpl.colors.ListedColormap(colours, name="softgrasp")
+
+
+def save(figure: Any, out_png: Path) -> tuple[Path, Path]:
+    """Write the figure as PNG and, beside it, as PDF; close it and return both names."""
+    out_pdf = out_png.with_suffix(".pdf")
+    figure.savefig(out_png, bbox_inches="tight", pad_inches=0.04)
+    figure.savefig(out_pdf, bbox_inches="tight", pad_inches=0.04)
+    plt.close(figure)
+    return out_png, out_pdf
+
+
+def length_unit(largest: float) -> tuple[float, str]:
+    """Factor and name of the unit in which a length in metres reads well."""
+    if largest >= 0.1 or largest == 0.0:
+        return 1.0, "m"
+    return (1e3, "mm") if largest >= 1e-4 else (1e6, "µm")

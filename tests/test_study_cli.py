@@ -1,0 +1,95 @@
+"""The command as a new user meets it: run, two ranks, and what happens on wrong input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FORWARD = ROOT / "demos" / "scenes" / "paper_forward.toml"
+pytestmark = pytest.mark.serial
+
+
+def softgrasp(*args: str, ranks: int = 1) -> subprocess.CompletedProcess[str]:
+    launcher = Path(sys.executable).with_name("mpiexec")
+    if ranks > 1 and not launcher.exists():
+        launcher = Path(shutil.which("mpiexec") or pytest.skip("no mpiexec"))
+    start = [str(launcher), "-n", str(ranks)] if ranks > 1 else []
+    return subprocess.run(
+        [*start, sys.executable, "-m", "study.cli", *args], cwd=ROOT, capture_output=True, text=True, timeout=240
+    )
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> None:
+    out = tmp_path / "out"
+    run = softgrasp("simulate", str(FORWARD), "--out", str(out), ranks=ranks)
+    assert run.returncode == 0, run.stderr
+    result = json.loads((out / "result.json").read_text())
+    assert (result["n_s"], result["n_e"], result["states"], result["steps"]) == (2, 956, 1916, 600)
+    assert result["hand_final"] == pytest.approx([5.0, 3.0], abs=1e-12)  # the motion is prescribed: rounding only
+    assert result["energy_drift"] < 1e-12  # momentum-form midpoint conserves to rounding
+    assert result["ranks"] == ranks
+    assert {"assembly", "factor", "steps", "per_step"} <= result["time"].keys()
+    assert result["memory_peak_mb"] > 50  # MiB; Python with PETSc alone needs more
+    for name in ("trajectory.csv", "scene.toml", "move.png", "move.pdf", "move.gif", "traces.png", "report.html"):
+        assert (out / name).stat().st_size > 500, name
+    assert "data:image/png;base64" in (out / "report.html").read_text()
+
+
+def test_set_changes_the_mesh(tmp_path: Path) -> None:
+    run = softgrasp("simulate", str(FORWARD), "--out", str(tmp_path), "--set", "tissue.cells=[10,20]", "--no-pictures")
+    assert run.returncode == 0, run.stderr
+    assert json.loads((tmp_path / "result.json").read_text())["states"] == 880
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (("--set", "tissue.cels=[4,8]"), ("tissue.cels", "tissue.cells")),
+        (("--set", "tissue.material.mu=-1.0"), ("tissue.material.mu", "> 0")),
+        (("--set", "time.steps=0"), ("time.steps",)),
+        (("--set", "motion.target=[1.0,2.0,3.0]"), ("motion.target",)),
+        (("--set", "contact.box=[[0.4,0.4],[0.5,0.5]]"), ("contact",)),
+        (("--set", "control.outputs=[{kind='node', point=[9.0,9.0]}]"), ("control.outputs[0].point", "outside")),
+        (("--resume",), ("checkpoint.json", "--resume")),
+    ],
+)
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_wrong_input_is_one_sentence(tmp_path: Path, args: tuple[str, ...], words: tuple[str, ...], ranks: int) -> None:
+    run = softgrasp("simulate", str(FORWARD), "--out", str(tmp_path / "out"), *args, ranks=ranks)
+    assert run.returncode != 0
+    assert "Traceback" not in run.stderr
+    message = run.stderr[run.stderr.index("error:") :]
+    assert message.count("error:") == 1  # one rank speaks
+    for word in words:
+        assert word in message, message
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+def test_missing_scene_and_mesh(tmp_path: Path) -> None:
+    run = softgrasp("simulate", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out"))
+    assert run.returncode == 1
+    assert "none.toml" in run.stderr
+    scene = tmp_path / "lost.toml"
+    text = (ROOT / "demos" / "scenes" / "pillow_3d.toml").read_text()
+    scene.write_text(text.replace("meshes/pillow_small.msh", "no_such.msh"))
+    run = softgrasp("simulate", str(scene), "--out", str(tmp_path / "out"))
+    assert run.returncode == 1
+    assert "no_such.msh" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_scenes_schema_explain_and_help(tmp_path: Path) -> None:
+    listing = softgrasp("scenes")
+    assert listing.returncode == 0
+    for name in ("paper_forward", "paper_lqr", "paper_lqr_undamped", "franka_muscle", "block_3d", "pillow_3d"):
+        assert name in listing.stdout
+    assert "tissue" in json.loads(softgrasp("schema").stdout)["properties"]
+    assert "rho g L / E" in softgrasp("explain", str(ROOT / "demos" / "scenes" / "franka_muscle.toml")).stdout
+    assert "simulate" in softgrasp("--help").stdout
