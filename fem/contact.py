@@ -21,12 +21,6 @@ Floats = npt.NDArray[np.float64]
 
 BOX_TOLERANCE = 1e-8  # of the largest extent: far above round-off of midpoints, far below any cell
 
-_PLANES = {f"{axis}{end}": (i, j) for i, axis in enumerate("xyz") for j, end in enumerate("-+")}
-_ALIASES = {
-    2: {"left": "x-", "right": "x+", "bottom": "y-", "top": "y+"},
-    3: {"left": "x-", "right": "x+", "front": "y-", "back": "y+", "bottom": "z-", "top": "z+"},
-}
-
 
 def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     """Owned exterior facets in the contact zone, sorted.
@@ -53,9 +47,8 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     if contact.sides:
         keys.append(f"contact.sides = {list(contact.sides)}")
         on_side = np.zeros(len(facets), dtype=np.bool_)
-        for side in contact.sides:
-            axis, end = _plane(side, tissue.dimension)
-            on_side |= np.abs(midpoints[:, axis] - (low, high)[end][axis]) <= tolerance
+        for axis, end in _planes(contact, tissue.dimension):
+            on_side |= np.abs(midpoints[:, axis] - (high if end > 0 else low)[axis]) <= tolerance
         chosen &= on_side
     if contact.box is not None:
         keys.append(f"contact.box = {[list(corner) for corner in contact.box]}")
@@ -199,12 +192,11 @@ def _tagged_facets(tissue: TissueMesh, tag: int) -> Ints:
     return np.asarray(tissue.facet_tags.find(tag), dtype=np.int32)
 
 
-def _plane(side: str, dimension: int) -> tuple[int, int]:
-    plane = _PLANES.get(_ALIASES[dimension].get(side, side))
-    if plane is None or plane[0] >= dimension:
-        known = list(_ALIASES[dimension]) + [name for name, (axis, _) in _PLANES.items() if axis < dimension]
-        raise SceneError(f"contact.sides has the unknown side {side!r}: in {dimension}D use {', '.join(known)}.")
-    return plane
+def _planes(contact: Contact, dimension: int) -> list[tuple[int, int]]:
+    try:
+        return contact.axes(dimension)
+    except ValueError as error:
+        raise SceneError(f"{error}") from error
 
 
 def _inside(points: Floats, box: Any, tolerance: float, key: str) -> npt.NDArray[np.bool_]:

@@ -71,7 +71,8 @@ class TissueMidpoint:
         self.solver: TissueSolver = make_solver(
             midpoint_matrix(system, dt), solver, system.layout, "softgrasp_midpoint_", rtol, reproducible
         )
-        self.K = system.K_ee
+        # blocks of d x d: a quarter less memory traffic than single entries
+        self.K = system.K_ee.convert("baij", PETSc.Mat())
         self.r, self.h, self.k, self.w, self.load = (system.K_ee.createVecLeft() for _ in range(5))
         # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
         self.load_array: Array = self.load.array_w
@@ -167,6 +168,7 @@ class TissueMidpoint:
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
         self.solver.destroy()
+        self.K.destroy()
         for name in ("r", "h", "k", "w", "load", "k_old", "y"):
             if hasattr(self, name):
                 getattr(self, name).destroy()

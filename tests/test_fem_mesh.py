@@ -18,14 +18,15 @@ from fem.errors import MeshError, SceneError
 from fem.geometry import TissueMesh, make_mesh, structured_mesh
 from fem.meshcheck import check_cells, components, signed_volumes
 from fem.meshfile import read_mesh
+from fem.scene_tissue import Contact
 
 COMM = MPI.COMM_WORLD
 PILLOW = Path(__file__).parents[1] / "demos" / "scenes" / "meshes" / "pillow_small.msh"
 WIDE = 1e-12  # sums of a few hundred positive terms of order one: round-off is below 1e-13
 
 
-def zone(sides: Any = (), box: Any = None, facet_tag: int | None = None) -> SimpleNamespace:
-    return SimpleNamespace(sides=sides, box=box, facet_tag=facet_tag)
+def zone(sides: Any = (), box: Any = None, facet_tag: int | None = None) -> Contact:
+    return Contact.model_construct(sides=list(sides), box=box, facet_tag=facet_tag)
 
 
 def integral(form: Any) -> float:
@@ -196,7 +197,7 @@ def test_loose_part_is_refused(mpi_tmp_path: Path) -> None:
     ("contact", "words"),
     [
         (zone(["left"], [[0.5, 0], [1, 2]]), r"contact.sides.*contact.box.*spans \(0, 0\) to \(1, 2\)"),
-        (zone(["front"]), "unknown side 'front'"),
+        (zone(["front"]), "'front'; a 2D tissue has no such side"),
         (zone(facet_tag=5), "facet_tag = 5 needs facet tags"),
         (zone(box=[[0, 0, 0], [1, 1, 1]]), "two corners with 2 coordinates"),
     ],
