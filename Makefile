@@ -7,10 +7,10 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint bench clean
+.PHONY: help env demo test lint bench pictures clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
 
 env: $(STAMP) ## make .venv with everything needed (redone when pyproject.toml changes)
 
@@ -34,6 +34,9 @@ test: lint ## lint, then the tests on 1, 2 and 3 ranks
 
 bench: $(STAMP) ## print the table of costs of the forward run
 	$(BIN)/python -m study.bench_forward
+
+pictures: demo ## make the README's picture again
+	cp out/move.png docs/paper_forward.png
 
 clean: ## remove .venv, out and caches
 	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache

@@ -1,0 +1,30 @@
+"""Every demo runs, on all ranks, and so does the Python of the README."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
+
+
+@pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
+def test_demo(path: Path, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mpi_tmp_path)
+    runpy.run_path(str(path), run_name="__main__")
+
+
+def test_there_are_demos() -> None:
+    assert len(DEMOS) >= 3
+
+
+def test_python_of_the_readme(mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert blocks
+    monkeypatch.chdir(ROOT)  # the README speaks from the root of the checkout
+    for block in blocks:
+        exec(compile(block.replace('"out', f'"{mpi_tmp_path}/out'), "README.md", "exec"), {"__name__": "__main__"})
