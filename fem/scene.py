@@ -12,14 +12,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
 
-from fem.scene_tissue import Box, Contact, Layer, Material, Model, NonNegative, Positive, Tissue, check_box
+from fem.scene_control import Control, ControlOutput, Loop, Reduction, Study
+from fem.scene_tissue import Contact, Layer, Material, Model, NonNegative, Positive, Tissue
 
 __all__ = [
-    "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Material",
-    "Motion", "Output", "Scene", "Time", "Tissue", "check_dimension", "scene_schema",
+    "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
+    "Motion", "Output", "Reduction", "Scene", "Study", "Time", "Tissue", "check_dimension", "scene_schema",
 ]  # fmt: skip
 
 
@@ -118,61 +118,6 @@ class Time(Model):
     )
 
 
-class ControlOutput(Model):
-    """One vector-valued output of the control problem."""
-
-    kind: Literal["node", "region", "hand"] = Field(description="a node, the mean of a region, or the hand [no unit]")
-    point: list[float] | None = Field(None, description="the node nearest to it is taken [m]; kind node")
-    box: Box | None = Field(None, description="[[lo], [hi]] [m]; mean over the nodes inside; kind region")
-    name: str = Field("", description="label [no unit]")
-
-    @model_validator(mode="after")
-    def _check(self) -> ControlOutput:
-        for key, kind in (("point", "node"), ("box", "region")):
-            if (getattr(self, key) is not None) != (self.kind == kind):
-                raise ValueError(f"{key} and kind = '{kind}' go together; give both or neither")
-        check_box(self.box, "box")
-        return self
-
-
-Weight = float | list[list[float]]
-
-
-def _check_weight(key: str, weight: Weight, definite: bool) -> None:
-    word = "> 0" if definite else ">= 0"
-    if isinstance(weight, list):
-        if any(len(row) != len(weight) for row in weight) or not weight:
-            raise ValueError(f"{key} is not square; give a number or a square symmetric matrix")
-        matrix = np.array(weight)
-        if not np.array_equal(matrix, matrix.T):
-            raise ValueError(f"{key} is not symmetric; give a number or a square symmetric matrix")
-        eigenvalues = np.linalg.eigvalsh(matrix)
-        least = float(eigenvalues[0])
-        # rounding of eigvalsh is of the order n eps |matrix|
-        noise = 10 * len(weight) * float(np.finfo(float).eps) * float(np.abs(eigenvalues).max())
-        good = least > noise if definite else least >= -noise
-        if not good:
-            raise ValueError(f"{key} has the eigenvalue {least:.3g}; all must be {word}")
-    elif weight < 0 or (definite and weight == 0):
-        raise ValueError(f"{key} is {weight}; it must be {word}")
-
-
-class Control(Model):
-    """Quadratic cost: integral of y' Q y + u' R u."""
-
-    outputs: Annotated[list[ControlOutput], Field(min_length=1)] = Field(
-        description="outputs y {kind, point or box [m], name}"
-    )
-    Q: Weight = Field(1.0, description="weight of the outputs [1/(m2 s)]: number or matrix, positive semidefinite")
-    R: Weight = Field(1.0, description="weight of the hand load [1/(N2 s)]: number or matrix, positive definite")
-
-    @model_validator(mode="after")
-    def _check(self) -> Control:
-        _check_weight("Q", self.Q, definite=False)
-        _check_weight("R", self.R, definite=True)
-        return self
-
-
 class Output(Model):
     """What is kept of a run."""
 
@@ -199,6 +144,8 @@ class Scene(Model):
     control: Annotated[Control | None, BeforeValidator(_off)] = Field(
         None, description="control problem [various]; off unless given"
     )
+    reduction: Reduction = Field(default_factory=Reduction, description="reduced models to compare [various]")
+    study: Study = Field(default_factory=Study, description="how studies judge [various]")
     output: Output = Field(default_factory=Output, description="what is kept [no unit]")
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
 

@@ -343,3 +343,19 @@ def test_library_and_conversions(name: str) -> None:
     assert entry.source
     assert entry.rho > 0
     assert math.isfinite(lam)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("reduction.mu_range=[500.0,20.0]", r"reduction\.mu_range"),
+        ("reduction.N=[0]", r"reduction\.N"),
+        ("reduction.engin='gram'", "engine"),
+        ("control.loop.limit=-1.0", r"control\.loop\.limit"),
+        ("control.method='newton'", "newton-adi"),
+        ("study.tolerance=2", r"study\.tolerance"),
+    ],
+)
+def test_later_sections_are_checked_too(change: str, words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        load_scene(PAPER.parent / "paper_lqr.toml", [change])
