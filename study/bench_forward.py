@@ -226,6 +226,22 @@ def show(console: Console, rows: Sequence[Row]) -> None:
         console.print(f"goal {verdict}: {goal.text} {_number(goal.value)} <= {goal.limit:g}")
 
 
+def write_markdown(path: Path, rows: Sequence[Row]) -> None:
+    """The table as the README shows it. Not collective."""
+    heads = ["problem", "n_e", "ranks", "solver", "assembly [s]", "factor [s]", "TS step [µs]", "bare solve [µs]"]
+    heads += ["TS / solve", "SciPy step [µs]", "pyMOR step [µs]", "memory [MiB]"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
+    for row in rows:
+        if "error" in row:
+            continue
+        step, seconds = row["step_us"], row["seconds"]
+        cells = [row["problem"], str(row["n_e"]), str(row["ranks"]), row["solver"]]
+        numbers = [seconds["assembly"], seconds["factor"], step["ts"], step.get("solve"), row.get("ratio")]
+        numbers += [step.get("scipy"), step.get("pymor"), row["memory_mb"]]
+        lines.append("| " + " | ".join(cells + [_number(value) for value in numbers]) + " |")
+    path.write_text("\n".join(lines) + "\n")
+
+
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """One line a row, numbers in full. Not collective."""
     names = ["problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats"]
@@ -315,7 +331,8 @@ def main(
     report = {"command": "bench_forward", "rows": rows, "exponents": exponents(rows), "goals": reached}
     (out / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
     write_csv(out / "bench.csv", rows)
-    for file in (out / "bench.json", out / "bench.csv", *draw(out / "bench.png", rows)):
+    write_markdown(out / "bench.md", rows)
+    for file in (out / "bench.json", out / "bench.csv", out / "bench.md", *draw(out / "bench.png", rows)):
         console.print(f"  {file}")
     if any("error" in row for row in rows):
         raise typer.Exit(1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 
 import h5py
@@ -11,7 +13,7 @@ from mpi4py import MPI
 
 from fem.build import Model, build
 from fem.errors import CheckpointError, Interrupted, ResourceError
-from fem.run import RunOptions, simulate
+from fem.run import Run, RunOptions, simulate
 from fem.scene_file import load_scene
 
 SCENES = Path(__file__).parent.parent / "demos" / "scenes"
@@ -35,6 +37,20 @@ def test_restart_is_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Path, snapshots: 
     assert whole.energy_drift == rest.energy_drift
     if whole.snapshots is not None and rest.snapshots is not None:
         assert np.array_equal(whole.snapshots.Z, rest.snapshots.Z)
+
+
+def test_ctrl_c_on_one_rank_leaves_a_restart_file(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    def interrupt(run: Run) -> None:
+        if comm.rank == comm.size - 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    extra = ("time.steps=4000", 'output.snapshots="none"', "tissue.cells=[6,12]")
+    whole = simulate(small(comm, *extra))
+    with pytest.raises(Interrupted, match="stopped after step"):
+        simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path, progress=interrupt))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    rest = simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path, resume=True))
+    assert np.array_equal(whole.final, rest.final)
 
 
 @pytest.mark.parametrize("scene", ["paper_forward", "paper_lqr"])

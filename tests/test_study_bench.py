@@ -154,6 +154,7 @@ def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypat
         lines = list(csv.DictReader(file))
     assert float(lines[0]["ts_us"]) == report["rows"][0]["step_us"]["ts"]
     assert lines[0]["scipy_us"] == ""
+    assert len((tmp_path / "bench.md").read_text().splitlines()) == 2 + 4  # heads, and the rows that did not fail
     assert (tmp_path / "bench.png").stat().st_size > 0
 
 
