@@ -44,7 +44,7 @@ def test_ctrl_c_on_one_rank_leaves_a_restart_file(comm: MPI.Intracomm, mpi_tmp_p
         if comm.rank == comm.size - 1:
             os.kill(os.getpid(), signal.SIGINT)
 
-    extra = ("time.steps=4000", 'output.snapshots="none"', "tissue.cells=[6,12]")
+    extra = ("time.steps=1000", 'output.snapshots="none"', "tissue.cells=[6,12]")
     whole = simulate(small(comm, *extra))
     with pytest.raises(Interrupted, match="stopped after step"):
         simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path, progress=interrupt))
