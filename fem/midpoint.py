@@ -71,8 +71,8 @@ class TissueMidpoint:
         self.solver: TissueSolver = make_solver(
             midpoint_matrix(system, dt), solver, system.layout, "softgrasp_midpoint_", rtol, reproducible
         )
-        # blocks of d x d: a quarter less memory traffic than single entries; on one rank only, because PETSc 3.25
-        # converts the off-process part of a parallel matrix wrongly and takes the original apart
+        # blocks of d x d: a quarter less memory traffic than single entries; on one rank, because the conversion of a
+        # parallel matrix takes its source apart
         self.K = system.K_ee.copy()
         if system.layout.comm.size == 1:
             self.K.convert("baij")

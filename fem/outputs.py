@@ -99,9 +99,9 @@ def _inside(system: BlockSystem, point: list[float], i: int) -> None:
 
 def _farthest(system: BlockSystem) -> Array:
     layout = system.layout
-    best = (-1.0, ())
+    best: tuple[float, tuple[float, ...]] = (1.0, ())
     if len(layout.nodes):
         distance = layout.rounded(np.linalg.norm(layout.nodes - layout.reference, axis=1))
         far = np.flatnonzero(distance == distance.max())
-        best = (float(distance.max()), min(tuple(layout.rounded(layout.nodes[j]).tolist()) for j in far))
-    return np.asarray(max(layout.comm.allgather(best))[1], dtype=float)
+        best = (-float(distance.max()), min(tuple(layout.rounded(layout.nodes[j]).tolist()) for j in far))
+    return np.asarray(min(layout.comm.allgather(best))[1], dtype=float)
