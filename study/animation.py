@@ -1,8 +1,9 @@
-"""The move as an animated GIF, at the speed at which it happens."""
+"""The move as an animated GIF, at the speed at which it happens unless the eye cannot follow."""
 
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 MOST_FRAMES = 60
+SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them the animation runs slower or faster than the move
+TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
 MOST_BYTES = 3_000_000
 REST = 1.0  # [s] the last frame stays longer
 
@@ -33,7 +36,7 @@ def gif_move(
     target: npt.ArrayLike | None,
     out_gif: Path,
 ) -> Path:
-    """Body, hand, path and target in motion, in real time; at most 60 frames and 3 MB.
+    """Body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
 
     Args:
         picture: the body.
@@ -46,12 +49,10 @@ def gif_move(
     Returns:
         The name of the file.
     """
-    kept = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int))
+    kept, ticks = _timing(np.asarray(times, dtype=np.float64))
     frames, times = np.asarray(frames, dtype=np.float64)[kept], np.asarray(times, dtype=np.float64)[kept]
     shot = make_shot(picture, frames, times, np.asarray(table, dtype=np.float64), target)
     images = _render(shot, frames, times)
-    # GIF counts in hundredths of a second: round the instants, so that the errors do not add up.
-    ticks = np.maximum(np.diff(np.round(100 * times)), 2.0)
     durations = [int(10 * n) for n in ticks] + [int(1000 * REST)]
     for scale in (1.0, 0.8, 0.6, 0.45):
         data = _encode(images, durations, scale)
@@ -61,25 +62,57 @@ def gif_move(
     return out_gif
 
 
+def speed_up(times: Array) -> float:
+    """How many times faster than the move its animation runs: 1 from 0.3 to 30 s, else steps of 1, 2, 5 [1].
+
+    Longer moves are shown in at most 30 s, shorter ones in at least 1 s.
+    """
+    total = float(times[-1] - times[0])
+    if SHORTEST <= total <= LONGEST or total <= 0.0:
+        return 1.0
+    ratio = total / LONGEST if total > LONGEST else total
+    power = 10.0 ** np.floor(np.log10(ratio) + 1e-9)
+    steps = [m * power for m in (1, 2, 5, 10)]
+    if total > LONGEST:
+        return float(next(m for m in steps if m >= ratio * (1 - 1e-9)))
+    return float(max(m for m in steps if m <= ratio * (1 + 1e-9)))
+
+
+def _timing(times: Array) -> tuple[list[int], list[int]]:
+    """Frames to show and how long each but the last [1/100 s]; rounding errors do not add up."""
+    some = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
+    at = np.round(100 * (times - times[0]) / speed_up(times)).astype(int)  # GIF counts in hundredths of a second
+    kept = some[:1]
+    for i in some[1:]:
+        if at[i] - at[kept[-1]] >= TICKS:
+            kept.append(i)
+    if len(some) > 1 and kept[-1] != some[-1]:
+        kept = [*(kept[:-1] if len(kept) > 1 else kept), some[-1]]
+    return kept, [max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)]
+
+
 def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
     """One picture per frame, all of one size."""
     images = []
+    fast = speed_up(times)
+    digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
+    note = f" ({fast:g}$\\times$)" if fast != 1 else ""
     with paper_style():
-        figure, axes = make_axes(shot, 1)
+        figure, axes = make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
         ax = axes[0]
+        # The longest text first, so that all frames have the size of the first.
+        stamp = ax.set_title(f"$t$ = {times[-1]:.{digits}f} s{note}", pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
         figure.set_dpi(110)
         draw_scene(ax, shot, frames[:1], None, shot.hands[:1])
         figure.canvas.draw()
         box = figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
-        height = 0.02 if shot.picture.dimension == 2 else 0.92
-        stamp = figure.text(0.98, height, "", ha="right", va="bottom", fontsize=10, transform=ax.transAxes)
         for i in range(len(frames)):
             for artist in [*ax.collections, *ax.lines]:
                 artist.remove()
             draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
-            stamp.set_text(f"$t$ = {times[i]:.2f} s")
+            stamp.set_text(f"$t$ = {times[i]:.{digits}f} s{note}")
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=110, bbox_inches=box)
             images.append(Image.open(buffer).convert("RGB"))

@@ -11,9 +11,10 @@ from fem.fields import SeriesWriter
 from fem.gather import gather_picture, vertex_displacement
 from fem.petsc import Array
 from fem.run import Run, Trajectory, frame_steps
+from study.shapes import pick_instants, way_done
 
 MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
-SHOWN = (0.0, 0.35, 0.65, 1.0)  # instants of the still picture; a rest-to-rest move bends the body most near 1/3, 2/3
+SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run when few instants are kept
 
 
 class Frames:
@@ -33,8 +34,7 @@ class Frames:
         self.picture = gather_picture(model) if pictures else None
         vertices = model.space.mesh.mesh.geometry.index_map().size_global
         self.few = vertices > MANY_VERTICES
-        grid = frame_steps(model.scene)
-        self.chosen = {min(grid, key=lambda n: abs(n - f * grid[-1])) for f in SHOWN}
+        self.chosen: set[int] = set()
         self.times: list[float] = []
         self.hands: list[Array] = []
         self.states: list[np.ndarray] = []
@@ -44,6 +44,8 @@ class Frames:
         n = self.model.system.layout.n_local
         z, v = run.state.array[:n], run.state.array[n:]
         t, q_s, v_s = run.reached * run.dt, run.drive.q[run.reached], run.drive.v[run.reached]
+        if self.few and not self.chosen:
+            self.chosen = self._ahead(run)
         if self.writer is not None:
             self.writer.write(t, z, v, q_s, v_s)
         if self.pictures and (not self.few or run.reached in self.chosen):
@@ -53,6 +55,13 @@ class Frames:
             if state is not None:
                 self.states.append(state.astype(np.float32))
 
+    def _ahead(self, run: Run) -> set[int]:
+        """Steps of the still picture before they are reached; the hand's table is known unless forces drive it."""
+        grid = frame_steps(self.model.scene)
+        times = np.arange(len(run.drive.q), dtype=np.float64)
+        done = way_done(np.column_stack([times, run.drive.q]), times[grid])
+        return {grid[int(np.argmin(abs(done - share)))] for share in SHOWN[:-1]} | {grid[-1]}
+
     def close(self) -> list[Path]:
         """Finish the field files. Collective."""
         return list(self.writer.close()) if self.writer is not None else []
@@ -60,7 +69,8 @@ class Frames:
     def draw(self, directory: Path, run: Trajectory) -> list[Path]:
         """Figures and animation; rank 0 only."""
         from study.animation import gif_move
-        from study.plots import figure_move, figure_traces
+        from study.plots import figure_move
+        from study.traces import figure_traces
 
         scene = self.model.scene
         if self.picture is None or not self.states:
@@ -69,7 +79,7 @@ class Frames:
         target = scene.motion.target
         states = np.stack(self.states)
         times = np.array(self.times)
-        chosen = [int(np.argmin(abs(times - run.times[n]))) for n in sorted(self.chosen)]
+        chosen = list(range(len(times))) if self.few else pick_instants(self.picture, states, times, table)
         files = [*figure_move(self.picture, states[chosen], times[chosen], table, target, directory / "move.png")]
         files += figure_traces(
             run.times,

@@ -1,4 +1,4 @@
-"""Figures of a move: the deformed body with hand and target, and the traces against time.
+"""Figures of a move: the deformed body with hand, path and target.
 
 Everything comes in as arrays; nothing here computes a simulation.
 """
@@ -16,23 +16,24 @@ import numpy.typing as npt
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from study.shapes import (
+    AZIMUTH,
     chained,
     contact_centre,
-    edge_sides,
     facet_normals,
     hand_polygons,
+    hands_at,
     interfaces,
-    outer_edges,
     overlap,
-    silhouette,
+    seen,
+    shadow,
     subdivision,
+    view_direction,
 )
-from study.style import CYCLE, HAND, OUTLINE, TARGET, WIDTH, colour_map, length_unit, paper_style, save
+from study.style import COLUMN, HAND, OUTLINE, STEPS, TARGET, WIDTH, colour_map, length_unit, paper_style, save
 
 if TYPE_CHECKING:
     from fem.gather import PictureMesh
@@ -40,8 +41,10 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
-STEPS = [1, 2, 5, 10]  # of the axes
-ELEVATION, AZIMUTH = 18.0, -58.0  # view of 3D scenes [degree]
+PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
+CAPTION = 0.72  # width of a caption [inch]
+DOTS: Any = (0, (1, 1.2))
+DASHES: Any = (0, (5, 3))
 
 
 @dataclass(frozen=True)
@@ -52,22 +55,22 @@ class Shot:
         picture: the body.
         hands: hand coordinates at the instants, shape (k, n_s).
         path: where the grip of the hand passes, shape (steps, d) [m].
-        target: hand coordinates aimed at, shape (n_s,), or None.
         norm: scale of the colours [unit].
         unit: factor and name of the unit of the colours.
-        low, high: corners of the scene, shape (d,) [m].
+        low, high: corners of the scene in the plane of the picture, shape (2,) [m].
         hand: polygons of the hand where it starts, each (corners, d); empty in 3D.
+        aim: closed lines around the body at the target in the plane of the picture, each (k, 2) [m].
     """
 
     picture: PictureMesh
     hands: Array
     path: Array
-    target: Array | None
     norm: Any
     unit: tuple[float, str]
     low: Array
     high: Array
     hand: list[Array]
+    aim: list[Array]
 
     def values(self, displacement: Array, q_s: Array) -> Array:
         """|u - R q_s| at the vertices in the unit of the colour bar, shape (n,)."""
@@ -76,7 +79,7 @@ class Shot:
 
 def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> Shot:
     """Prepare the views of a move; see `figure_move` for the arguments. Not collective."""
-    hands = np.stack([np.interp(times, table[:, 0], column) for column in table[:, 1:].T], axis=1)
+    hands = hands_at(table, times)
     aim = None
     if target is not None:
         aim = np.zeros(picture.n_s)
@@ -87,12 +90,13 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
     norm = mpl.colors.Normalize(0.0, unit[0] * max(relative) or 1.0)
     polygons, grip = hand_polygons(picture) if picture.dimension == 2 else ([], contact_centre(picture))
     path = np.vstack([grip + picture.rigid(q, grip[None, :]) for q in table[:, 1:]])
-    seen = [_box(picture.points + u) for u in states] + [_box(path)]
-    seen += [_box(p + picture.rigid(q, p)) for p in polygons for q in hands]
+    boxes = [_box(picture.points + u) for u in states] + [_box(path)]
+    boxes += [_box(p + picture.rigid(q, p)) for p in polygons for q in hands]
     if aim is not None:
-        seen += [_box(p + picture.rigid(aim, p)) for p in (picture.points, *polygons)]
-    low, high = _box(np.vstack(seen))
-    return Shot(picture, hands, path, aim, norm, unit, low, high, polygons)
+        boxes += [_box(p + picture.rigid(aim, p)) for p in (picture.points, *polygons)]
+    low, high = _box(np.vstack(boxes))
+    lines = [] if aim is None else _outline(picture, picture.points + picture.rigid(aim))
+    return Shot(picture, hands, path, norm, unit, low, high, polygons, lines)
 
 
 def figure_move(
@@ -123,253 +127,236 @@ def figure_move(
     with paper_style():
         apart = len(states) > 1 and overlap(picture, states)
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
-        figure, axes = make_axes(shot, len(groups))
+        figure, axes = make_axes(shot, len(groups), captions=True)
         for ax, group in zip(axes, groups, strict=True):
-            draw_scene(ax, shot, states[group], times[group], shot.hands[group])
-        if apart and picture.dimension == 2:
+            draw_scene(ax, shot, states[group], None if apart else times[group], shot.hands[group])
+            if apart:
+                ax.set_title(_time(times[group[0]]), pad=3)
+        if picture.dimension == 2:
             _name_layers(axes[-1], shot, states[-1])
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
         return save(figure, out_png)
 
 
-def figure_traces(
-    times: Array,
-    outputs: Array,
-    names: tuple[str, ...],
-    q_s: Array,
-    out_png: Path,
-    *,
-    rigid: Array | None = None,
-    dimension: int | None = None,
-) -> tuple[Path, Path]:
-    """Hand and outputs against time, and below what the outputs move relative to the hand; PNG and PDF.
-
-    Args:
-        times: shape (m,) [s].
-        outputs: absolute displacements, shape (m, c) [m].
-        names: one per output, ending in _x, _y or _z.
-        q_s: hand, shape (m, n_s) [m, rad].
-        out_png: name of the picture; the PDF gets its stem.
-        rigid: share of the outputs that moves with the hand, shape (m, c); by default the hand's translation.
-        dimension: 2 or 3; needed when a 2D hand turns.
-
-    Returns:
-        Names of PNG and PDF.
-    """
-    d = dimension or min(q_s.shape[1], 3)
-    axes_of = ["xyz".find(name.rsplit("_", 1)[-1][-1:]) for name in names]
-    shown = [i for i, axis in enumerate(axes_of) if 0 <= axis < d]
-    moving = np.stack([q_s[:, axes_of[i]] for i in shown], axis=1) if rigid is None else rigid[:, shown]
-    relative = outputs[:, shown] - moving
-    bodies = list(dict.fromkeys(names[i].rsplit("_", 1)[0] for i in shown))
-    angles = q_s.shape[1] > d
-    with paper_style():
-        figure, axes = plt.subplots(
-            2 + angles, 1, figsize=(WIDTH * 0.8, 3.6 + 1.3 * angles), sharex=True, layout="constrained"
-        )
-        factors = [
-            length_unit(float(np.abs(a).max(initial=0.0)))
-            for a in (np.hstack([outputs[:, shown], q_s[:, :d]]), relative)
-        ]
-        for j in np.flatnonzero(np.abs(q_s[:, :d]).max(axis=0) > 0).tolist():
-            axes[0].plot(times, factors[0][0] * q_s[:, j], "--", color=CYCLE[j], lw=1.1, label=f"hand, ${'xyz'[j]}$")
-        for k, i in enumerate(shown):
-            body = names[i].rsplit("_", 1)[0]
-            look = {"color": CYCLE[axes_of[i]], "ls": ("-", "-.", ":")[bodies.index(body) % 3]}
-            label = f"{body}, ${'xyz'[axes_of[i]]}$"
-            axes[0].plot(times, factors[0][0] * outputs[:, i], label=label, **look)
-            axes[1].plot(times, factors[1][0] * relative[:, k], label=label, **look)
-        axes[0].set_ylabel(f"displacement [{factors[0][1]}]")
-        axes[1].set_ylabel(f"relative to the hand [{factors[1][1]}]")
-        if angles:
-            for j in range(d, q_s.shape[1]):
-                axes[2].plot(times, q_s[:, j], "--", color=CYCLE[(j - d) % len(CYCLE)], label=f"angle {j - d + 1}")
-            axes[2].set_ylabel("hand angle [rad]")
-        for ax in axes:
-            ax.axhline(0.0, color="#bbbbbb", lw=0.6, zorder=0)
-            if ax is not axes[1]:  # same lines as above
-                ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), handlelength=2.4)
-            ax.yaxis.set_major_locator(MaxNLocator(5, steps=STEPS))
-        axes[-1].set_xlabel("time [s]")
-        axes[-1].set_xlim(float(times[0]), float(times[-1]))
-        figure.align_ylabels(axes)
-        return save(figure, out_png)
-
-
 def draw_scene(ax: Any, shot: Shot, states: Array, times: Array | None, hands: Array) -> None:
     """Bodies, hand, path, target and, if given, the times beside the bodies on axes from `make_axes`."""
-    if shot.picture.dimension == 3:
-        _draw_3d(ax, shot, states, times, hands)
-        return
     picture = shot.picture
-    lines = np.vstack([picture.facets, interfaces(picture)])
-    reach = float((shot.high - shot.low).max())
-    ax.plot(*shot.path.T, ls=(0, (5, 3)), color=OUTLINE, lw=0.9, zorder=1)
+    ax.plot(*seen(shot.path).T, ls=DASHES, color=OUTLINE, lw=0.9, zorder=1)
     for i, (u, q) in enumerate(zip(states, hands, strict=True)):
-        x = picture.points + u
-        if len(picture.cells) <= MANY_CELLS:
-            ax.tripcolor(
-                x[:, 0], x[:, 1], picture.cells, shot.values(u, q), shading="gouraud", cmap=colour_map(),
-                norm=shot.norm, rasterized=True, zorder=2,
-            )  # fmt: skip
-        ax.add_collection(LineCollection(list(x[lines]), colors=OUTLINE, linewidths=0.6, zorder=3), autolim=False)
-        hand = [p + picture.rigid(q, p) for p in shot.hand]
-        ax.add_collection(
-            PolyCollection(hand, facecolors=HAND, edgecolors=HAND, linewidths=0.3, zorder=4), autolim=False
-        )
+        if picture.dimension == 2:
+            _draw_2d(ax, shot, u, q)
+        else:
+            _draw_3d(ax, shot, u, q)
         if times is not None:
-            middle, foot = (x[:, 0].min() + x[:, 0].max()) / 2, min(x[:, 1].min(), *(h[:, 1].min() for h in hand))
-            ax.text(middle, foot - 0.02 * reach, f"$t$ = {times[i]:.3g} s", ha="center", va="top", zorder=6)
-    if shot.target is not None:
-        x = picture.points + picture.rigid(shot.target)
-        for edge in chained(picture.facets):
-            ax.plot(*x[edge].T, ls=(0, (1, 1.2)), color=TARGET, lw=1.5, zorder=5)
+            hand = [p + picture.rigid(q, p) for p in shot.hand]
+            _caption(ax, shot, _box(seen(np.vstack([picture.points + u, *hand]))), _time(times[i]))
+    for line in shot.aim:
+        ax.plot(*line.T, ls=DOTS, color=TARGET, lw=1.3, zorder=5)
 
 
-def make_axes(shot: Shot, panels: int) -> tuple[Any, list[Any]]:
-    """Figure and axes of the right shape for the scene; call within `paper_style`."""
-    span = shot.high - shot.low
-    if shot.picture.dimension == 3:
-        figure = plt.figure(figsize=(WIDTH if panels > 1 else 0.8 * WIDTH, 4.2))
-        axes = [figure.add_subplot(1, panels, i + 1, projection="3d") for i in range(panels)]
-        for ax in axes:
-            _frame_3d(ax, shot)
-        return figure, axes
-    pad = 0.06 * float(span.max())
-    low, high = shot.low - [pad, 1.6 * pad], shot.high + pad
-    width, height = high - low
-    stacked = panels > 1 and width > height
-    rows, columns = (panels, 1) if stacked else (1, panels)
-    scale = min((WIDTH - 1.6) / (columns * width), 5.4 / (rows * height))  # [inch/m]
-    size = (columns * width * scale + 0.25 * (columns - 1), rows * height * scale + 0.12 * (rows - 1))
-    figure, grid = plt.subplots(rows, columns, figsize=size, sharex=True, sharey=True, squeeze=False)
-    figure.subplots_adjust(0, 0, 1, 1, hspace=0.06, wspace=0.06)
-    axes = list(grid.ravel())
-    for i, ax in enumerate(axes):
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        ax.xaxis.set_major_locator(MaxNLocator(6, steps=STEPS))
-        ax.yaxis.set_major_locator(MaxNLocator(6, steps=STEPS))
-        if i // columns == rows - 1:
-            ax.set_xlabel("$x$ [m]")
-        if i % columns == 0:
-            ax.set_ylabel("$y$ [m]")
+def make_axes(
+    shot: Shot, panels: int, *, captions: bool, width: float | None = None, tallest: float | None = None
+) -> tuple[Any, list[Any]]:
+    """Figure and axes of the right shape for the scene; call within `paper_style`.
+
+    Args:
+        shot: the move.
+        panels: how many pictures side by side; one fills a column unless it is flat, several the page.
+        captions: leave room for them, beside the bodies of one panel or above each of several.
+        width, tallest: of the figure and of all panels together [inch].
+    """
+    solid, many = shot.picture.dimension == 3, panels > 1
+    span = np.maximum(shot.high - shot.low, 1e-3 * float((shot.high - shot.low).max()))
+    flat = span[0] > 2.2 * span[1]
+    width = width or (WIDTH if many or flat else COLUMN)
+    tallest = tallest or (3.9 if many else 2.8)
+    corner = _free_corner(shot) if solid else ""
+    left, right, bottom = (0.1 if corner else 0.9, 0.72, 0.05) if solid else (0.56, 0.72, 0.42)
+    title = LINE if captions and many else 0.0
+    pads = np.array([[PAD, PAD], [PAD, PAD]])  # [[left, bottom], [right, top]]
+    if captions and not many:
+        pads += np.array([[0.0, 0.0], [CAPTION, 0.0]]) if _upright(shot) else np.array([[PAD, LINE], [PAD, 0.0]])
+
+    def scale_of(shape: tuple[int, int]) -> float:
+        """Inches per metre with that many rows and columns."""
+        free = np.array([width - left - right - GAP * (shape[1] - 1), tallest - (GAP + title) * (shape[0] - 1)])
+        return float(((free / shape[::-1] - pads.sum(axis=0)) / span).min())
+
+    shapes = [(r, -(-panels // r)) for r in range(1, panels + 1) if panels % r == 0]
+    rows, columns = max(shapes, key=scale_of)
+    scale = scale_of((rows, columns))
+    low, high = shot.low - pads[0] / scale, shot.high + pads[1] / scale
+    w, h = (high - low) * scale
+    size = (left + columns * w + (columns - 1) * GAP + right, bottom + rows * h + (rows - 1) * (GAP + title) + 0.05)
+    figure, axes = plt.figure(figsize=size), []
+    for i in range(panels):
+        x, y = left + (i % columns) * (w + GAP), bottom + (rows - 1 - i // columns) * (h + GAP + title)
+        ax = figure.add_axes((x / size[0], y / size[1], w / size[0], h / size[1]))
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.append(ax)
+        if solid:
+            ax.set_axis_off()
+            continue
+        ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=STEPS))
+        ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=STEPS))
+        ax.tick_params(labelbottom=i // columns == rows - 1, labelleft=i % columns == 0)
+        ax.set_xlabel("$x$ [m]" if i // columns == rows - 1 else "")
+        ax.set_ylabel("$y$ [m]" if i % columns == 0 else "")
+    if solid:
+        _tripod(figure, size, scale, corner == "top")
     return figure, axes
 
 
 def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
-    """Colour bar of the relative displacement, as high as the axes."""
-    colours = mpl.cm.ScalarMappable(shot.norm, colour_map())
-    label = f"displacement relative to the hand [{shot.unit[1]}]"
-    if shot.picture.dimension == 3:
-        figure.subplots_adjust(0.0, 0.0, 0.9, 0.94, wspace=0.0)
-        place = figure.add_axes((0.91, 0.2, 0.022, 0.55))
-    else:
-        figure.canvas.draw()  # equal axes know their place only now
-        boxes = [ax.get_position() for ax in axes]
-        low, high = min(b.y0 for b in boxes), max(b.y1 for b in boxes)
-        gap = 0.12 / figure.get_figwidth()
-        place = figure.add_axes((max(b.x1 for b in boxes) + gap, low, 1.1 * gap, high - low))
-    bar = figure.colorbar(colours, cax=place, label=label)
+    """Colour bar of the relative displacement beside the axes, at most 2.4 inch high; none for outlines."""
+    if len(shot.picture.cells) > MANY_CELLS:
+        return
+    boxes = [ax.get_position() for ax in axes]
+    inch = 1 / figure.get_figheight()
+    low, high = min(b.y0 for b in boxes), max(b.y1 for b in boxes)
+    middle, height = (low + high) / 2, min(high - low, 2.4 * inch)
+    x, gap = max(b.x1 for b in boxes), 0.1 / figure.get_figwidth()
+    place = figure.add_axes((x + gap, middle - height / 2, gap, height))
+    words = "displacement relative to the hand" if height > 2.2 * inch else "displacement relative\nto the hand"
+    words = words if height > 1.2 * inch else "displacement\nrelative to\nthe hand"
+    label = f"{words} [{shot.unit[1]}]"
+    bar = figure.colorbar(mpl.cm.ScalarMappable(shot.norm, colour_map()), cax=place, label=label)
     bar.outline.set_linewidth(0.5)
-    bar.ax.yaxis.set_major_locator(MaxNLocator(6, steps=STEPS))
+    bar.ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(height / inch / 0.35, 2, 6)), steps=STEPS))
 
 
 def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
     """One row above the axes, where nothing is hidden."""
-    entries: list[Any] = [
-        Patch(color=HAND, label="hand" if shot.hand else "held by the hand"),
-        Line2D([], [], ls=(0, (5, 3)), color=OUTLINE, lw=0.9, label="path of the hand"),
-    ]
-    if shot.target is not None:
-        entries.append(Line2D([], [], ls=(0, (1, 1.2)), color=TARGET, lw=1.5, label="target"))
-    row: dict[str, Any] = {"handles": entries, "ncols": 3, "borderaxespad": 0.0, "columnspacing": 1.4}
-    if shot.picture.dimension == 3:
-        figure.legend(loc="upper center", bbox_to_anchor=(0.46, 0.97), **row)
-    else:
-        axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), **row)
+    entries: list[Any] = [Line2D([], [], ls=DASHES, color=OUTLINE, lw=0.9, label="path of the hand")]
+    if shot.hand or len(shot.picture.cells) <= MANY_CELLS:
+        entries.insert(0, Patch(color=HAND, label="hand" if shot.hand else "held by the hand"))
+    if shot.aim:
+        entries.append(Line2D([], [], ls=DOTS, color=TARGET, lw=1.3, label="target"))
+    title = LINE if axes[0].get_title() else 0.0
+    top = max(ax.get_position().y1 for ax in axes) + (0.05 + title) / figure.get_figheight()
+    figure.legend(
+        handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=3, borderaxespad=0.0, columnspacing=1.2,
+        handlelength=1.8,
+    )  # fmt: skip
 
 
-def _frame_3d(ax: Any, shot: Shot) -> None:
-    span = np.maximum(shot.high - shot.low, 0.02 * float((shot.high - shot.low).max()))
-    low, high = shot.low - 0.04 * span.max(), shot.high + 0.04 * span.max()
-    ax.set_proj_type("ortho")
-    ax.computed_zorder = False
-    ax.view_init(ELEVATION, AZIMUTH)
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(high - low, zoom=1.0)
-    for axis, name, extent in zip((ax.xaxis, ax.yaxis, ax.zaxis), "xyz", high - low, strict=True):
-        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.line.set_linewidth(0.6)
-        axis._axinfo["grid"].update(color="#dddddd", linewidth=0.4)
-        axis.set_major_locator(MaxNLocator(max(2, round(5 * extent / (high - low).max())), steps=STEPS))
-        axis.set_label_text(f"${name}$ [m]")
-    ax.tick_params(labelsize=8, pad=1)
+def _time(t: float) -> str:
+    return f"$t$ = {t:.3g} s"
+
+
+def _upright(shot: Shot) -> bool:
+    """Whether the hand goes more up or down than sideways in the picture."""
+    along, up = np.ptp(seen(shot.path), axis=0)
+    return bool(up > along)
+
+
+def _caption(ax: Any, shot: Shot, box: Array, text: str) -> None:
+    """A caption below the box of a body, or to its right if the bodies stand above each other."""
+    if _upright(shot):
+        look: dict[str, Any] = {"xytext": (4, 0), "ha": "left", "va": "center"}
+        ax.annotate(text, (box[1, 0], box[:, 1].mean()), textcoords="offset points", zorder=6, **look)
+        return
+    left, right = ax.get_xlim()
+    half = CAPTION / 2 * (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
+    middle, way = float(box[:, 0].mean()), seen(shot.path[-1] - shot.path[0])
+    # The body next to it and lower lies to the left if the hand goes up to the right: keep off it.
+    middle = max(middle, box[0, 0] + half) if way.prod() > 0 else middle
+    middle = min(middle, box[1, 0] - half) if way.prod() < 0 else middle
+    middle = min(max(middle, left + half), max(right - half, left + half))
+    look = {"xytext": (0, -3), "ha": "center", "va": "top"}
+    ax.annotate(text, (middle, box[0, 1]), textcoords="offset points", zorder=6, **look)
+
+
+def _free_corner(shot: Shot) -> str:
+    """The left corner that the bodies leave free: "top", "bottom" or "" for none."""
+    way = seen(shot.path[-1] - shot.path[0])
+    if abs(float(way[0])) < 0.5 * float((shot.high - shot.low)[0]):
+        return ""
+    return "top" if way.prod() > 0 else "bottom"
+
+
+def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> None:
+    """The directions of a 3D scene, each arm of the same length in space, in a left corner."""
+    length = 0.55 / scale  # [m], rounded down to 1, 2 or 5 times a power of ten
+    power = 10.0 ** np.floor(np.log10(length))
+    length = power * max(m for m in (1, 2, 5) if m * power <= length * 1.001)
+    ends = seen(length * np.eye(3))
+    low = np.minimum(ends.min(axis=0), 0.0)
+    reach = np.maximum(ends.max(axis=0), 0.0) - low
+    y = size[1] - 0.25 - scale * reach[1] if top else 0.4
+    ax = figure.add_axes((0.08 / size[0], y / size[1], *(scale * reach / size)))
+    ax.set(xlim=(low[0], low[0] + reach[0]), ylim=(low[1], low[1] + reach[1]))
+    ax.set_axis_off()
+    for name, end in zip("xyz", ends, strict=True):
+        ax.annotate("", end, (0.0, 0.0), arrowprops={"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0})
+        away = 5 * end / np.linalg.norm(end)
+        ax.annotate(f"${name}$", end, away, textcoords="offset points", ha="center", va="center")
+    ax.annotate(
+        f"{length:g} m each", (0.0, 0.0), (0, -9), xycoords="axes fraction", textcoords="offset points", va="top"
+    )
 
 
 def _name_layers(ax: Any, shot: Shot, u: Array) -> None:
-    """Names of the layers beside the body, on the side with more room."""
+    """Names of the layers beside the body on the side with more room; without room in it."""
     picture, x = shot.picture, shot.picture.points + u
     if len(picture.names) == 1:
         return
-    low, high = _box(x)
-    room = (low[0] - ax.get_xlim()[0], ax.get_xlim()[1] - high[0])
-    gap = 0.02 * float((shot.high - shot.low).max())
-    place, align = (low[0] - gap, "right") if room[0] > room[1] else (high[0] + gap, "left")
+    (left, right), (low, high) = ax.get_xlim(), _box(x)
+    room = (low[0] - left, right - high[0])
+    inch = (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
+    place, align = (low[0] - 0.06 * inch, "right") if room[0] > room[1] else (high[0] + 0.06 * inch, "left")
+    look: dict[str, Any] = {"color": OUTLINE}
+    if max(room) < CAPTION * inch:
+        place, align = (low[0] + high[0]) / 2, "center"
+        look = {"color": HAND, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
     heights = x[:, 1][picture.cells].mean(axis=1)
     for i, name in enumerate(picture.names):
-        ax.text(place, heights[picture.layers == i].mean(), name, ha=align, va="center", color=OUTLINE)
+        ax.text(place, heights[picture.layers == i].mean(), name, ha=align, va="center", zorder=6, **look)
 
 
 def _box(x: Array) -> Array:
-    """Lower and upper corner of points, shape (2, d)."""
-    return np.stack([x.min(axis=0), x.max(axis=0)])
+    """Lower and upper corner of points in the plane of the picture, shape (2, 2)."""
+    flat = seen(x)
+    return np.stack([flat.min(axis=0), flat.max(axis=0)])
 
 
-def _draw_3d(ax: Any, shot: Shot, states: Array, times: Array | None, hands: Array) -> None:
+def _outline(picture: PictureMesh, x: Array) -> list[Array]:
+    """Closed lines around a body with its vertices at x, each (k, 2) [m]."""
+    if picture.dimension == 2:
+        return [x[line] for line in chained(picture.facets)]
+    return shadow(seen(x), picture.facets)
+
+
+def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     picture = shot.picture
-    elevation, azimuth = np.radians([ELEVATION, AZIMUTH])
-    view = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    left = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    up = np.cross(view, -left)
-    # The bodies lie along the path: beside it is room for their times.
-    slope = float((shot.path[-1] - shot.path[0]) @ up * ((shot.path[-1] - shot.path[0]) @ left))
-    beside = left if len(states) == 1 else left + (up if slope < 0 else -up)
-    project = ax.get_proj()
-    sides = edge_sides(picture.facets)
-    many = len(picture.cells) > MANY_CELLS
-    if not many:
-        # One collection for all instants: it sorts its faces from back to front.
-        painted = [_paint(shot, u, q, view) for u, q in zip(states, hands, strict=True)]
-        faces, colours = (np.vstack(part) for part in zip(*painted, strict=True))
-        body = Poly3DCollection(faces, facecolors=colours, edgecolors=colours, linewidths=0.2, zorder=2)
-        body.set_rasterized(True)
-        ax.add_collection3d(body)
-    for i, u in enumerate(states):
-        x = picture.points + u
-        if many:
-            edges = silhouette(x, picture.facets, sides, view)
-            ax.add_collection3d(Line3DCollection(x[edges], colors=OUTLINE, linewidths=0.6, zorder=3))
-        if times is not None:
-            a, b, _ = proj_transform(*x[np.argmax(x @ beside)], project)
-            beside_it: dict[str, Any] = {
-                "xytext": (-5, 0),
-                "textcoords": "offset points",
-                "ha": "right",
-                "va": "center",
-            }
-            ax.annotate(f"$t$ = {times[i]:.3g} s", (a, b), **beside_it, zorder=6)
-    ax.plot(*shot.path.T, ls=(0, (5, 3)), color=OUTLINE, lw=0.9, zorder=4)
-    if shot.target is not None:
-        x = picture.points + picture.rigid(shot.target)
-        edges = outer_edges(x, picture.facets, silhouette(x, picture.facets, sides, view), view)
-        look: dict[str, Any] = {"colors": TARGET, "linewidths": 1.4, "linestyles": (0, (1, 1.2)), "zorder": 5}
-        ax.add_collection3d(Line3DCollection(x[edges], **look))
+    x = picture.points + u
+    if len(picture.cells) <= MANY_CELLS:
+        ax.tripcolor(
+            x[:, 0], x[:, 1], picture.cells, shot.values(u, q), shading="gouraud", cmap=colour_map(),
+            norm=shot.norm, rasterized=True, zorder=2,
+        )  # fmt: skip
+    lines = np.vstack([picture.facets, interfaces(picture)])
+    ax.add_collection(LineCollection(list(x[lines]), colors=OUTLINE, linewidths=0.5, zorder=3), autolim=False)
+    hand = [p + picture.rigid(q, p) for p in shot.hand]
+    ax.add_collection(PolyCollection(hand, facecolors=HAND, edgecolors=HAND, linewidths=0.3, zorder=4), autolim=False)
 
 
-def _paint(shot: Shot, u: Array, q: Array, view: Array) -> tuple[Array, Array]:
-    """Visible boundary of one instant, (m, 3, 3) [m], in small triangles with shaded colours (m, 3)."""
+def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     picture = shot.picture
+    x = picture.points + u
+    if len(picture.cells) > MANY_CELLS:
+        lines = LineCollection(_outline(picture, x), colors=OUTLINE, linewidths=0.6, zorder=3)
+        ax.add_collection(lines, autolim=False)
+        return
+    faces, colours = _paint(shot, u, q)
+    look: dict[str, Any] = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.5, "joinstyle": "round"}
+    ax.add_collection(PolyCollection(list(seen(faces)), zorder=2, rasterized=True, **look), autolim=False)
+
+
+def _paint(shot: Shot, u: Array, q: Array) -> tuple[Array, Array]:
+    """Visible boundary of one instant from back to front, (m, 3, 3) [m], and its shaded colours (m, 3)."""
+    picture, view = shot.picture, view_direction()
     code = np.array([1, len(picture.points), len(picture.points) ** 2])
     held = np.isin(np.sort(picture.facets, axis=1) @ code, np.sort(picture.contact, axis=1) @ code)
     corners = (picture.points + u)[picture.facets]
@@ -384,4 +371,6 @@ def _paint(shot: Shot, u: Array, q: Array, view: Array) -> tuple[Array, Array]:
     lit = np.clip(normals[front] @ light, 0.0, 1.0)[:, None, None]
     dark = np.array(mpl.colors.to_rgb(HAND)) + 0.14 * lit
     rgb = np.where(held[front][:, None, None], dark, rgb * (0.75 + 0.25 * lit))
-    return faces.reshape(-1, 3, 3), rgb.reshape(-1, 3)
+    faces, rgb = faces.reshape(-1, 3, 3), rgb.reshape(-1, 3)
+    order = np.argsort(faces.mean(axis=1) @ view)
+    return faces[order], rgb[order]

@@ -1,4 +1,4 @@
-"""Geometry of pictures: the drawn hand, outlines, and which instants to show. Plain arrays in and out."""
+"""Geometry of pictures: the view, the drawn hand, outlines, and which instants to show. Plain arrays in and out."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from contourpy import contour_generator
+from PIL import Image, ImageDraw, ImageFilter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -15,10 +17,29 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 
-def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Array) -> list[int]:
-    """Instants for one picture: first, last and one or two between, at equal steps along the path of the hand.
+ELEVATION, AZIMUTH = 18.0, -58.0  # view of 3D scenes [degree]
+MARGIN = 0.08  # of a body's smaller side, kept free between two bodies of one picture
 
-    Four if the bodies do not hide each other, else three.
+
+def view_direction() -> Array:
+    """Unit vector from a 3D scene to the viewer, shape (3,)."""
+    e, a = np.radians([ELEVATION, AZIMUTH])
+    return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+
+def seen(x: Array) -> Array:
+    """Points in the plane of the picture, shape (..., 2) [m]: themselves in 2D, parallel projection in 3D."""
+    if x.shape[-1] == 2:
+        return x
+    a, view = np.radians(AZIMUTH), view_direction()
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    return np.asarray(x @ np.stack([right, np.cross(view, right)], axis=1))
+
+
+def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Array) -> list[int]:
+    """Instants for one picture: first, last and one or two between, near even steps of way and much bent.
+
+    Four if they fit into one picture without hiding each other, else three if those do, else four for panels.
 
     Args:
         picture: the body.
@@ -29,17 +50,43 @@ def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Arra
     Returns:
         Numbers of the states.
     """
-    d = picture.dimension
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(table[:, 1 : 1 + d], axis=0), axis=1)))
-    at = np.interp(times, table[:, 0], way)
-    measure = at if at[-1] > at[0] else times
-    for count in (4, 3):
-        inner = np.linspace(measure[0], measure[-1], count)[1:-1]
-        middle = [int(np.argmin(np.abs(measure - m))) for m in inner]
-        chosen = sorted({0, *middle, len(states) - 1})
-        if not overlap(picture, states[chosen]):
-            break
-    return chosen
+    last = len(states) - 1
+    if last < 3:
+        return list(range(last + 1))
+    done = way_done(table, times)
+    if not ((done > 0.02) & (done < 0.98)).any():  # frames are too far apart to see the move
+        done = (times - times[0]) / (times[-1] - times[0])
+    hands = hands_at(table, times)
+    relative = np.stack([u - picture.rigid(q) for u, q in zip(states, hands, strict=True)])
+    bent = np.linalg.norm(relative - relative[0], axis=2).max(axis=1)
+    bent /= bent.max() or 1.0
+    low, high = _boxes(picture, states)
+
+    def inner(at: float, reach: float) -> list[tuple[float, int]]:
+        """Instants whose way is near ``at``, with their merit."""
+        near = np.flatnonzero((np.abs(done - at) <= reach) & (done > 0.02) & (done < 0.98))
+        return [(float(bent[i]) - 3 * abs(float(done[i]) - at), int(i)) for i in near]
+
+    pairs = [(a + b, (0, i, j, last)) for a, i in inner(1 / 3, 0.17) for b, j in inner(2 / 3, 0.17) if i < j]
+    single = [(a, (0, i, last)) for a, i in inner(1 / 2, 0.25)]
+    for choice in (pairs, single):
+        for _, chosen in sorted(choice, reverse=True):
+            if not _boxes_overlap(low[list(chosen)], high[list(chosen)]):
+                return list(chosen)
+    halves = (np.flatnonzero((done > 0.02) & (done <= 0.5)), np.flatnonzero((done > 0.5) & (done < 0.98)))
+    return sorted({0, last, *(int(h[np.argmax(bent[h])]) for h in halves if len(h))})
+
+
+def way_done(table: Array, times: Array) -> Array:
+    """Share of the hand's way that is behind it at the given times [1]; of the time if the hand rests."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(table[:, 1:], axis=0), axis=1)))
+    at = np.interp(times, table[:, 0], way) if way[-1] > 0 else np.asarray(times, dtype=np.float64)
+    return np.asarray((at - at[0]) / ((at[-1] - at[0]) or 1.0))
+
+
+def hands_at(table: Array, times: Array) -> Array:
+    """Hand coordinates at the given times, shape (k, n_s)."""
+    return np.stack([np.interp(times, table[:, 0], column) for column in table[:, 1:].T], axis=1)
 
 
 def hand_polygons(picture: PictureMesh) -> tuple[list[Array], Array]:
@@ -110,12 +157,22 @@ def contact_centre(picture: PictureMesh) -> Array:
 
 
 def overlap(picture: PictureMesh, states: Array) -> bool:
-    """Whether the boxes of two instants in a row share more than a twentieth of their size."""
-    x = picture.points + states
-    low, high = x.min(axis=1), x.max(axis=1)
-    shared = np.minimum(high[1:], high[:-1]) - np.maximum(low[1:], low[:-1])
-    size = np.prod(high - low, axis=1).min()
-    return bool((np.prod(np.maximum(shared, 0.0), axis=1) > 0.05 * size).any())
+    """Whether two of the bodies come near each other in the picture, by their boxes."""
+    return _boxes_overlap(*_boxes(picture, states))
+
+
+def _boxes(picture: PictureMesh, states: Array) -> tuple[Array, Array]:
+    """Corners of the bodies in the picture with some margin, each (k, 2) [m]."""
+    # Instant by instant: one after the other needs little memory.
+    flat = [seen(picture.points + u) for u in states]
+    low, high = np.stack([x.min(axis=0) for x in flat]), np.stack([x.max(axis=0) for x in flat])
+    margin = MARGIN / 2 * float((high - low).min())
+    return low - margin, high + margin
+
+
+def _boxes_overlap(low: Array, high: Array) -> bool:
+    i, j = np.triu_indices(len(low), 1)
+    return bool(((np.minimum(high[i], high[j]) - np.maximum(low[i], low[j])) > 0).all(axis=1).any())
 
 
 def _pieces(facets: Any, n: int) -> list[Any]:
@@ -157,47 +214,27 @@ def facet_normals(corners: Array) -> Array:
     return np.asarray(n / np.maximum(np.linalg.norm(n, axis=1), 1e-300)[:, None])
 
 
-def edge_sides(facets: Any) -> tuple[Any, Any]:
-    """Edges (m, 2) of a closed surface and the two triangles at each, (m, 2)."""
-    edges = np.sort(np.vstack([facets[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
-    owner = np.tile(np.arange(len(facets)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    edges, owner = edges[order], owner[order]
-    pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
-    return edges[pair], np.stack([owner[pair], owner[pair + 1]], axis=1)
+def shadow(flat: Array, facets: Any, fine: int = 700) -> list[Array]:
+    """Closed lines around the union of triangles in the plane, exact to 1 / ``fine`` of its size.
 
+    Args:
+        flat: points, shape (n, 2) [m].
+        facets: triangles, shape (m, 3).
+        fine: pixels along the longer side.
 
-def silhouette(x: Array, facets: Any, sides: tuple[Any, Any], view: Array) -> Any:
-    """Edges where the surface turns from the viewer: one triangle faces him, the other does not."""
-    facing = facet_normals(x[facets]) @ view > 0
-    edges, pairs = sides
-    return edges[facing[pairs[:, 0]] != facing[pairs[:, 1]]]
-
-
-def outer_edges(x: Array, facets: Any, edges: Any, view: Array) -> Any:
-    """Those edges of a silhouette that border the shadow of the surface: outside them nothing is hit. Shape (m, 2)."""
-    across = np.linalg.svd(view[None, :])[2][1:]
-    flat = x @ across.T
-    p, q = flat[edges[:, 0]], flat[edges[:, 1]]
-    normal = np.stack([q[:, 1] - p[:, 1], p[:, 0] - q[:, 0]], axis=1)
-    normal *= 1e-3 * np.ptp(flat, axis=0).max() / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-    a, b, c = (flat[facets[:, i]] for i in range(3))
-    hit = []
-    for points in ((p + q) / 2 + normal, (p + q) / 2 - normal):
-        inside = np.zeros(len(points), dtype=np.bool_)
-        for chunk in np.array_split(np.arange(len(points)), 1 + len(points) * len(facets) // 10_000_000):
-            s = points[chunk][:, None, :]
-            turns = [_turn(a, b, s), _turn(b, c, s), _turn(c, a, s)]
-            inside[chunk] = (np.all([t > 0 for t in turns], axis=0) | np.all([t < 0 for t in turns], axis=0)).any(
-                axis=1
-            )
-        hit.append(inside)
-    return edges[~(hit[0] & hit[1])]
-
-
-def _turn(a: Array, b: Array, s: Array) -> Array:
-    """Twice the signed area of the triangles a, b, s."""
-    return np.asarray((b - a)[..., 0] * (s - a)[..., 1] - (b - a)[..., 1] * (s - a)[..., 0])
+    Returns:
+        Lines, each (k, 2) [m].
+    """
+    low = flat.min(axis=0)
+    pixel = float(np.ptp(flat, axis=0).max()) / fine
+    at = (flat - low) / pixel + 4.0  # [pixel], with a free border
+    width, height = (np.ceil(at.max(axis=0)) + 5).astype(int)
+    image = Image.new("L", (int(width), int(height)))
+    draw = ImageDraw.Draw(image)
+    for corners in at[facets].reshape(-1, 6).tolist():
+        draw.polygon(corners, fill=255)
+    mask = np.asarray(image.filter(ImageFilter.GaussianBlur(1.0)), dtype=np.float64)
+    return [low + pixel * (np.asarray(line) - 4.0) for line in contour_generator(z=mask).lines(127.5)]
 
 
 def subdivision(n: int) -> Array:

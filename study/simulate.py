@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from fem.build import build
+from fem.effects import EFFECTS
 from fem.results import simulate_result, write_results
 from fem.run import Run, RunOptions, simulate
 from fem.scene import Scene
 from fem.scene_file import load_scene_collective, resolved_toml
+from study.equation import equation
 from study.frames import Frames
-from study.report import write_report
+from study.report import Section, equation_text, write_report
 
 Rows = list[tuple[str, str]]
 
@@ -97,29 +101,44 @@ def show(console: Console, rows: Rows) -> None:
 
 
 def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: Path, overrides: list[str]) -> Path:
+    from study.animation import speed_up  # brings Matplotlib, which only rank 0 needs
+
+    faster = speed_up(np.array([0.0, scene.time_end]))
     captions = {
-        "move.png": "The body at the start, in the middle and at the end of the move.",
-        "move.gif": "The move in real time.",
+        "move.png": "The body at some instants of the move.",
+        "move.gif": "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed.",
         "traces.png": "Hand and outputs against time; below, the outputs relative to the hand.",
     }
     figures = [(out / name, text) for name, text in captions.items() if (out / name).exists()]
     sizes = [
-        ("hand n_s", str(result["n_s"])),
-        ("tissue n_e", str(result["n_e"])),
-        ("states 2n", str(result["states"])),
-        ("cells", str(result["cells"])),
+        ("hand n_s", result["n_s"]),
+        ("tissue n_e", result["n_e"]),
+        ("states 2n", result["states"]),
+        ("cells", result["cells"]),
+        ("steps", result["steps"]),
         ("time step", f"{result['dt']:.6g} s"),
+        ("end", f"{scene.time_end:.6g} s"),
     ]
-    about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", str(result["ranks"]))]
+    effects = [
+        (name, effect.active(scene), *((effect.term, effect.cost) if effect.active(scene) else ("", "")))
+        for name, effect in EFFECTS.items()
+    ]
+    about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", result["ranks"])]
     about.append(("scene hash", result["scene_hash"]))
     launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
-    sets = "".join(f" --set '{o}'" for o in overrides)
+    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
     return write_report(
         out / "report.html",
         title=scene.name,
         subtitle=scene.description,
-        tables=[("Result", list(rows)), ("Size", list(sizes)), ("Made with", list(about))],
-        figures=figures,
+        sections=[
+            Section("", figures=figures),
+            Section("Result", rows=rows),
+            Section("Equation", code=equation_text(equation(scene))),
+            Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
+            Section("Size", rows=sizes),
+            Section("Made with", rows=about),
+        ],
         scene=resolved_toml(scene),
-        reproduce=f"{launch}softgrasp simulate {path.name}{sets}",
+        reproduce=f"{launch}softgrasp simulate {shlex.quote(path.name)}{sets}",
     )

@@ -18,8 +18,9 @@ HAND = "#2b2b2b"
 OUTLINE = "#555555"
 TARGET = ORANGE
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
-WIDTH = 6.3  # [inch], text width of A4
+COLUMN, WIDTH = 3.4, 7.0  # [inch], one column and both of a two-column page
 DPI = 300
+STEPS = [1, 2, 5, 10]  # between ticks
 
 
 @contextmanager
@@ -27,16 +28,16 @@ def paper_style() -> Iterator[None]:
     """Matplotlib settings for figures in print, restored afterwards."""
     settings: Any = {
         "font.family": "sans-serif",
-        "font.size": 9,
-        "axes.labelsize": 9,
-        "axes.titlesize": 9,
-        "legend.fontsize": 8.5,
-        "xtick.labelsize": 8.5,
-        "ytick.labelsize": 8.5,
+        "font.size": 8,
+        "axes.labelsize": 8,
+        "axes.titlesize": 8,
+        "legend.fontsize": 7.5,
+        "xtick.labelsize": 7.5,
+        "ytick.labelsize": 7.5,
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.linewidth": 0.7,
-        "lines.linewidth": 1.4,
+        "lines.linewidth": 1.2,
         "legend.frameon": False,
         "axes.prop_cycle": cycler(color=CYCLE),
         "pdf.fonttype": 42,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fem  # noqa: F401
 
 # isort: split
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ import pytest
 from PIL import Image
 
 from fem.gather import PictureMesh
-from study.animation import gif_move
-from study.plots import figure_move, figure_traces
-from study.shapes import edge_sides, hand_polygons, outer_edges, pick_instants, silhouette
+from study.animation import gif_move, speed_up
+from study.plots import figure_move
+from study.report import Section, write_report
+from study.shapes import hand_polygons, overlap, pick_instants, seen, shadow, view_direction
+from study.traces import figure_traces
 
 pytestmark = pytest.mark.serial  # no communication here
 
@@ -148,16 +151,115 @@ def test_pads_lie_outside_and_touch_the_contact() -> None:
         assert (grip[axis] - 0.5) * grip_side > 0.5  # beyond the end that is held
 
 
-def test_silhouette_of_a_cube_is_a_hexagon() -> None:
+def test_parallel_projection_keeps_what_is_across_the_view() -> None:
+    view = view_direction()
+    assert np.linalg.norm(view) == pytest.approx(1.0, abs=1e-15)  # rounding
+    x = np.random.default_rng(3).normal(size=(5, 3))
+    across = x - np.outer(x @ view, view)
+    np.testing.assert_allclose(np.linalg.norm(seen(x), axis=1), np.linalg.norm(across, axis=1), rtol=1e-14)  # rounding
+    assert seen(np.array([0.0, 0.0, 1.0]))[0] == pytest.approx(0.0, abs=1e-15)  # up stays up; rounding
+
+
+def test_shadow_of_a_cube_is_a_hexagon_of_known_area() -> None:
     picture = cube()
-    view = np.array([1.0, 0.7, 0.5]) / np.linalg.norm([1.0, 0.7, 0.5])
-    edges = silhouette(picture.points, picture.facets, edge_sides(picture.facets), view)
-    assert len(edges) == 6
-    assert len(outer_edges(picture.points, picture.facets, edges, view)) == 6
+    (line,) = shadow(seen(picture.points), picture.facets)
+    x, y = line.T
+    area = abs(float(x[:-1] @ y[1:] - x[1:] @ y[:-1])) / 2
+    # A unit cube's shadow has the area |v_x| + |v_y| + |v_z|; the outline is half a pixel of 1/700 off all round.
+    assert area == pytest.approx(float(np.abs(view_direction()).sum()), rel=5e-3)
+    assert overlap(picture, np.zeros((2, 8, 3)))
 
 
 def test_instants_do_not_overlap_when_they_need_not() -> None:
     picture = rectangle()
-    assert len(pick_instants(picture, *move(picture, 4.0, 31)[:3])) == 4
-    assert len(pick_instants(picture, *move(picture, 0.1, 31)[:3])) == 3
-    assert pick_instants(picture, *move(picture, 0.0, 31)[:3]) == [0, 15, 30]
+    far, near, still = (move(picture, reach, 31)[:3] for reach in (4.0, 0.1, 0.0))
+    chosen = pick_instants(picture, *far)
+    assert (len(chosen), chosen[0], chosen[-1]) == (4, 0, 30)
+    assert not overlap(picture, far[0][chosen])
+    between = pick_instants(picture, *move(picture, 2.5, 31)[:3])
+    assert len(between) == 3  # four would touch
+    for states, times, table in (near, still):
+        panels = pick_instants(picture, states, times, table)
+        assert len(panels) == 4
+        assert 0 < panels[1] <= 15 < panels[2] < 30  # one in each half
+
+
+def test_instants_differ_when_the_hand_rests_after_its_move() -> None:
+    picture = rectangle()
+    states, times, table, _ = move(picture, 4.0, 31)
+    # As long again at rest: equal steps of time would show the same body twice.
+    states, times = np.vstack([states, np.repeat(states[-1:], 30, axis=0)]), np.append(times, times[1:] + 1.0)
+    table = np.vstack([table, np.column_stack([times[31:], np.repeat(table[-1:, 1:], 30, axis=0)])])
+    chosen = pick_instants(picture, states, times, table)
+    ways = np.linalg.norm(np.diff(table[chosen, 1:], axis=0), axis=1)
+    assert len(chosen) == 4
+    assert ways.min() > 0.15 * ways.sum()
+
+
+def test_many_frames_still_take_their_time(tmp_path: Path) -> None:
+    picture = rectangle(2)
+    states, times, table, target = move(picture, 3.0, 61)
+    image = Image.open(gif_move(picture, states, times, table, target, tmp_path / "move.gif"))
+    shown = []
+    for i in range(image.n_frames):
+        image.seek(i)
+        shown.append(image.info["duration"])
+    assert sum(shown[:-1]) == 1000  # [ms], 1/60 s is no whole number of ticks
+    assert min(shown) >= 20  # shorter ones are slowed down by viewers
+
+
+def test_long_moves_are_shown_faster_and_short_ones_slower() -> None:
+    assert speed_up(np.array([0.0, 3.0])) == 1.0
+    assert speed_up(np.array([0.0, 300.0])) == 10.0
+    assert speed_up(np.array([0.0, 301.0])) == 20.0
+    assert speed_up(np.array([0.0, 0.03])) == pytest.approx(0.02, rel=1e-12)  # rounding
+
+
+class Page(HTMLParser):
+    """Checks that tags are balanced and collects texts and addresses."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.cells: list[tuple[str, str]] = []
+        self.sources: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+        self.sources += [value or "" for key, value in attrs if key in ("src", "href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and data.strip():
+            self.cells.append((self.open[-1], data.strip()))
+
+
+def test_report_is_one_balanced_page(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 1.0, 9)
+    png, _ = figure_traces(t, t[:, None], ("tip_x",), t[:, None] * [1.0, 0.0], tmp_path / "a.png")
+    table = Section(
+        "Errors", "First.\n\nSecond <b>.", header=("N", "error", "ok"), rows=[(4, 1.25e-7, True), (6, None, False)]
+    )
+    path = write_report(
+        tmp_path / "r.html", title="A & B", subtitle="s", tables=[("Short", [("a", 1)])], figures=[(png, "caption")],
+        sections=[table], scene="[tissue]", reproduce="softgrasp reduce x.toml",
+    )  # fmt: skip
+    page = Page(path.read_text())
+    assert not page.open
+    assert len(page.sources) == 1  # the figure only
+    assert page.sources[0].startswith("data:image/png;base64,")
+    for cell in (
+        ("h1", "A & B"),
+        ("p", "Second <b>."),
+        ("th", "error"),
+        ("td", "1.25e-07"),
+        ("td", "yes"),
+        ("td", "a"),
+    ):
+        assert cell in page.cells
+    with pytest.raises(ValueError, match="'Bad' has 2 columns"):
+        write_report(tmp_path / "x.html", title="t", sections=[Section("Bad", rows=[(1, 2), (1, 2, 3)])])

@@ -1,0 +1,84 @@
+"""Hand and outputs of a move against time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import numpy.typing as npt
+from matplotlib.ticker import MaxNLocator
+
+from study.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style, save
+
+Array = npt.NDArray[np.float64]
+
+
+def figure_traces(
+    times: Array,
+    outputs: Array,
+    names: tuple[str, ...],
+    q_s: Array,
+    out_png: Path,
+    *,
+    rigid: Array | None = None,
+    dimension: int | None = None,
+) -> tuple[Path, Path]:
+    """Hand and outputs against time, and below what the outputs move relative to the hand; PNG and PDF.
+
+    Args:
+        times: shape (m,) [s].
+        outputs: absolute displacements, shape (m, c) [m].
+        names: one per output, ending in _x, _y or _z.
+        q_s: hand, shape (m, n_s) [m, rad].
+        out_png: name of the picture; the PDF gets its stem.
+        rigid: share of the outputs that moves with the hand, shape (m, c); by default the hand's translation.
+        dimension: 2 or 3; needed when a 2D hand turns.
+
+    Returns:
+        Names of PNG and PDF.
+    """
+    d = dimension or min(q_s.shape[1], 3)
+    axes_of = ["xyz".find(name.rsplit("_", 1)[-1][-1:]) for name in names]
+    shown = [i for i, axis in enumerate(axes_of) if 0 <= axis < d]
+    moving = np.stack([q_s[:, axes_of[i]] for i in shown], axis=1) if rigid is None else rigid[:, shown]
+    relative = outputs[:, shown] - moving
+    bodies = list(dict.fromkeys(names[i].rsplit("_", 1)[0] for i in shown))
+    angles = q_s.shape[1] > d
+    with paper_style():
+        figure, axes = plt.subplots(
+            2 + angles, 1, figsize=(COLUMN, 3.4 + 1.5 * angles), sharex=True, layout="constrained"
+        )
+        factors = [
+            length_unit(float(np.abs(a).max(initial=0.0)))
+            for a in (np.hstack([outputs[:, shown], q_s[:, :d]]), relative)
+        ]
+        for k, i in enumerate(shown):
+            body = names[i].rsplit("_", 1)[0]
+            look: dict[str, Any] = {"color": CYCLE[axes_of[i]], "ls": ("-", "-.", ":")[bodies.index(body) % 3]}
+            axes[0].plot(times, factors[0][0] * outputs[:, i], label=f"{body}, ${'xyz'[axes_of[i]]}$", **look)
+            axes[1].plot(times, factors[1][0] * relative[:, k], **look)
+        # The hand last: its thin dashes lie on the lines of the outputs.
+        for j in np.flatnonzero(np.abs(q_s[:, :d]).max(axis=0) > 0).tolist():
+            look = {"color": HAND, "ls": ((0, (4, 3)), (0, (1, 1.5)), (0, (4, 2, 1, 2)))[j], "lw": 0.8}
+            axes[0].plot(times, factors[0][0] * q_s[:, j], label=f"hand, ${'xyz'[j]}$", **look)
+        axes[0].set_ylabel(f"displacement [{factors[0][1]}]")
+        axes[1].set_ylabel(f"relative to hand [{factors[1][1]}]")
+        if angles:
+            for j in range(d, q_s.shape[1]):
+                axes[2].plot(times, q_s[:, j], color=CYCLE[(j - d) % len(CYCLE)], label=f"angle {j - d + 1}")
+            axes[2].set_ylabel("hand angle [rad]")
+            axes[2].legend(loc="best", handlelength=2.0)
+        entries, labels = axes[0].get_legend_handles_labels()
+        figure.legend(
+            entries, labels, loc="outside upper center", ncols=min(4, max(2, (len(labels) + 1) // 2)), handlelength=2.4,
+            columnspacing=1.4,
+        )  # fmt: skip
+        for ax in axes:
+            ax.axhline(0.0, color="#bbbbbb", lw=0.6, zorder=0)
+            ax.yaxis.set_major_locator(MaxNLocator(5, steps=STEPS))
+        axes[-1].set_xlabel("time [s]")
+        axes[-1].set_xlim(float(times[0]), float(times[-1]))
+        figure.align_ylabels(axes)
+        return save(figure, out_png)
