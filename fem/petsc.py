@@ -58,8 +58,3 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     x.destroy()
     y.destroy()
     return result
-
-
-def matrix_bytes(A: PETSc.Mat) -> float:
-    """Memory of a matrix over all ranks [byte]. Collective."""
-    return float(A.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["memory"])

@@ -61,19 +61,19 @@ class TissueSolver:
                 f"(PETSc reason {self.ksp.getConvergedReason()}); choose time.solver = 'mumps' or a larger time.rtol"
             )
 
-    def residual(self, r: PETSc.Vec, w: PETSc.Vec) -> float:
-        """Relative residual |S w - r| / |r|. Collective."""
+    def residual(self, r: PETSc.Vec, w: PETSc.Vec, size: float = 0.0) -> float:
+        """Residual |S w - r| / max(|r|, size); ``size`` is that of the terms of r, which may cancel. Collective."""
         y = self.S.createVecLeft()
         self.S.mult(w, y)
         y.axpy(-1.0, r)
-        scale = r.norm()
+        scale = max(r.norm(), size)
         value = y.norm() / scale if scale > 0 else y.norm()
         y.destroy()
         return float(value)
 
-    def check(self, r: PETSc.Vec, w: PETSc.Vec, where: str) -> float:
+    def check(self, r: PETSc.Vec, w: PETSc.Vec, where: str, size: float = 0.0) -> float:
         """Raise unless S w = r holds to the tolerance: direct solvers do not tell. Collective."""
-        value = self.residual(r, w)
+        value = self.residual(r, w, size)
         if not np.isfinite(value) or value > self.tolerance:
             raise SolverError(
                 f"{self.name}: relative residual {value:.1e} at {where} exceeds {self.tolerance:.0e}; "

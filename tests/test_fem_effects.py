@@ -154,6 +154,21 @@ def test_equilibrium_is_static_and_stays(comm: MPI.Intracomm, effects: dict[str,
     assert np.abs(Z[layout.n_e :]).max() < 1e-11 * np.abs(static).max() * 100  # times the highest frequency
 
 
+def test_a_held_hand_keeps_its_tissue_in_equilibrium(comm: MPI.Intracomm) -> None:
+    """Two-way under a force that holds the weight: load and stiffness cancel, and the check of the solve knows it."""
+    scene = make_scene(
+        effects=WEIGHT | {"reaction": True},
+        motion=HOLD | {"drive": "force"},
+        time={"start": "equilibrium", "end": 3.0},
+    )
+    model = build(scene, comm)
+    system = model.system
+    holding = -(system.M_hand + system.M_rigid) @ [1.0, -9.0]
+    run = simulate(model, force=lambda n, t, q, v: holding)
+    assert np.abs(run.q_s).max() < 1e-10  # rounding of the balance, in metres, over 60 steps
+    assert max(run.residuals) < 1e-12  # rounding of a direct solve
+
+
 @pytest.mark.parametrize("effects", [{}, VISCOUS, RAYLEIGH])
 @pytest.mark.parametrize("reaction", [False, True])
 def test_free_fall_strains_nothing(comm: MPI.Intracomm, effects: dict[str, Any], reaction: bool) -> None:

@@ -1,0 +1,164 @@
+"""One HDF5 file for a reduced model: small matrices, and the lift with the nodes it belongs to."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fem.errors import agree
+from fem.layout import BlockLayout
+from fem.petsc import Array
+from fem.system import LayerMaterial
+from reduction.model import Lift, ModelError, Outputs, ReducedModel
+
+FORMAT = "softgrasp reduced model 1"
+ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns
+PLAIN = (
+    "name", "N", "coordinates", "frame", "structure", "fixed_solid", "alpha", "in_space", "damped", "hand_weight",
+    "two_way", "scene_hash", "seconds",
+)  # fmt: skip
+
+
+def save_model(model: ReducedModel, path: Path) -> None:
+    """Write a model; every rank adds its rows of the lift in turn. Collective when the model holds a lift.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    lift = model.lift
+    comm = None if lift is None else lift.layout.comm
+    partial = path.with_name(path.name + ".part")
+    if lift is None or comm is None:
+        _write_small(model, partial)
+    else:
+        with agree(comm):
+            if comm.rank == 0:
+                _write_small(model, partial)
+        for rank in range(comm.size):
+            # one file, one writer at a time: the file library here is not a parallel one
+            with agree(comm):
+                if comm.rank == rank:
+                    _write_rows(lift, partial)
+    if comm is None or comm.rank == 0:
+        partial.replace(path)
+    if comm is not None:
+        comm.Barrier()
+
+
+def _write_small(model: ReducedModel, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lift = model.lift
+    data: dict[str, Any] = {key: getattr(model, key) for key in PLAIN}
+    data["materials"] = [asdict(m) for m in model.materials]
+    data["names"] = list(model.outputs.names)
+    with h5py.File(path, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["model"] = json.dumps(data)
+        for key, value in model.parts.items():
+            file[f"parts/{key}"] = value
+        file["outputs/C_z"], file["outputs/C_s"] = model.outputs.C_z, model.outputs.C_s
+        if model.gravity is not None:
+            file["gravity"] = model.gravity
+        if lift is not None:
+            layout, d = lift.layout, lift.layout.dimension
+            file.create_dataset("lift/nodes", (layout.n_e // d, d), dtype="f8")
+            for key, part in _lift_arrays(lift).items():
+                file.create_dataset(f"lift/{key}", (layout.n_e, part.shape[1]), dtype="f8")
+
+
+def _lift_arrays(lift: Lift) -> dict[str, Array]:
+    found = {"L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
+    return {key: part for key, part in found.items() if part is not None}
+
+
+def _write_rows(lift: Lift, path: Path) -> None:
+    layout, d = lift.layout, lift.layout.dimension
+    with h5py.File(path, "r+") as file:
+        first, count = layout.start // d, layout.n_local // d
+        file["lift/nodes"][first : first + count] = layout.nodes
+        for key, part in _lift_arrays(lift).items():
+            for at in range(0, layout.n_local, ROWS):
+                rows = part[at : at + ROWS]
+                file[f"lift/{key}"][layout.start + at : layout.start + at + len(rows)] = rows
+
+
+def load_model(path: Path, layout: BlockLayout | None = None, scene_hash: str | None = None) -> ReducedModel:
+    """Read a model. Collective over ``layout.comm``; without a layout each caller reads for itself.
+
+    Args:
+        path: file of :func:`save_model`.
+        layout: where the lift goes, by node coordinates: any rank count; None leaves the lift out (online use).
+        scene_hash: refuse a model of another scene.
+
+    Raises:
+        ModelError: the file is missing, damaged, of another scene or of another mesh.
+    """
+    if layout is None:
+        return _read(path, None, scene_hash)
+    with agree(layout.comm):
+        model = _read(path, layout, scene_hash)
+    return model
+
+
+def _read(path: Path, layout: BlockLayout | None, scene_hash: str | None) -> ReducedModel:
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise ModelError(f"{path} is no reduced model of this version ({FORMAT!r}); reduce the scene again")
+            data = json.loads(file.attrs["model"])
+            parts = {key: value[()] for key, value in file["parts"].items()}
+            outputs = Outputs(file["outputs/C_z"][()], file["outputs/C_s"][()], tuple(data.pop("names")))
+            gravity = file["gravity"][()] if "gravity" in file else None
+            lift = None if layout is None else _read_lift(file, layout, path)
+    except (OSError, KeyError, ValueError) as error:
+        raise ModelError(f"{path} cannot be read as a reduced model ({error}); reduce the scene again") from error
+    if scene_hash is not None and data["scene_hash"] != scene_hash:
+        raise ModelError(f"{path} was made for another scene (hash {data['scene_hash'][:12]}); reduce the scene again")
+    materials = tuple(LayerMaterial(**m) for m in data.pop("materials"))
+    known = {f.name for f in fields(ReducedModel)}
+    return ReducedModel(
+        **{key: value for key, value in data.items() if key in known},
+        parts=parts,
+        materials=materials,
+        outputs=outputs,
+        gravity=gravity,
+        lift=lift,
+    )
+
+
+def _read_lift(file: h5py.File, layout: BlockLayout, path: Path) -> Lift:
+    """Rows of this rank, found by the coordinates of its nodes."""
+    if "lift" not in file:
+        raise ModelError(f"{path} holds no lift; load it without a layout, or reduce the scene again")
+    nodes = file["lift/nodes"][()]
+    d = layout.dimension
+    if nodes.shape != (layout.n_e // d, d):
+        raise ModelError(
+            f"{path} belongs to a mesh of {len(nodes)} free nodes in {nodes.shape[1]}D, this one has "
+            f"{layout.n_e // d} in {d}D; load it with its own scene"
+        )
+    distance, index = cKDTree(nodes).query(layout.nodes) if len(layout.nodes) else (np.zeros(0), np.zeros(0, int))
+    size = float(np.ptp(nodes, axis=0).max())
+    # coordinates are read back bit for bit; another partition may have computed them with other rounding
+    if distance.max(initial=0.0) > 1e-9 * size or len(np.unique(index)) != len(index):
+        raise ModelError(f"{path} belongs to another mesh: its nodes lie elsewhere; load it with its own scene")
+    rows = (index[:, None] * d + np.arange(d)).ravel()
+    arrays = {key: _pick(file[f"lift/{key}"], rows) for key in ("L_q", "L_v", "W_G") if f"lift/{key}" in file}
+    return Lift(layout, arrays["L_q"], arrays["L_v"], arrays.get("W_G"))
+
+
+def _pick(dataset: h5py.Dataset, rows: np.ndarray) -> Array:
+    """Rows of a dataset, read slab by slab."""
+    result = np.empty((len(rows), dataset.shape[1]), order="F")
+    slab = rows // ROWS
+    for s in np.unique(slab):
+        block = dataset[s * ROWS : (s + 1) * ROWS]
+        mine = np.flatnonzero(slab == s)
+        result[mine] = block[rows[mine] - s * ROWS]
+    return result

@@ -1,0 +1,59 @@
+"""A reduced basis as blocks: the rows of the hand on every rank, the rows of the tissue distributed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from fem.layout import BlockLayout
+from fem.petsc import Array
+
+Coordinates = Literal["qv", "qp"]
+Frame = Literal["absolute", "relative"]
+Structure = Literal["none", "symplectic", "second_order"]
+
+
+@dataclass(frozen=True)
+class Basis:
+    """V of shape (2n, N) in the row blocks [hand q; hand v or p; tissue q; tissue v or p].
+
+    ``coordinates`` says whether the second half of each pair is a velocity (the paper's Galerkin models) or a
+    momentum (canonical, symplectic models): p_e = M_es v_s + M_ee v_e, or p_z = M_ee v_z in the relative frame, and
+    p_s = M_hand v_s of the hand when its rows take part. ``frame`` says whether the tissue rows are absolute or
+    relative to the rigid motion of the hand, q_e = z + T q_s. With ``structure = "symplectic"`` the whole V is
+    symplectic, V' J V = J; with ``fixed_solid`` its tissue columns are, by themselves.
+
+    Attributes:
+        name: key in the registry.
+        layout: sizes and ownership.
+        V_sq, V_sv: rows of the hand, (n_s, N), the same on every rank.
+        V_q, V_p: local rows of the tissue, (n_local, N): displacement, and velocity or momentum.
+        coordinates, frame, structure: see above.
+        fixed_solid: the first 2 n_s columns are the hand's own unit vectors.
+        inner: inner product it was built in, see `reduction.inner`.
+        rate: weight c between displacement and momentum there; 1 unless the coordinates are canonical and weighted.
+        pairs: columns come as (first half; second half) with one complex structure on (q, p) or (q, v).
+        sigma: singular values the truncation was chosen from, descending (empty when no snapshots were used).
+        seconds: time to build it, by stage.
+    """
+
+    name: str
+    layout: BlockLayout
+    V_sq: Array
+    V_sv: Array
+    V_q: Array
+    V_p: Array
+    coordinates: Coordinates = "qv"
+    frame: Frame = "absolute"
+    structure: Structure = "none"
+    fixed_solid: bool = False
+    inner: Literal["euclidean", "mass", "energy"] = "euclidean"
+    rate: float = 1.0
+    pairs: bool = False
+    sigma: tuple[Array, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def N(self) -> int:
+        """Number of basis vectors, the dimension of the first-order reduced model."""
+        return int(self.V_q.shape[1])

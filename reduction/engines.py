@@ -1,0 +1,237 @@
+"""Engines that factor a tall distributed snapshot matrix: X = Q R with Q' Q = I, Q distributed, R small.
+
+What follows (weights, complex structure, symplectic pairs) is small and dense, runs on rank 0 and is broadcast, so
+every rank sees the same numbers. Limits, measured at sigma_j = 10^(-16 j / 599):
+
+    engine  what runs                                             sigma right to 1e-8 relative down to sigma / sigma_1
+    tsqr    SLEPc BV, tall-skinny QR: the default                 1e-10
+    svd     SLEPc SVD: trlanczos for the leading k,               all k
+            scalapack when all are wanted                         1e-10
+    gram    X' X and its eigenvalues (method of snapshots),       1e-6; nothing below 6e-8, so never the default
+            fast, then one Rayleigh-Ritz step
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+import scipy.linalg
+from mpi4py import MPI
+from slepc4py import SLEPc
+
+from fem.errors import SolverError
+from fem.petsc import Array, PETSc, total
+from reduction.states import BasisError
+
+EngineName = Literal["tsqr", "svd", "gram"]
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
+EPS = float(np.finfo(float).eps)
+# sqrt(eps) is where eigenvalues of X'X drown; 4 keeps U = X V / s well enough conditioned for one repair step
+GRAM_FLOOR = 4 * EPS**0.5
+BLOCK_ROWS = 20_000  # rows of one LAPACK QR: fits the cache better than one tall one
+SVD_PREFIX = "softgrasp_svd_"
+SVD_TOLERANCE = 1e-13
+
+
+@dataclass(frozen=True)
+class Factor:
+    """scale * Q R = X up to rounding (or its best approximation of rank r when ``partial``).
+
+    Attributes:
+        Q: local rows (n_local, r), orthonormal columns over all ranks.
+        R: (r, c), the same bits on every rank.
+        scale: power of two that keeps squares of R from under- and overflow.
+        floor: singular values below ``floor * sigma_1`` are noise.
+        partial: only the leading singular triplets were computed.
+        square: sum of all sigma^2 of X / scale, also of those that are not in R.
+    """
+
+    Q: Array
+    R: Array
+    scale: float
+    floor: float
+    partial: bool
+    square: float
+
+
+def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
+    """Run small dense work on rank 0 and broadcast what it returns or raises. Collective."""
+    answer: tuple[Any, Exception | None] = (None, None)
+    if comm.rank == 0:
+        try:
+            answer = (call(), None)
+        except Exception as error:
+            answer = (None, error)
+    result, failure = comm.bcast(answer) if comm.size > 1 else answer
+    if failure is not None:
+        raise failure
+    return result
+
+
+def magnitude(comm: MPI.Intracomm, *blocks: Array) -> float:
+    """Power of two next to the largest entry over all ranks; 1 when all are zero. Collective."""
+    largest = max((float(max(X.max(), -X.min())) for X in blocks if X.size), default=0.0)
+    largest = comm.allreduce(largest, MPI.MAX)
+    if not np.isfinite(largest):
+        raise BasisError("the snapshots hold NaN or infinity; a basis needs finite snapshots")
+    # 2^-1000 .. 2^1000 so that the inverse is finite too
+    return float(2.0 ** np.clip(np.frexp(largest)[1], -1000, 1000)) if largest > 0 else 1.0
+
+
+def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | None = None) -> Factor:
+    """Factor a row-distributed matrix. Collective.
+
+    Args:
+        comm: ranks that share the rows.
+        X: local rows (n_local, c); read only.
+        engine: see the module.
+        k: number of leading triplets that are enough; only ``svd`` uses it.
+
+    Raises:
+        BasisError: the engine is unknown, X holds NaN or infinity, or X is zero.
+        SolverError: SLEPc fails.
+    """
+    if engine not in ENGINES:
+        raise BasisError(f"engine '{engine}' is unknown; choose one of {', '.join(ENGINES)}")
+    if not comm.allreduce(bool(np.isfinite(X).all()), MPI.LAND):
+        raise BasisError("the snapshots hold NaN or infinity; a basis needs finite snapshots")
+    scale = magnitude(comm, X)
+    X = np.asfortranarray(X) if scale == 1.0 else np.asfortranarray(X / scale)
+    square = float(comm.allreduce(float(np.vdot(X, X))))
+    if square == 0.0:
+        raise BasisError("all snapshots are zero; there is nothing to build a basis from")
+    rows = int(comm.allreduce(X.shape[0]))
+    if engine == "gram":
+        Q, R, floor = *_gram(comm, X), GRAM_FLOOR
+    else:
+        # LAPACK's own bound on an absolute error in sigma, with its usual factor sqrt of the size
+        floor = EPS * max(X.shape[1], 100) ** 0.5
+        if rows <= X.shape[1]:
+            Q, R = _gathered(comm, X)
+        elif engine == "tsqr" or X.shape[1] < comm.size:  # ScaLAPACK needs a column for every rank
+            Q, R = _tsqr(comm, X, rows)
+        else:
+            Q, R = _svd(comm, X, rows, k)
+    partial = engine == "svd" and k is not None and Q.shape[1] < min(rows, X.shape[1])
+    return Factor(Q, R, scale, floor, partial, square)
+
+
+def _dense(comm: MPI.Intracomm, X: Array, rows: int) -> PETSc.Mat:
+    """PETSc view of a Fortran-ordered array."""
+    A = PETSc.Mat().createDense(((X.shape[0], rows), (None, X.shape[1])), array=X, comm=comm)
+    A.assemble()
+    return A
+
+
+def _tsqr(comm: MPI.Intracomm, X: Array, rows: int) -> tuple[Array, Array]:
+    """SLEPc BV: tall-skinny QR over the ranks."""
+    m = X.shape[1]
+    A = _dense(comm, X, rows)
+    bv = SLEPc.BV().createFromMat(A)
+    bv.setType(SLEPc.BV.Type.MAT)  # the default type has no tall-skinny QR
+    small = PETSc.Mat().createDense((m, m), comm=MPI.COMM_SELF)
+    small.setUp()
+    try:
+        bv.setOrthogonalization(block=SLEPc.BV.OrthogBlockType.TSQR)
+        bv.orthogonalize(small)
+        view = bv.getMat()  # BV.getArray reads past the local rows on two ranks
+        Q = np.array(view.getDenseArray(), order="F")
+        bv.restoreMat(view)
+        R = np.triu(small.getDenseArray())
+    except (PETSc.Error, SystemError) as error:
+        raise SolverError(
+            f"SLEPc BV: QR of {rows} x {m} snapshots failed ({error}); check memory, or use engine = 'svd'"
+        ) from error
+    finally:
+        for thing in (bv, A, small):
+            thing.destroy()
+    return Q, np.asarray(comm.bcast(R) if comm.size > 1 else R)
+
+
+def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array, Array]:
+    """SLEPc SVD: the leading k triplets by thick-restart Lanczos, or all by ScaLAPACK."""
+    m = X.shape[1]
+    A = _dense(comm, X, rows)
+    svd = SLEPc.SVD().create(comm)
+    svd.setOptionsPrefix(SVD_PREFIX)
+    svd.setOperators(A)
+    leading = k is not None and 3 * k < m  # beyond a third of them, all at once is cheaper
+    svd.setType(SLEPc.SVD.Type.TRLANCZOS if leading else SLEPc.SVD.Type.SCALAPACK)
+    if leading:
+        svd.setDimensions(nsv=k)
+        svd.setTolerances(SVD_TOLERANCE, 1000)
+    u, v = A.createVecLeft(), A.createVecRight()
+    try:
+        svd.solve()
+        count = svd.getConverged()
+        if leading and count < k:
+            raise SolverError(
+                f"SLEPc SVD: {count} of {k} singular values converged in {svd.getIterationNumber()} iterations; "
+                "ask for fewer, or use engine = 'tsqr'"
+            )
+        count = k if leading and k is not None else count
+        Q, sigma = np.empty((X.shape[0], count), order="F"), np.empty(count)
+        for j in range(count):
+            sigma[j] = svd.getSingularTriplet(j, u, v)
+            Q[:, j] = u.array_r
+    except (PETSc.Error, SystemError) as error:
+        raise SolverError(f"SLEPc SVD failed on {rows} x {m} snapshots ({error}); use engine = 'tsqr'") from error
+    finally:
+        for thing in (svd, A, u, v):
+            thing.destroy()
+    return Q, total(comm, Q.T @ X)
+
+
+def _gathered(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
+    """QR of a matrix with no more rows than columns, on rank 0: it is small."""
+    parts = comm.gather(X)
+    blocks: list[Array] | None = None
+    R: Array | None = None
+    if parts is not None:
+        Q, R = np.linalg.qr(np.vstack(parts))
+        blocks = np.split(Q, np.cumsum([len(p) for p in parts])[:-1])
+    mine = comm.scatter(blocks)
+    return np.asfortranarray(mine), np.asarray(comm.bcast(R))
+
+
+def _triangle(comm: MPI.Intracomm, X: Array) -> Array:
+    """R of X = Q R by QR of row blocks, then of the stacked triangles on rank 0."""
+    R = np.zeros((0, X.shape[1]))
+    for i in range(0, len(X), BLOCK_ROWS):
+        R = np.linalg.qr(np.vstack([R, X[i : i + BLOCK_ROWS]]), mode="r")
+    parts = comm.gather(R)
+    return on_root(comm, lambda: np.linalg.qr(np.vstack(parts or []), mode="r"))
+
+
+def _gram(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
+    """Method of snapshots: X'X = V S^2 V', U = X V / s."""
+    C = total(comm, X.T @ X)
+    s2, V = on_root(comm, lambda: scipy.linalg.eigh(C))
+    s, V = np.sqrt(np.maximum(s2[::-1], 0.0)), V[:, ::-1]
+    keep = s > GRAM_FLOOR * s[0]
+    U = X @ (V[:, keep] / s[keep])
+    # U is orthonormal to eps (sigma_1 / sigma_r)^2 only; dividing by its triangle keeps the nested spans
+    Q = np.asfortranarray(scipy.linalg.solve_triangular(_triangle(comm, U), U.T, trans="T", check_finite=False).T)
+    return Q, total(comm, Q.T @ X)
+
+
+def small_svd(comm: MPI.Intracomm, R: Any) -> tuple[Any, Array, Any]:
+    """SVD of a small replicated matrix, the same bits everywhere, with fixed signs. Collective.
+
+    The largest entry of every right singular vector is made real and positive, so that the answer does not depend on
+    the rank count beyond rounding.
+    """
+
+    def call() -> tuple[Any, Array, Any]:
+        try:
+            U, s, V_h = scipy.linalg.svd(R, full_matrices=False)
+        except np.linalg.LinAlgError:
+            U, s, V_h = scipy.linalg.svd(R, full_matrices=False, lapack_driver="gesvd")
+        pivot = V_h[np.arange(len(s)), np.abs(V_h).argmax(axis=1)]
+        phase = np.where(pivot == 0, 1.0, pivot) / np.where(pivot == 0, 1.0, np.abs(pivot))
+        return U * phase, s, V_h * phase.conj()[:, None]
+
+    return on_root(comm, call)

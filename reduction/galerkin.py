@@ -1,0 +1,106 @@
+"""The paper's reduced models: Galerkin projection of E x' = A x + B u + F g in (q, v), W = V [SBRH21].
+
+With z = q_e - T q_s the rows of x = [q_s, v_s, q_e, v_e] read
+
+    q_s' = v_s,   q_e' = v_e (relative frame: z' = v_z),
+    M_hand v_s' [+ G' v_z' + M_rigid (v_s' - g)] = u          ([...] two-way only)
+    M_ee v_z' + G (v_s' - g) + D v_z [+ alpha G v_s] + K_ee z = 0
+
+K_ee z replaces the paper's K_es q_s + K_ee q_e: the same numbers without the cancellation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fem.petsc import Array, times_columns, total
+from fem.system import BlockSystem, LayerMaterial, coupling
+from reduction.basis import Basis
+from reduction.small import Operators, Parameters, Parts
+
+
+def relative_rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array]:
+    """Displacement and second row block of every basis vector relative to the hand, local rows. Not collective."""
+    if basis.frame == "relative":
+        return basis.V_q, basis.V_p
+    return (
+        np.asfortranarray(basis.V_q - system.T @ basis.V_sq),
+        np.asfortranarray(basis.V_p - system.T @ basis.V_sv),
+    )
+
+
+def unit_coupling(system: BlockSystem) -> tuple[list[Array], list[Array]]:
+    """G and M_rigid of every layer at density 1. Collective."""
+    unit = LayerMaterial(0.0, 0.0, 1.0)
+    pairs = [coupling((layer,), (unit,), system.T) for layer in system.layers]
+    return [g for g, _ in pairs], [r for _, r in pairs]
+
+
+def galerkin_parts(basis: Basis, system: BlockSystem) -> Parts:
+    """Small matrices from which every parameter is assembled. Collective.
+
+    The rows of the tissue are tested with V_v itself (the paper), or with V_v - T V_sv where virtual work asks for it:
+    two-way coupling, and bases of second order, whose models stay symmetric that way.
+    """
+    comm = system.layout.comm
+    S_q, S_v = basis.V_sq, basis.V_sv
+    Z, Z_v = relative_rows(basis, system)
+    W = Z_v if system.two_way or basis.structure == "second_order" else basis.V_p
+    G, rigid = unit_coupling(system)
+    parts: Parts = {
+        "identity_E": S_q.T @ S_q + total(comm, basis.V_q.T @ basis.V_q),
+        "identity_A": S_q.T @ S_v + total(comm, basis.V_q.T @ basis.V_p),
+        "S_q": S_q,
+        "S_v": S_v,
+        "M_hand": system.M_hand,
+        "rigid": np.stack(rigid),
+        "WG": np.stack([total(comm, W.T @ g) for g in G]),
+        "ZG": np.stack([total(comm, Z_v.T @ g) for g in G]),
+    }
+    stacks: dict[str, list[Array]] = {}
+    for layer in system.layers:
+        for key, component in (("mu", layer.K_mu), ("lambda", layer.K_lambda)):
+            K_Z = times_columns(component.ee, Z)
+            stacks.setdefault(f"K_{key}", []).append(total(comm, W.T @ K_Z))
+            stacks.setdefault(f"energy_{key}", []).append(total(comm, Z.T @ K_Z))
+            if system.damping.active:
+                K_Z = times_columns(component.ee, Z_v)
+                stacks.setdefault(f"D_{key}", []).append(total(comm, W.T @ K_Z))
+        M_Z = times_columns(layer.M_1.ee, Z_v)
+        stacks.setdefault("M", []).append(total(comm, W.T @ M_Z))
+        stacks.setdefault("energy_M", []).append(total(comm, Z_v.T @ M_Z))
+    parts.update({key: np.stack(value) for key, value in stacks.items()})
+    return parts
+
+
+def galerkin_operators(parts: Parts, p: Parameters) -> Operators:
+    """E, A, B, F and the energies at one parameter; online. Not collective."""
+    S_q, S_v, M_hand = parts["S_q"], parts["S_v"], parts["M_hand"]
+    G, rigid = p.density(parts["WG"]), p.density(parts["rigid"])
+    Z_G = p.density(parts["ZG"])
+    M = p.density(parts["M"]) + G @ S_v
+    if p.two_way:
+        M += S_v.T @ (Z_G.T + rigid @ S_v)
+    A = parts["identity_A"] - p.stiffness(parts["K_mu"], parts["K_lambda"])
+    if p.damped:
+        A -= p.viscosity(parts["D_mu"], parts["D_lambda"])
+        A -= p.alpha * (M if p.in_space else p.density(parts["M"]))
+    F = G + (S_v.T @ rigid if p.two_way else 0.0) + (S_v.T @ M_hand if p.hand_weight else 0.0)
+    energy = symmetric(p.stiffness(parts["energy_mu"], parts["energy_lambda"]) + p.density(parts["energy_M"]))
+    cross = Z_G @ S_v
+    hand = M_hand + rigid if p.two_way else M_hand
+    return Operators(
+        E=parts["identity_E"] + S_v.T @ M_hand @ S_v + M,
+        A=A,
+        B=S_v.T.copy(),
+        F=F,
+        S_q=S_q,
+        S_v=S_v,
+        energy=energy,
+        total=symmetric(energy + S_v.T @ hand @ S_v + ((cross + cross.T) if p.two_way else 0.0)),
+    )
+
+
+def symmetric(X: Array) -> Array:
+    """(X + X') / 2."""
+    return np.asarray((X + X.T) / 2)

@@ -1,0 +1,185 @@
+"""Inner products of hand and tissue, and how stacks of their rows are kept on the ranks.
+
+    name        (q, v) coordinates                        canonical (q, p)
+    euclidean   q'q + v'v                                 q'q + p'p
+    mass        q' M q + v' M v                           c q' M q + p' M^-1 p / c
+    energy      q' K q + v' M v                           c q' K q + p' K^-1 p / c
+
+M = blkdiag(M_hand, M_ee) and K = blkdiag(T' K_ee T, K_ee), the diagonal blocks of the coupled matrices. In canonical
+coordinates a basis can be orthonormal and symplectic at once only if the weight of p is the inverse of that of q, hence
+K^-1 in place of M^-1. The rate c [1/s or s] makes both halves of the snapshots equally large, whatever the units are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from fem.layout import BlockLayout
+from fem.petsc import Array, PETSc, times_columns, total
+from fem.solvers import choose_solver, make_solver
+from fem.system import BlockSystem
+from reduction.basis import Basis
+from reduction.states import BasisError
+
+InnerName = Literal["euclidean", "mass", "energy"]
+INNERS: tuple[InnerName, ...] = get_args(InnerName)
+
+
+@dataclass(frozen=True)
+class Weight:
+    """Symmetric positive definite weight of one half: hand (n_s, n_s) and tissue (n_e, n_e)."""
+
+    hand: Array
+    tissue: PETSc.Mat
+
+
+def weights(system: BlockSystem, inner: InnerName) -> tuple[Weight, Weight] | None:
+    """Weights of displacement and velocity in (q, v); None for the Euclidean product. Collective.
+
+    Raises:
+        BasisError: the name is unknown.
+    """
+    if inner == "euclidean":
+        return None
+    mass = Weight(system.M_hand, system.M_ee)
+    if inner == "mass":
+        return mass, mass
+    if inner != "energy":
+        raise BasisError(f"inner product '{inner}' is unknown; choose one of {', '.join(INNERS)}")
+    K_ss = total(system.layout.comm, system.T.T @ times_columns(system.K_ee, system.T))
+    return Weight((K_ss + K_ss.T) / 2, system.K_ee), mass
+
+
+@dataclass(frozen=True)
+class Rows:
+    """How some row blocks are stacked on a rank: hand rows of every half (rank 0 only), then tissue rows.
+
+    Attributes:
+        layout: sizes and ownership.
+        halves: 1 for displacements or momenta alone, 2 for both.
+        hand: whether the hand's rows take part.
+    """
+
+    layout: BlockLayout
+    halves: int
+    hand: bool
+
+    @property
+    def top(self) -> int:
+        """Hand rows of one half on this rank."""
+        return self.layout.n_s if self.hand and self.layout.comm.rank == 0 else 0
+
+    @property
+    def local(self) -> int:
+        """Rows on this rank."""
+        return self.halves * (self.top + self.layout.n_local)
+
+    def hand_rows(self, half: int) -> slice:
+        """Rows of the hand in one half."""
+        return slice(half * self.top, (half + 1) * self.top)
+
+    def tissue_rows(self, half: int) -> slice:
+        """Rows of the tissue in one half."""
+        start, n = self.halves * self.top, self.layout.n_local
+        return slice(start + half * n, start + (half + 1) * n)
+
+    def fill(self, X: Array, half: int, s: Array, e: Array) -> None:
+        """Copy hand and tissue rows of one half into a stack. Not collective."""
+        X[self.hand_rows(half)] = s[: self.top]
+        X[self.tissue_rows(half)] = e
+
+    def stack(self, *halves: tuple[Array, Array]) -> Array:
+        """Stack (hand, tissue) pairs, Fortran order. Not collective."""
+        X = np.empty((self.local, halves[0][1].shape[1]), order="F")
+        for half, (s, e) in enumerate(halves):
+            self.fill(X, half, s, e)
+        return X
+
+    def split(self, X: Array) -> list[tuple[Array, Array]]:
+        """Undo :meth:`stack`; the hand's rows come to every rank, zero when it takes no part. Collective."""
+        comm, n_s = self.layout.comm, self.layout.n_s
+        s = [np.zeros((n_s, X.shape[1])) for _ in range(self.halves)]
+        if self.hand:
+            s = comm.bcast([np.array(X[self.hand_rows(h)]) for h in range(self.halves)])
+        return [(s[h], np.asfortranarray(X[self.tissue_rows(h)])) for h in range(self.halves)]
+
+    def weigh(self, X: Array, by: tuple[Weight, ...] | None) -> Array:
+        """Return W X for the weight of each half; X itself without weights. Collective."""
+        if by is None:
+            return X
+        result = np.empty_like(X, order="F")
+        for half, weight in enumerate(by[: self.halves]):
+            rows, hand = self.tissue_rows(half), self.hand_rows(half)
+            result[rows] = times_columns(weight.tissue, X[rows])
+            if self.top:
+                result[hand] = weight.hand @ X[hand]
+        return result
+
+    def gram(self, X: Array, Y: Array) -> Array:
+        """X' Y over all ranks. Collective."""
+        return total(self.layout.comm, X.T @ Y)
+
+
+def solve_columns(A: PETSc.Mat, layout: BlockLayout, X: Array) -> Array:
+    """Return the local rows of A^-1 X, A symmetric positive definite; factored once. Collective.
+
+    Raises:
+        SolverError: the factorisation fails, or the solution has a large residual.
+    """
+    solver = make_solver(A.copy(), choose_solver(layout)[0], layout, "softgrasp_inner_", rtol=1e-12)
+    b, x = A.createVecs()
+    result = np.empty(X.shape, order="F")
+    try:
+        for j in range(X.shape[1]):
+            b.array_w[:] = X[:, j]
+            solver.solve(b, x)
+            if j == 0:
+                solver.check(b, x, "the inner product")
+            result[:, j] = x.array_r
+    finally:
+        solver.destroy()
+        b.destroy()
+        x.destroy()
+    return result
+
+
+def orthonormality(basis: Basis, system: BlockSystem) -> float:
+    """Largest entry of V' W V - I in the basis's own inner product, from the blocks alone. Collective.
+
+    With fixed solid modes the tissue columns alone count: those of the hand are unit vectors.
+    """
+    rows = Rows(basis.layout, 2, hand=True)
+    first = 2 * basis.layout.n_s if basis.fixed_solid else 0
+    V = rows.stack((basis.V_sq, basis.V_q), (basis.V_sv, basis.V_p))[:, first:]
+    by = weights(system, basis.inner)
+    if by is not None and basis.coordinates == "qp":
+        W_V = np.empty_like(V)
+        weight, q, p = by[0], rows.tissue_rows(0), rows.tissue_rows(1)
+        W_V[q] = basis.rate * times_columns(weight.tissue, V[q])
+        W_V[p] = solve_columns(weight.tissue, basis.layout, V[p]) / basis.rate
+        if rows.top:
+            W_V[rows.hand_rows(0)] = basis.rate * weight.hand @ V[rows.hand_rows(0)]
+            W_V[rows.hand_rows(1)] = np.linalg.solve(weight.hand, V[rows.hand_rows(1)]) / basis.rate
+    elif by is not None and basis.pairs:
+        W_V = rows.weigh(V, (by[0], by[0]))
+    else:
+        W_V = rows.weigh(V, by)
+    return float(np.abs(rows.gram(V, W_V) - np.eye(V.shape[1])).max(initial=0.0))
+
+
+def symplecticity(basis: Basis) -> float:
+    """Largest entry of V' J V - J, with the tissue's columns alone when the solid modes are fixed. Collective.
+
+    J = [0 I; -I 0] on the rows (q; p) and on the columns (first half; second half).
+    """
+    rows = Rows(basis.layout, 1, hand=True)
+    first = 2 * basis.layout.n_s if basis.fixed_solid else 0
+    q = rows.stack((basis.V_sq, basis.V_q))[:, first:]
+    p = rows.stack((basis.V_sv, basis.V_p))[:, first:]
+    form = rows.gram(q, p)
+    k = form.shape[0] // 2
+    J = np.eye(2 * k, k=k) - np.eye(2 * k, k=-k)
+    return float(np.abs(form - form.T - J).max(initial=0.0))

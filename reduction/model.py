@@ -1,0 +1,288 @@
+"""Reduced models: small matrices for every material and gravity, and the small model at one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from fem.errors import SoftgraspError
+from fem.layout import BlockLayout
+from fem.petsc import Array
+from fem.system import LayerMaterial
+from reduction.basis import Coordinates, Frame, Structure
+from reduction.canonical import canonical_operators
+from reduction.galerkin import galerkin_operators
+from reduction.small import Operators, Parameters, Parts
+from reduction.spectrum import Spectrum, spectrum
+
+
+class ModelError(SoftgraspError):
+    """A reduced model cannot be made, or is asked for what it does not hold."""
+
+
+class UnstableModelError(SoftgraspError):
+    """A reduced model with growing modes was about to be run."""
+
+
+@dataclass(frozen=True)
+class Lift:
+    """Rows that turn reduced states into tissue states relative to the hand; the only distributed part of a model.
+
+    Attributes:
+        layout: sizes and ownership.
+        L_q: z = L_q x, local rows (n_local, N).
+        L_v: v_z = L_v x / scale [- W_G v_s], local rows (n_local, N).
+        W_G: M_ee^-1 G, local rows (n_local, n_s), in canonical coordinates of the absolute frame; else None.
+    """
+
+    layout: BlockLayout
+    L_q: Array
+    L_v: Array
+    W_G: Array | None = None
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """y = C_z x + C_s q_s, the scene's outputs [m].
+
+    Attributes:
+        C_z: part of the tissue relative to the hand, (p, N).
+        C_s: rigid part, (p, n_s).
+        names: one per component.
+    """
+
+    C_z: Array
+    C_s: Array
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SmallModel:
+    """E x' = A x + B u + f at one parameter; everything that a run needs, nothing of full order.
+
+    Attributes:
+        name: of the basis.
+        operators: E, A, B, readouts of the hand and energies.
+        f: load of gravity, (N,).
+        outputs: y = C_z x + C_s q_s.
+        M_hand: hand mass matrix, (n_s, n_s).
+        fixed_solid: the first 2 n_s coordinates are q_s and v_s.
+        two_way: the hand feels the tissue.
+        structured: without damping the model conserves its energy by construction.
+        scale: density over that of the projection (canonical models, else 1).
+    """
+
+    name: str
+    operators: Operators
+    f: Array
+    outputs: Outputs
+    M_hand: Array
+    fixed_solid: bool
+    two_way: bool
+    structured: bool
+    scale: float = 1.0
+
+    @property
+    def N(self) -> int:
+        """Dimension of the first-order model."""
+        return len(self.operators.A)
+
+    @property
+    def n_s(self) -> int:
+        """Degrees of freedom of the hand."""
+        return len(self.M_hand)
+
+    @property
+    def inner(self) -> slice:
+        """Coordinates whose equations decide on stability: the tissue's own where the hand does not feel it."""
+        return slice(2 * self.n_s if self.fixed_solid and not self.two_way else 0, self.N)
+
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """Eigenvalues without the exact zeros of the free hand. Not collective.
+
+        Raises:
+            ModelError: E is singular, as with linearly dependent columns.
+        """
+        self.check_independent()
+        inner, op = self.inner, self.operators
+        Q = op.energy if inner.start else op.total
+        found = spectrum(op.E[inner, inner], op.A[inner, inner], Q[inner, inner], self.structured)
+        return replace(found, zeros=self.N - len(found.eigenvalues))
+
+    def check_independent(self) -> None:
+        """Refuse a singular E, which LAPACK need not notice. Not collective.
+
+        Raises:
+            ModelError: E is singular to rounding, as with linearly dependent columns.
+        """
+        E = np.abs(self.operators.E)
+        if not np.isfinite(E).all():
+            raise ModelError(f"{self.name}: the reduced matrices are not finite; check basis and materials")
+        rows, columns = (np.sqrt(np.where(m > 0, m, 1.0)) for m in (E.max(axis=1), E.max(axis=0)))
+        values = np.linalg.svd(self.operators.E / np.outer(rows, columns), compute_uv=False)
+        if values[-1] <= 4 * self.N * np.finfo(float).eps * values[0]:
+            raise ModelError(
+                f"{self.name}: the reduced E is singular; its basis vectors are linearly dependent, take fewer"
+            )
+
+    @property
+    def spectral_abscissa(self) -> float:
+        """Largest real part of an eigenvalue, apart from the exact zeros of the free hand [1/s]."""
+        return self.spectrum.abscissa
+
+    @property
+    def stable(self) -> bool:
+        """No eigenvalue right of the axis beyond the tolerance, :data:`reduction.spectrum.GROWTH_TOLERANCE`.
+
+        The double zero of the free hand (it drifts at constant velocity) does not count.
+        """
+        return self.spectrum.stable
+
+    def energy(self, x: Array) -> Array:
+        """Tissue energy (z' K z + v_z' M v_z) / 2 of states (..., N) [J]."""
+        return np.asarray(np.einsum("...i,...i->...", x @ self.operators.energy, x) / 2)
+
+    def total_energy(self, x: Array) -> Array:
+        """Energy with that of the hand's motion, of states (..., N) [J]; two-way it is the Hamiltonian."""
+        return np.asarray(np.einsum("...i,...i->...", x @ self.operators.total, x) / 2)
+
+    def equilibrium(self) -> Array:
+        """State at rest under gravity with the hand at the origin, (N,).
+
+        Raises:
+            ModelError: the hand is not fixed, so that the model has no such coordinates.
+        """
+        if not self.fixed_solid:
+            raise ModelError(f"{self.name}: an equilibrium needs a basis with fixed solid modes")
+        k = 2 * self.n_s
+        x = np.zeros(self.N)
+        if self.f.any():
+            x[k:] = -np.linalg.solve(self.operators.A[k:, k:], self.f[k:])
+        return x
+
+
+@dataclass(frozen=True)
+class ReducedModel:
+    """Small matrices in lambda, mu, rho of every layer and in gravity: a new parameter costs no full-order work.
+
+    Attributes:
+        name: of the basis.
+        N: number of basis vectors.
+        coordinates: "qv" is the paper's Galerkin model, "qp" a canonical one.
+        frame: absolute or relative to the hand.
+        structure: of the basis.
+        fixed_solid: the first 2 n_s coordinates are q_s and v_s.
+        parts: small matrices, the same bits on every rank.
+        materials: those of the projection.
+        outputs: of the scene.
+        alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
+        damped: damping terms were projected.
+        hand_weight, two_way: effects of the scene.
+        gravity: acceleration of free fall in the hand's degrees of freedom, (n_s,), or None.
+        lift: how states return to the mesh, or None.
+        scene_hash: of the scene the model was made for.
+        seconds: offline time by stage.
+    """
+
+    name: str
+    N: int
+    coordinates: Coordinates
+    frame: Frame
+    structure: Structure
+    fixed_solid: bool
+    parts: Parts
+    materials: tuple[LayerMaterial, ...]
+    outputs: Outputs
+    alpha: float = 0.0
+    in_space: bool = False
+    damped: bool = False
+    hand_weight: bool = False
+    two_way: bool = False
+    gravity: Array | None = None
+    lift: Lift | None = None
+    scene_hash: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> SmallModel:
+        """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.
+
+        A (q, v) model is affine in mu, lambda, rho, beta mu and beta lambda of each layer. A canonical one needs
+        M_ee^-1, which is affine in 1/rho only when all densities change by one factor.
+
+        Args:
+            materials: one per layer; None takes those of the projection.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+
+        Raises:
+            ModelError: materials that the parts cannot represent.
+        """
+        materials = self.materials if materials is None else materials
+        p = self.parameters(materials)
+        if self.coordinates == "qv":
+            operators = galerkin_operators(self.parts, p)
+        else:
+            operators = canonical_operators(self.parts, p, self.fixed_solid, self.frame == "absolute")
+        g = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
+        conservative = not p.damped or (p.alpha == 0 and all(m.beta == 0 for m in materials))
+        kept = self.coordinates == "qp" or self.structure == "second_order"
+        return SmallModel(
+            name=self.name,
+            operators=operators,
+            f=np.zeros(self.N) if g is None else operators.F @ g,
+            outputs=self.outputs,
+            M_hand=self.parts["M_hand"],
+            fixed_solid=self.fixed_solid,
+            two_way=self.two_way,
+            structured=conservative and kept,
+            scale=p.scale,
+        )
+
+    def parameters(self, materials: tuple[LayerMaterial, ...]) -> Parameters:
+        """Check materials and bundle them with the effects of the scene. Not collective.
+
+        Raises:
+            ModelError: wrong number of layers, an impossible value, densities that are no common multiple of those of
+                the projection (canonical models), or viscosity in a model without damping.
+        """
+        if len(materials) != len(self.materials):
+            raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")
+        for m in materials:
+            if not (m.mu > 0 and m.lam > -2 * m.mu / 3 and m.rho > 0 and m.beta >= 0):
+                raise ModelError(f"{m} is no elastic material; mu, rho must be > 0, lambda > -2 mu / 3 and beta >= 0")
+        if not self.damped and any(m.beta > 0 for m in materials):
+            raise ModelError("beta > 0 needs a model projected with effects.damping; name it in the scene")
+        scale = 1.0
+        if self.coordinates == "qp":
+            ratios = [m.rho / old.rho for m, old in zip(materials, self.materials, strict=True)]
+            scale = ratios[0]
+            # the common factor enters squared at most: more than rounding apart is another mass distribution
+            if max(ratios) - min(ratios) > 1e-12 * scale:
+                raise ModelError(
+                    "a canonical model holds M_ee^-1 and takes densities that all change by one factor; "
+                    "project again, or use a (q, v) model"
+                )
+        return Parameters(materials, self.alpha, self.damped, self.in_space, self.hand_weight, self.two_way, scale)
+
+    def reconstruct(self, small: SmallModel, x: Array, v_s: Array | None = None) -> tuple[Array, Array]:
+        """Relative tissue states of reduced states x (N, m): z and v_z, local rows (n_local, m). Not collective.
+
+        Args:
+            small: the parameter that x was computed at.
+            x: reduced states, one a column.
+            v_s: hand velocity (n_s, m); None takes S_v x.
+
+        Raises:
+            ModelError: the model was loaded without its lift.
+        """
+        lift = self.lift
+        if lift is None:
+            raise ModelError(f"{self.name}: the model holds no lift; load it with the layout of its mesh")
+        z, v_z = lift.L_q @ x, lift.L_v @ x
+        if small.scale != 1.0:
+            v_z /= small.scale
+        if lift.W_G is not None:
+            v_z -= lift.W_G @ (small.operators.S_v @ x if v_s is None else v_s)
+        return z, v_z

@@ -1,0 +1,221 @@
+"""Running small models: for given forces or a prescribed hand, one step a call, or many runs at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fem.petsc import Array
+from reduction.model import ModelError, SmallModel, UnstableModelError
+from reduction.propagator import Propagator, march, propagator
+
+
+@dataclass(frozen=True)
+class ReducedTrajectory:
+    """What a reduced run returns.
+
+    Attributes:
+        times: (steps + 1,) [s].
+        x: reduced states, (steps + 1, N).
+        q_s, v_s: hand, (steps + 1, n_s).
+        outputs: y, (steps + 1, p) [m].
+        output_names: one per component.
+    """
+
+    times: Array
+    x: Array
+    q_s: Array
+    v_s: Array
+    outputs: Array
+    output_names: tuple[str, ...]
+
+
+def _check_stable(model: SmallModel, allow_unstable: bool) -> None:
+    if not (allow_unstable or model.stable):
+        raise UnstableModelError(
+            f"{model.name} with N = {model.N} is unstable (spectral abscissa {model.spectral_abscissa:.2e} 1/s); "
+            "choose another N or a structure-preserving basis, or run with allow_unstable"
+        )
+
+
+def run(
+    model: SmallModel | Propagator,
+    dt: float | None = None,
+    force: Array | None = None,
+    hand: tuple[Array, Array] | None = None,
+    x0: Array | None = None,
+    allow_unstable: bool = False,
+) -> ReducedTrajectory:
+    """Run for given forces, or a prescribed hand. Online; not collective.
+
+    Args:
+        model: small model, or a propagator made beforehand.
+        dt: step [s]; needed with a small model.
+        force: u on the hand at the step midpoints, (steps, n_s) [N, N m].
+        hand: q_s and v_s of a prescribed hand, (steps + 1, n_s) each, instead of a force.
+        x0: initial state (N,); None is zero. With a prescribed hand its first 2 n_s entries are replaced.
+        allow_unstable: run a model with growing modes all the same.
+
+    Raises:
+        UnstableModelError: the model is unstable and ``allow_unstable`` is not set.
+        ModelError: neither or both of force and hand are given, or shapes do not fit.
+    """
+    if (force is None) == (hand is None):
+        raise ModelError("give either the force on the hand or the motion of the hand")
+    step = prepared(model, dt, hand is not None)
+    model = step.model
+    _check_stable(model, allow_unstable)
+    inputs = force_inputs(model, force) if hand is None else hand_inputs(model, hand, step.dt)
+    start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
+    x = march(step, inputs, step.X_inverse @ start[model.N - step.size :]) @ step.X.T
+    if hand is None:
+        return trajectory(model, step.dt, x, x @ model.operators.S_q.T, x @ model.operators.S_v.T)
+    q, v = hand
+    return trajectory(model, step.dt, np.hstack([consistent(q, v, step.dt), v, x]), q, v)
+
+
+def prepared(model: SmallModel | Propagator, dt: float | None, driven: bool) -> Propagator:
+    """A propagator for the kind of input; checks one that was made beforehand."""
+    if isinstance(model, SmallModel):
+        if dt is None:
+            raise ModelError("give the time step dt [s]")
+        return propagator(model, dt, driven)
+    if model.driven != driven or (dt is not None and dt != model.dt):
+        raise ModelError("the propagator was made for another time step or another kind of input")
+    return model
+
+
+def force_inputs(model: SmallModel, force: Array | None) -> Array:
+    """Check the forces (steps, n_s)."""
+    u = np.asarray(force, dtype=float)
+    if u.ndim != 2 or u.shape[1] != model.n_s or len(u) < 1:
+        raise ModelError(f"the force has the shape {u.shape}; it must be (steps, {model.n_s})")
+    return u
+
+
+def consistent(q: Array, v: Array, dt: float) -> Array:
+    """Positions that the midpoint rule reaches with the velocities v: q_0 + dt sum (v_n + v_{n+1}) / 2.
+
+    A table of an analytic motion differs from them by O(dt^2); the tissue feels velocities and accelerations.
+    """
+    return np.vstack([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
+
+
+def hand_inputs(model: SmallModel, hand: tuple[Array, Array], dt: float) -> Array:
+    """Mean position, velocity and acceleration of each step from tables (steps + 1, n_s); (steps, 3 n_s)."""
+    q, v = hand
+    if q.shape != v.shape or q.ndim != 2 or q.shape[1] != model.n_s or len(q) < 2:
+        raise ModelError(
+            f"the hand's tables have the shapes {q.shape} and {v.shape}; both must be (steps + 1, {model.n_s})"
+        )
+    q = consistent(q, v, dt)
+    return np.hstack([(q[1:] + q[:-1]) / 2, (v[1:] + v[:-1]) / 2, np.diff(v, axis=0) / dt])
+
+
+def trajectory(model: SmallModel, dt: float, x: Array, q: Array, v: Array) -> ReducedTrajectory:
+    """Bundle states (steps + 1, N) with the outputs."""
+    y = x @ model.outputs.C_z.T + q @ model.outputs.C_s.T
+    return ReducedTrajectory(dt * np.arange(float(len(x))), x, q, v, y, model.outputs.names)
+
+
+class Stepper:
+    """One step a call, for a control loop: u goes in, the outputs come out; nothing is allocated but the result.
+
+    Args:
+        model: small model, or a propagator made beforehand.
+        dt: step [s]; needed with a small model.
+        x0: initial state (N,); None is zero.
+        allow_unstable: step a model with growing modes all the same.
+
+    Raises:
+        UnstableModelError: the model is unstable and ``allow_unstable`` is not set.
+    """
+
+    def __init__(
+        self,
+        model: SmallModel | Propagator,
+        dt: float | None = None,
+        x0: Array | None = None,
+        allow_unstable: bool = False,
+    ) -> None:
+        self.step = prepared(model, dt, False)
+        model = self.step.model
+        _check_stable(model, allow_unstable)
+        k, op = self.step.size, model.operators
+        C = model.outputs.C_z + model.outputs.C_s @ op.S_q
+        # new state, and outputs of the new state, in one product
+        self._matrix = np.ascontiguousarray(np.vstack([self.step.matrix, C @ self.step.X @ self.step.matrix]))
+        self._row = np.zeros(self._matrix.shape[1])
+        self._row[-1] = 1.0
+        self._new = np.zeros(len(self._matrix))
+        self._w, self._u = self._row[:k], self._row[k:-1]
+        self._w_new, self.outputs = self._new[:k], self._new[k:]
+        self._dot = np.dot
+        if x0 is not None:
+            self._w[:] = self.step.X_inverse @ x0
+        self.outputs[:] = C @ (self.step.X @ self._w)
+
+    def __call__(self, u: Array) -> Array:
+        """Advance by dt under the force u (n_s,); returns the outputs, overwritten by the next call."""
+        self._u[:] = u
+        self._dot(self._matrix, self._row, self._new)
+        self._w[:] = self._w_new
+        return self.outputs
+
+    @property
+    def state(self) -> Array:
+        """Reduced state x now, (N,)."""
+        return np.asarray(self.step.X @ self._w)
+
+
+def run_batch(
+    models: Sequence[SmallModel | Propagator],
+    dt: float,
+    forces: Array,
+    allow_unstable: bool = False,
+) -> list[ReducedTrajectory]:
+    """Many parameters or many inputs at once, from rest: one product for the whole batch in each step.
+
+    Args:
+        models: one for all runs, or one for each; all of one dimension.
+        dt: step [s].
+        forces: (runs, steps, n_s), or (steps, n_s) for all runs [N, N m].
+        allow_unstable: run models with growing modes all the same.
+
+    Raises:
+        UnstableModelError: a model is unstable and ``allow_unstable`` is not set.
+        ModelError: the batch does not fit together.
+    """
+    steps = [prepared(m, dt, False) for m in models]
+    u = np.asarray(forces, dtype=float)
+    if u.ndim == 2:
+        u = np.broadcast_to(u, (len(steps), *u.shape))
+    n_s = steps[0].model.n_s if steps else 0
+    sizes = {s.matrix.shape for s in steps}
+    if len(sizes) != 1 or u.ndim != 3 or u.shape[2] != n_s or (len(steps) not in (1, len(u))):
+        raise ModelError(
+            f"{len(steps)} models of the shapes {sorted(sizes)} do not fit forces of the shape {u.shape}; give one "
+            "model or one for each run, all with one N"
+        )
+    for s in steps:
+        _check_stable(s.model, allow_unstable)
+    runs, first = len(u), steps[0]
+    k, b, m = first.size, first.steps, n_s
+    count = -(-u.shape[1] // b)
+    padded = np.zeros((runs, count * b, m))
+    padded[:, : u.shape[1]] = u
+    rows = np.zeros((count + 1, runs, b * k + b * m + 1))
+    rows[:-1, :, b * k : -1] = padded.reshape(runs, count, b * m).transpose(1, 0, 2)
+    rows[:, :, -1] = 1.0
+    stack = np.ascontiguousarray(first.block.T) if len(steps) == 1 else np.stack([s.block for s in steps])
+    for old, new in zip(rows[:-1, :, (b - 1) * k :], rows[1:, :, : b * k], strict=True):
+        new[:] = old @ stack if len(steps) == 1 else np.matmul(stack, old[:, :, None])[:, :, 0]
+    result = []
+    for i in range(runs):
+        s = steps[i if len(steps) > 1 else 0]
+        w = rows[1:, i, : b * k].reshape(-1, k)[: u.shape[1]]
+        x, op = np.vstack([np.zeros(k), w]) @ s.X.T, s.model.operators
+        result.append(trajectory(s.model, dt, x, x @ op.S_q.T, x @ op.S_v.T))
+    return result

@@ -1,0 +1,157 @@
+"""Proper orthogonal decomposition in a weighted inner product, and the paper's four POD bases [SBRH21]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from mpi4py import MPI
+
+from fem.petsc import Array
+from reduction.basis import Coordinates
+from reduction.engines import EngineName, Factor, factor, on_root, small_svd
+from reduction.inner import InnerName, Rows, Weight, weights
+from reduction.states import BasisError, Blocks, States
+from reduction.truncation import Columns, Part
+
+Halves = list[tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a builder of parts gets.
+
+    Attributes:
+        states: system and snapshots.
+        blocks: the snapshots in the coordinates and the frame of the method.
+        hand: whether the hand's rows take part in the decomposition.
+        coordinates: "qv" or "qp".
+        inner: inner product.
+        engine: engine of the tall factorisation.
+        k: leading triplets that are enough, None for all.
+    """
+
+    states: States
+    blocks: Blocks
+    hand: bool
+    coordinates: Coordinates
+    inner: InnerName
+    engine: EngineName
+    k: int | None
+
+
+def cholesky_of(comm: MPI.Intracomm, G: Array) -> Array:
+    """Lower factor of a small Gram matrix (real or complex), the same bits on every rank. Collective.
+
+    Raises:
+        BasisError: the inner product is not positive definite.
+    """
+    try:
+        return on_root(comm, lambda: np.linalg.cholesky((G + G.T.conj()) / 2))
+    except np.linalg.LinAlgError as error:
+        raise BasisError(
+            "the inner product is not positive definite on the snapshots; check density, stiffness and contact zone"
+        ) from error
+
+
+def weighted_factor(
+    rows: Rows, X: Array, by: tuple[Weight, ...] | None, engine: EngineName, k: int | None = None
+) -> tuple[Factor, Array | None]:
+    """X = Q R with Q' Q = I, and the Cholesky factor L of Q' W Q (None without weight). Collective.
+
+    The columns of Q L^-T are orthonormal in W, and L' R are the coordinates of X in them. Because Q is orthonormal,
+    the condition of Q' W Q is at most that of W, not that of X.
+    """
+    f = factor(rows.layout.comm, X, engine, None if by is not None else k)
+    if by is None:
+        return f, None
+    return f, cholesky_of(rows.layout.comm, rows.gram(f.Q, rows.weigh(f.Q, by)))
+
+
+def pod_part(
+    title: str,
+    rows: Rows,
+    X: Array,
+    by: tuple[Weight, ...] | None,
+    engine: EngineName,
+    place: Callable[[Halves], Columns],
+    k: int | None = None,
+) -> Part:
+    """POD_k(X): the k leading left singular vectors in the inner product W, U' W U = I. Collective.
+
+    They minimise sum_j |x_j - U U' W x_j|_W^2.
+
+    Args:
+        title: what X holds, for messages.
+        rows: how X is stacked.
+        X: snapshots, local rows (rows.local, m).
+        by: weight of every half; None is Euclidean.
+        engine: engine of the tall factorisation.
+        place: puts the rows of U into the rows of a basis.
+        k: leading triplets that are enough, None for all.
+    """
+    comm = rows.layout.comm
+
+    def empty(_: int) -> tuple[Columns, ...]:
+        return (place(rows.split(np.zeros((rows.local, 0)))),)
+
+    if not comm.allreduce(bool(np.any(X)), MPI.LOR):
+        return Part(title, np.zeros(0), 0.0, 0, empty)
+    f, L = weighted_factor(rows, X, by, engine, k)
+    u, s, _ = small_svd(comm, f.R if L is None else L.T @ f.R)
+    C = u if L is None else scipy.linalg.solve_triangular(L.T, u)
+
+    def columns(k: int) -> tuple[Columns, ...]:
+        U = f.Q @ C[:, :k]
+        if by is not None and k:
+            # one more step takes the rounding of L^-1 out; it is triangular, so the nested spans stay
+            repair = cholesky_of(comm, rows.gram(U, rows.weigh(U, by)))
+            U = U @ np.linalg.inv(repair.T)
+        return (place(rows.split(U)),)
+
+    square = f.square if L is None else float(np.sum(s**2))
+    return Part(title, s, square, int(np.count_nonzero(s > f.floor * s[0])), columns, f.scale)
+
+
+def _whole(halves: Halves) -> Columns:
+    (s_q, e_q), (s_p, e_p) = halves
+    return Columns(s_q, s_p, e_q, e_p)
+
+
+def _displacement(halves: Halves) -> Columns:
+    ((s, e),) = halves
+    return Columns(s, np.zeros_like(s), e, np.zeros_like(e))
+
+
+def _velocity(halves: Halves) -> Columns:
+    ((s, e),) = halves
+    return Columns(np.zeros_like(s), s, np.zeros_like(e), e)
+
+
+def joint_parts(request: Request) -> tuple[Part, ...]:
+    """Global POD: V = POD_k(X), X = [q_s; v_s; q_e; v_e]; without the hand, V_e = POD_k(X_e), X_e = [q_e; v_e].
+
+    V' W V = I over displacement and velocity rows together. Collective.
+    """
+    b, layout = request.blocks, request.states.layout
+    rows = Rows(layout, 2, request.hand)
+    X = rows.stack((b.s_q, b.e_q), (b.s_p, b.e_p))
+    by = weights(request.states.system, request.inner)
+    return (pod_part("states", rows, X, by, request.engine, _whole, request.k),)
+
+
+def componentwise_parts(request: Request) -> tuple[Part, ...]:
+    """Componentwise POD: V = blkdiag(POD_k1(X_q), POD_k2(X_v)), displacement and velocity by themselves.
+
+    V_q' W_q V_q = I and V_v' W_v V_v = I. Collective.
+    """
+    b, layout = request.blocks, request.states.layout
+    rows = Rows(layout, 1, request.hand)
+    by = weights(request.states.system, request.inner)
+    q, v = (None, None) if by is None else ((by[0],), (by[1],))
+    return (
+        pod_part("displacements", rows, rows.stack((b.s_q, b.e_q)), q, request.engine, _displacement, request.k),
+        pod_part("velocities", rows, rows.stack((b.s_p, b.e_p)), v, request.engine, _velocity, request.k),
+    )

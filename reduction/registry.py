@@ -1,0 +1,213 @@
+"""All bases by key: what each is, what the paper calls it, and how to make one or a whole sweep."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fem.petsc import Array
+from reduction.basis import Basis, Coordinates, Frame, Structure
+from reduction.craig_bampton import craig_bampton_parts
+from reduction.engines import EngineName
+from reduction.inner import INNERS, InnerName
+from reduction.pod import Request, componentwise_parts, joint_parts
+from reduction.psd import complex_svd_parts, cotangent_lift_parts, svd_like_parts
+from reduction.states import BasisError, Blocks, States
+from reduction.truncation import PAPER_ENERGY, Columns, Part, Truncation, counts_of
+
+
+@dataclass(frozen=True)
+class Method:
+    """One basis of the registry.
+
+    Attributes:
+        key: name in scenes and results.
+        title: one line for tables and figures.
+        paper: what the paper calls it, None for those beyond it.
+        preserving: the reduced model keeps the Hamiltonian or the second-order structure.
+        build: makes the parts from the snapshots.
+        coordinates, frame, structure: of the basis, see :class:`reduction.basis.Basis`.
+        fixed: the hand's unit columns are kept apart from the decomposition.
+        pairs: units are pairs of columns, so N is even.
+        snapshots: whether it needs any.
+    """
+
+    key: str
+    title: str
+    paper: str | None
+    preserving: bool
+    build: Callable[[Request], tuple[Part, ...]]
+    coordinates: Coordinates
+    frame: Frame
+    structure: Structure
+    fixed: bool
+    pairs: bool
+    snapshots: bool = True
+
+
+def _methods() -> dict[str, Method]:
+    table: list[tuple[str, str, dict[str, str], Callable[[Request], tuple[Part, ...]], bool]] = [
+        ("global_pod", "global POD", {"": "Global POD", "_fixed": "POD with fixed solid modes"}, joint_parts, False),
+        (
+            "componentwise_pod",
+            "componentwise POD",
+            {"": "Componentwise POD", "_fixed": "Componentwise POD with fixed solid modes"},
+            componentwise_parts,
+            False,
+        ),
+        (
+            "psd",
+            "PSD complex SVD",
+            {"": "Global Proper Symplectic Decomposition (GPSD)", "_fixed": "PSD with fixed solid modes"},
+            complex_svd_parts,
+            True,
+        ),
+        ("psd_cotangent_lift", "PSD cotangent lift", {}, cotangent_lift_parts, True),
+        ("psd_svd_like", "PSD SVD-like", {}, svd_like_parts, True),
+    ]
+    result: dict[str, Method] = {}
+    for stem, title, papers, build, pairs in table:
+        for suffix, fixed in (("", False), ("_fixed", True)):
+            key = "pod_fixed" if stem + suffix == "global_pod_fixed" else stem + suffix
+            words = ("POD" if key == "pod_fixed" else title) + (", fixed solid modes" if fixed else "")
+            paper = papers.get(suffix)
+            for form in ("qp", "qv") if pairs else ("qv",):
+                canonical = form == "qp"
+                tail = "_qv" if pairs and not canonical else ""
+                structure: Structure = "symplectic" if canonical else "none"
+                method = Method(
+                    key + tail, words + (" in (q, v)" if tail else ""), paper, canonical, build,
+                    "qp" if canonical else "qv", "absolute", structure, fixed, pairs,
+                )  # fmt: skip
+                result[method.key] = method
+                relative = f"{method.key}_relative"
+                result[relative] = replace(
+                    method, key=relative, title=f"{method.title}, hand-relative", paper=None, frame="relative"
+                )
+    result["craig_bampton"] = Method(
+        "craig_bampton", "Craig-Bampton", None, True, craig_bampton_parts,
+        "qv", "relative", "second_order", True, True, snapshots=False,
+    )  # fmt: skip
+    return result
+
+
+METHODS: dict[str, Method] = _methods()
+"""Every basis by key."""
+
+PAPER_METHODS = ("global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed")
+"""The six of the paper, in its order."""
+
+
+def find_method(name: str) -> Method:
+    """Look a basis up.
+
+    Raises:
+        BasisError: there is none of this name.
+    """
+    if name not in METHODS:
+        raise BasisError(f"basis '{name}' is unknown; choose one of {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def make_basis(
+    name: str,
+    states: States,
+    size: int | Truncation | None = None,
+    inner: InnerName | None = None,
+    engine: EngineName = "tsqr",
+) -> Basis:
+    """Build one basis. Collective.
+
+    Args:
+        name: key of :data:`METHODS`.
+        states: system and snapshots.
+        size: N of the whole basis, or a rule; None keeps 99.9 % of the energy, as the paper does.
+        inner: inner product; None is Euclidean, for Craig-Bampton mass.
+        engine: engine of the tall factorisation.
+
+    Raises:
+        BasisError: unknown name, unusable snapshots, or N that does not fit.
+        SolverError: the factorisation fails.
+    """
+    return make_bases(name, states, (Truncation(energy=PAPER_ENERGY) if size is None else size,), inner, engine)[0]
+
+
+def make_bases(
+    name: str,
+    states: States,
+    sizes: Sequence[int | Truncation],
+    inner: InnerName | None = None,
+    engine: EngineName = "tsqr",
+) -> tuple[Basis, ...]:
+    """Build the bases of a sweep with one factorisation: smaller ones are leading columns of the larger. Collective.
+
+    Args and errors as in :func:`make_basis`; one basis for each of ``sizes``.
+    """
+    method = find_method(name)
+    metric = _inner_of(method, inner)
+    rules = [Truncation(N=size) if isinstance(size, int | np.integer) else size for size in sizes]
+    clock = [time.perf_counter()]
+    n_s = states.layout.n_s
+    if method.pairs and not method.fixed and method.frame == "relative" and states.system.two_way:
+        raise BasisError(
+            f"{name}: with two-way coupling M_ee v_z is no canonical momentum beside that of the hand; "
+            f"use {name.replace('_relative', '')} or a basis with fixed solid modes"
+        )
+    blocks = states.blocks(method.coordinates, method.frame) if method.snapshots else _no_blocks(states)
+    clock.append(time.perf_counter())
+    known = [rule.N for rule in rules if rule.N is not None]
+    k = max(known) if known and len(known) == len(rules) else None
+    parts = method.build(Request(states, blocks, not method.fixed, method.coordinates, metric, engine, k))
+    hand = 2 * n_s if method.fixed else 0
+    if not method.snapshots and k is None:
+        raise BasisError(f"{name} uses no snapshots, so it has no energy to keep; give N")
+    counts = [counts_of(parts, 2 if method.pairs else 1, hand, rule, name) for rule in rules]
+    clock.append(time.perf_counter())
+    columns = [part.columns(max(c[i] for c in counts)) for i, part in enumerate(parts)]
+    clock.append(time.perf_counter())
+    seconds = dict(zip(("snapshots", "factor", "vectors"), np.diff(clock).tolist(), strict=True))
+    whole = Basis(
+        method.key, states.layout, *(np.zeros((0, 0)),) * 4, method.coordinates, method.frame, method.structure,
+        method.fixed, metric, parts[0].rate, method.pairs,
+        tuple(part.scale * part.sigma for part in parts if len(part.sigma)), seconds,
+    )  # fmt: skip
+    return tuple(_cut(whole, columns, c) for c in counts)
+
+
+def _inner_of(method: Method, inner: InnerName | None) -> InnerName:
+    if inner is not None and inner not in INNERS:
+        raise BasisError(f"inner product '{inner}' is unknown; choose one of {', '.join(INNERS)}")
+    if method.snapshots:
+        return inner or "euclidean"
+    if inner not in (None, "mass"):
+        raise BasisError(f"{method.key} is orthonormal in the mass product by definition; leave inner out")
+    return "mass"
+
+
+def _no_blocks(states: States) -> Blocks:
+    n_s, n = states.layout.n_s, states.layout.n_local
+    return Blocks(np.zeros((n_s, 0)), np.zeros((n_s, 0)), np.zeros((n, 0)), np.zeros((n, 0)))
+
+
+def _cut(whole: Basis, columns: Sequence[tuple[Columns, ...]], counts: tuple[int, ...]) -> Basis:
+    """Hand columns if fixed, then the leading units of every part, first halves before second halves."""
+    n_s, n = whole.layout.n_s, whole.layout.n_local
+    sets = [half.first(k) for halves, k in zip(columns, counts, strict=True) for half in halves]
+    if whole.fixed_solid:
+        tissue = np.zeros((n, 2 * n_s))
+        sets.insert(0, Columns(np.eye(n_s, 2 * n_s), np.eye(n_s, 2 * n_s, k=n_s), tissue, tissue))
+
+    def joined(blocks: list[Array]) -> Array:
+        return np.asfortranarray(np.hstack(blocks))
+
+    return replace(
+        whole,
+        V_sq=joined([c.s_q for c in sets]),
+        V_sv=joined([c.s_p for c in sets]),
+        V_q=joined([c.e_q for c in sets]),
+        V_p=joined([c.e_p for c in sets]),
+        seconds=dict(whole.seconds),
+    )

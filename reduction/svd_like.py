@@ -1,0 +1,176 @@
+"""SVD-like decomposition of a small dense matrix, by deflation so that small pairs keep their digits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg
+from mpi4py import MPI
+
+from fem.petsc import Array
+from reduction.engines import EPS, on_root
+
+# eigenvalues of X'JX carry an absolute error eps * |X|^2: a stage takes those that keep about ten digits
+STAGE = 1e-6
+SMALLEST = 1e-13  # what is left below this share of |X| is rounding of the snapshots
+# V'JV = J can hold to about eps |s|^2 only: vectors that are almost J-orthogonal make no pair with each other
+LONGEST = 200.0  # |s|^2 + |t|^2
+DROP = 0.1  # directions without partner are taken together down to this share of the largest
+
+
+def poisson(Y: Array) -> Array:
+    """J Y for rows (q; p), J = [0 I; -I 0]. Not collective."""
+    q, p = np.split(Y, 2)
+    return np.vstack([p, -q])
+
+
+def form(X: Array, Y: Array) -> Array:
+    """X' J Y. Not collective."""
+    return X.T @ poisson(Y)
+
+
+def svd_like_pairs(comm: MPI.Intracomm, X: Array, limit: int | None = None) -> tuple[Array, Array]:
+    """Symplectic S = [s_1 .. s_k, t_1 .. t_k] that spans X, ordered by the weight of the pairs. Collective.
+
+    X = S D Q with orthogonal Q; D holds sigma_i twice for every hyperbolic pair, +-i sigma_i^2 the eigenvalues of the
+    skew matrix X'JX, and 1 for directions that have no partner in X [BBH19]. One eigenvalue problem loses every pair
+    below sqrt(eps) sigma_1, so each stage takes only the large ones, and the next works on X - S S^+ X with the
+    symplectic inverse S^+ = J' S' J; the stages together are the same decomposition. A direction u without partner
+    in X gets the one that is J-orthogonal to all others, t = (I - S S^+) J' u.
+
+    Args:
+        comm: ranks, all with the same X.
+        X: rows (q; p), shape (2 r, m).
+        limit: number of pairs that are enough; None for all.
+
+    Returns:
+        S (2 r, 2 k), S' J S = J, and w (k,) descending; sum w^2 = |X|_F^2 when all are taken and have partners.
+    """
+    return on_root(comm, lambda: _pairs(X, limit))
+
+
+def _pairs(X: Array, limit: int | None) -> tuple[Array, Array]:
+    # q and p of equal size lose the fewest digits; (q / t, p t) is canonical
+    r = len(X) // 2
+    q, p = np.linalg.norm(X[:r]), np.linalg.norm(X[r:])
+    ratio = float(q / p) ** 0.5 if q > 0 and p > 0 else 1.0
+    # complex unitary maps are orthogonal and symplectic: work in the few dimensions that q + i p spans
+    E, s, V_h = scipy.linalg.svd(X[:r] / ratio + 1j * X[r:] * ratio, full_matrices=False)
+    keep = s > EPS * s[0]
+    E, Z = E[:, keep], s[keep, None] * V_h[keep]
+
+    def back(Y: Array) -> Array:
+        a, b = np.split(Y, 2)
+        x = E @ (a + 1j * b)
+        return np.vstack([x.real * ratio, x.imag / ratio])
+
+    pool = _Pool(np.vstack([Z.real, Z.imag]), lambda Y: np.linalg.norm(back(Y), axis=0))
+    pool.collect(limit)
+    S, T = balanced(back(pool.S), back(pool.T))
+    order = np.argsort(-pool.weights, kind="stable")
+    return np.hstack([S[:, order], T[:, order]]), pool.weights[order]
+
+
+class _Pool:
+    """Pairs found so far and what is left of X; ``norms`` measures columns in the units of X."""
+
+    def __init__(self, X: Array, norms: Callable[[Array], Array]) -> None:
+        self.norms = norms
+        self.S: Array = np.zeros((len(X), 0))
+        self.T: Array = np.zeros((len(X), 0))
+        self.weights: Array = np.zeros(0)
+        self.largest = 0.0
+        self._compress(X)
+        self.largest = self.size
+
+    def _compress(self, rest: Array) -> None:
+        """Keep the few columns that span the rest as well: X'JX only turns."""
+        U, s, _ = scipy.linalg.svd(rest, full_matrices=False)
+        keep = s > max(EPS * s[0], 0.01 * SMALLEST * self.largest) if len(s) else s > 0
+        self.U, self.s = U[:, keep], s[keep]
+        self.rest = self.U * self.s
+        self.size = float(self.s[0]) if keep.any() else 0.0
+
+    def collect(self, limit: int | None) -> None:
+        """Find pairs until the rest is rounding, or until no later pair can be among the ``limit`` heaviest."""
+        while self.size > SMALLEST * self.largest and 2 * self.S.shape[1] < len(self.S):
+            if limit is not None and self._enough(limit):
+                break
+            if not self._stage():
+                self._alone()
+        # what the stages lost to each other
+        pair = _symplectic(np.hstack([self.S, self.T]))
+        self.S, self.T = np.hsplit(pair, 2)
+
+    def _enough(self, limit: int) -> bool:
+        if len(self.weights) < limit:
+            return False
+        return float(np.linalg.norm(self.norms(self.rest))) < float(np.sort(self.weights)[-limit])
+
+    def _stage(self) -> bool:
+        """Add the hyperbolic pairs of the rest that are large and well conditioned; whether there were any."""
+        B = form(self.rest, self.rest)
+        # i B is Hermitian; for an eigenvalue lambda > 0, u = (b + i a) / sqrt(2) gives a'Bb = lambda, a, b orthonormal
+        values, vectors = scipy.linalg.eigh(1j * (B - B.T) / 2)
+        pick = values > max(STAGE * values[-1], 100 * EPS * self.size**2)
+        values, vectors = values[pick][::-1], np.sqrt(2) * vectors[:, pick][:, ::-1]
+        sigma = np.sqrt(values)
+        S, T = self.rest @ (vectors.imag / sigma), self.rest @ (vectors.real / sigma)
+        good = np.sum(S**2, axis=0) + np.sum(T**2, axis=0) <= LONGEST
+        if not good.any():
+            return False
+        S, T = np.hsplit(_symplectic(np.hstack([S[:, good], T[:, good]])), 2)
+        self._add(S, T, sigma[good] * np.hypot(self.norms(S), self.norms(T)))
+        return True
+
+    def _alone(self) -> None:
+        """Add the largest directions of the rest, almost J-orthogonal to each other, with partners from outside."""
+        room = (len(self.S) - 2 * self.S.shape[1]) // 2
+        k = min(int(np.count_nonzero(self.s > DROP * self.size)), room)
+        U, s = self.U[:, :k], self.s[:k]
+        T = -poisson(U)  # J' U, for which U'JT = U'U = I
+        for _ in range(2):
+            T = self._complement(T)
+        T = T + U @ form(T, T) / 2  # now T'JT = 0 up to U'JU
+        S, T = np.hsplit(_symplectic(np.hstack([U, T])), 2)
+        self._add(S, T, s * self.norms(U))
+
+    def _add(self, S: Array, T: Array, weights: Array) -> None:
+        self.S, self.T = np.hstack([self.S, S]), np.hstack([self.T, T])
+        self.weights = np.concatenate([self.weights, weights])
+        rest = self.rest
+        for _ in range(2):  # the second pass takes out the rounding of the first
+            rest = self._complement(rest)
+        self._compress(rest)
+
+    def _complement(self, Y: Array) -> Array:
+        """(I - S S^+) Y."""
+        return Y - self.T @ form(self.S, Y) + self.S @ form(self.T, Y)
+
+
+def symplectic_repair(B: Array) -> Array:
+    """C = (J^-1 B)^(-1/2) with C' B C = J for a skew B near J: S C is symplectic when S' J S = B. Not collective."""
+    return np.linalg.inv(np.real(scipy.linalg.sqrtm(-poisson(B))))
+
+
+def _symplectic(S: Array) -> Array:
+    """Nearest symplectic columns, the symplectic polar factor."""
+    k = S.shape[1] // 2
+    J = np.eye(2 * k, k=k) - np.eye(2 * k, k=-k)
+    for _ in range(3):
+        B = form(S, S)
+        if np.abs(B - J).max(initial=0.0) < 4 * EPS:
+            break
+        S = S @ symplectic_repair(B)
+    return S
+
+
+def balanced(S: Array, T: Array) -> tuple[Array, Array]:
+    """Rotate every pair (s, t) so that |s| = |t|; s'Jt and the span stay. Not collective.
+
+    s cos + t sin and -s sin + t cos have equal norms when tan(2 phi) = (|s|^2 - |t|^2) / (-2 s't).
+    """
+    difference = np.sum(S**2, axis=0) - np.sum(T**2, axis=0)
+    phi = 0.5 * np.arctan2(difference, -2 * np.sum(S * T, axis=0))
+    return S * np.cos(phi) + T * np.sin(phi), T * np.cos(phi) - S * np.sin(phi)

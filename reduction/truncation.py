@@ -1,0 +1,155 @@
+"""How many vectors: N given, by energy, or by a tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fem.petsc import Array
+from reduction.states import BasisError
+
+PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Equally many basis columns in the row blocks of :class:`reduction.basis.Basis`."""
+
+    s_q: Array
+    s_p: Array
+    e_q: Array
+    e_p: Array
+
+    def first(self, k: int) -> Columns:
+        """The leading k columns. Not collective."""
+        return Columns(self.s_q[:, :k], self.s_p[:, :k], self.e_q[:, :k], self.e_p[:, :k])
+
+
+@dataclass(frozen=True)
+class Part:
+    """One ordered family of units, each of one column or of a symplectic pair.
+
+    Attributes:
+        title: what it spans, for messages.
+        sigma: importance of the units over ``scale``, descending (singular values).
+        total: sum of all sigma^2, also of those that were not computed.
+        rank: number of units that are more than noise.
+        columns: makes the leading k units; one set of columns per half of the pair. Collective.
+        scale: power of two taken out of sigma, so that squares neither overflow nor vanish.
+        rate: weight c between displacement and momentum, see `reduction.inner`.
+    """
+
+    title: str
+    sigma: Array
+    total: float
+    rank: int
+    columns: Callable[[int], tuple[Columns, ...]]
+    scale: float = 1.0
+    rate: float = 1.0
+
+
+@dataclass(frozen=True)
+class Truncation:
+    """Exactly one of the three says how many vectors are taken.
+
+    Attributes:
+        N: dimension of the whole basis, with the hand's columns.
+        energy: share of sum sigma^2 to keep in every part, 0 < energy < 1.
+        tol: relative projection error sqrt(sum of dropped sigma^2 / total) to reach in every part, 0 < tol < 1.
+    """
+
+    N: int | None = None
+    energy: float | None = None
+    tol: float | None = None
+
+    def __post_init__(self) -> None:
+        if sum(x is not None for x in (self.N, self.energy, self.tol)) != 1:
+            raise BasisError("give exactly one of N, energy and tol")
+        for key, value in (("energy", self.energy), ("tol", self.tol)):
+            if value is not None and not 0 < value < 1:
+                raise BasisError(f"{key} = {value} must lie between 0 and 1")
+        if self.N is not None and self.N < 1:
+            raise BasisError(f"N = {self.N} must be at least 1")
+
+    @property
+    def share(self) -> float:
+        """Share of sum sigma^2 that may be dropped."""
+        if self.energy is not None:
+            return 1.0 - self.energy
+        return (self.tol or 0.0) ** 2
+
+
+def needed(sigma: Array, total: float, share: float) -> int | None:
+    """Smallest k whose dropped tail is at most ``share`` of the total; None if sigma ends before. Not collective."""
+    if total <= 0:
+        return 0
+    # from the small end: total minus a running sum would lose the tail to rounding
+    unknown = max(total - float(np.sum(sigma**2)), 0.0) if len(sigma) else total
+    tail = np.append(np.cumsum((sigma**2)[::-1])[::-1], 0.0)
+    # what was not computed is in the tail unless it is only rounding of the total
+    tail += unknown if unknown > 1e-14 * total * max(len(sigma), 1) else 0.0
+    good = np.flatnonzero(tail <= share * total)
+    return int(good[0]) if len(good) else None
+
+
+def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) -> tuple[int, ...]:
+    """Share N - hand columns among the parts, greedily by sigma^2 over the total of the part. Not collective.
+
+    Args:
+        parts: families of units.
+        width: columns of one unit.
+        N: dimension of the whole basis.
+        hand: columns that the hand takes.
+        name: of the basis, for messages.
+
+    Returns:
+        Units of every part.
+
+    Raises:
+        BasisError: N is smaller than the hand's columns, not a multiple of the unit, or more than the rank.
+    """
+    free = N - hand
+    if free < width or free % width:
+        least = f"the {hand} columns of the hand plus " if hand else ""
+        more = "an even number, at least 2" if width == 2 else "at least 1"
+        raise BasisError(f"{name}: N = {N} does not fit; it must be {least}{more}")
+    want, ranks = free // width, [part.rank for part in parts]
+    if want > sum(ranks):
+        found = " + ".join([*(str(width * r) for r in ranks), *([f"{hand} of the hand"] if hand else [])])
+        raise BasisError(
+            f"{name}: N = {N} is more than the snapshots carry above rounding ({found}); "
+            f"ask for N <= {hand + width * sum(ranks)}"
+        )
+    if len(parts) == 1:
+        return (want,)
+    queue = sorted(
+        (-float(part.sigma[j] ** 2) / part.total, i, j)
+        for i, part in enumerate(parts)
+        for j in range(min(part.rank, want))
+    )
+    chosen = [i for _, i, _ in queue[:want]]
+    return tuple(chosen.count(i) for i in range(len(parts)))
+
+
+def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, name: str) -> tuple[int, ...]:
+    """Units of every part by the rule. Not collective.
+
+    Raises:
+        BasisError: N does not fit, or the rule asks for more than the rank.
+    """
+    if rule.N is not None:
+        return allocate(parts, width, rule.N, hand, name)
+    counts = []
+    for part in parts:
+        k = needed(part.sigma, part.total, rule.share)
+        if k is None or k > part.rank:
+            raise BasisError(
+                f"{name}: the {part.title} cannot be kept to {rule.share:.1e} of its energy with the {part.rank} "
+                "singular values above rounding; ask for a larger tol, or for N"
+            )
+        counts.append(k)
+    if not any(counts):
+        raise BasisError(f"{name}: the snapshots of the {' and of the '.join(p.title for p in parts)} are zero")
+    return tuple(counts)

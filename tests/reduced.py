@@ -1,0 +1,116 @@
+"""Bases for tests of reduced models: whole spaces, and smooth functions of the nodes that no rank count changes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from fem.build import Model, build
+from fem.layout import BlockLayout
+from fem.motion import force_values
+from fem.outputs import make_outputs
+from fem.petsc import total
+from fem.run import Trajectory, simulate
+from fem.system import BlockSystem
+from reduction.basis import Basis
+from reduction.model import ReducedModel
+from reduction.online import ReducedTrajectory, run
+from reduction.project import project
+from tests.helpers import Array, make_scene
+
+KINDS = [(c, f, s) for c in ("qv", "qp") for f in ("absolute", "relative") for s in (True, False)]
+"""Every kind of model: coordinates, frame, fixed solid modes."""
+FORCED = {"motion": {"drive": "force"}, "output": {"snapshots": "memory"}}
+DAMPED = {"effects": {"damping": {"kind": "rayleigh", "beta": 0.01, "alpha": 0.3, "drag": "space"}}}
+TINY = {"tissue": {"cells": [2, 4]}, "time": {"steps": 30}}
+
+
+def model_of(comm: MPI.Intracomm, *changes: dict[str, Any]) -> Model:
+    """A small block whose hand is driven by a force."""
+    return build(make_scene(TINY, FORCED, *changes), comm)
+
+
+def joined(
+    layout: BlockLayout, q: Array, p: Array, hand: Array, coordinates: Any, frame: Any, fixed: bool, structure: Any
+) -> Basis:
+    """Basis of tissue blocks q, p; the hand's unit columns in front, or rows ``hand`` = [q_s; v_s or p_s]."""
+    n_s, k = layout.n_s, 2 * layout.n_s
+    if fixed:
+        q, p = (np.asfortranarray(np.pad(X, ((0, 0), (k, 0)))) for X in (q, p))
+        hand = np.eye(k, q.shape[1])
+    return Basis("test", layout, hand[:n_s], hand[n_s:], q, p, coordinates, frame, structure, fixed)
+
+
+def whole_basis(layout: BlockLayout, coordinates: Any, frame: Any, fixed: bool) -> Basis:
+    """All unit vectors: [q_s, v_s | q, p] or [q_s, q | v_s, p]."""
+    n_s, n_e = layout.n_s, layout.n_e
+    one = np.eye(layout.n_local, n_e, layout.start)
+    zero = np.zeros_like(one)
+    if fixed:
+        q, p = np.hstack([one, zero]), np.hstack([zero, one])
+        return joined(layout, q, p, one, coordinates, frame, True, "none")
+    n = n_s + n_e
+    q, p = (np.asfortranarray(np.pad(one, ((0, 0), (at, 2 * n - at - n_e)))) for at in (n_s, n + n_s))
+    hand = np.vstack([np.eye(n_s, 2 * n), np.eye(n_s, 2 * n, n)])
+    return Basis("whole", layout, hand[:n_s], hand[n_s:], q, p, coordinates, frame, "none", False)
+
+
+def waves(layout: BlockLayout, k: int, seed: int) -> Array:
+    """k smooth displacement fields without symmetry, local rows."""
+    d = layout.dimension
+    rng = np.random.default_rng(seed)  # the same numbers on every rank
+    columns = []
+    for _ in range(k):
+        direction, phase = rng.standard_normal((d, d)) * 2.5, rng.uniform(0, 6, d)
+        columns.append(np.cos(layout.nodes @ direction + phase).ravel())
+    return np.array(columns).T.reshape(layout.n_local, k)
+
+
+def symplectic_basis(
+    layout: BlockLayout, pairs: int, frame: Any, fixed: bool, coordinates: Any = "qp", lift: bool = False
+) -> Basis:
+    """V = [Re C, -Im C; Im C, Re C] with C* C = I; ``lift`` takes Im C = 0."""
+    n_s, root = layout.n_s, layout.comm.rank == 0
+    real, imaginary = waves(layout, pairs, 1), 0.0 if lift else 0.4 * waves(layout, pairs, 2)
+    C = real + 1j * imaginary
+    rng = np.random.default_rng(3)
+    hand = rng.standard_normal((n_s, pairs)) + (0 if lift else 0.4j * rng.standard_normal((n_s, pairs)))
+    if fixed:
+        hand = np.zeros_like(hand)
+    local = C.conj().T @ C + (hand.conj().T @ hand if root else 0)
+    gram = total(layout.comm, local.real) + 1j * total(layout.comm, local.imag)
+    change = np.linalg.inv(np.linalg.cholesky(gram).conj().T)
+    C, hand = C @ change, hand @ change
+    q, p = np.hstack([C.real, -C.imag]), np.hstack([C.imag, C.real])
+    rows = np.vstack([np.hstack([hand.real, -hand.imag]), np.hstack([hand.imag, hand.real])])
+    structure = "symplectic" if coordinates == "qp" else ("second_order" if lift else "none")
+    return joined(layout, np.asfortranarray(q), np.asfortranarray(p), rows, coordinates, frame, fixed, structure)
+
+
+def reduced(model: Model, basis: Basis) -> ReducedModel:
+    """Project with the scene's outputs."""
+    return project(basis, model.system, make_outputs(model.scene, model.system), "hash")
+
+
+def force_of(model: Model) -> Array:
+    """The scene's force on the hand."""
+    return force_values(model.scene, model.system.layout.n_s, model.system.M_hand)
+
+
+def step_of(model: Model) -> float:
+    """The scene's time step."""
+    return model.scene.time_end / model.scene.time.steps
+
+
+def full_and_reduced(model: Model, basis: Basis) -> tuple[Trajectory, ReducedTrajectory, ReducedModel]:
+    """Both runs for the scene's force."""
+    rom = reduced(model, basis)
+    return simulate(model), run(rom.at(), step_of(model), force_of(model), allow_unstable=True), rom
+
+
+def distance(system: BlockSystem, a: Array, b: Array) -> float:
+    """|a - b|_F / |b|_F of local rows."""
+    sums = total(system.layout.comm, np.array([np.sum((a - b) ** 2), np.sum(b**2)]))
+    return float(np.sqrt(sums[0] / sums[1]))

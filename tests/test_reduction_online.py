@@ -1,0 +1,351 @@
+"""Running, storing and judging reduced models: against pyMOR, plain loops and dense matrices."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg
+from mpi4py import MPI
+
+from fem.build import build
+from fem.run import simulate
+from reduction.archive import load_model, save_model
+from reduction.errors import full_energy, projection_error, trajectory_errors
+from reduction.model import ModelError, SmallModel
+from reduction.online import Stepper, run, run_batch
+from reduction.propagator import propagator, rotation
+from tests.helpers import Array, close, gather_rows, gather_states, make_scene
+from tests.reduced import (
+    DAMPED,
+    FORCED,
+    KINDS,
+    TINY,
+    force_of,
+    model_of,
+    reduced,
+    step_of,
+    symplectic_basis,
+    whole_basis,
+)
+
+SMALL = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
+
+
+def small_of(model: Any, kind: tuple[Any, ...] = ("qp", "relative", True), pairs: int = 4) -> SmallModel:
+    coordinates, frame, fixed = kind
+    return reduced(model, symplectic_basis(model.system.layout, pairs, frame, fixed, coordinates)).at()
+
+
+def plain_loop(small: SmallModel, dt: float, force: Array, x: Array) -> Array:
+    """The midpoint rule as it is written, in the raw coordinates."""
+    op, states = small.operators, [x]
+    for u in force:
+        right = (op.E + dt / 2 * op.A) @ x + dt * (op.B @ u + small.f)
+        x = np.linalg.solve(op.E - dt / 2 * op.A, right)
+        states.append(x)
+    return np.array(states)
+
+
+def wiggle(steps: int, dt: float) -> Array:
+    t = dt * (np.arange(steps) + 0.5)
+    return np.stack([40 * np.cos(1.5 * t), 20 * np.cos(2.2 * t + 0.4)], axis=1)
+
+
+# --- trajectories
+
+
+@pytest.mark.serial  # imported on several ranks, pyMOR makes all but the first wait for its orders
+def test_same_trajectory_as_pymor(comm: MPI.Intracomm) -> None:
+    timestepping = pytest.importorskip("pymor.algorithms.timestepping")
+    iosys = pytest.importorskip("pymor.models.iosys")
+    model = model_of(comm, DAMPED)
+    dt, steps = 0.01, 40
+    for kind in KINDS:
+        small = small_of(model, kind)
+        op = small.operators
+        C = small.outputs.C_z + small.outputs.C_s @ op.S_q
+        lti = iosys.LTIModel.from_matrices(
+            op.A, op.B, C, E=op.E, T=dt * steps, time_stepper=timestepping.ImplicitMidpointTimeStepper(steps)
+        )
+        theirs = lti.solve(input="[40 * cos(1.5 * t[0]), 20 * cos(2.2 * t[0] + 0.4)]").to_numpy()
+        theirs = theirs if theirs.shape[0] == steps + 1 else theirs.T
+        own = run(small, dt, wiggle(steps, dt), allow_unstable=True)
+        # rounding of 40 steps; E of canonical models has condition 1e4
+        assert close(own.x, theirs) < 1e-10, kind
+        assert close(own.outputs, theirs @ C.T) < 1e-10, kind
+
+
+@pytest.mark.parametrize("steps", [1, 7, 8, 21])
+def test_blocks_of_steps_are_the_plain_rule(comm: MPI.Intracomm, steps: int) -> None:
+    model = model_of(comm, {"effects": {"gravity": {"g": [1.0, -9.0]}}})
+    dt = 0.013
+    for kind in KINDS:
+        small = small_of(model, kind)
+        x0 = np.cos(np.arange(small.N))
+        own = run(small, dt, wiggle(steps, dt), x0=x0, allow_unstable=True)
+        assert own.x.shape == (steps + 1, small.N)
+        assert close(own.times, dt * np.arange(steps + 1)) < 1e-15
+        assert close(own.x, plain_loop(small, dt, wiggle(steps, dt), x0)) < 1e-10, kind  # rounding, as above
+
+
+def test_a_prescribed_hand_is_the_force_that_carries_it(comm: MPI.Intracomm) -> None:
+    """u_n = M_hand (v_{n+1} - v_n) / dt reproduces the hand; the table's own positions differ by O(dt^2)."""
+    scene = make_scene(TINY, DAMPED, {"output": {"snapshots": "memory"}})
+    model = build(scene, comm)
+    full, dt = simulate(model), step_of(model)
+    u = np.diff(full.v_s, axis=0) / dt @ model.system.M_hand.T
+    for kind in KINDS:
+        if not kind[2]:
+            continue
+        small = small_of(model, kind)
+        tables = run(small, dt, hand=(full.q_s, full.v_s), allow_unstable=True)
+        forced = run(small, dt, u, allow_unstable=True)
+        assert close(tables.v_s, forced.v_s) < 1e-12  # sums of 30 terms
+        assert close(tables.x, forced.x) < 1e-10, kind  # rounding, as above
+        assert (tables.q_s == full.q_s).all()
+        assert 1e-9 < close(tables.q_s, forced.q_s) < 1e-2  # (dt / T)^2 = 1e-3
+    with pytest.raises(ModelError, match="cannot be prescribed"):
+        run(small_of(model, ("qp", "relative", False)), dt, hand=(full.q_s, full.v_s))
+
+
+def test_start_in_equilibrium_stays_there(comm: MPI.Intracomm) -> None:
+    model = model_of(comm, {"effects": {"gravity": {"g": [1.0, -9.0]}}})
+    for kind in KINDS:
+        small = small_of(model, kind)
+        if not kind[2]:
+            with pytest.raises(ModelError, match="fixed solid"):
+                small.equilibrium()
+            continue
+        x = small.equilibrium()
+        assert np.abs(x).max() > 1e-3
+        own = run(small, 0.01, np.zeros((200, 2)), x0=x, allow_unstable=True)
+        # rounding against the load; a (q, v) model may amplify it
+        assert close(own.x, np.tile(x, (201, 1))) < 1e-9, kind
+
+
+def test_one_step_at_a_time_is_the_run(comm: MPI.Intracomm) -> None:
+    model = model_of(comm, DAMPED)
+    dt, u = 0.01, wiggle(25, 0.01)
+    for kind in KINDS:
+        small = small_of(model, kind)
+        x0 = np.sin(np.arange(small.N))
+        own = run(small, dt, u, x0=x0, allow_unstable=True)
+        stepper = Stepper(small, dt, x0, allow_unstable=True)
+        assert close(stepper.outputs, own.outputs[0]) < 1e-12
+        outputs = np.array([stepper(force).copy() for force in u])
+        assert close(outputs, own.outputs[1:]) < 1e-11, kind  # rounding of powers of one matrix
+        assert close(stepper.state, own.x[-1]) < 1e-11, kind
+
+
+def test_a_batch_is_its_runs(comm: MPI.Intracomm) -> None:
+    model = model_of(comm, DAMPED)
+    rom = reduced(model, symplectic_basis(model.system.layout, 4, "relative", True))
+    (m,) = model.system.materials
+    many = [rom.at((replace(m, lam=lam, mu=mu),)) for lam, mu in ((30.0, 20.0), (50.0, 50.0), (500.0, 400.0))]
+    dt, u = 0.01, wiggle(21, 0.01)
+    for single, whole in zip(many, run_batch(many, dt, u), strict=True):
+        assert close(run(single, dt, u).x, whole.x) < 1e-12  # the same products in another order
+    forces = np.stack([u, 2 * u, -u])
+    for force, whole in zip(forces, run_batch(many[:1], dt, forces), strict=True):
+        assert close(run(many[0], dt, force).outputs, whole.outputs) < 1e-12
+    with pytest.raises(ModelError, match="do not fit"):
+        run_batch(many[:2], dt, forces)
+
+
+def test_wrong_inputs_are_named(comm: MPI.Intracomm) -> None:
+    small = small_of(model_of(comm))
+    with pytest.raises(ModelError, match="either"):
+        run(small, 0.01)
+    with pytest.raises(ModelError, match="time step"):
+        run(small, force=np.zeros((3, 2)))
+    with pytest.raises(ModelError, match=r"\(steps, 2\)"):
+        run(small, 0.01, np.zeros((3, 3)))
+    with pytest.raises(ModelError, match="steps \\+ 1"):
+        run(small, 0.01, hand=(np.zeros((3, 2)), np.zeros((4, 2))))
+    with pytest.raises(ModelError, match="another"):
+        run(propagator(small, 0.01), 0.02, np.zeros((3, 2)))
+
+
+# --- energy
+
+
+def test_rotations_keep_their_length() -> None:
+    angle, wide = np.linspace(0.02, 3.1, 500), np.longdouble
+    angle = angle[np.abs(np.cos(angle)) > 0.01]
+    c, s = rotation(angle)
+    length = c.astype(wide) ** 2 + s.astype(wide) ** 2 - 1
+    # plain rounding leaves 5e-17 in the median, 2e-16 at worst
+    assert np.abs(length).max() < 1e-16
+    if np.finfo(wide).eps < 1e-18:  # elsewhere a long double is no wider than a double
+        assert np.median(np.abs(length)) < 1e-18
+    assert np.abs(np.arctan2(s, c) - angle).max() < 1e-12  # 200 units in the last place at 1e-2
+    slow = np.geomspace(1e-9, 1e-2, 30)
+    c, s = rotation(slow)
+    assert np.abs(np.arctan2(s, c) / slow - 1).max() < 1e-12  # the bound of the docstring
+
+
+@pytest.mark.parametrize("frame", ["absolute", "relative"])
+def test_energy_is_constant_over_many_steps(comm: MPI.Intracomm, frame: str) -> None:
+    small = small_of(model_of(comm), ("qp", frame, True), 7)
+    x0 = np.zeros(small.N)
+    x0[4:] = np.cos(np.arange(small.N - 4))
+    energy = small.energy(run(small, 0.005, np.zeros((100_000, 2)), x0=x0).x)
+    # the issue's bound; rounding of 12500 products adds up at random to about 1e-14
+    assert np.abs(energy / energy[0] - 1).max() < 1e-12
+    stepper = Stepper(small, 0.005, x0)
+    for _ in range(2000):
+        stepper(np.zeros(2))
+    assert abs(small.energy(stepper.state) / energy[0] - 1) < 1e-13
+
+
+@pytest.mark.parametrize("two_way", [False, True])
+def test_energy_never_grows_with_damping(comm: MPI.Intracomm, two_way: bool) -> None:
+    model = model_of(comm, DAMPED, {"effects": {"reaction": two_way, "damping": {"beta": 0.002}}})
+    for kind in KINDS:
+        small = small_of(model, kind)
+        if kind[0] == "qv":
+            continue
+        x0 = np.cos(np.arange(small.N))
+        if not two_way:
+            # the hand at rest: its motion would do work on the tissue
+            x0 = x0 if not kind[2] else np.where(np.arange(small.N) < 4, 0.0, x0)
+        own = run(small, 0.01, np.zeros((400, 2)), x0=x0)
+        energy = small.total_energy(own.x) if (two_way or not kind[2]) else small.energy(own.x)
+        drop = np.diff(energy)
+        assert drop.max() <= 1e-14 * energy[0], kind  # rounding of the quadratic form
+        assert energy[-1] < 0.9 * energy[0], kind
+
+
+# --- time
+
+
+@pytest.mark.serial
+def test_online_speed(comm: MPI.Intracomm) -> None:
+    """600 steps below 1.5 ms and one step below 5 us at N = 30: the best of many tries, ten times slower than usual."""
+    model = model_of(comm)
+    small = small_of(model, pairs=13)
+    assert small.N == 30
+    step, u = propagator(small, 0.005), wiggle(600, 0.005)
+    stepper = Stepper(step)
+
+    def best(call: Any, count: int) -> float:
+        times = []
+        for _ in range(30):
+            begin = perf_counter()
+            for _ in range(count):
+                call()
+            times.append((perf_counter() - begin) / count)
+        return min(times)
+
+    assert best(lambda: run(step, force=u), 1) < 1.5e-3
+    assert best(lambda: stepper(u[0]), 200) < 5e-6
+
+
+# --- file
+
+
+def test_file_keeps_everything(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    model = model_of(comm, DAMPED, {"effects": {"gravity": {"g": [1.0, -9.0]}}})
+    layout = model.system.layout
+    alone = build(model.scene, MPI.COMM_SELF).system.layout
+    for kind in KINDS:
+        coordinates, frame, fixed = kind
+        rom = reduced(model, symplectic_basis(layout, 3, frame, fixed, coordinates))
+        path = mpi_tmp_path / f"{coordinates}{frame}{fixed}.h5"
+        save_model(rom, path)
+        again = load_model(path, layout, "hash")
+        online = load_model(path)
+        for other in (again, online):
+            assert other.materials == rom.materials
+            assert other.seconds == rom.seconds
+            assert (other.at().operators.A == rom.at().operators.A).all()
+            assert (other.at().f == rom.at().f).all()
+            assert other.outputs.names == rom.outputs.names
+        assert online.lift is None
+        x = np.cos(np.arange(rom.N))[:, None]
+        z, v = rom.reconstruct(rom.at(), x)
+        for mine, theirs in zip((z, v), again.reconstruct(again.at(), x), strict=True):
+            assert (mine == theirs).all()
+        # another number of ranks: every rank holds the whole mesh
+        z_alone, _ = (lambda m: m.reconstruct(m.at(), x))(load_model(path, alone))
+        assert close(gather_rows(alone, z_alone), gather_rows(layout, z)) < 1e-15  # the same numbers
+
+
+def test_files_that_do_not_fit_are_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    model = model_of(comm)
+    path = mpi_tmp_path / "model.h5"
+    save_model(reduced(model, symplectic_basis(model.system.layout, 3, "relative", True)), path)
+    with pytest.raises(ModelError, match="another scene"):
+        load_model(path, scene_hash="other")
+    with pytest.raises(ModelError, match="mesh of"):
+        load_model(path, model_of(comm, {"tissue": {"cells": [3, 6]}}).system.layout)
+    with pytest.raises(ModelError, match="another mesh"):
+        load_model(path, model_of(comm, {"tissue": {"size": [1.0, 1.9]}}).system.layout)
+    with pytest.raises(ModelError, match="cannot be read"):
+        load_model(mpi_tmp_path / "none.h5", model.system.layout)
+    bad = mpi_tmp_path / f"bad{comm.rank}.h5"
+    bad.write_bytes(b"not a file")
+    with pytest.raises(ModelError, match="cannot be read"):
+        load_model(bad)
+    bare = mpi_tmp_path / f"bare{comm.rank}.h5"
+    save_model(load_model(path), bare)
+    with pytest.raises(ModelError, match="no lift"):
+        load_model(bare, model.system.layout)
+
+
+# --- errors
+
+
+def test_errors_against_dense_matrices(comm: MPI.Intracomm) -> None:
+    model = model_of(comm, SMALL, FORCED, {"output": {"every": 3}})
+    layout, system = model.system.layout, model.system
+    full, dt = simulate(model), step_of(model)
+    snapshots = full.snapshots
+    T = gather_rows(layout, system.T)
+    z, v = np.split(gather_states(layout, snapshots.Z), 2)
+    energy = full_energy(system, snapshots)
+    norm = np.linalg.norm
+    X = np.concatenate([snapshots.q_s, z + T @ snapshots.q_s, snapshots.v_s, v + T @ snapshots.v_s])
+    for kind in KINDS:
+        coordinates, frame, fixed = kind
+        rom = reduced(model, symplectic_basis(layout, 3, frame, fixed, coordinates))
+        small = rom.at()
+        own = run(small, dt, force_of(model), allow_unstable=True)
+        errors = trajectory_errors(rom, small, own, system, snapshots)
+        q_s, v_s = own.q_s[::3].T, own.v_s[::3].T
+        z_r, v_r = (gather_rows(layout, part) for part in rom.reconstruct(small, own.x[::3].T, v_s))
+        X_r = np.concatenate([q_s, z_r + T @ q_s, v_s, v_r + T @ v_s])
+        relative = norm(np.concatenate([z_r - z, v_r - v])) / norm(np.concatenate([z, v]))
+        half = len(X) // 2
+        # sums in another order
+        assert abs(errors.error / (norm(X_r - X) / norm(X)) - 1) < 1e-10
+        assert abs(errors.error_deformation / relative - 1) < 1e-10
+        assert abs(errors.error_displacement / (norm((X_r - X)[:half]) / norm(X[:half])) - 1) < 1e-10
+        peak = np.abs(small.energy(own.x[::3]) - energy).max() / energy.max()
+        assert errors.error_energy == pytest.approx(peak, rel=1e-12)
+        # everything that the model can show
+        eye = np.eye(small.N)
+        z_c, v_c = (gather_rows(layout, part) for part in rom.reconstruct(small, eye))
+        S_q, S_v = small.operators.S_q, small.operators.S_v
+        V = np.concatenate([S_q, z_c + T @ S_q, S_v, v_c + T @ S_v])
+        floor = norm(X - V @ scipy.linalg.lstsq(V, X)[0]) / norm(X)
+        assert abs(projection_error(rom, small, system, snapshots) / floor - 1) < 1e-8  # least squares of condition 1e4
+        assert errors.error > floor
+
+
+def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
+    model = model_of(comm, SMALL)
+    snapshots = simulate(model).snapshots
+    rom = reduced(model, whole_basis(model.system.layout, "qp", "absolute", True))
+    own = run(rom.at(), step_of(model), force_of(model))
+    errors = trajectory_errors(rom, rom.at(), own, model.system, snapshots)
+    # rounding of 30 steps in other coordinates
+    assert max(errors.error, errors.error_deformation, errors.error_energy) < 1e-9
+    assert projection_error(rom, rom.at(), model.system, snapshots) < 1e-13
+    with pytest.raises(ModelError, match="reach step 30"):
+        trajectory_errors(rom, rom.at(), run(rom.at(), 0.1, np.zeros((5, 2))), model.system, snapshots)
