@@ -16,7 +16,7 @@ from mpi4py import MPI
 from fem.build import Model
 from fem.checkpoint import read_checkpoint, write_checkpoint
 from fem.drive import Drive, Force, ForceDrive, TableDrive
-from fem.errors import Interrupted, SolverError
+from fem.errors import Interrupted, SoftgraspError, SolverError
 from fem.midpoint import TissueMidpoint, TissueState
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
@@ -179,7 +179,9 @@ class Run:
             ts.solve(x)
         except PETSc.Error as error:
             cause = error.__cause__
-            text = str(cause) if isinstance(cause, SolverError) else f"PETSc error {error.ierr} ({cause})"
+            if cause is not None and not isinstance(cause, SoftgraspError):
+                raise cause from error  # a bug, perhaps on this rank alone: the command must end all ranks
+            text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
             raise SolverError(f"step {self.reached + 1} of {self.steps}: {text}") from error
         if self.reached != step:
             raise SolverError(

@@ -1,0 +1,170 @@
+"""Hard cases of the hand's Riccati equation: weights of any size, hardly any damping, outputs that see nothing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import scipy.linalg
+
+from fem.petsc import Array
+from lqr.dense import DenseRiccati, gather_tissue, relative_space
+from lqr.diagnose import diagnose
+from lqr.identities import translation_defect, velocity_defect
+from lqr.newton import NewtonADI
+from lqr.problem import RiccatiProblem, RiccatiSolution
+from study.control_problem import make_problem
+from study.hard_rows import Family, Outcome, Row, make, ours, plain, thin
+
+RESIDUAL = 1e-6  # of the low-rank solver, relative to |C'QC|
+EXACT = "a hundred times the tolerance of the solver on the residual"
+
+
+@cache
+def problem_of(cells: str = "[3, 6]", beta: float = 0.002, *more: str) -> RiccatiProblem:
+    """The paper's control problem on a small mesh. Not collective."""
+    damping = f"effects={{damping={{kind='kelvin-voigt', beta={beta!r}}}}}" if beta else "effects={}"
+    return make_problem(make("paper_lqr", f"tissue.cells={cells}", damping, *more))
+
+
+def identities(problem: RiccatiProblem, solution: RiccatiSolution) -> float:
+    """Worst defect of the two identities that the exact gain obeys for every mesh and damping. Not collective."""
+    return max(translation_defect(problem, solution), velocity_defect(problem, solution) or 0.0)
+
+
+def dense(problem: RiccatiProblem) -> float:
+    """Diagnose, solve densely, and check the exact identities. Not collective.
+
+    Raises:
+        ControlError, SolverError: there is no gain, or none within the tolerance.
+    """
+    diagnose(problem).require()
+    return identities(problem, DenseRiccati().solve(problem))
+
+
+def low_rank(problem: RiccatiProblem) -> float:
+    """The same by Newton's method with low-rank ADI. Not collective.
+
+    Raises:
+        ControlError, SolverError: there is no gain, or none within the tolerance.
+    """
+    diagnose(problem).require()
+    return identities(problem, NewtonADI(tol=1e-8).solve(problem))
+
+
+def paper_matrices(problem: RiccatiProblem) -> tuple[Array, Array, Array, Array, Array]:
+    """E, A, B, C of the paper in absolute displacements [q_s, v_s, q_e, v_e], and T. Not collective.
+
+    Raises:
+        ValueError: more than one rank.
+    """
+    space, tissue = relative_space(problem), gather_tissue(problem)
+    if space is None or tissue is None:
+        raise ValueError("the textbook way runs on one rank")
+    n_s, n = problem.layout.n_s, len(tissue.M)
+    L, R = np.eye(len(space.E)), np.eye(len(space.E))
+    q, v = slice(2 * n_s, 2 * n_s + n), slice(2 * n_s + n, None)
+    L[q, :n_s], L[v, n_s : 2 * n_s] = -tissue.T, -tissue.T
+    R[q, :n_s] = tissue.T
+    return R @ space.E @ L, R @ space.A @ L, space.B, space.C @ L, tissue.T
+
+
+def textbook(problem: RiccatiProblem) -> Outcome:
+    """SciPy's solver on the paper's matrices as they are; defect of the same identities. Not collective.
+
+    The remark tells when it hands out a gain whose closed loop does not decay.
+    """
+    E, A, B, C, T = paper_matrices(problem)
+    X = scipy.linalg.solve_continuous_are(A, B, C.T @ problem.Q @ C, problem.R, e=E)
+    K = -np.linalg.solve(problem.R, B.T @ X @ E)
+    n_s = problem.layout.n_s
+    one, none, nothing = np.eye(n_s), np.zeros((n_s, n_s)), np.zeros_like(T)
+    x, v = np.vstack([one, none, T, nothing]), np.vstack([none, one, nothing, T])
+    wanted, start = problem.C_s.T @ problem.Q @ problem.C_s, E @ x
+    first = np.linalg.norm((K @ x).T @ problem.R @ (K @ x) - wanted) / np.linalg.norm(wanted)
+    cost = start.T @ X @ start
+    second = np.linalg.norm((K @ x).T @ problem.R @ (K @ v) - cost) / np.linalg.norm(cost)
+    abscissa = float(scipy.linalg.eigvals(A + B @ K, E).real.max())
+    text = "" if abscissa < 0 else f"closed loop grows by {abscissa:.0e}/s, no warning"
+    return Outcome(float(max(first, second)) if np.isfinite(X).all() else math.nan, text)
+
+
+# --- weights
+
+
+def weight_rows(quick: bool) -> list[Row]:
+    """Input weights R from 1e-12 to 1e12."""
+    problem, rows = problem_of(), []
+    for power in thin([-12, -8, -4, -2, 0, 2, 4, 8, 12], quick):
+        r = 10.0**power
+        case = replace(problem, R=r * problem.R)
+        scipy_ = plain(textbook, case)
+        rows.append(Row(f"R = {r:.0e}", r, ours(dense, case), scipy_, 1e-6, EXACT, may_refuse=r > 1e10, group="dense"))
+        mine = ours(low_rank, case)
+        rows.append(Row(f"R = {r:.0e}, low rank", r, mine, scipy_, RESIDUAL, EXACT, may_refuse=True, group="low rank"))
+    return rows
+
+
+def output_rows(quick: bool) -> list[Row]:
+    """Outputs that are weighted hugely, singularly or not at all, that see little, or nothing of what moves."""
+    problem, undamped = problem_of(), problem_of("[3, 6]", 0.0)
+    hand = problem_of("[3, 6]", 0.002, "control.outputs=[{kind='hand'}]")
+    hand_undamped = problem_of("[3, 6]", 0.0, "control.outputs=[{kind='hand'}]")
+    cases: list[tuple[str, RiccatiProblem, bool]] = [
+        ("Q = 1e12", replace(problem, Q=1e12 * problem.Q), False),
+        ("Q = diag(1, 1e-8)", replace(problem, Q=np.diag([1.0, 1e-8])), False),
+        ("Q = diag(1, 0): nobody sees y", replace(problem, Q=np.diag([1.0, 0.0])), True),
+        ("Q = 0", replace(problem, Q=np.zeros((2, 2))), True),
+        ("only deformation is seen", replace(problem, C_s=np.zeros_like(problem.C_s)), True),
+        ("only the hand is seen, damped tissue", hand, False),
+        ("only the hand is seen, undamped tissue", hand_undamped, True),
+        ("the tip is seen, undamped tissue", undamped, True),
+        ("Q with a negative eigenvalue", replace(problem, Q=np.diag([1.0, -1.0])), True),
+        ("R singular", replace(problem, R=np.diag([1.0, 0.0])), True),
+    ]
+    rows = []
+    for i, (name, case, refuse) in enumerate(cases[::2] if quick else cases):
+        reason = "there is no stabilising feedback, or no minimum" if refuse else EXACT
+        rows.append(Row(name, i + 1, ours(dense, case), plain(textbook, case), None if refuse else 1e-6, reason))
+    return rows
+
+
+# --- damping
+
+
+def lqr_damping_rows(quick: bool) -> list[Row]:
+    """Kelvin-Voigt damping down to none: the gain must be right, or the modes that are lost must be named."""
+    rows = []
+    for beta in [2e-3, 2e-6] if quick else [0.2, 0.02, 2e-3, 2e-4, 2e-5, 2e-6, 2e-8, 2e-10, 2e-14]:
+        case = problem_of("[3, 6]", beta)
+        scipy_, name = plain(textbook, case), f"beta = {beta:.0e} s"
+        weak = beta < 1e-5
+        rows.append(Row(name, beta, ours(dense, case), scipy_, 1e-6, EXACT, may_refuse=weak, group="dense"))
+        mine, may = ours(low_rank, case), beta < 1e-3
+        rows.append(Row(f"{name}, low rank", beta, mine, scipy_, RESIDUAL, EXACT, may_refuse=may, group="low rank"))
+    case = problem_of("[3, 6]", 0.0)
+    reason = "without damping X is not of low rank and high modes are lost to rounding"
+    rows.append(Row("undamped", 0.0, ours(low_rank, case), plain(textbook, case), None, reason, group="low rank"))
+    if not quick:
+        paper = make_problem(make("paper_lqr_undamped"))
+        slow = Outcome(None, "not run: a minute of SciPy at 880 states")
+        name = "paper_lqr_undamped, 880 states"
+        rows.append(Row(name, 0.0, ours(low_rank, paper), slow, None, reason, group="low rank"))
+    return rows
+
+
+FAMILIES = (
+    Family("weights", "Input weights from 1e-12 to 1e12", "R", "defect of the gain's identities",
+           "SciPy on the paper's matrices",
+           "Balanced energy coordinates stand twenty-four decades of weights; the raw matrices do not.", weight_rows),
+    Family("outputs", "Weights and outputs that see too little", "case", "defect of the gain's identities",
+           "SciPy on the paper's matrices",
+           "Where no feedback exists the plain way may return a number all the same; ours names what is not seen.",
+           output_rows, axis="listed"),
+    Family("lqr_damping", "Riccati equations with hardly any damping", "Kelvin-Voigt time beta [s]",
+           "defect of the gain's identities", "SciPy on the paper's matrices",
+           "As damping goes, poles meet the axis: the gain stays right as long as there is one, then modes are named.",
+           lqr_damping_rows),
+)  # fmt: skip
