@@ -9,6 +9,8 @@ every rank sees the same numbers. Limits, measured at sigma_j = 10^(-16 j / 599)
             scalapack when all are wanted                         1e-10
     gram    X' X and its eigenvalues (method of snapshots),       1e-6; nothing below 6e-8, so never the default
             fast, then one Rayleigh-Ritz step
+
+When a rank has fewer rows than the matrix has columns, it is small: each rank's QR and rank 0 do it, for tsqr and svd.
 """
 
 from __future__ import annotations
@@ -109,8 +111,9 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
     else:
         # LAPACK's own bound on an absolute error in sigma, with its usual factor sqrt of the size
         floor = EPS * max(X.shape[1], 100) ** 0.5
-        if rows <= X.shape[1]:
-            Q, R = _gathered(comm, X)
+        if comm.allreduce(X.shape[0], MPI.MIN) < X.shape[1]:
+            # SLEPc loses columns of Q when a rank has fewer rows than columns and the snapshots are deficient
+            Q, R = _flat(comm, X)
         elif engine == "tsqr" or X.shape[1] < comm.size:  # ScaLAPACK needs a column for every rank
             Q, R = _tsqr(comm, X, rows)
         else:
@@ -185,16 +188,16 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
     return Q, total(comm, Q.T @ X)
 
 
-def _gathered(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
-    """QR of a matrix with no more rows than columns, on rank 0: it is small."""
-    parts = comm.gather(X)
+def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
+    """QR of what each rank has, then of the stacked triangles on rank 0: for few rows."""
+    Q_local, R_local = np.linalg.qr(X)
+    parts = comm.gather(R_local)
     blocks: list[Array] | None = None
     R: Array | None = None
     if parts is not None:
         Q, R = np.linalg.qr(np.vstack(parts))
         blocks = np.split(Q, np.cumsum([len(p) for p in parts])[:-1])
-    mine = comm.scatter(blocks)
-    return np.asfortranarray(mine), np.asarray(comm.bcast(R))
+    return np.asfortranarray(Q_local @ comm.scatter(blocks)), np.asarray(comm.bcast(R))
 
 
 def _triangle(comm: MPI.Intracomm, X: Array) -> Array:

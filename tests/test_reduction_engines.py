@@ -1,17 +1,21 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
+import typer
 from mpi4py import MPI
+from typer.testing import CliRunner
 
 from fem.petsc import total
 from reduction.engines import ENGINES, EngineName, factor, magnitude, on_root, small_svd
 from reduction.states import BasisError
 from reduction.svd_like import balanced, form, svd_like_pairs
 from reduction.truncation import Columns, Part, Truncation, allocate, counts_of, needed
+from study import bench_bases
 from study.bench_bases import known_matrix, parse_shapes, reach, spectrum_of
 from tests.helpers import Array, close, same_everywhere
 
@@ -102,6 +106,22 @@ def test_deficient_snapshots_have_the_right_rank(comm: MPI.Intracomm, engine: En
     assert close(s[:rank] * f.scale, true[:rank]) < 1e-13  # well conditioned
     U = whole(comm, f.Q @ u[:, :rank])
     assert close(U @ (U.T @ full), full) < 1e-12  # same span
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("rows", [30, 61, 119, 120, 200])
+def test_few_rows_a_rank_and_deficient_snapshots_keep_q_orthonormal(
+    comm: MPI.Intracomm, engine: EngineName, rows: int
+) -> None:
+    full = decaying(rows, 24, 12, rank=9) @ np.eye(24, 40)
+    sizes = [rows, 0, 0] if rows == 30 else [rows // 2, rows - rows // 2, 0]  # a rank may have none
+    sizes = [*sizes[: comm.size - 1], rows - sum(sizes[: comm.size - 1])]
+    start = sum(sizes[: comm.rank])
+    f = factor(comm, np.asfortranarray(full[start : start + sizes[comm.rank]]), engine)
+    gram = total(comm, f.Q.T @ f.Q)
+    assert np.abs(gram - np.eye(len(gram))).max() < 1e-13  # rounding of a QR
+    limit = 1e-7 if engine == "gram" else 1e-13  # its floor; rounding
+    assert np.abs(f.scale * whole(comm, f.Q) @ f.R - full).max() < limit
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -311,5 +331,34 @@ def test_rules_that_make_no_sense_are_refused(rule: dict[str, Any]) -> None:
 
 def test_shapes_of_the_benchmark() -> None:
     assert parse_shapes("100x10, 200x4") == [(100, 10), (200, 4)]
-    with pytest.raises(Exception, match="is no shape"):
+    with pytest.raises(typer.BadParameter, match="is no shape"):
         parse_shapes("10x100")
+
+
+def test_benchmark_measures_every_engine(comm: MPI.Intracomm) -> None:
+    row = bench_bases.measure(comm, 900, 200, 1)
+    names = {"tsqr", "svd", "svd_all", "gram", "psd_tsqr", "psd_gram"}
+    assert set(row["engines"]) == (names | {"numpy", "psd_numpy"} if comm.size == 1 else names)
+    for name, found in row["engines"].items():
+        assert found["off"] < 1e-12, name  # rounding
+        assert found["seconds"] > 0
+        assert found["rough"] <= found["right"] < (1e-4 if name != "svd" else 0.01), name
+    assert bench_bases.missed([row]) == []
+    row["engines"]["tsqr"]["right"] = 2e-10
+    assert "goal 1e-10" in bench_bases.missed([row])[0]
+
+
+def test_benchmark_prints_one_table_and_fails_with_its_workers(
+    mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        bench_bases, "launch", lambda n, m, k, repeats: {"rows": n, "columns": m, "ranks": k, "error": "no"}
+    )
+    for variable in bench_bases.IN_MPI_JOB:
+        monkeypatch.delenv(variable, raising=False)
+    folder = mpi_tmp_path / str(MPI.COMM_WORLD.rank)
+    done = CliRunner().invoke(bench_bases.app, ["--sizes", "40x8", "--ranks", "1", "--out", str(folder)])
+    assert done.exit_code == 1
+    assert "40 x 8, 1 rank(s): no" in done.stdout
+    assert (folder / "bench_bases.json").is_file()
+    assert (folder / "bench_bases.csv").read_text().startswith("engine,rows,columns,ranks,seconds")

@@ -1,0 +1,59 @@
+"""What a run costs, and what the Riccati equation says it costs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fem.petsc import Array, total
+from lqr.gain import PlantState
+from lqr.problem import RiccatiProblem, RiccatiSolution
+
+
+def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: float) -> Array:
+    """J(t_n) = sum_k dt (y_mid' Q y_mid + u_k' R u_k), the midpoint quadrature of the run's own step.
+
+    With u = K x_mid and X from the Riccati equation every step satisfies, exactly and for every dt,
+
+        V(x_{n+1}) - V(x_n) = -(J(t_{n+1}) - J(t_n)),    V(x) = x'E'XE x,
+
+    because the midpoint rule keeps quadratic balances [HLW06]; so J(T) + V(x(T)) = V(x(0)) up to the residual of X.
+    Input that is sampled and held costs more: by the integral of |u - K x|^2 weighted with R, second order in the
+    length of the tick. Not collective.
+
+    Args:
+        outputs: y - y_bar at the grid points [m], (steps + 1, p).
+        inputs: u - u_bar of each step [N, N m], (steps, n_s).
+        Q: (p, p).
+        R: (n_s, n_s).
+        dt: step [s].
+
+    Returns:
+        J at the grid points, (steps + 1,), J[0] = 0.
+    """
+    y = (outputs[1:] + outputs[:-1]) / 2
+    rate = np.einsum("ki,ij,kj->k", y, Q, y, optimize=True) + np.einsum("ki,ij,kj->k", inputs, R, inputs, optimize=True)
+    return np.concatenate([[0.0], dt * np.cumsum(rate)])
+
+
+def descriptor_times(problem: RiccatiProblem, x: PlantState) -> tuple[Array, Array]:
+    """E x as hand rows (2 n_s,) and local tissue rows (2 n_local,). Collective."""
+    system = problem.system
+    hand = problem.M_s @ x.v_s
+    if system.two_way:
+        hand = hand + total(problem.layout.comm, system.G.T @ x.v_z)
+    v, y = system.M_ee.createVecs()
+    v.array_w[:] = x.v_z
+    system.M_ee.mult(v, y)
+    momentum = np.array(y.array_r) + system.G @ x.v_s
+    v.destroy()
+    y.destroy()
+    return np.concatenate([x.q_s, hand]), np.concatenate([x.z, momentum])
+
+
+def predicted_cost(problem: RiccatiProblem, solution: RiccatiSolution, error: PlantState) -> float:
+    """V = e'E'XE e = |Z'E e|^2 for e = x - x_bar: the cost from here to infinity. Collective."""
+    hand, tissue = descriptor_times(problem, error)
+    n = problem.layout.n_local
+    product = total(problem.layout.comm, solution.Z_z.T @ tissue[:n] + solution.Z_v.T @ tissue[n:])
+    product += solution.Z_s.T @ hand
+    return float(product @ product)

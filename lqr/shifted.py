@@ -1,0 +1,321 @@
+"""One tissue solve a shift: S(p) = p^2 M_ee - p D_ee + K_ee, complex symmetric, of the order n_e."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from fem.errors import SolverError, agree
+from fem.petsc import Array, PETSc, petsc_options
+from fem.system import BlockSystem
+
+Complex = NDArray[np.complex128]
+PREFIX = "softgrasp_shifted_"
+# Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
+# in complex numbers needs less than half the time of MUMPS on the real form of twice the order. Beyond, a whole factor
+# on each rank costs too much memory and MUMPS is the faster one.
+GATHER_LIMIT = {2: 150_000, 3: 12_000}
+
+
+class ShiftedTissue(Protocol):
+    """Solves S(p) B = F for distributed F.
+
+    Attributes:
+        name: gathered or distributed.
+        seconds: time by stage, factor and solve [s].
+        factors: factorisations made by this rank's communicator.
+    """
+
+    name: str
+    seconds: dict[str, float]
+    factors: int
+
+    def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
+        """Local rows of S(p)^{-1} F, (n_local, k). Collective.
+
+        Args:
+            p: shift; 0 gives K_ee^{-1}.
+            F: local rows.
+            ahead: shifts that will probably come next.
+        """
+
+    def destroy(self) -> None:
+        """Free the factors. Collective."""
+
+
+def make_shifted(system: BlockSystem, wanted: str = "auto") -> ShiftedTissue:
+    """The solver for a size: ``gathered`` or ``distributed``. Collective.
+
+    Raises:
+        SolverError: the name is unknown.
+    """
+    name = wanted
+    if wanted == "auto":
+        small = system.layout.n_e <= GATHER_LIMIT[system.layout.dimension]
+        name = "gathered" if small else "distributed"
+    if name == "gathered":
+        return GatheredTissue(system)
+    if name == "distributed":
+        return DistributedTissue(system)
+    raise SolverError(f"the shifted solver {wanted!r} is unknown; choose auto, gathered or distributed")
+
+
+class GatheredTissue:
+    """Every rank holds all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
+
+    SuperLU in complex numbers with diagonal pivots and one fill-reducing order for all shifts.
+
+    Args:
+        system: operators.
+    """
+
+    name = "gathered"
+
+    def __init__(self, system: BlockSystem) -> None:
+        layout = system.layout
+        self.comm, self.n_local = layout.comm, layout.n_local
+        self.counts = np.array(self.comm.allgather(layout.n_local))
+        K = self._gather(system.K_ee)
+        lu = scipy.sparse.linalg.splu(K, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_SYMMETRIC)
+        self.order: NDArray[np.int64] = np.argsort(lu.perm_c)
+        del lu
+        self.K, self.M = self._permute(K), self._permute(self._gather(system.M_ee))
+        damping = system.damping
+        self.alpha, self.beta = damping.alpha, damping.beta
+        self.D = None if damping.matrix is None else self._permute(self._gather(damping.matrix))
+        parts = [self.K, self.M] + ([] if self.D is None else [self.D])
+        self.same = all(np.array_equal(A.indices, self.K.indices) for A in parts)
+        self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
+        self.seconds = {"factor": 0.0, "solve": 0.0}
+        self.factors = 0
+
+    def _gather(self, A: PETSc.Mat) -> scipy.sparse.csc_matrix:
+        """All rows on every rank; the matrix is symmetric, so its rows serve as columns."""
+        indptr, columns, values = A.getValuesCSR()
+        parts = self.comm.allgather((np.diff(indptr), columns, values))
+        lengths, columns, values = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+        n = len(lengths)
+        return scipy.sparse.csc_matrix((values, columns.astype(np.int32), indptr), shape=(n, n))
+
+    def _permute(self, A: scipy.sparse.csc_matrix) -> scipy.sparse.csc_matrix:
+        result = A[self.order][:, self.order].tocsc()
+        result.sort_indices()
+        return result
+
+    def _matrix(self, p: complex) -> scipy.sparse.csc_matrix:
+        m, k = p * p - p * self.alpha, 1.0 - p * self.beta
+        if not self.same:
+            S = k * self.K + m * self.M
+            return (S if self.D is None else S - p * self.D).tocsc()
+        data = k * self.K.data + m * self.M.data
+        if self.D is not None:
+            data = data - p * self.D.data
+        return scipy.sparse.csc_matrix((data, self.K.indices, self.K.indptr), shape=self.K.shape)
+
+    def _factor(self, p: complex) -> scipy.sparse.linalg.SuperLU:
+        S = self._matrix(p if p.imag else p.real)
+        try:
+            return scipy.sparse.linalg.splu(S, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
+        except RuntimeError as error:
+            raise SolverError(f"the factorisation of S(p) failed at the shift p = {p:.4g} ({error})") from error
+
+    def _prepare(self, shifts: Sequence[complex]) -> None:
+        """Factor up to one shift a rank. Collective."""
+        wanted = list(dict.fromkeys(shifts))[: self.comm.size]
+        self.cache = {p: (rank, None) for rank, p in enumerate(wanted)}
+        if self.comm.size == 1:
+            self.cache[wanted[0]] = (0, self._factor(wanted[0]))
+        else:
+            with agree(self.comm):
+                if self.comm.rank < len(wanted):
+                    p = wanted[self.comm.rank]
+                    self.cache[p] = (self.comm.rank, self._factor(p))
+        self.factors += len(wanted)
+
+    def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
+        """Local rows of S(p)^{-1} F, (n_local, k); complex even where p is real. Collective.
+
+        Args:
+            p: shift; 0 gives K_ee^{-1}.
+            F: local rows.
+            ahead: shifts that will probably come next, for the other ranks.
+
+        Raises:
+            SolverError: a pivot vanishes.
+        """
+        p = complex(p)
+        begin = time.perf_counter()
+        if p not in self.cache:
+            self._prepare([p, *(complex(q) for q in ahead)])
+        middle = time.perf_counter()
+        owner, lu = self.cache[p]
+        result = (
+            _lu_solve(lu, F, self.order, p.imag == 0)
+            if self.comm.size == 1
+            else self._solve_on(owner, lu, F, p.imag == 0)
+        )
+        self.seconds["factor"] += middle - begin
+        self.seconds["solve"] += time.perf_counter() - middle
+        return result
+
+    def _solve_on(self, owner: int, lu: scipy.sparse.linalg.SuperLU | None, F: Array | Complex, real: bool) -> Complex:
+        """Rows to the owner of the factor, solve there, rows back. Collective."""
+        k = F.shape[1]
+        local = np.ascontiguousarray(F, dtype=complex)
+        mine = self.comm.rank == owner
+        whole = np.empty((int(self.counts.sum()), k), dtype=complex) if mine else None
+        sizes = self.counts * k
+        self.comm.Gatherv(local, None if whole is None else [whole, sizes], root=owner)
+        if whole is not None and lu is not None:
+            whole = np.ascontiguousarray(_lu_solve(lu, whole, self.order, real))
+        result = np.empty((self.n_local, k), dtype=complex)
+        self.comm.Scatterv(None if whole is None else [whole, sizes], result, root=owner)
+        return result
+
+    def destroy(self) -> None:
+        """Free the factors. Not collective."""
+        self.cache.clear()
+
+
+_SYMMETRIC = {"SymmetricMode": True, "Equil": False}
+
+
+def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:
+    """Solve with a factor of the permuted matrix; real factors take real and imaginary part one after the other."""
+    right = F[order]
+    result = np.empty(F.shape, dtype=complex)
+    if not real:
+        result[order] = lu.solve(np.asfortranarray(right, dtype=complex))
+    elif np.iscomplexobj(right):
+        result.real[order] = lu.solve(np.asfortranarray(right.real))
+        result.imag[order] = lu.solve(np.asfortranarray(right.imag))
+    else:
+        result[order] = lu.solve(np.asfortranarray(right))
+    return result
+
+
+class DistributedTissue:
+    """MUMPS on the symmetric real form of twice the order, [X, -Y; -Y, -X] for S = X + iY, unknowns interleaved.
+
+    One matrix object for all shifts: the symbolic factorisation is made once. Collective throughout.
+
+    Args:
+        system: operators.
+    """
+
+    name = "distributed"
+
+    def __init__(self, system: BlockSystem) -> None:
+        layout = system.layout
+        self.comm, self.n_local, self.n_e = layout.comm, layout.n_local, layout.n_e
+        self.indptr, self.columns, self.K = system.K_ee.getValuesCSR()
+        self.M = self._values(system.M_ee)
+        damping = system.damping
+        self.alpha, self.beta = damping.alpha, damping.beta
+        self.D = None if damping.matrix is None else self._values(damping.matrix)
+        self.seconds = {"factor": 0.0, "solve": 0.0}
+        self.factors = 0
+        self.shift: complex | None = None
+        self._set_up(layout.comm)
+
+    def _values(self, A: PETSc.Mat) -> Array:
+        indptr, columns, values = A.getValuesCSR()
+        with agree(self.comm):
+            if not (np.array_equal(indptr, self.indptr) and np.array_equal(columns, self.columns)):
+                raise SolverError("mass, stiffness and damping have different sparsity patterns; assemble them on one")
+        return np.asarray(values)
+
+    def _set_up(self, comm: MPI.Intracomm) -> None:
+        n = self.n_local
+        lengths = np.repeat(2 * np.diff(self.indptr), 2)
+        self.real_indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+        # rows 2i and 2i + 1 have the same columns: 2j and 2j + 1 for every j of row i
+        pair = (2 * np.repeat(self.columns, 2).reshape(-1, 2) + [0, 1]).astype(np.int32)
+        entry = np.repeat(np.arange(n), np.diff(self.indptr))
+        first = self.real_indptr[2 * entry] + 2 * (np.arange(len(entry)) - self.indptr[entry])
+        second = self.real_indptr[2 * entry + 1] + 2 * (np.arange(len(entry)) - self.indptr[entry])
+        self.at = (first, first + 1, second, second + 1)
+        self.real_columns = np.empty(int(self.real_indptr[-1]), dtype=np.int32)
+        for position, column in zip(self.at, (pair[:, 0], pair[:, 1]) * 2, strict=True):
+            self.real_columns[position] = column
+        sizes = ((2 * n, 2 * self.n_e), (2 * n, 2 * self.n_e))
+        data = self._data(0.0)
+        self.S = PETSc.Mat().createAIJ(sizes, csr=(self.real_indptr, self.real_columns, data), comm=comm)
+        self.S.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.ksp = PETSc.KSP().create(comm)
+        self.ksp.setOptionsPrefix(PREFIX)
+        self.ksp.setOperators(self.S)
+        self.ksp.setType("preonly")
+        pc = self.ksp.getPC()
+        pc.setType("cholesky")  # LDL' for an indefinite matrix
+        pc.setFactorSolverType("mumps")
+        # compressed ordering of 2 x 2 pivots: two to three times faster on these matrices than the default
+        with petsc_options(PREFIX, {"mat_mumps_icntl_12": 1, "mat_mumps_icntl_14": 40}):
+            self.ksp.setFromOptions()
+
+    def _data(self, p: complex) -> Array:
+        m, k = p * p - p * self.alpha, 1.0 - p * self.beta
+        S = np.asarray(k * self.K + m * self.M, dtype=complex)
+        if self.D is not None:
+            S -= p * self.D
+        data = np.empty(int(self.real_indptr[-1]))
+        for position, value in zip(self.at, (S.real, -S.imag, -S.imag, -S.real), strict=True):
+            data[position] = value
+        return data
+
+    def _factor(self, p: complex) -> None:
+        self.S.setValuesCSR(self.real_indptr, self.real_columns, self._data(p))
+        self.S.assemble()
+        self.ksp.setOperators(self.S)  # without it setUp takes the old factor for good
+        try:
+            self.ksp.setUp()
+        except PETSc.Error as error:
+            raise SolverError(f"MUMPS failed at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
+        if self.ksp.getPC().getFailedReason():
+            raise SolverError(f"MUMPS failed at the shift p = {p:.4g}: S(p) is singular or memory ran out")
+        self.shift = p
+        self.factors += 1
+
+    def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
+        """Local rows of S(p)^{-1} F, (n_local, k). Collective.
+
+        Args:
+            p: shift; 0 gives K_ee^{-1}.
+            F: local rows.
+            ahead: not used.
+
+        Raises:
+            SolverError: the factorisation fails.
+        """
+        p = complex(p)
+        begin = time.perf_counter()
+        if p != self.shift:
+            self._factor(p)
+        middle = time.perf_counter()
+        n, k = self.n_local, F.shape[1]
+        right = np.empty((2 * n, k), order="F")
+        right[0::2], right[1::2] = F.real, -F.imag
+        sizes = ((2 * n, 2 * self.n_e), (None, k))
+        answer = np.zeros((2 * n, k), order="F")
+        B = PETSc.Mat().createDense(sizes, array=right, comm=self.S.comm)
+        X = PETSc.Mat().createDense(sizes, array=answer, comm=self.S.comm)
+        self.ksp.getPC().getFactorMatrix().matSolve(B, X)
+        result = answer[0::2] + 1j * answer[1::2]
+        B.destroy()
+        X.destroy()
+        self.seconds["factor"] += middle - begin
+        self.seconds["solve"] += time.perf_counter() - middle
+        return result
+
+    def destroy(self) -> None:
+        """Free matrix and factor. Collective."""
+        self.ksp.destroy()
+        self.S.destroy()

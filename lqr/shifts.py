@@ -1,0 +1,159 @@
+"""Shifts of ADI and RADI: closed-loop poles of the modal problem, then clipped Ritz values in the energy product."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+
+from fem.petsc import Array, total
+from lqr.adjoint import Right
+from lqr.plant import Block, Plant
+
+WINDOW = 12  # blocks of Z whose Ritz values give the next shifts
+BATCH = 8  # solves between two projections
+LOWEST = 1e-2  # of the smallest closed-loop frequency: a Ritz value nearer to the hand's zero poles is spurious
+HIGHEST = 10.0  # of the largest frequency
+SHARP = 0.05  # damping ratio below which a mode needs a shift of its own; others share the Ritz values
+AXIS = 1e-9  # a shift keeps at least this share of its modulus away from the imaginary axis
+
+
+@dataclass(frozen=True)
+class ShiftRange:
+    """Moduli that a shift may have [1/s], and the estimate of the highest frequency."""
+
+    low: float
+    high: float
+    fastest: float
+
+    def clip(self, p: complex) -> complex:
+        """Nearest admissible shift in the left half plane, Im >= 0. Not collective."""
+        size = abs(p)
+        if not np.isfinite(size) or size == 0:
+            return complex(-self.low)
+        p = complex(-abs(p.real), abs(p.imag)) * (min(max(size, self.low), self.high) / size)
+        if p.imag <= 1e-7 * abs(p):  # a pair this flat is a double real shift to rounding of 1 / Im p
+            return complex(p.real, 0.0)
+        return complex(min(p.real, -AXIS * abs(p)), p.imag)
+
+
+def shift_range(plant: Plant, poles: Sequence[complex] | np.ndarray) -> ShiftRange:
+    """Range between the slowest pole of the modal problem and the fastest tissue mode. Collective.
+
+    The largest frequency is estimated from the diagonals: omega_max^2 >= max K_ii / M_ii, within a factor of about 4
+    for Lagrange elements.
+    """
+    system = plant.system
+    K, M = system.K_ee.getDiagonal(), system.M_ee.getDiagonal()
+    local = float((K.array_r / M.array_r).max(initial=0.0))
+    largest = np.sqrt(plant.comm.allreduce(local, op=MPI.MAX))
+    K.destroy()
+    M.destroy()
+    fastest = max(largest, system.damping.beta * largest**2)
+    slowest = float(np.min(np.abs(poles))) if len(poles) else 1e-3 * largest
+    return ShiftRange(LOWEST * slowest, HIGHEST * fastest, float(largest))
+
+
+def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np.ndarray, Array]:
+    """Ritz values of (A - B K)' on span E'V in the energy inner product, and how much of the residual lies on each.
+
+    H^{-1}, H = blkdiag(1, M_s, K_ee, M_ee): without feedback the plant is dissipative in this product, so no Ritz value
+    is unstable. Collective.
+
+    Args:
+        plant: the plant.
+        V: columns of Z, costate form.
+        W: residual factor.
+        gain: K', None for K = 0.
+
+    Returns:
+        The values, and the norm of the component of W along each Ritz vector.
+    """
+    s, k = plant.n_s, V.columns
+    E_V, A_V = plant.mass_adjoint(V), plant.plant_adjoint(V)
+    hand, tall = A_V.hand, A_V.tall
+    if gain is not None:
+        B_V = plant.B.T @ V.hand[s:]
+        hand, tall = hand - gain.block.hand @ B_V, tall - gain.block.tall @ B_V
+    # H^{-1} E'V: two-way the mass blocks of hand and tissue invert together
+    test = np.vstack([V.hand[:s], V.hand[s:] if plant.two_way else np.linalg.solve(plant.M_s, E_V.hand[s:])])
+    products = total(plant.comm, V.tall.T @ np.hstack([E_V.tall, tall, W.tall]))
+    products += test.T @ np.hstack([E_V.hand, hand, W.hand])
+    found: tuple[np.ndarray, Array] | None = None
+    if plant.comm.rank == 0:
+        found = _pencil_pairs(products[:, k : 2 * k], products[:, :k], products[:, 2 * k :])
+    return plant.comm.bcast(found)
+
+
+def _pencil_pairs(F: Array, G: Array, W: Array) -> tuple[np.ndarray, Array]:
+    """Eigenvalues of (F, G) on the numerical range of the symmetric part of G, and components of W."""
+    scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
+    G, F, W = G / scale / scale[:, None], F / scale / scale[:, None], W / scale[:, None]
+    sizes, vectors = np.linalg.eigh((G + G.T) / 2)
+    keep = sizes > 1e-12 * sizes[-1]  # of the Gram matrix: columns independent to 1e-6
+    basis = vectors[:, keep] / np.sqrt(sizes[keep])
+    values, ritz = np.linalg.eig(basis.T @ F @ basis)
+    return values, np.linalg.norm(np.linalg.solve(ritz, basis.T @ W), axis=1)
+
+
+def choose_shifts(candidates: np.ndarray, weights: Array, count: int) -> list[complex]:
+    """Greedy choice: the candidate where most of the residual is left, after the shifts chosen before it.
+
+    Like the min-max choice of [P00], with the components of the residual in place of 1: a pole whose residual is
+    already annihilated is not taken again, one that the outputs hardly see is taken late. Not collective.
+
+    Args:
+        candidates: admissible values, Re < 0, Im >= 0.
+        weights: size of the residual at each.
+        count: number of shifts; a complex one stands for its pair.
+    """
+    size = np.log(np.maximum(weights, 1e-300))
+    chosen: list[complex] = []
+    while len(chosen) < min(count, len(candidates)):
+        p = complex(candidates[int(np.argmax(size))])
+        factor = np.abs((candidates - np.conj(p)) / (candidates + p))
+        if p.imag:
+            factor = factor * np.abs((candidates - p) / (candidates + np.conj(p)))
+        size = size + np.log(np.maximum(factor, 1e-300))
+        chosen.append(p)
+    return chosen
+
+
+@dataclass
+class ShiftQueue:
+    """The next shifts of one sweep.
+
+    Attributes:
+        limits: admissible range.
+        pending: shifts to come.
+        projections: how often Ritz values were computed.
+    """
+
+    limits: ShiftRange
+    pending: list[complex] = field(default_factory=list)
+    projections: int = 0
+
+    @classmethod
+    def start(cls, limits: ShiftRange, poles: Sequence[complex] | np.ndarray) -> ShiftQueue:
+        """The hand's and the lightly damped poles in their order, clipped, doubles removed. Not collective."""
+        pending: list[complex] = []
+        for i, p in enumerate(limits.clip(complex(p)) for p in poles):
+            wanted = i < 4 or -p.real < SHARP * abs(p)
+            if wanted and all(abs(p - q) > 1e-3 * abs(p.real) for q in pending):
+                pending.append(p)
+        return cls(limits, pending)
+
+    def refill(self, plant: Plant, recent: Block, W: Block, gain: Right | None) -> None:
+        """Ritz values of the recent blocks, clipped and chosen. Collective."""
+        values, sizes = ritz_pairs(plant, recent, W, gain)
+        clipped = np.array([self.limits.clip(complex(p)) for p in values])
+        weights = sizes * np.abs(clipped)  # from the energy norm to the 2-norm of the residual
+        upper = values.imag >= 0
+        self.pending = choose_shifts(clipped[upper], weights[upper], BATCH)
+        self.projections += 1
+
+    def next(self) -> tuple[complex, list[complex]]:
+        """The next shift and those after it. Not collective."""
+        return self.pending.pop(0), self.pending[:]
