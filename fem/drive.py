@@ -75,6 +75,7 @@ class ForceDrive:
             self.GY = (GY + GY.T) / 2
             self.lhs = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
         self.inverse = np.linalg.inv(self.lhs)
+        self.solve = self._two_way if system.two_way else self._one_way  # chosen once, not in every step
 
     def _responses(self, midpoint: TissueMidpoint) -> Array:
         Y = np.empty(self.system.G.shape, order="F")
@@ -84,26 +85,32 @@ class ForceDrive:
             Y[:, j] = midpoint.w.array_r
         return Y
 
-    def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
-        """One solve, and with two-way coupling two small reductions. Collective."""
+    def _one_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
+        """One solve. Collective."""
+        q, v = self.q[n], self.v[n]
+        a = self.inverse @ (self.force(n, (n + 0.5) * self.dt, q, v) + self.weight)
+        np.dot(self.system.G, -(self.kappa * a + self.alpha * v - self.g), out=midpoint.load_array)
+        midpoint.solve_midpoint()
+        self._move(n, a)
+
+    def _two_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
+        """One solve and one small reduction. Collective."""
         q, v = self.q[n], self.v[n]
         u = self.force(n, (n + 0.5) * self.dt, q, v) + self.weight
         c0 = self.alpha * v - self.g
-        if not self.system.two_way:
-            a = self.inverse @ u
-            c = self.kappa * a + c0
-            np.dot(self.system.G, -c, out=midpoint.load_array)
-            midpoint.solve_midpoint()
-        else:
-            G, layout = self.system.G, self.system.layout
-            midpoint.solver.solve(midpoint.h, midpoint.w)
-            x = midpoint.w.array_w
-            relative = self.theta * x - midpoint.s * state.array[layout.n_local :]
-            pull = total(layout.comm, G.T @ relative) - self.theta * (self.GY @ c0)
-            a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
-            c = self.kappa * a + c0
-            x -= self.Y @ c
-            np.dot(G, -c, out=midpoint.load_array)
-            midpoint.r.waxpy(1.0, midpoint.load, midpoint.h)
+        G, layout = self.system.G, self.system.layout
+        midpoint.solver.solve(midpoint.h, midpoint.w)
+        x = midpoint.w.array_w
+        relative = self.theta * x - midpoint.s * state.array[layout.n_local :]
+        pull = total(layout.comm, G.T @ relative) - self.theta * (self.GY @ c0)
+        a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
+        c = self.kappa * a + c0
+        x -= self.Y @ c
+        np.dot(G, -c, out=midpoint.load_array)
+        midpoint.r.waxpy(1.0, midpoint.load, midpoint.h)
+        self._move(n, a)
+
+    def _move(self, n: int, a: Array) -> None:
+        v = self.v[n]
         self.v[n + 1] = v + self.dt * a
-        self.q[n + 1] = q + self.dt * (v + self.v[n + 1]) / 2
+        self.q[n + 1] = self.q[n] + self.dt * (v + self.v[n + 1]) / 2

@@ -164,7 +164,7 @@ class TissueMidpoint:
         work, lost = total(self.system.layout.comm, np.array([self.work, self.dissipated]))
         return float(work), float(lost)
 
-    def residual(self) -> float:
+    def residual(self, where: str = "a time step") -> float:
         """Check the last solve; raises SolverError. Collective.
 
         In equilibrium under gravity the load cancels in r, and a two-way step subtracts the hand's part from w: what is
@@ -172,7 +172,7 @@ class TissueMidpoint:
         """
         # the array, not the vector: it is written through a view, so the norm that PETSc remembers may be an old one
         square = total(self.system.layout.comm, np.array([np.dot(self.load_array, self.load_array)]))[0]
-        return self.solver.check(self.r, self.w, "a time step", float(np.sqrt(square)))
+        return self.solver.check(self.r, self.w, where, float(np.sqrt(square)))
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

@@ -91,6 +91,11 @@ def motion_table(scene: Scene, n_s: int) -> HandTable:
     t = end * np.arange(steps + 1) / steps
     motion = scene.motion
     if motion.profile == "quintic":
+        if end / steps > motion.duration / 2:
+            raise SceneError(
+                f"time.steps = {steps} gives steps of {end / steps:g} s, too long for a move of {motion.duration:g} s; "
+                f"take at least {int(np.ceil(2 * end / motion.duration))}"
+            )
         target = np.zeros(n_s)
         target[: len(motion.target or [])] = motion.target or []
         s, ds, _ = quintic(t, motion.duration)

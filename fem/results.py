@@ -59,9 +59,9 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
         "output_final": run.outputs[-1].tolist(),
         "energy_drift": run.energy_drift,
         "time": {
-            **{key: value for key, value in seconds.items() if key != "steps"},
+            **{key: value for key, value in seconds.items() if key not in ("steps", "per_step")},
             "steps": seconds["steps"],
-            "per_step": seconds["steps"] / max(steps - 1, 1),
+            "per_step": seconds["per_step"],
         },
         "memory_peak_mb": peak_memory_mb(comm),
         "forms": len(model.inventory.forms),

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from fem.build import Model
 from fem.checkpoint import read_checkpoint, write_checkpoint
 from fem.drive import Drive, Force, ForceDrive, TableDrive
-from fem.errors import Interrupted, SoftgraspError, SolverError
+from fem.errors import Interrupted, SceneError, SoftgraspError, SolverError
 from fem.midpoint import TissueMidpoint, TissueState
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
@@ -110,7 +110,7 @@ class Run:
         self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = 0.0
-        self.seconds = 0.0
+        self.seconds, self.counted = 0.0, 0
 
     def _recorders(self) -> list[tuple[np.ndarray, Array]]:
         """Local dofs and column block of every output that this rank has a share in."""
@@ -174,6 +174,7 @@ class Run:
         if step <= self.reached:
             return
         ts.setMaxSteps(step)
+        before = self.reached
         begin = time.perf_counter()
         try:
             ts.solve(x)
@@ -188,6 +189,7 @@ class Run:
                 f"{self.solver[0]}: TS stopped at step {self.reached} of {step} (reason {ts.getConvergedReason()})"
             )
         self.seconds += time.perf_counter() - begin
+        self.counted += step - before
         if self.state is not self.store.work:
             self.store.work.array[:] = self.state.array  # the TS solution is current between segments
             x.stateIncrease()
@@ -218,7 +220,8 @@ class Run:
         names = tuple(f"{o.name}_{'xyz'[i] if o.size <= 3 else i + 1}" for o in outputs for i in range(o.size))
         times = self.end * np.arange(self.steps + 1) / self.steps
         snapshots = self.store.finish(times, self.drive.q, self.drive.v)
-        seconds = {**self.model.watch.seconds, "steps": comm.allreduce(self.seconds, MPI.MAX)}
+        spent = comm.allreduce(self.seconds, MPI.MAX)
+        seconds = {**self.model.watch.seconds, "steps": spent, "per_step": spent / max(self.counted, 1)}
         return Trajectory(
             times=times,
             q_s=self.drive.q,
@@ -332,7 +335,7 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
             run.start()
         with _interruptible() as stop:
             _run_segments(run, ts, x, options, stop)
-        return run.trajectory(run.midpoint.residual())
+        return run.trajectory(run.midpoint.residual(f"step {run.reached} of {run.steps}"))
     finally:
         ts.destroy()
         run.midpoint.destroy()
@@ -340,12 +343,14 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
 
 def _run_segments(run: Run, ts: Any, x: Any, options: RunOptions, stop: list[bool]) -> None:
     comm: MPI.Intracomm = run.model.system.layout.comm
+    if options.until is not None and options.until <= run.reached and run.reached < run.steps:
+        raise SceneError(f"the run is at step {run.reached} already; --until must be larger, not {options.until}")
     boundaries, frames, checkpoints = _boundaries(run, options)
     if options.frame is not None and run.reached == 0:
         options.frame(run)
     if run.reached == 0:
         run.advance_to(ts, x, 1)
-        run.residual_first = run.midpoint.residual()
+        run.residual_first = run.midpoint.residual(f"step 1 of {run.steps}")
     last, chunk = boundaries[-1], 1
     while run.reached < last:
         limit = next(b for b in boundaries if b > run.reached)
@@ -362,6 +367,7 @@ def _run_segments(run: Run, ts: Any, x: Any, options: RunOptions, stop: list[boo
         if options.progress is not None:
             options.progress(run)
         stopped = comm.allreduce(bool(stop), MPI.LOR)
+        stopped = stopped and run.reached < run.steps  # at the end there is nothing left to stop
         if run.reached in checkpoints or stopped or (run.reached == last < run.steps):
             manifest = write_checkpoint(run, options.directory / "checkpoint")
             if stopped or run.reached == last:

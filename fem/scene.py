@@ -79,7 +79,7 @@ class Effects(Model):
 class Motion(Model):
     """What the hand does."""
 
-    target: list[float] | None = Field(
+    target: Annotated[list[float] | None, BeforeValidator(_off)] = Field(
         None, description="final displacement of the hand [m], then its angles [rad] with effects.rotation"
     )
     duration: Positive = Field(1.0, description="duration of the motion [s], > 0")

@@ -162,9 +162,9 @@ def _parse(text: str, override: str) -> Any:
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
-        if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./+-]*", text):  # the shell ate the quotes
+        if re.fullmatch(r"[A-Za-z_./~][A-Za-z0-9_./~+-]*", text):  # the shell ate the quotes
             return text
-        raise SceneError(f"--set {override}: '{text}' is not a TOML value") from None
+        raise SceneError(f"--set {override}: '{text}' is not a TOML value; a text is '\"...\"'") from None
     if table.keys() != {"value"}:
         raise SceneError(f"--set {override}: it must hold one value")
     return table["value"]

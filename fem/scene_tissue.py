@@ -122,6 +122,8 @@ class Tissue(Model):
 
     @model_validator(mode="after")
     def _check(self) -> Tissue:
+        if "tissue" in self.layers:
+            raise ValueError("layers.tissue takes the name of the cells that no layer claims; give it another name")
         if self.mesh is not None:
             for key in ("size", "cells", "origin"):
                 if getattr(self, key) is not None:

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import psutil
 
-from fem.errors import ResourceError, agree
+from fem.errors import CheckpointError, ResourceError, agree
 from fem.layout import BlockLayout
 from fem.midpoint import TissueState, state_on
 from fem.petsc import Array
@@ -88,15 +88,16 @@ class MemoryStore(NoStore):
     def __init__(self, system: BlockSystem, steps: int, every: int) -> None:
         super().__init__(system)
         layout = system.layout
-        self.steps = np.arange(0, steps + 1, every)
-        needed = 16 * layout.n_e * len(self.steps)
+        count = steps // every + 1
+        needed = 16 * layout.n_e * count
         free = layout.comm.bcast(psutil.virtual_memory().available)
         if needed > 0.8 * free:
             raise ResourceError(
-                f"output.snapshots: {len(self.steps)} columns of {2 * layout.n_e} doubles need {needed} bytes "
+                f"output.snapshots: {count} columns of {2 * layout.n_e} doubles need {needed} bytes "
                 f"and {free} are free; set output.every = {every * int(np.ceil(needed / (0.5 * free)))} "
                 "or output.snapshots = 'hdf5'"
             )
+        self.steps = np.arange(0, steps + 1, every)
         self.Z = np.zeros((2 * layout.n_local, len(self.steps)), order="F")
         self.columns = {int(s): state_on(self.Z[:, j], system) for j, s in enumerate(self.steps)}
 
@@ -131,17 +132,18 @@ class Hdf5Store(NoStore):
         super().__init__(system)
         layout = system.layout
         self.directory = directory
-        self.steps = np.arange(0, steps + 1, every)
-        self.needed = 16 * layout.n_e * len(self.steps)
+        count = steps // every + 1
+        self.needed = 16 * layout.n_e * count
         with agree(layout.comm):
             if layout.comm.rank == 0:
                 directory.mkdir(parents=True, exist_ok=True)
                 free = shutil.disk_usage(directory).free
                 if self.needed > 0.9 * free:
                     raise ResourceError(
-                        f"output.snapshots: {len(self.steps)} columns of {2 * layout.n_e} doubles need "
+                        f"output.snapshots: {count} columns of {2 * layout.n_e} doubles need "
                         f"{self.needed} bytes and {free} are free in {directory}; set output.every to a larger number"
                     )
+        self.steps = np.arange(0, steps + 1, every)
         rows = 2 * layout.n_local
         fit = max(1, BUFFER_BYTES // max(8 * rows, 1))
         self.width = min(layout.comm.allreduce(fit, min), len(self.steps))
@@ -149,8 +151,19 @@ class Hdf5Store(NoStore):
         self.slots = [state_on(self.buffer[:, j], system) for j in range(self.width)]
         self.index = {int(s): j for j, s in enumerate(self.steps)}
         self.written = 0
-        with h5py.File(self._file(layout.comm.rank), "a" if resume else "w") as file:
-            file.require_dataset("Z", (len(self.steps), rows), dtype="f8", chunks=(1, max(rows, 1)))
+        with agree(layout.comm):
+            self._open(rows, resume)
+
+    def _open(self, rows: int, resume: bool) -> None:
+        path = self._file(self.system.layout.comm.rank)
+        try:
+            with h5py.File(path, "a" if resume else "w") as file:
+                file.require_dataset("Z", (len(self.steps), rows), dtype="f8", chunks=(1, max(rows, 1)))
+        except (OSError, TypeError) as error:
+            raise CheckpointError(
+                f"{path} does not fit this run ({error}); resume with the same scene and rank count, or run again "
+                "without --resume"
+            ) from error
 
     def _file(self, rank: int) -> Path:
         return self.directory / f"snapshots-rank{rank}.h5"

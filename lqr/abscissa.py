@@ -14,7 +14,8 @@ from lqr.plant import Block
 from lqr.problem import RiccatiProblem
 from reduction.engines import on_root
 
-ALL_MODES = 1300  # up to here every mode is kept: the Schur form of order 2600 takes half a minute
+ALL_MODES = 250  # up to here every mode is kept by default: a Schur form of order 500 takes 0.2 s
+DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600 takes half a minute
 SOME_MODES = 150
 
 
@@ -46,13 +47,14 @@ class ModalLoop:
 
     Args:
         problem: the plant.
-        modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`SOME_MODES`.
+        modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`SOME_MODES`. All modes are
+            allowed up to :data:`DENSE_LIMIT`.
     """
 
     def __init__(self, problem: RiccatiProblem, modes: int | None = None) -> None:
         self.problem, self.comm = problem, problem.layout.comm
         n_e = problem.layout.n_e
-        self.complete = modes is None and n_e <= ALL_MODES
+        self.complete = n_e <= (ALL_MODES if modes is None else min(modes, DENSE_LIMIT))
         self.Phi, self.massed, plant = (
             _all(problem) if self.complete else _lowest(problem, min(modes or SOME_MODES, n_e))
         )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fem.petsc import Array, total
-from lqr.abscissa import LoopQuality, ModalLoop
+from lqr.abscissa import DENSE_LIMIT, LoopQuality, ModalLoop
 from lqr.checks import ControlError
 from lqr.compress import triangular
 from lqr.coordinates import costates_to_absolute, factor_of, gain_of, gain_to_absolute
@@ -153,16 +153,25 @@ class GainJudge:
         self.Z_absolute = costates_to_absolute(problem.system, self.Z)
         self.start = start
         self.loop = ModalLoop(problem) if loop is None else loop
+        self.whole: ModalLoop | None = None
         self.optimal = float(np.sum(inner(problem.system, self.Z, descriptor(problem, start)) ** 2))
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
 
     def quality(self, gain: Block) -> LoopQuality:
-        """Abscissa and cost excess of any gain; at large n by :func:`lqr.spectrum.certified_abscissa`. Collective."""
-        found = self.loop.quality(gain, self.K, self.start, self.optimal)
+        """Abscissa and cost excess of any gain. Collective.
+
+        Large scenes take the abscissa from :func:`lqr.spectrum.certified_abscissa` and the cost from the lowest modes;
+        where the certificate fails, all modes are taken as long as a dense spectrum is affordable.
+        """
         if self.loop.complete:
-            return found
+            return self.loop.quality(gain, self.K, self.start, self.optimal)
         spectrum = certified_abscissa(self.problem, gain)
+        if not spectrum.certified and self.problem.layout.n_e <= DENSE_LIMIT:
+            if self.whole is None:
+                self.whole = ModalLoop(self.problem, DENSE_LIMIT)
+            return self.whole.quality(gain, self.K, self.start, self.optimal)
+        found = self.loop.quality(gain, self.K, self.start, self.optimal)
         excess = found.cost_excess if spectrum.value < 0 else np.inf
         return LoopQuality(spectrum.value, excess, spectrum.certified)
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.text import Text
 
 from fem import _stack as _stack  # threads and MPI before anything numerical
-from fem.errors import SoftgraspError
+from fem.errors import SceneError, SoftgraspError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -27,6 +27,9 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"),
 ]
+Out = Annotated[Path, typer.Option(help="folder for result.json, tables, pictures and report.html")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
+NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")]
 SceneFile = Annotated[Path, typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship")]
 
 
@@ -50,10 +53,16 @@ def scenes() -> None:
 
     from fem.scene_file import load_scene, shipped_scenes
 
-    table = Table("scene", "what it shows", "file", box=None, pad_edge=False)
-    for name, path in shipped_scenes().items():
-        table.add_row(name, load_scene(path).description, str(path))
+    found = shipped_scenes()
+    if not found:
+        raise SceneError("no scenes here: they ship with the checkout, in demos/scenes")
+    table = Table("scene", "what it shows", box=None, pad_edge=False)
+    for name, path in found.items():
+        table.add_row(name, load_scene(path).description)
     console().print(table)
+    folder = next(iter(found.values())).parent
+    here = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+    console().print(f"in {here}/, each as NAME.toml", soft_wrap=True)
 
 
 @app.command()
@@ -66,22 +75,29 @@ def schema() -> None:
 
 
 @app.command()
-def explain(scene: SceneFile, set_: Overrides = None) -> None:
+def explain(
+    scene: SceneFile,
+    out: Annotated[Path | None, typer.Option(help="also write result.json into this folder")] = None,
+    set_: Overrides = None,
+) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
     from fem.scene_file import load_scene_collective
     from study.explain import run_explain
 
-    run_explain(load_scene_collective(MPI.COMM_WORLD, scene, set_ or []), MPI.COMM_WORLD, console())
+    found = run_explain(load_scene_collective(MPI.COMM_WORLD, scene, set_ or []), MPI.COMM_WORLD, console())
+    if out is not None and MPI.COMM_WORLD.rank == 0:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "result.json").write_text(json.dumps({"command": "explain", **found.to_dict()}, indent=2) + "\n")
 
 
 @app.command()
 def simulate(
     scene: SceneFile,
-    out: Annotated[Path, typer.Option(help="folder for result.json, trajectories, pictures and fields")] = Path("out"),
+    out: Out = Path("out"),
     set_: Overrides = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
+    quiet: Quiet = False,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
-    no_pictures: Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")] = False,
+    no_pictures: NoPictures = False,
     until: Annotated[int | None, typer.Option(help="stop after this step and leave a checkpoint", min=1)] = None,
 ) -> None:
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
@@ -97,6 +113,77 @@ def simulate(
         until=until,
         pictures=not no_pictures,
     )
+
+
+@app.command()
+def reduce(
+    scene: SceneFile,
+    out: Out = Path("out"),
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    no_pictures: NoPictures = False,
+) -> None:
+    """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
+    from study.reduce import run_reduce
+
+    run_reduce(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures)
+
+
+@app.command()
+def control(
+    scene: SceneFile,
+    out: Out = Path("out"),
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    no_pictures: NoPictures = False,
+) -> None:
+    """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
+    from study.control import run_control
+
+    run_control(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures)
+
+
+@app.command()
+def study(
+    scene: SceneFile,
+    out: Out = Path("out"),
+    set_: Overrides = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="find the cheapest setting with at most this relative error")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="find the most accurate setting within this time per step, e.g. 1ms")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
+    from study.work_precision import run_study
+    from study.wp_answer import parse_budget
+
+    limit = None if budget is None else parse_budget(budget)
+    run_study(scene, out, set_ or [], console(), tolerance=tolerance, budget=limit, quiet=quiet)
+
+
+@app.command()
+def effects(scene: SceneFile, out: Out = Path("out"), set_: Overrides = None, quiet: Quiet = False) -> None:
+    """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""
+    from study.effects import run_effects
+
+    run_effects(scene, out, set_ or [], console(), quiet=quiet)
+
+
+@app.command()
+def hardcases(
+    out: Out = Path("out"),
+    quick: Annotated[bool, typer.Option("--quick", help="the quick half only")] = False,
+    family: Annotated[str | None, typer.Option(help="one family of cases only")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run the suite of hard cases: stay stable, or refuse with a reason."""
+    from study.hardcases import run_hardcases
+
+    result = run_hardcases(out, console(), quick=quick, family=family, quiet=quiet)
+    raise typer.Exit(0 if result["ok"] else 1)
 
 
 def main() -> None:

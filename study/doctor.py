@@ -121,6 +121,12 @@ def check_launcher() -> Check:
     found = family(text)
     # A launcher we cannot name (srun wrapper, vendor MPI) is judged by the launch alone.
     if "unknown" in (found, linked) or found == linked:
+        first = shutil.which("mpiexec")
+        if first is not None and not os.path.samefile(first, path):
+            other = family(run_limited([first, "--version"], LAUNCH_LIMIT)[1])
+            if "unknown" not in (other, linked) and other != linked:
+                cure = f"A bare `mpiexec` starts {first} of {other}, the wrong one: call {path} by its full path."
+                return Check("mpiexec", False, f"{path} ({found}, library {linked})", cure)
         return Check("mpiexec", True, f"{path} ({found}, library {linked})")
     cure = f"This mpiexec is {found} but the library is {linked}: use the mpiexec of {linked} by its full path."
     return Check("mpiexec", False, path, cure)

@@ -213,7 +213,7 @@ def _report(
         sections=sections,
         figures=[(out / "effects.png", CAPTION)],
         scene=resolved_toml(scene),
-        reproduce=f"{launch}softgrasp effects {path.name}{sets}",
+        reproduce=f"{launch}softgrasp effects {path}{sets}",
         equation=text.replace("+ - ", "- "),
     )
 

@@ -140,5 +140,5 @@ def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: P
             Section("Made with", rows=about),
         ],
         scene=resolved_toml(scene),
-        reproduce=f"{launch}softgrasp simulate {shlex.quote(path.name)}{sets}",
+        reproduce=f"{launch}softgrasp simulate {shlex.quote(str(path))}{sets}",
     )

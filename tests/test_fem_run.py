@@ -12,7 +12,7 @@ import pytest
 from mpi4py import MPI
 
 from fem.build import Model, build
-from fem.errors import CheckpointError, Interrupted, ResourceError
+from fem.errors import CheckpointError, Interrupted, ResourceError, SceneError
 from fem.run import Run, RunOptions, simulate
 from fem.scene_file import load_scene
 
@@ -20,7 +20,8 @@ SCENES = Path(__file__).parent.parent / "demos" / "scenes"
 
 
 def small(comm: MPI.Intracomm, *overrides: str, scene: str = "paper_forward") -> Model:
-    return build(load_scene(SCENES / f"{scene}.toml", ["tissue.cells=[4,8]", "time.steps=40", *overrides]), comm)
+    changes = ["tissue.cells=[4,8]", "time.steps=40", "time.end=3.0", *overrides]
+    return build(load_scene(SCENES / f"{scene}.toml", changes), comm)
 
 
 @pytest.mark.parametrize("snapshots", ["memory", "hdf5", "none"])
@@ -117,3 +118,23 @@ def test_snapshots_that_cannot_fit_are_refused_before_the_run(
     needed = 16 * model.system.layout.n_e * 41
     with pytest.raises(ResourceError, match=f"need {needed} bytes"):
         simulate(model)
+
+
+def test_until_behind_the_checkpoint_is_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    with pytest.raises(Interrupted):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, until=20))
+    with pytest.raises(SceneError, match="at step 20 already"):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True, until=10))
+
+
+def test_streamed_snapshots_of_another_stride_do_not_resume(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    hdf5 = 'output.snapshots="hdf5"'
+    with pytest.raises(Interrupted):
+        simulate(small(comm, hdf5), RunOptions(directory=mpi_tmp_path, until=20))
+    with pytest.raises(CheckpointError, match="does not fit this run"):
+        simulate(small(comm, hdf5, "output.every=2"), RunOptions(directory=mpi_tmp_path, resume=True))
+
+
+def test_steps_longer_than_the_move_are_refused(comm: MPI.Intracomm) -> None:
+    with pytest.raises(SceneError, match=r"time\.steps = 20 .* take at least 200"):
+        simulate(small(comm, "time.steps=20", "time.end=300.0", scene="paper_lqr"))

@@ -348,6 +348,7 @@ def test_library_and_conversions(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        ("tissue.layers.tissue={material='fat', box=[[0.0,0.0],[1.0,1.0]]}", "another name"),
         ("reduction.mu_range=[500.0,20.0]", r"reduction\.mu_range"),
         ("reduction.N=[0]", r"reduction\.N"),
         ("reduction.engin='gram'", "engine"),

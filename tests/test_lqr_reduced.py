@@ -12,6 +12,7 @@ from helpers import Array, FirstOrder, close, first_order, gather_rows, make_sce
 from mpi4py import MPI
 
 from fem.build import Model, build
+from lqr.abscissa import ModalLoop
 from lqr.checks import ControlError
 from lqr.coordinates import factor_of, gain_of, gain_to_absolute, to_absolute
 from lqr.dense import DenseRiccati
@@ -188,6 +189,21 @@ def test_a_gain_that_drives_away_is_marked_unstable() -> None:
     large = certified_abscissa(problem, K.times(-np.eye(2)))
     assert abs(large.value - bad.abscissa) < 1e-6
     assert not large.stable
+
+
+def test_the_road_of_large_scenes_says_the_same() -> None:
+    """Certificate and lowest modes against all modes; without a certificate all modes decide."""
+    _, problem, solution = plant()
+    start = hand_start(problem, -TARGET)
+    whole = GainJudge(problem, solution, start)
+    large = GainJudge(problem, solution, start, ModalLoop(problem, 20))
+    assert whole.loop.complete
+    assert not large.loop.complete
+    for name, N in (("pod", 12), ("pod", 20), ("structured", 8), ("pod_decomposed", 8)):
+        a, b = whole.report(family(name).at(N)), large.report(family(name).at(N))
+        assert a.stable == b.stable, name
+        assert abs(a.abscissa_full - b.abscissa_full) < 1e-6 or not a.stable, name
+        assert a.cost_excess == b.cost_excess or abs(a.cost_excess - b.cost_excess) < 1e-3 * a.cost_excess, name
 
 
 def test_cost_excess_against_a_dense_lyapunov_equation() -> None:

@@ -1,0 +1,133 @@
+"""Files of ``softgrasp reduce``: result.json, points.csv, scene.toml, figures and report.html."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fem.scene import Scene
+from fem.scene_file import resolved_toml
+from study.reduce_tables import (
+    ERROR_HEADER,
+    LEVELS,
+    N_NOTE,
+    TIME_HEADER,
+    error_rows,
+    time_rows,
+    write_csv,
+)
+from study.report import Section, write_report
+
+if TYPE_CHECKING:
+    from study.reduce import Reduced
+    from study.reduce_pictures import Views
+
+CAPTIONS = {
+    "errors.png": "Relative errors of the paper's six methods against N. First the state that the basis is built "
+    "from: [q_s, v_s, q_e, v_e], for PSD [q_s, p_s, q_e, p_e]; then [q_s, v_s, q_e, v_e] for all; then the deformation "
+    "alone, after removing the rigid motion of the hand; then the energy of the tissue. Thin dotted: projection error, "
+    "which no model of the basis can fall below. Red crosses: unstable models. Errors above 1 are drawn at 1.",
+    "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
+    "times.png": "Errors of all stable models against the time of a run, and against offline plus online time. Open "
+    "marks: global bases. Dashed: the full run with its matrix factored beforehand.",
+    "sigma.png": "Singular values over the first of each decomposition; thin lines are its further parts. Those of "
+    "PSD are symplectic or of complex snapshots, each a pair of columns.",
+    "modes.png": "First modes of the best method of the paper that keeps the hand apart, and of Craig-Bampton or the "
+    "best beyond the paper, scaled to the same largest displacement. Colour: displacement.",
+    "compare.png": "Reduced bodies under the outline of the full one, at the start, half-way and at the end.",
+    "compare.gif": "The same in motion.",
+}
+
+
+def draw_all(out: Path, found: Reduced, views: Views | None) -> list[Path]:
+    """All figures. Rank 0 only."""
+    from study.reduce_pictures import figure_compare, figure_modes, gif_compare
+    from study.reduce_plots import beyond_paper, figure_errors, figure_sigma, figure_times, of_paper
+
+    files: list[Path] = []
+    shown = [s for s in found.swept if s.points]
+    if of_paper(shown):
+        files += figure_errors(of_paper(shown), out / "errors.png")
+    if any(s not in of_paper(shown) for s in shown):
+        files += figure_errors(beyond_paper(shown), out / "errors_beyond.png")
+    if shown:
+        files += figure_times(shown, found.times.steps, out / "times.png")
+        files += figure_sigma(shown, out / "sigma.png") or ()
+    if views is not None and views.modes:
+        files += figure_modes(views, out / "modes.png")
+    if views is not None and views.reduced:
+        files += figure_compare(views, out / "compare.png")
+        files.append(gif_compare(views, out / "compare.gif"))
+    return files
+
+
+def write_all(
+    out: Path, path: Path, overrides: list[str], scene: Scene, found: Reduced, result: dict[str, Any], files: list[Path]
+) -> list[Path]:
+    """Numbers and report beside the figures that are there. Rank 0 only."""
+    table = write_csv(out / "points.csv", found.swept)
+    toml = out / "scene.toml"
+    toml.write_text(resolved_toml(scene))
+    drawn = {file.name for file in files}
+    report = write_report(
+        out / "report.html",
+        title=f"{scene.name}: reduced models",
+        subtitle=scene.description,
+        sections=sections(found, result, [(out / name, text) for name, text in CAPTIONS.items() if name in drawn]),
+        scene=resolved_toml(scene),
+        reproduce=reproduce(result["ranks"], path, overrides),
+    )
+    numbers = out / "result.json"
+    numbers.write_text(json.dumps(result, indent=2) + "\n")
+    return [numbers, table, toml, *files, report]
+
+
+def reproduce(ranks: int, path: Path, overrides: list[str]) -> str:
+    """The command."""
+    launch = f"mpiexec -n {ranks} " if ranks > 1 else ""
+    return f"{launch}softgrasp reduce {shlex.quote(str(path))}" + "".join(f" --set {shlex.quote(o)}" for o in overrides)
+
+
+def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, str]]) -> list[Section]:
+    """Parts of the page."""
+    levels, share = ", ".join(f"{level:.0e}" for level in LEVELS), f"{100 * result['reduction']['energy']:g} %"
+    explained = (
+        f"{N_NOTE}\n\n{share}: N that keeps this share of the snapshots' energy. Then errors at the N nearest "
+        f"to 14, and the least N of a stable model with an error of at most {levels}. An exclamation mark: "
+        "unstable. Each method is built from the snapshots of one run and repeats it, driven by the same hand."
+    )
+    header = (ERROR_HEADER[0], share, *ERROR_HEADER[2:])
+    parts = [
+        Section("Errors", text=explained, header=header, rows=error_rows(found.swept)),
+        Section("", figures=figures),
+        Section("Times", text="\n\n".join(result["speed_notes"]), header=TIME_HEADER, rows=time_rows(found.speeds)),
+    ]
+    refused = [(s.method.title, N, reason) for s in found.swept for N, reason in s.refused.items()]
+    if refused:
+        parts.append(Section("Refused", header=("method", "N", "reason"), rows=refused))
+    titles = {s.method.key: s.method.title for s in found.swept}
+    text = "Snapshots of one lambda and mu, test at others: error of the deformation over a grid of the box. "
+    text += "Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
+    if found.box:
+        rows = [
+            (titles[r["method"]], r["N"], r["trained"], r["median"], r["largest"]) for r in result["box"]["summary"]
+        ]
+        parts.append(
+            Section("Other parameters", text, header=("method", "N", "trained", "median", "largest"), rows=rows)
+        )
+        keys = list(found.box[0].errors)
+        parts.append(
+            Section(
+                "",
+                header=("lambda [Pa]", "mu [Pa]", *(titles[k] for k in keys)),
+                rows=[(p.lam, p.mu, *(p.errors[k] for k in keys)) for p in found.box],
+            )
+        )
+    elif found.no_box:
+        parts.append(Section("Other parameters", f"{text} Not here: {found.no_box}."))
+    about = [(key, result[key]) for key in ("n_s", "n_e", "states", "steps")]
+    about += [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", result["ranks"])]
+    about += [(f"time {key}", f"{value:.3g} s") for key, value in result["time"].items()]
+    return [*parts, Section("Made with", rows=[*about, ("scene hash", result["scene_hash"])])]

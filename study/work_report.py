@@ -1,0 +1,318 @@
+"""Files of ``softgrasp study``: result.json, points.csv, pictures and report; and what the terminal shows."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import shlex
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from fem.errors import agree
+from fem.results import package_version, peak_memory_mb
+from fem.scene_file import resolved_toml, scene_hash
+from reduction.registry import METHODS
+from study.report import Section, write_report
+from study.work_plots import PAPER_FULL, PAPER_REDUCED, figure_budget, figure_forward, figure_reduced, figure_series
+from study.wp_answer import seconds_text
+from study.wp_fit import Slope, pareto
+from study.wp_points import TITLES, Row, WorkPoint, plain
+
+if TYPE_CHECKING:
+    from study.work_precision import WorkStudy
+
+PAPER_SCENE = "paper_forward"
+FIRST = ("question", "series", "label", "seconds", "error", "ok", "pareto")
+FORWARD_HEADER = (
+    "setting",
+    "unknowns",
+    "error",
+    "deformation",
+    "assembly [s]",
+    "factor [s]",
+    "step [us]",
+    "run [s]",
+    "front",
+)
+REDUCED_HEADER = ("setting", "N", "state error", "output error", "online [s]", "from nothing [s]", "front")
+CAPTIONS = {
+    "work_forward.png": (
+        "Relative error of the outputs over the run against the time of a whole run (mesh, assembly, factor, steps). "
+        "Along a thin line the mesh stays and the steps grow. Right: order in space at the most steps, and change "
+        "through the time step on every mesh."
+    ),
+    "work_reduced.png": (
+        "Relative error of the state against the full run on the same mesh and steps. Left: time of one reduced run "
+        "once the model is there. Right: with everything before it. Open marks: the hand is part of the basis. "
+        "Unstable models are left out."
+    ),
+    "work_bases.png": "What a basis leaves of the snapshots against the time to make it; open marks miss it.",
+    "work_budget.png": "Time of single steps against the error of the outputs, with the budget.",
+}
+
+
+def is_paper(study: WorkStudy) -> bool:
+    """Whether the paper's own points may be drawn in. Not collective."""
+    return study.scene.name == PAPER_SCENE and study.scene.tissue.cells == [15, 30] and study.scene.time.steps == 600
+
+
+def write_study(
+    study: WorkStudy,
+    comm: MPI.Intracomm,
+    path: Path,
+    out: Path,
+    overrides: list[str],
+    begin: float,
+    asked: tuple[float | None, float | None],
+) -> dict[str, Any]:
+    """Write everything on rank 0; the result on all ranks. Collective.
+
+    Raises:
+        OSError: the folder cannot be written; on all ranks.
+    """
+    truth = study.reference
+    result: dict[str, Any] = {
+        "command": "study",
+        "scene": study.scene.name,
+        "scene_hash": scene_hash(study.scene),
+        "version": package_version(),
+        "ranks": comm.size,
+        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        "repeats": study.scene.study.repeats,
+        "reference": {
+            "note": truth.note, "error": truth.error, "error_deformation": truth.error_deformation,
+            "space": truth.space, "time": truth.time, "mixed": truth.mixed, "order": truth.order,
+            "extrapolated": truth.extrapolated, "settings": [s.label for s in truth.settings],
+        },
+        "points": {name: rows_of(points) for name, points in study.points.items()},
+        "pareto": {name: [p.label for p in pareto(points)] for name, points in study.points.items()},
+        "slopes": [vars(s) for s in study.slopes],
+        "skipped": study.skipped,
+        "answers": [a.to_dict() for a in study.answers],
+        "runs": {"measured": study.measured, "cached": study.cached},
+        "memory_peak_mb": peak_memory_mb(comm),
+        "time": {"total": comm.allreduce(time.perf_counter() - begin, MPI.MAX)},
+    }  # fmt: skip
+    result = plain(result)
+    files: list[str] = []
+    with agree(comm):
+        if comm.rank == 0:
+            out.mkdir(parents=True, exist_ok=True)
+            pictures = draw(study, asked[1], out)
+            report = _report(study, result, path, out, overrides, asked, pictures)
+            table = write_csv(result["points"], out / "points.csv")
+            (out / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+            files = [str(f) for f in (out / "result.json", table, *pictures, report)]
+    result["files"] = comm.bcast(files)
+    return result
+
+
+def rows_of(points: Sequence[WorkPoint]) -> list[Row]:
+    """Table rows with a mark for the front. Not collective."""
+    front = pareto(points)
+    return [p.to_row() | {"pareto": p in front} for p in points]
+
+
+def write_csv(points: dict[str, list[Row]], path: Path) -> Path:
+    """All points of all questions in one table, numbers in full. Rank 0 only."""
+    rows = [row for each in points.values() for row in each]
+    more = list(dict.fromkeys(key for row in rows for key in row if key not in FIRST))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*FIRST, *more], restval="")
+        writer.writeheader()
+        writer.writerows({k: "" if v is None else v for k, v in row.items()} for row in rows)
+    return path
+
+
+def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
+    """All figures that have points. Rank 0 only."""
+    found: list[Path] = []
+    points, paper = study.points, is_paper(study)
+    found += figure_forward(points["forward"], study.slopes, study.reference.error, paper, out / "work_forward.png")
+    if points.get("reduced"):
+        found += figure_reduced(points["reduced"], study.full["seconds"], paper, out / "work_reduced.png")
+    if points.get("bases"):
+        found += figure_series(
+            points["bases"], "time of the basis [s]", "left of the snapshots", out / "work_bases.png"
+        )
+    if budget is not None:
+        found += figure_budget(points["forward"], points.get("reduced", ()), budget, out / "work_budget.png")
+    return found
+
+
+# --- tables
+
+
+def forward_rows(points: Sequence[WorkPoint], front_only: bool = False) -> list[tuple[Any, ...]]:
+    """Rows under ``FORWARD_HEADER``. Not collective."""
+    front, rows = pareto(points), []
+    for p in front if front_only else points:
+        d = p.details
+        numbers = (d["assembly"], d["factor"], 1e6 * d["per_step"], p.seconds)
+        rows.append((p.label, d["n_e"], p.error, d["error_deformation"], *numbers, "*" if p in front else ""))
+    return rows
+
+
+def reduced_rows(points: Sequence[WorkPoint], front_only: bool = False) -> list[tuple[Any, ...]]:
+    """Rows under ``REDUCED_HEADER``; the front is that of the state error. Not collective."""
+    front = state_front(points)
+    rows = []
+    for p in sorted(front, key=lambda p: p.seconds) if front_only else points:
+        d = p.details
+        name = METHODS[p.series].title if p.series in METHODS else p.series
+        mark = "*" if p in front else "" if p.ok else "unstable"
+        rows.append((name, d["N"], d["error_full"], p.error, p.seconds, d["scratch"], mark))
+    return rows
+
+
+def state_front(points: Sequence[WorkPoint]) -> list[WorkPoint]:
+    """Front of state error against online time. Not collective."""
+    by_state = {
+        id(p): WorkPoint(p.question, p.series, p.label, p.seconds, p.details["error_full"], p.ok) for p in points
+    }
+    front = pareto(list(by_state.values()))
+    return [p for p in points if by_state[id(p)] in front]
+
+
+def slope_rows(slopes: Sequence[Slope]) -> list[tuple[Any, ...]]:
+    """Question, series, what against what, power, points. Not collective."""
+    return [
+        (
+            s.question,
+            METHODS[s.series].title if s.series in METHODS else s.series,
+            s.against,
+            f"{s.power:+.2f}",
+            s.count,
+        )
+        for s in slopes
+    ]
+
+
+def show(console: Console, study: WorkStudy, result: dict[str, Any]) -> None:
+    """Print fronts, slopes and answers. Rank 0 prints."""
+    console.print(study.reference.note, markup=False)
+    _print(
+        console,
+        "full model, Pareto front",
+        FORWARD_HEADER[:-1],
+        [r[:-1] for r in forward_rows(study.points["forward"], True)],
+    )
+    if study.points.get("reduced"):
+        rows = [r[:-1] for r in reduced_rows(study.points["reduced"], True)]
+        _print(console, "reduced models on the scene's own mesh, Pareto front", REDUCED_HEADER[:-1], rows)
+    _print(console, "slopes, x^power", ("question", "series", "of", "power", "points"), slope_rows(study.slopes))
+    for name, reason in study.skipped.items():
+        console.print(f"{TITLES[name]}: left out, {reason}", markup=False)
+    if is_paper(study):
+        console.print(
+            f"The paper: {PAPER_FULL} s for the full run, here {study.full['seconds']:.3g} s; {PAPER_REDUCED} s and an "
+            "error of about 1e-3 at N = 14.",
+            markup=False,
+        )
+    for answer in study.answers:
+        style = "bold" if answer.met else "bold red"
+        for k, sentence in enumerate(answer.sentences):
+            console.print(sentence, style=style if k == 0 else None, markup=False, soft_wrap=True)
+    runs = result["runs"]
+    console.print(f"{runs['measured']} runs measured, {runs['cached']} from the cache", style="dim")
+    console.print("files:")
+    for file in result["files"]:
+        console.print(f"  {file}", soft_wrap=True, markup=False)
+
+
+def _print(console: Console, title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
+    for k, name in enumerate(header):
+        table.add_column(escape(name), justify="left" if k == 0 else "right")
+    for row in rows:
+        table.add_row(*(escape(f"{c:.3g}" if isinstance(c, float) else str(c)) for c in row))
+    console.print(table)
+
+
+# --- report
+
+
+def _report(
+    study: WorkStudy,
+    result: dict[str, Any],
+    path: Path,
+    out: Path,
+    overrides: list[str],
+    asked: tuple[float | None, float | None],
+    pictures: Sequence[Path],
+) -> Path:
+    drawn = {p.name for p in pictures}
+    sections = [Section("Answer", text="\n\n".join(a.sentences)) for a in study.answers]
+    sections.append(Section("Reference", text=study.reference.note, rows=_reference_rows(study)))
+    tables: dict[str, tuple[Sequence[str], list[tuple[Any, ...]]]] = {
+        "forward": (FORWARD_HEADER, forward_rows(study.points["forward"])),
+        "reduced": (REDUCED_HEADER, reduced_rows(study.points.get("reduced", ()))),
+        "bases": (
+            ("engine", "tolerance", "vectors", "left of the snapshots", "|U'U - I|", "time [s]"),
+            [
+                (p.series, d["tolerance"], d["columns"], p.error, d["orthonormality"], p.seconds)
+                for p in study.points.get("bases", ())
+                for d in (p.details,)
+            ],
+        ),
+    }
+    for name, (header, rows) in tables.items():
+        picture = f"work_{name}.png"
+        figures = [(out / picture, CAPTIONS[picture])] if picture in drawn else []
+        text = f"Left out: {study.skipped[name]}." if name in study.skipped else ""
+        if rows or text:
+            sections.append(Section(TITLES[name], text=text, figures=figures))
+            if rows:
+                sections.append(Section("", header=header, rows=rows))
+    if "work_budget.png" in drawn:
+        sections.append(Section("Budget", figures=[(out / "work_budget.png", CAPTIONS["work_budget.png"])]))
+    slopes = slope_rows(study.slopes)
+    sections.append(Section("Slopes", header=("question", "series", "of", "power", "points"), rows=slopes))
+    sections.append(Section("How it is measured", rows=_how(study, result)))
+    launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
+    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
+    sets += "" if asked[0] is None else f" --tolerance {asked[0]:g}"
+    sets += "" if asked[1] is None else f" --budget {asked[1]:g}s"
+    return write_report(
+        out / "report.html",
+        title=f"{study.scene.name}: accuracy against time",
+        subtitle=study.scene.description,
+        sections=sections,
+        scene=resolved_toml(study.scene),
+        reproduce=f"{launch}softgrasp study {shlex.quote(path.name)}{sets}",
+    )
+
+
+def _reference_rows(study: WorkStudy) -> list[tuple[Any, ...]]:
+    truth = study.reference
+    rows: list[tuple[Any, ...]] = [
+        (f"error estimate, {name}", f"{a:.1e} of the outputs, {b:.1e} of their deformation")
+        for name, (a, b) in (("space", truth.space), ("time", truth.time), ("mixed", truth.mixed))
+    ]
+    return [*rows, ("runs behind it", "; ".join(s.label for s in truth.settings))]
+
+
+def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
+    rows: list[tuple[Any, ...]] = [
+        ("error", "max over the run of |y - y*|, over max |y*|; y displacements at the places of the outputs"),
+        ("deformation", "the same after removing the rigid motion of the hand"),
+        ("places", "the same points of the body on every mesh, not the nearest nodes"),
+        ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
+        ("repeats", f"{study.scene.study.repeats}: the first is the whole run, the others its first steps"),
+        ("front", "no other point is faster and more accurate"),
+    ]
+    if is_paper(study):
+        rows.append(
+            ("the paper", f"{PAPER_FULL} s full, {PAPER_REDUCED} s and about 1e-3 at N = 14, on its own machine")
+        )
+    seconds = seconds_text(result["time"]["total"])
+    about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", str(result["ranks"]))]
+    return [*rows, *about, ("scene hash", result["scene_hash"]), ("time of this study", seconds)]

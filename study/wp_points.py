@@ -1,0 +1,261 @@
+"""What a work-precision study collects: settings, points, the cache that lets it resume, and how it is stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from fem.errors import Interrupted, agree
+from fem.petsc import Array
+from fem.results import package_version
+from fem.scene import Scene
+from fem.scene_file import scene_hash
+from study.effects_switch import changed
+
+FORMAT = 1  # of the cached files
+QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati")
+TITLES = {
+    "forward": "Full model: mesh, order, time step, solver",
+    "reduced": "Reduced models: basis and N",
+    "bases": "Bases: engine and tolerance",
+    "riccati": "Riccati equation: method and tolerance",
+    "reduced_riccati": "Reduced Riccati equation: basis and N",
+}
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How the full model is solved.
+
+    Attributes:
+        cells: of the structured box; None on a mesh file.
+        order: of the displacement, 1 or 2.
+        steps: equal time steps.
+        solver: linear solver.
+        rtol: tolerance of an iterative one.
+    """
+
+    cells: tuple[int, ...] | None
+    order: int
+    steps: int
+    solver: str = "auto"
+    rtol: float = 1e-10
+
+    @property
+    def mesh(self) -> str:
+        """Mesh and order in words."""
+        shape = "mesh file" if self.cells is None else " x ".join(map(str, self.cells))
+        return f"{shape}, P{self.order}"
+
+    @property
+    def label(self) -> str:
+        """All in words."""
+        tail = "" if self.solver == "auto" else f", {self.solver}" + (f" {self.rtol:g}" if self.solver == "cg" else "")
+        return f"{self.mesh}, {self.steps} steps{tail}"
+
+    @property
+    def overrides(self) -> list[str]:
+        """Arguments of ``--set`` that give this setting."""
+        found = [] if self.cells is None else [f"tissue.cells={list(self.cells)}"]
+        found += [f"tissue.order={self.order}", f"time.steps={self.steps}"]
+        if self.solver != "auto":
+            found += [f"time.solver={self.solver}", f"time.rtol={self.rtol:g}"]
+        return found
+
+    def unknowns(self, d: int) -> int:
+        """About how many tissue unknowns a structured mesh has. Not collective."""
+        return 0 if self.cells is None else d * int(np.prod([self.order * n + 1 for n in self.cells]))
+
+
+def scene_setting(scene: Scene) -> Setting:
+    """The scene's own setting. Not collective."""
+    cells = None if scene.tissue.cells is None else tuple(scene.tissue.cells)
+    return Setting(cells, scene.tissue.order, scene.time.steps, scene.time.solver, scene.time.rtol)
+
+
+def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: Sequence[float] | None = None) -> Scene:
+    """The scene under another setting. Not collective.
+
+    Args:
+        scene: the scene.
+        setting: mesh, order, steps and solver.
+        snapshots: where they go.
+        reference: point that the hand turns about, which by default moves a little with the mesh.
+    """
+
+    def edit(table: dict[str, Any]) -> None:
+        if setting.cells is not None:
+            table["tissue"]["cells"] = list(setting.cells)
+        table["tissue"]["order"] = setting.order
+        table["time"] |= {"steps": setting.steps, "solver": setting.solver, "rtol": setting.rtol}
+        table["output"] = table.get("output", {}) | {"snapshots": snapshots, "every": 1}
+        if reference is not None:
+            table["hand"]["reference"] = list(reference)
+
+    return changed(scene, edit)
+
+
+@dataclass(frozen=True)
+class WorkPoint:
+    """One point of one diagram.
+
+    Attributes:
+        question: one of :data:`QUESTIONS`.
+        series: points that are one line.
+        label: the setting in words.
+        seconds: what it costs.
+        error: relative, of what the question is about.
+        ok: a setting that may be used; unstable models may not.
+        details: everything else that was measured.
+    """
+
+    question: str
+    series: str
+    label: str
+    seconds: float
+    error: float
+    ok: bool = True
+    details: Row = field(default_factory=dict)
+
+    def to_row(self) -> Row:
+        """A flat table row; numbers that are not finite become None. Not collective."""
+        row = asdict(self)
+        return {k: plain(v) for k, v in (row | row.pop("details")).items()}
+
+
+def plain(value: Any) -> Any:
+    """A value that JSON can hold: what is not finite becomes None. Not collective."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return int(value) if isinstance(value, np.integer) else value
+
+
+class Cache:
+    """Measured points as JSON files by hash, so that an interrupted study goes on where it stopped.
+
+    The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
+    of ranks and the version. Collective but for the constructor.
+
+    Args:
+        folder: where the files are.
+        comm: ranks.
+        scene: the study's scene.
+    """
+
+    def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene) -> None:
+        self.folder, self.comm = folder, comm
+        self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
+        self.hits = self.misses = 0
+
+    def path(self, kind: str, key: Row) -> Path:
+        """File of a point."""
+        whole = {"scene": self.scene, "ranks": self.comm.size, "version": package_version(), "format": FORMAT} | key
+        return (
+            self.folder / f"{kind}-{hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:20]}.json"
+        )
+
+    def get(self, kind: str, key: Row, measure: Callable[[], Row]) -> Row:
+        """The cached value, or the measured one, which is then kept; both as they come out of JSON."""
+        found: Row | None = None
+        if self.comm.rank == 0:
+            try:
+                found = json.loads(self.path(kind, key).read_text())["value"]
+            except (OSError, ValueError, KeyError):
+                found = None
+        found = self.comm.bcast(found)
+        if found is not None:
+            self.hits += 1
+            return found
+        self.misses += 1
+        value = json.loads(json.dumps(plain(measure())))
+        with agree(self.comm):
+            if self.comm.rank == 0:
+                self._write(self.path(kind, key), {"kind": kind, "key": key, "value": value})
+        return dict(self.comm.bcast(value))
+
+    def _write(self, path: Path, data: Row) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(data))
+        os.replace(part, path)  # a file is there whole or not at all
+
+
+def as_array(rows: Any) -> Array:
+    """An array out of JSON."""
+    return np.array(rows, dtype=float)
+
+
+@dataclass
+class Guard:
+    """Says between two points whether to go on, and how far the study is.
+
+    Attributes:
+        comm: ranks.
+        progress: called with the name of the point that comes and the share of work done.
+        work: expected work in all, any unit.
+        done: of it.
+        stop: filled by the first Ctrl-C.
+    """
+
+    comm: MPI.Intracomm
+    progress: Callable[[str, float], None] | None = None
+    work: float = 1.0
+    done: float = 0.0
+    stop: list[bool] = field(default_factory=list)
+
+    def next(self, label: str, work: float = 0.0) -> None:
+        """Before a point. Collective.
+
+        Raises:
+            Interrupted: somebody asked to stop.
+        """
+        if self.comm.allreduce(bool(self.stop), MPI.LOR):
+            raise Interrupted(
+                f"stopped before '{label}' with {100 * min(self.done / self.work, 1):.0f} % done; the same command "
+                "goes on from there"
+            )
+        if self.progress is not None:
+            self.progress(label, min(self.done / self.work, 1.0))
+        self.done += work
+
+
+@contextmanager
+def interruptible(guard: Guard) -> Iterator[None]:
+    """Turn the first Ctrl-C into a flag that is looked at between points; a second one interrupts at once."""
+
+    def note(number: int, frame: Any) -> None:
+        guard.stop.append(True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    try:
+        previous = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not the main thread: leave signals alone
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def with_details(point: WorkPoint, **more: Any) -> WorkPoint:
+    """The point with more details. Not collective."""
+    return replace(point, details=point.details | more)
