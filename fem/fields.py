@@ -64,6 +64,7 @@ class SeriesWriter:
         directory: made if missing.
         format: "vtx" (``fields.bp``), "xdmf" (``fields.xdmf`` and ``fields.h5``) or "auto", the first of these that
             DOLFINx can write here.
+        name: stem of the files.
 
     Collective.
 
@@ -72,7 +73,7 @@ class SeriesWriter:
         OSError: the directory cannot be made.
     """
 
-    def __init__(self, model: Model, directory: Path, format: str = "auto") -> None:
+    def __init__(self, model: Model, directory: Path, format: str = "auto", name: str = "fields") -> None:
         if format not in FORMATS:
             raise ResourceError(f"output.fields = {format!r} is not one of {', '.join(FORMATS)}")
         if format == "vtx" and not dolfinx.has_adios2:
@@ -82,7 +83,7 @@ class SeriesWriter:
         with agree(self.comm):
             if self.comm.rank == 0:
                 directory.mkdir(parents=True, exist_ok=True)
-        stem = directory / "fields"
+        stem = directory / name
         self.files = (
             (stem.with_suffix(".bp"),) if self.format == "vtx" else (stem.with_suffix(".xdmf"), stem.with_suffix(".h5"))
         )

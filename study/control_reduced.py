@@ -10,7 +10,7 @@ import numpy as np
 
 from fem.build import Model
 from fem.errors import SolverError
-from lqr.abscissa import SOME_MODES, LoopQuality, ModalLoop
+from lqr.abscissa import SOME_MODES, LoopQuality
 from lqr.checks import ControlError
 from lqr.coordinates import factor_of
 from lqr.plant import Block
@@ -20,7 +20,7 @@ from lqr.reduced_bases import BASES, BasisFamily, make_family
 from lqr.retune import BoxPoint, Materials, Retuner, over_box
 from lqr.solve import solve
 from reduction.engines import on_root
-from study.control_solve import WHOLE_SPECTRUM, Design, worth
+from study.control_solve import WHOLE_SPECTRUM, Design, every_mode, worth
 from study.reduce_box import box_materials, outside
 
 TITLES = {
@@ -137,7 +137,7 @@ def _without_spectrum(found: Design, family: BasisFamily, N: int) -> GainReport:
     reduced = reduce_riccati(problem, family.at(N))
     quality = LoopQuality(nothing, nothing, False)
     if problem.layout.n_e <= WHOLE_SPECTRUM:
-        quality = ModalLoop(problem).quality(reduced.gain, judge.K, judge.start, judge.optimal)
+        quality = every_mode(problem).quality(reduced.gain, judge.K, judge.start, judge.optimal)
     return GainReport(
         family.name,
         N,

@@ -11,7 +11,7 @@ from fem.build import Model, Stopwatch
 from fem.errors import SceneError, SolverError
 from fem.motion import motion_table
 from fem.petsc import Array
-from lqr.abscissa import ALL_MODES, SOME_MODES, LoopQuality, ModalLoop
+from lqr.abscissa import DENSE_LIMIT, SOME_MODES, LoopQuality, ModalLoop
 from lqr.actuation import Actuation
 from lqr.checks import ControlError
 from lqr.coordinates import gain_of
@@ -174,15 +174,20 @@ def _solve(model: Model, problem: RiccatiProblem, progress: Progress | None) -> 
         raise type(error)(scene_words(str(error))) from error
 
 
+def every_mode(problem: RiccatiProblem) -> ModalLoop:
+    """The closed loop of a small scene with its whole spectrum. Collective."""
+    return ModalLoop(problem, problem.layout.n_e)
+
+
 def _judge(problem: RiccatiProblem, solution: RiccatiSolution, error: Block) -> tuple[GainJudge, LoopQuality]:
     """The lowest modes and shift-and-invert; all modes where that does not converge, as far as they fit."""
     judge = GainJudge(problem, solution, error, ModalLoop(problem, min(SOME_MODES, problem.layout.n_e)))
     try:
-        return judge, worth(judge, gain_of(solution), ALL_MODES)
+        return judge, worth(judge, gain_of(solution), DENSE_LIMIT)
     except SolverError:
-        if problem.layout.n_e > ALL_MODES:
+        if problem.layout.n_e > DENSE_LIMIT:
             raise
-    judge = GainJudge(problem, solution, error, ModalLoop(problem))
+    judge = GainJudge(problem, solution, error, every_mode(problem))
     return judge, judge.quality(gain_of(solution))
 
 
@@ -197,4 +202,4 @@ def worth(judge: GainJudge, gain: Block, whole: int = WHOLE_SPECTRUM) -> LoopQua
     found = judge.quality(gain)
     if found.certified or judge.problem.layout.n_e > whole:
         return found
-    return ModalLoop(judge.problem).quality(gain, judge.K, judge.start, judge.optimal)
+    return every_mode(judge.problem).quality(gain, judge.K, judge.start, judge.optimal)

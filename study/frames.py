@@ -24,13 +24,14 @@ class Frames:
         model: the model.
         directory: where the field files go.
         pictures: keep what figures and animation need.
+        name: of the field files; a resumed run takes another, so that the frames before the stop stay.
     """
 
-    def __init__(self, model: Model, directory: Path, pictures: bool = True) -> None:
+    def __init__(self, model: Model, directory: Path, pictures: bool = True, name: str = "fields") -> None:
         self.model, self.pictures = model, pictures
         self.writer = None
         if model.scene.output.fields != "none":
-            self.writer = SeriesWriter(model, directory, model.scene.output.fields)
+            self.writer = SeriesWriter(model, directory, model.scene.output.fields, name)
         self.picture = gather_picture(model) if pictures else None
         vertices = model.space.mesh.mesh.geometry.index_map().size_global
         self.few = vertices > MANY_VERTICES

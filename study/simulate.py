@@ -48,7 +48,9 @@ def run_simulate(
     model = build(scene, comm)
     layout = model.system.layout
     console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {comm.size} rank(s)")
-    frames = Frames(model, out, pictures)
+    frames = Frames(model, out, pictures, "fields-resumed" if resume else "fields")
+    if resume:
+        console.print("resumed: fields-resumed and the pictures begin where the run was stopped", soft_wrap=True)
     columns = (TextColumn("steps"), BarColumn(), MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("steps", total=scene.time.steps)

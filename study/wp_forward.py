@@ -17,6 +17,7 @@ CG_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 POINT_WORK = {2: 8e6, 3: 6e5}  # unknowns times steps of a point of the diagram
 LARGEST = {2: 150_000, 3: 40_000}  # unknowns of a setting that no run of the diagram tried
 GROWTH = 4.0  # and its work over that of the largest point
+FINEST = 3  # numbers of steps behind a slope in time: coarser ones may not resolve the motion
 SAFETY = 0.9  # of the tolerance that a predicted error may use
 Group = tuple[tuple[int, ...] | None, int]
 
@@ -130,7 +131,7 @@ def forward_slopes(points: Sequence[WorkPoint]) -> list[Slope]:
                 found.append(Slope("forward", name, f"error against {against}", power, len(mine)))
     timed = [p for p in plain if p.details.get("error_time", 0) > 0]
     for series in dict.fromkeys(p.series for p in timed):
-        mine = [p for p in timed if p.series == series]
+        mine = sorted((p for p in timed if p.series == series), key=lambda p: p.details["steps"])[-FINEST:]
         power = power_law([p.details["steps"] for p in mine], [p.details["error_time"] for p in mine])
         if power is not None:
             found.append(Slope("forward", series, "change in time against steps", power, len(mine)))

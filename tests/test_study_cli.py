@@ -72,6 +72,16 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, args: tuple[str, ...], word
     assert not (tmp_path / "out" / "result.json").exists()
 
 
+def test_a_resumed_run_says_where_its_pictures_begin(tmp_path: Path) -> None:
+    small = ("simulate", str(FORWARD), "--out", str(tmp_path), "--set", "tissue.cells=[4,8]", "--set", "time.steps=40")
+    assert softgrasp(*small, "--until", "20", "--no-pictures").returncode != 0  # stopped, as asked
+    run = softgrasp(*small, "--resume", "--no-pictures")
+    assert run.returncode == 0, run.stderr
+    assert "begin where the run was stopped" in run.stdout
+    assert any(tmp_path.glob("fields-resumed*"))
+    assert json.loads((tmp_path / "result.json").read_text())["output_final"][0] > 5  # the tissue came along
+
+
 def test_missing_scene_and_mesh(tmp_path: Path) -> None:
     run = softgrasp("simulate", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out"))
     assert run.returncode == 1
