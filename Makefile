@@ -7,7 +7,7 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint bench pictures clean
+.PHONY: help env demo test lint bench paper pictures clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -34,6 +34,9 @@ test: lint ## lint, then the tests on 1, 2 and 3 ranks
 
 bench: $(STAMP) ## print the table of costs of the forward run
 	$(BIN)/python -m study.bench_forward
+
+paper: $(STAMP) ## every figure and table of the paper, and a page that compares
+	$(BIN)/python -m study.paper --out out/paper
 
 pictures: demo ## make the README's picture again
 	cp out/move.png docs/paper_forward.png

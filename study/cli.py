@@ -149,7 +149,7 @@ def study(
     out: Out = Path("out"),
     set_: Overrides = None,
     tolerance: Annotated[
-        float | None, typer.Option(help="find the cheapest setting with at most this relative error")
+        str | None, typer.Option(help="find the cheapest setting with at most this relative error, e.g. 1e-3")
     ] = None,
     budget: Annotated[
         str | None, typer.Option(help="find the most accurate setting within this time per step, e.g. 1ms")
@@ -158,10 +158,11 @@ def study(
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
     from study.work_precision import run_study
-    from study.wp_answer import parse_budget
+    from study.wp_answer import parse_budget, parse_tolerance
 
     limit = None if budget is None else parse_budget(budget)
-    run_study(scene, out, set_ or [], console(), tolerance=tolerance, budget=limit, quiet=quiet)
+    wanted = None if tolerance is None else parse_tolerance(tolerance)
+    run_study(scene, out, set_ or [], console(), tolerance=wanted, budget=limit, quiet=quiet)
 
 
 @app.command()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -148,7 +149,7 @@ def control_model(
         notes += [text for text in (few, why and f"no re-tuning: {why}") if text]
     made = make_controller(model, solved, swept)
     if made is None:
-        notes.append("no small controller: no a-priori gain of order N <= 12 is certified to be stable")
+        notes.append("no small controller: no a-priori gain of small order with tissue in it is certified to be stable")
     timing = plan(model, solved, own_end)
     notes += [timing.note] if timing.note else []
     frames = Frames(model, out, pictures)
@@ -189,17 +190,17 @@ def show(console: Console, found: Found, result: dict[str, Any]) -> None:
         console.print(f"note: {sentence}", soft_wrap=True, markup=False)
     table = Table(box=None, show_header=False, pad_edge=False)
     for row in summary_rows(result):
-        table.add_row(*row)
+        table.add_row(*map(escape, row))  # no brackets lost
     console.print(table)
     if not found.swept:
         return
-    best = Table("best stable gain", "N", "error of P", "error of K", "excess cost", "abscissa [1/s]", "ARE [ms]",
+    best = Table("best stable gain", "N", "error of P", "error of K", "excess cost", "abscissa [1/s]", "ARE, ms",
                  "not stable at N", box=None, pad_edge=False)  # fmt: skip
     for s in found.swept:
         r = s.best()
         bad = ", ".join(str(x.N) for x in s.reports if not x.stable)
         if r is None:
-            best.add_row(s.title, *([""] * 6), bad or s.refused)
+            best.add_row(s.title, *([""] * 6), bad or escape(s.refused))
             continue
         values = (f"{r.error_P:.1e}", f"{r.error_K:.1e}", f"{r.cost_excess:.1e}", f"{r.abscissa_full:.4g}")
         best.add_row(s.title, str(r.N), *values, f"{1e3 * r.time_are:.2g}", bad)

@@ -12,6 +12,7 @@ import numpy as np
 
 from fem.build import Model
 from fem.errors import SolverError
+from fem.layout import BlockLayout
 from fem.petsc import Array
 from fem.scene_file import scene_hash
 from lqr.actuation import Actuation
@@ -23,7 +24,7 @@ from lqr.gain import Gain
 from lqr.plant import Block
 from lqr.reduced_loop import ReducedLoop, ReducedTrajectory
 from lqr.small_plant import m_orthonormal, project
-from study.control_reduced import FAST_N, MANY_STATES, SweptBasis
+from study.control_reduced import MANY_STATES, SweptBasis, fast_order
 from study.control_solve import Design, actuation
 from study.frames import Frames
 from study.loop_plots import move_steps
@@ -42,7 +43,7 @@ class LoopPlan:
         dt: time step [s].
         steps: number.
         settle: time after which a rigid body under this gain is at the target [s].
-        note: why the scene's own end is not taken; empty when it is.
+        note: why the scene's own end is not taken, or that it is too early; else empty.
     """
 
     dt: float
@@ -97,15 +98,18 @@ def plan(model: Model, found: Design, own_end: bool) -> LoopPlan:
     settle = SETTLED / slowest if slowest > 0 else scene.time_end
     needed = int(np.ceil(settle / dt))
     steps = scene.time.steps
-    if own_end or needed <= steps:
+    if needed <= steps:
         return LoopPlan(dt, steps, settle)
+    if own_end:
+        note = f"the loop ends at t = {scene.time_end:g} s, but this gain needs about {settle:.2g} s; raise "
+        return LoopPlan(dt, steps, settle, note + "time.end, or control.Q for a faster move")
     longer = min(needed, LONGEST * steps)
     note = f"the loop runs {longer} steps to t = {longer * dt:.3g} s; at t = {scene.time_end:g} s it would still move"
     return LoopPlan(dt, longer, settle, note)
 
 
 def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) -> MadeController | None:
-    """The best certified a-priori gain of order N <= 12 as a controller; None when there is none. Collective.
+    """The best certified a-priori gain of a small order as a controller; None when there is none. Collective.
 
     Its states are [q_s, v_s, eta, eta'] with z = V eta, V the modes of the basis. The gain that is lifted by the filter
     W'z of these modes acts on them only, so that the small controller is the gain that was judged.
@@ -113,7 +117,7 @@ def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) ->
     problem, layout = found.problem, model.system.layout
     n = layout.n_local
     basis = next((s for s in swept if s.name == "structured"), None)
-    best = None if basis is None else basis.best(FAST_N)
+    best = None if basis is None else basis.best(fast_order(layout.n_s), 2 * layout.n_s + 2)
     if found.modal:
         name, gain = "modal", Gain.of(found.solution)
         # the factor spans the modes; what is dropped has 1e-12 of its largest column in X
@@ -122,7 +126,7 @@ def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) ->
         return None
     else:
         name, gain = basis.name, gain_of_basis(found, basis, best.N)
-        V = basis.family.at(best.N).U.tall[n:, -((best.N - 2 * layout.n_s) // 2) or 2 * best.N :]
+        V = basis.family.at(best.N).U.tall[n:, -((best.N - 2 * layout.n_s) // 2) :]
     plant, shapes = project(problem, V)
     K = shapes.reduce_gain(problem, gain)
     loop = None if model.scene.control is None else model.scene.control.loop
@@ -186,7 +190,7 @@ def run_loops(
         SolverError: the loop under the optimal gain diverges.
     """
     problem, scene, law = found.problem, model.scene, actuation(model)
-    others = [] if found.modal else best_gains(swept, model.system.layout.states)
+    others = [] if found.modal else best_gains(swept, model.system.layout)
     runs, done = (len(others) + 1) * timing.steps, 0
 
     def progress(run: Any) -> None:
@@ -215,11 +219,11 @@ def run_loops(
     return LoopRuns(timing, full, to_come, reduced, small_run(model, found, made, timing, law))
 
 
-def best_gains(swept: Sequence[SweptBasis], states: int) -> list[tuple[SweptBasis, int]]:
+def best_gains(swept: Sequence[SweptBasis], layout: BlockLayout) -> list[tuple[SweptBasis, int]]:
     """The best stable order of every method, a priori that of the controller; of a large plant that one only."""
-    limits = {"structured": FAST_N}
+    limits = {"structured": fast_order(layout.n_s)}
     fine = [(s, best.N) for s in swept if (best := s.best(limits.get(s.name))) is not None]
-    return fine if states <= MANY_STATES else [(s, N) for s, N in fine if s.name == "structured"]
+    return fine if layout.states <= MANY_STATES else [(s, N) for s, N in fine if s.name == "structured"]
 
 
 def small_run(

@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from lqr.abscissa import ModalLoop
 from lqr.coordinates import gain_of
-from study.control_reduced import FAST_N, TITLES, SweptBasis
+from study.control_reduced import TITLES, SweptBasis, fast_order
 from study.loop_plots import figure_decay, figure_histories, figure_loop_move
 from study.style import BLUE, COLUMN, GREEN, HAND, ORANGE, PURPLE, WIDTH, paper_style, save
 
@@ -158,7 +158,7 @@ def pole_sets(found: Design, swept: Sequence[SweptBasis]) -> dict[str, Poles]:
     K = gain_of(found.solution)
     sets = {"without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))), "optimal gain": loop.poles(K)}
     basis = next((s for s in swept if s.name == "structured"), None)
-    best = None if basis is None else basis.best(FAST_N)
+    best = None if basis is None else basis.best(fast_order(found.problem.layout.n_s))
     if basis is not None and best is not None:
         sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(basis.reduced(found.problem, best.N).gain)
     return {name: p[np.argsort(np.abs(p))][: 2 * SHOWN_MODES] for name, p in sets.items()}

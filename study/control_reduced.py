@@ -31,7 +31,7 @@ TITLES = {
     "pod_decomposed": "POD of decomposed P",
     "structured": "modes by cost, a priori",
 }
-FAST_N = 12  # order up to which a gain is offered for the control loop and re-tuned
+FAST_STATES = 8  # of the tissue, up to which a gain is offered for the control loop and re-tuned: N <= 12 in 2D
 MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by solves with the full plant
 FEW_ORDERS = 3
 REPEATS = 5  # of a re-tuning, the best counts
@@ -61,9 +61,9 @@ class SweptBasis:
         """Name in tables."""
         return TITLES.get(self.name, self.name)
 
-    def best(self, largest: int | None = None) -> GainReport | None:
-        """The stable gain of least cost, of any order or up to ``largest``. Not collective."""
-        fine = [r for r in self.reports if r.stable and (largest is None or largest >= r.N)]
+    def best(self, largest: int | None = None, least: int = 0) -> GainReport | None:
+        """The stable gain of least cost, of any order or between two. Not collective."""
+        fine = [r for r in self.reports if r.stable and least <= r.N and (largest is None or largest >= r.N)]
         return min(fine, key=lambda r: (r.cost_excess, r.N), default=None)
 
     def reduced(self, problem: RiccatiProblem, N: int) -> ReducedRiccati:
@@ -71,6 +71,11 @@ class SweptBasis:
         if self.family is None:
             raise ControlError(f"basis {self.name} is refused: {self.refused}")
         return reduce_riccati(problem, self.family.at(N))
+
+
+def fast_order(n_s: int) -> int:
+    """Largest order of a gain for the control loop: the hand's states and a few of the tissue. Not collective."""
+    return 2 * n_s + FAST_STATES
 
 
 def orders(model: Model, found: Design) -> tuple[list[int], str]:
@@ -81,7 +86,7 @@ def orders(model: Model, found: Design) -> tuple[list[int], str]:
     dense = found.judge.loop.complete and model.system.layout.n_e > WHOLE_SPECTRUM
     if (states <= MANY_STATES and not dense) or len(wanted) <= FEW_ORDERS:
         return wanted, ""
-    small = [N for N in wanted if N <= FAST_N]
+    small = [N for N in wanted if fast_order(model.system.layout.n_s) >= N]
     pick = np.linspace(0, len(wanted) - 1, FEW_ORDERS).round().astype(int)
     chosen = sorted({*small[-1:], *(wanted[i] for i in pick[1:])})
     why = "by all its eigenvalues" if dense else "by solves with the full plant"
@@ -179,14 +184,14 @@ class Retuned:
 def retune(
     model: Model, found: Design, swept: Sequence[SweptBasis], notify: Notify | None = None
 ) -> tuple[tuple[Retuned, ...], str]:
-    """The a-priori basis and the paper's best at N <= 12, re-tuned over the box; or why not. Collective."""
+    """The a-priori basis and the paper's best at a small order, re-tuned over the box; or why not. Collective."""
     states = model.system.layout.states
     reason = outside(model)
     if not reason and states > BOX_STATES:
         reason = f"{states} states are more than {BOX_STATES}: the full solutions to compare with would take long"
-    chosen = re_tunable(swept)
+    chosen = re_tunable(swept, model.system.layout.n_s)
     if not reason and not chosen:
-        reason = f"no basis has a stable gain of order N <= {FAST_N}"
+        reason = f"no basis has a stable gain of order N <= {fast_order(model.system.layout.n_s)}"
     if reason:
         return (), reason
     settings = box_materials(model)
@@ -233,9 +238,9 @@ def _at(
     return [replace(point, seconds=seconds) for point in points]
 
 
-def re_tunable(swept: Sequence[SweptBasis]) -> list[tuple[SweptBasis, int]]:
-    """The a-priori basis and the best of the others, each at its best order up to :data:`FAST_N`. Not collective."""
-    fine = [(s, best) for s in swept if (best := s.best(FAST_N)) is not None]
+def re_tunable(swept: Sequence[SweptBasis], n_s: int) -> list[tuple[SweptBasis, int]]:
+    """The a-priori basis and the best of the others, each at its best small order. Not collective."""
+    fine = [(s, best) for s in swept if (best := s.best(fast_order(n_s))) is not None]
     own = [(s, r.N) for s, r in fine if s.name == "structured"]
     others = sorted(((r.cost_excess, s.name, s, r.N) for s, r in fine if s.name != "structured"), key=lambda o: o[:2])
     return [*own, *((s, N) for _, _, s, N in others[:1])]

@@ -68,7 +68,7 @@ def figure_forward(
     """
     plain = [p for p in usable(points) if p.series != "solver"]
     with paper_style():
-        figure = plt.figure(figsize=(WIDTH, 4.0), layout="constrained")
+        figure = plt.figure(figsize=(WIDTH, 4.3), layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
         ax, space, time = (figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))
         for name in dict.fromkeys(p.series for p in plain):
@@ -96,7 +96,8 @@ def figure_forward(
             low = min([p.error for p in plain if p.error > 0], default=reference_error)
             ax.set_ylim(bottom=min(0.5 * reference_error, 0.5 * low))
             handles.append(Line2D([], [], color="#bbbbbb", lw=5, alpha=0.5, label="error of the reference"))
-        ax.legend(handles=[h for h in handles if h is not None], loc="upper right", fontsize=6.5)
+        shown = [h for h in handles if h is not None]
+        figure.legend(handles=shown, loc="outside upper center", ncols=3, fontsize=6.5)
         _orders(space, time, plain, slopes)
         return save(figure, out_png)
 
@@ -232,7 +233,7 @@ def figure_budget(
             y = [p.error for p in good]
             ax.plot([p.details["p50"] for p in good], y, ls="", marker="o", ms=2.8, color=colour, label=name)
             ax.plot([p.details["max"] for p in good], y, ls="", marker="|", ms=4, color=colour, alpha=0.6)
-        ax.axvline(budget, label="the budget", **LINE)
+        ax.axvline(budget, label="the budget", **(LINE | {"zorder": 5}))
         _axes(ax, "time of a step [s]: median, bar to 99 %, thin to the largest", "relative error of the outputs")
         ax.legend(loc="best")
         return save(figure, out_png)

@@ -211,10 +211,10 @@ class Predictor:
         if nested:
             coarse = nested[0]
             widest = max((c[0] for c, _ in groups if c is not None), default=coarse[0])
-            for k in range(1, 33):
+            for k in (*range(1, 17), *range(18, 32, 2), *range(32, 64, 4), *range(64, 257, 16)):
                 cells = tuple(n * k for n in coarse)
                 groups += [(cells, order) for order in (1, 2) if (cells, order) not in self.space]
-                if cells[0] > 4 * widest:
+                if cells[0] > 16 * widest:
                     break
         base = self.scene.time.steps
         counts = sorted({max(LEAST_STEPS, round(base * 2 ** (k / 2))) for k in range(-10, 5)} | set(step_counts(base)))
