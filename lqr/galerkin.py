@@ -151,7 +151,7 @@ class StructuredGalerkin:
     """
 
     tol: float = 1e-6
-    max_iterations: int = 12
+    max_iterations: int = 24
     modes: int = MODES
     per_step: int = 2
     tissue: str = "auto"
