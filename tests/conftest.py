@@ -65,11 +65,19 @@ def pytest_configure(config: pytest.Config) -> None:
         reporter._tw._file = open(os.devnull, "w")  # noqa: SIM115  (lives as long as the process)
 
 
+# Thousands of small collective calls: minutes on more ranks than cores. Three ranks run their rank-count tests alone.
+CHATTY = {
+    "test_lqr_large", "test_lqr_reduced", "test_study_bench", "test_study_control", "test_study_effects",
+    "test_study_reduce", "test_study_work",
+}  # fmt: skip
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    if OWN.size > 1:
-        for item in items:
-            if item.get_closest_marker("serial"):
-                item.add_marker(pytest.mark.skip(reason="runs on one rank only"))
+    for item in items:
+        if OWN.size > 1 and item.get_closest_marker("serial"):
+            item.add_marker(pytest.mark.skip(reason="runs on one rank only"))
+        elif OWN.size > 2 and item.path.stem in CHATTY and "rank_count" not in item.name:
+            item.add_marker(pytest.mark.skip(reason="runs on one and two ranks"))
 
 
 @pytest.fixture(autouse=True)
