@@ -44,18 +44,23 @@ class TissueSolver:
         ksp: the PETSc solver.
         S: the matrix.
         tolerance: relative residual that :meth:`check` accepts.
+        factor: the factor itself on one rank, whose triangular solves need no detour through ``ksp``; else None.
     """
 
     name: SolverName
     ksp: PETSc.KSP
     S: PETSc.Mat
     tolerance: float
+    factor: PETSc.Mat | None = None
 
     def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
         """Solve S w = r.
 
         Collective. Raises :class:`SolverError` when the iteration does not converge.
         """
+        if self.factor is not None:
+            self.factor.solve(r, w)
+            return
         self.ksp.solve(r, w)
         if self.ksp.getConvergedReason() < 0:
             raise SolverError(
@@ -141,6 +146,7 @@ def make_solver(
         _set_up_direct(ksp, name, prefix, reproducible)
     try:
         ksp.setUp()
+        ksp.setUpOnBlocks()  # the redundant factor would otherwise be made in the first solve
     except PETSc.Error as error:
         raise SolverError(
             f"{name}: the factorisation of the tissue matrix (n_e = {layout.n_e}) failed (PETSc error {error.ierr}); "
@@ -148,7 +154,8 @@ def make_solver(
         ) from error
     if ksp.getPC().getFailedReason():
         raise SolverError(f"{name}: set-up failed (reason {ksp.getPC().getFailedReason()}); the matrix is not definite")
-    return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol))
+    factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
+    return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol), factor)
 
 
 def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str, reproducible: bool) -> None:

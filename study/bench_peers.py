@@ -14,6 +14,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from fem.petsc import Array, PETSc
+from fem.solvers import TissueSolver
 from fem.system import BlockSystem
 
 
@@ -48,15 +49,16 @@ class TextbookLoop:
 
 
 class BareSolve:
-    """Nothing but ``ksp.solve`` with one right-hand side. Collective."""
+    """Nothing but the triangular solves with one right-hand side. Collective."""
 
-    def __init__(self, ksp: PETSc.KSP, r: PETSc.Vec) -> None:
-        self.ksp, self.r, self.w = ksp, r.copy(), r.duplicate()
+    def __init__(self, solver: TissueSolver, r: PETSc.Vec) -> None:
+        self.r, self.w = r.copy(), r.duplicate()
+        self.solve = solver.ksp.solve if solver.factor is None else solver.factor.solve
 
     def advance(self, k: int) -> None:
         """Solve k times. Collective."""
         for _ in range(k):
-            self.ksp.solve(self.r, self.w)
+            self.solve(self.r, self.w)
 
 
 def to_scipy(A: PETSc.Mat) -> Any:

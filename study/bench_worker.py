@@ -150,7 +150,7 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int,
     ksp = run.midpoint.solver.ksp
     methods = {
         "ts": of_ts,
-        "solve": of(BareSolve(ksp, run.midpoint.r), k),
+        "solve": of(BareSolve(run.midpoint.solver, run.midpoint.r), k),
         "loop": of(TextbookLoop(system, DT, ksp, loads), k),
     }
     factor = {}
