@@ -146,7 +146,8 @@ def make_solver(
         _set_up_direct(ksp, name, prefix, reproducible)
     try:
         ksp.setUp()
-        ksp.setUpOnBlocks()  # the redundant factor would otherwise be made in the first solve
+        if ksp.comm.size > 1 and name != "cg":
+            _first_solve(ksp, S)
     except PETSc.Error as error:
         raise SolverError(
             f"{name}: the factorisation of the tissue matrix (n_e = {layout.n_e}) failed (PETSc error {error.ierr}); "
@@ -156,6 +157,14 @@ def make_solver(
         raise SolverError(f"{name}: set-up failed (reason {ksp.getPC().getFailedReason()}); the matrix is not definite")
     factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
     return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol), factor)
+
+
+def _first_solve(ksp: PETSc.KSP, S: PETSc.Mat) -> None:
+    """Solve for zero: PETSc makes a redundant factor in the first solve, which belongs to the set-up. Collective."""
+    w, r = S.createVecs()
+    ksp.solve(r, w)
+    r.destroy()
+    w.destroy()
 
 
 def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str, reproducible: bool) -> None:
