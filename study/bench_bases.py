@@ -5,10 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
-import sys
-import tempfile
-import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -25,7 +21,8 @@ from fem.petsc import Array, total
 from reduction.engines import factor, small_svd
 from study.bench_forward import parse_ranks
 from study.bench_worker import interleave, medians, timed
-from study.doctor import IN_MPI_JOB, find_mpiexec
+from study.doctor import IN_MPI_JOB
+from study.workers import launch_worker, leave_result
 
 SIZES = "10000x600,100000x600"
 KEPT = 60  # basis vectors that are made
@@ -177,25 +174,8 @@ def measure(comm: MPI.Intracomm, n: int, m: int, repeats: int) -> Row:
 
 def launch(n: int, m: int, ranks: int, repeats: int) -> Row:
     """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
-    head = {"rows": n, "columns": m, "ranks": ranks}
-    mpiexec = find_mpiexec()
-    if mpiexec is None:
-        return head | {"error": "no mpiexec found; `softgrasp doctor` says what to do"}
-    root = str(Path(__file__).resolve().parent.parent)
-    path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "row.json"
-        text = json.dumps({"n": n, "m": m, "repeats": repeats, "file": str(file)})
-        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "study.bench_bases", "--worker", text]
-        try:
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=WORKER_LIMIT)
-        except subprocess.TimeoutExpired:
-            return head | {"error": f"no result after {WORKER_LIMIT:g} s"}
-        if done.returncode == 0 and file.is_file():
-            return dict(json.loads(file.read_text()))
-    lines = (done.stderr + done.stdout).strip().splitlines() or ["no output"]
-    return head | {"error": f"exit status {done.returncode}: {lines[-1]}"}
+    spec = {"n": n, "m": m, "repeats": repeats}
+    return {"rows": n, "columns": m, "ranks": ranks} | launch_worker("study.bench_bases", spec, ranks, WORKER_LIMIT)
 
 
 def table_of(results: Sequence[Row]) -> Table:
@@ -251,18 +231,7 @@ def write_csv(path: Path, results: Sequence[Row]) -> None:
 
 def run_worker(spec: dict[str, Any]) -> None:
     """Measure what the driver asks for and leave the numbers in its file. Collective."""
-    comm = MPI.COMM_WORLD
-    try:
-        result = measure(comm, spec["n"], spec["m"], spec["repeats"])
-        if comm.rank == 0:
-            Path(spec["file"]).write_text(json.dumps(result))
-    except Exception:
-        if comm.size == 1:
-            raise
-        # the other ranks may wait in a collective call
-        sys.stderr.write(traceback.format_exc())
-        sys.stderr.flush()
-        comm.Abort(1)
+    leave_result(spec["file"], lambda: measure(MPI.COMM_WORLD, spec["n"], spec["m"], spec["repeats"]))
 
 
 @app.command(help=HELP)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +15,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from study.doctor import IN_MPI_JOB, find_mpiexec
+from study.doctor import IN_MPI_JOB
+from study.workers import launch_worker
 
 SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"
 LARGE = (("2d", 1_000_000), ("3d", 200_000))
@@ -88,25 +86,7 @@ def parse_ranks(text: str) -> list[int]:
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
     """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
-    mpiexec = find_mpiexec()
-    if mpiexec is None:
-        return {"error": "no mpiexec found; `softgrasp doctor` says what to do", "ranks": ranks}
-    root = str(Path(__file__).resolve().parent.parent)
-    path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "row.json"
-        text = json.dumps(spec | {"file": str(file)})
-        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "study.bench_forward", "--worker", text]
-        try:
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=WORKER_LIMIT)
-        except subprocess.TimeoutExpired:
-            return {"error": f"no result after {WORKER_LIMIT:g} s", "ranks": ranks}
-        if done.returncode == 0 and file.is_file():
-            return dict(json.loads(file.read_text()))
-    lines = (done.stderr + done.stdout).strip().splitlines() or ["no output"]
-    said = next((line for line in lines if "Error: " in line and not line.startswith(" ")), lines[-1])
-    return {"error": f"exit status {done.returncode}: {said}", "ranks": ranks}
+    return {"ranks": ranks} | launch_worker("study.bench_forward", spec, ranks, WORKER_LIMIT)
 
 
 def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:

@@ -5,9 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from study.bench_forward import Goal, growth, parse_ranks
-from study.doctor import IN_MPI_JOB, find_mpiexec
+from study.doctor import IN_MPI_JOB
+from study.workers import launch_worker
 
 SIZES = "10,20,40,80,160"
 LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
@@ -57,25 +55,7 @@ def parse_meshes(text: str) -> list[int]:
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
     """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
-    mpiexec = find_mpiexec()
-    if mpiexec is None:
-        return {"error": "no mpiexec found; `softgrasp doctor` says what to do", "ranks": ranks}
-    root = str(Path(__file__).resolve().parent.parent)
-    path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "row.json"
-        text = json.dumps(spec | {"file": str(file)})
-        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "study.bench_riccati", "--worker", text]
-        try:
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=WORKER_LIMIT)
-        except subprocess.TimeoutExpired:
-            return {"error": f"no result after {WORKER_LIMIT:g} s", "ranks": ranks}
-        if done.returncode == 0 and file.is_file():
-            return dict(json.loads(file.read_text()))
-    lines = (done.stderr + done.stdout).strip().splitlines() or ["no output"]
-    said = next((line for line in lines if "Error: " in line and not line.startswith(" ")), lines[-1])
-    return {"error": f"exit status {done.returncode}: {said}", "ranks": ranks}
+    return {"ranks": ranks} | launch_worker("study.bench_riccati", spec, ranks, WORKER_LIMIT)
 
 
 def flat(rows: Sequence[Row]) -> list[Row]:

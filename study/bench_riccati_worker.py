@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
-import sys
 import time
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +28,7 @@ from lqr.residual import residual
 from study.bench_peers import to_scipy
 from study.bench_worker import peak_mb
 from study.control_problem import make_problem
+from study.workers import leave_result
 
 METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
 REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
@@ -235,16 +232,5 @@ def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
 
 def run_worker(spec: dict[str, Any]) -> None:
     """Measure what the driver asks for and leave the numbers in its file. Collective."""
-    comm = MPI.COMM_WORLD
     arguments = {key: value for key, value in spec.items() if key != "file"}
-    try:
-        result = measure_peer(**arguments) if "peer" in arguments else measure(**arguments)
-        if comm.rank == 0:
-            Path(spec["file"]).write_text(json.dumps(result))
-    except Exception:
-        if comm.size == 1:
-            raise
-        # the other ranks may wait in a collective call
-        sys.stderr.write(traceback.format_exc())
-        sys.stderr.flush()
-        comm.Abort(1)
+    leave_result(spec["file"], lambda: measure_peer(**arguments) if "peer" in arguments else measure(**arguments))

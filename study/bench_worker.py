@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import json
 import resource
 import statistics
-import sys
 import time
-import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +21,7 @@ from fem.run import Run, RunOptions, make_ts, simulate
 from fem.scene import Scene
 from fem.scene_file import load_scene_collective, shipped_scenes
 from study.bench_peers import BareSolve, PymorLoop, ScipyLoop, TextbookLoop, has_pymor, to_scipy
+from study.workers import leave_result
 
 DT = 0.005  # [s], that of the paper: 600 steps in 3 s
 PAPER_STEPS = 600
@@ -273,14 +271,6 @@ def run_worker(spec: dict[str, Any]) -> None:
     """Measure what the driver asks for and leave the numbers in its file. Collective."""
     comm = MPI.COMM_WORLD
     arguments = {key: value for key, value in spec.items() if key not in ("file", "large")}
-    try:
-        result = measure_large(comm, **arguments) if spec["large"] else measure(comm, **arguments)
-        if comm.rank == 0:
-            Path(spec["file"]).write_text(json.dumps(result))
-    except Exception:
-        if comm.size == 1:
-            raise
-        # the other ranks may wait in a collective call
-        sys.stderr.write(traceback.format_exc())
-        sys.stderr.flush()
-        comm.Abort(1)
+    leave_result(
+        spec["file"], lambda: measure_large(comm, **arguments) if spec["large"] else measure(comm, **arguments)
+    )
