@@ -88,6 +88,7 @@ def read_checkpoint(run: Run, directory: Path) -> None:
                 _restore(run, file, entry["step"])
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
+    run.midpoint.join(run.state)
     for vector in (run.state.z, run.state.v, run.midpoint.h, run.midpoint.k):
         vector.stateIncrease()
 

@@ -36,11 +36,11 @@ class TableDrive:
             c -= system.gravity
         if system.damping.in_space:
             c += system.damping.alpha * (table.v[1:] + table.v[:-1]) / 2
-        self.G, self.c = system.G, -c
+        self.c = -c
 
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One product with the n_s columns of G and one solve. Collective."""
-        np.dot(self.G, self.c[n], out=midpoint.load_array)
+        midpoint.set_load(self.c[n])
         midpoint.solve_midpoint()
 
 
@@ -70,26 +70,18 @@ class ForceDrive:
         self.theta = s * s + self.alpha * s
         self.lhs = system.M_hand
         if system.two_way:
-            self.Y = self._responses(midpoint)
+            self.Y = midpoint.make_responses()
             GY = total(system.layout.comm, system.G.T @ self.Y)
             self.GY = (GY + GY.T) / 2
             self.lhs = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
         self.inverse = np.linalg.inv(self.lhs)
         self.solve = self._two_way if system.two_way else self._one_way  # chosen once, not in every step
 
-    def _responses(self, midpoint: TissueMidpoint) -> Array:
-        Y = np.empty(self.system.G.shape, order="F")
-        for j in range(Y.shape[1]):
-            midpoint.r.array_w[:] = self.system.G[:, j]
-            midpoint.solver.solve(midpoint.r, midpoint.w)
-            Y[:, j] = midpoint.w.array_r
-        return Y
-
     def _one_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One solve. Collective."""
         q, v = self.q[n], self.v[n]
         a = self.inverse @ (self.force(n, (n + 0.5) * self.dt, q, v) + self.weight)
-        np.dot(self.system.G, -(self.kappa * a + self.alpha * v - self.g), out=midpoint.load_array)
+        midpoint.set_load(-(self.kappa * a + self.alpha * v - self.g))
         midpoint.solve_midpoint()
         self._move(n, a)
 
@@ -99,15 +91,11 @@ class ForceDrive:
         u = self.force(n, (n + 0.5) * self.dt, q, v) + self.weight
         c0 = self.alpha * v - self.g
         G, layout = self.system.G, self.system.layout
-        midpoint.solver.solve(midpoint.h, midpoint.w)
-        x = midpoint.w.array_w
+        x = midpoint.respond()
         relative = self.theta * x - midpoint.s * state.array[layout.n_local :]
         pull = total(layout.comm, G.T @ relative) - self.theta * (self.GY @ c0)
         a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
-        c = self.kappa * a + c0
-        x -= self.Y @ c
-        np.dot(G, -c, out=midpoint.load_array)
-        midpoint.r.waxpy(1.0, midpoint.load, midpoint.h)
+        midpoint.accelerate(self.kappa * a + c0)
         self._move(n, a)
 
     def _move(self, n: int, a: Array) -> None:

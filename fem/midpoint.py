@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fem.errors import SolverError
+from fem.held import every_rank_steps_all, held_operators
 from fem.petsc import Array, PETSc, total
 from fem.solvers import SolverName, TissueSolver, make_solver
 from fem.system import BlockSystem
@@ -56,39 +58,52 @@ def state_on(array: Array, system: BlockSystem) -> TissueState:
 class TissueMidpoint:
     """The tissue half of the step, for a load known at the midpoint.
 
+    When every rank holds the whole factor it holds the vectors whole as well, and a step sends no message: all ranks
+    compute the same numbers and each writes its own rows into the state.
+
     Args:
         system: operators.
         dt: step [s].
         solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
         reproducible: same bits in every parallel run, see :func:`fem.solvers.make_solver`.
+
+    Attributes:
+        held: operators on the rows held.
+        r, h, k, w, load: vectors on the rows held; ``load_array``, ``w_array`` ... their arrays.
+        w_own: the rows of w that this rank owns, an array.
     """
 
     def __init__(
         self, system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: bool = False
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
-        self.solver: TissueSolver = make_solver(
-            midpoint_matrix(system, dt), solver, system.layout, "softgrasp_midpoint_", rtol, reproducible
-        )
-        # blocks of d x d: a quarter less memory traffic than single entries; on one rank, because the conversion of a
-        # parallel matrix takes its source apart
-        self.K = system.K_ee.copy()
-        if system.layout.comm.size == 1:
-            self.K.convert("baij")
-        self.r, self.h, self.k, self.w, self.load = (system.K_ee.createVecLeft() for _ in range(5))
+        self.held = held_operators(system, every_rank_steps_all(system.layout, solver, reproducible))
+        self.K, self.G, self.rows = self.held.K, self.held.G, self.held.rows
+        S = self.held.matrix(midpoint_matrix(system, dt))
+        self.solver: TissueSolver = make_solver(S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible)
+        self.r, self.h, self.k, self.w, self.load = (self.K.createVecLeft() for _ in range(5))
         # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
         self.load_array: Array = self.load.array_w
-        self.w_array, self.r_array, self.k_array = self.w.array_r, self.r.array_r, self.k.array_r
+        self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
+        self.w_own = self.w_array[self.rows]
+        self.x = self.w  # w as the state is distributed
+        self._move = self._move_all
+        if self.held.whole:
+            layout = system.layout
+            self.x = PETSc.Vec().createWithArray(
+                self.w_own, size=(layout.n_local, layout.n_e), bsize=layout.dimension, comm=layout.comm
+            )
+            self.z = self.w.duplicate()
+            self.z_own = self.z.array_r[self.rows]
+            self._move = self._move_own
         damping = system.damping
-        self.alpha, self.beta, self.D = damping.alpha, damping.beta, damping.matrix
+        self.alpha, self.beta = damping.alpha, damping.beta
         self.a = 2 * self.s / (self.s + self.alpha)
         self.b = self.a * (1 + self.s * self.beta) / 2
         self._propagate = self._undamped
-        if self.D is not None:
-            self.k_old, self.y = self.k.duplicate(), self.k.duplicate()
-            self.y_array = self.y.array_r
-            self._propagate = self._general
+        if damping.matrix is not None:
+            self._prepare_general()
         elif damping.active:
             self.k_old = self.k.duplicate()
             self.k_old_array = self.k_old.array_r
@@ -96,67 +111,125 @@ class TissueMidpoint:
         self.work = 0.0
         self.dissipated = 0.0
 
+    def _prepare_general(self) -> None:
+        """The damping matrix with its mass-proportional part, so that a step needs one product with it. Collective."""
+        self.k_old, self.y = self.k.duplicate(), self.k.duplicate()
+        self.y_array = self.y.array_r
+        if self.held.D is None or self.held.M is None:
+            raise SolverError("a damping matrix is missing")
+        self.M, self.D = self.held.M, self.held.D.copy()
+        self.D.axpy(self.alpha, self.M, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self._propagate = self._general
+
     def start(self, state: TissueState) -> None:
         """Set the carried vectors k = K z and h = s M v - K z. Collective."""
-        self.K.mult(state.z, self.k)
-        self.system.M_ee.mult(state.v, self.h)
+        self.join(state)
+        K, M, y = self.system.K_ee, self.system.M_ee, state.z.duplicate()
+        K.mult(state.z, y)
+        self.k.array_w[:] = self.held.gather(y.array_r)
+        M.mult(state.v, y)
+        self.h.array_w[:] = self.held.gather(y.array_r)
         self.h.scale(self.s)
         self.h.axpy(-1.0, self.k)
+        y.destroy()
+
+    def join(self, state: TissueState) -> None:
+        """Take a state over whose carried vectors are set. Collective."""
+        if self.held.whole:
+            self.z.array_w[:] = self.held.gather(state.z.array_r)
+
+    def set_load(self, c: Array) -> None:
+        """Load G c of the midpoint for c of shape (n_s,). Not collective."""
+        np.dot(self.G, c, out=self.load_array)
 
     def solve_midpoint(self) -> None:
         """Solve S w = h + l for the load in ``load``. Collective."""
         self.r.waxpy(1.0, self.load, self.h)
         self.solver.solve(self.r, self.w)
 
+    def respond(self) -> Array:
+        """Solve S w = h, the step without a load; the owned rows of w. Collective."""
+        self.solver.solve(self.h, self.w)
+        return self.w_own
+
+    def make_responses(self) -> Array:
+        """Set Y = S^{-1} G for :meth:`accelerate`; its owned rows (n_local, n_s). Collective.
+
+        Raises:
+            SolverError: a solve missed its tolerance.
+        """
+        self.Y = np.empty(self.G.shape, order="F")
+        for j in range(self.Y.shape[1]):
+            self.r.array_w[:] = self.G[:, j]
+            self.solver.solve(self.r, self.w)
+            self.solver.check(self.r, self.w, "the response to the hand")
+            self.Y[:, j] = self.w.array_r
+        return self.Y[self.rows]
+
+    def accelerate(self, c: Array) -> None:
+        """Turn S^{-1} h in w into S^{-1} (h - G c), and set load and right-hand side to match. Not collective."""
+        w = self.w.array_w  # not the view: PETSc must see that w changed
+        w -= self.Y @ c
+        np.dot(self.G, -c, out=self.load_array)
+        self.r.waxpy(1.0, self.load, self.h)
+
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry k and h on. Collective."""
-        w = self.w
-        if new is old:
-            old.z.axpy(2.0, w)
-            old.v.axpby(2 * self.s, -1.0, w)
-        else:
-            new.z.waxpy(2.0, w, old.z)
-            old.v.copy(new.v)
-            new.v.axpby(2 * self.s, -1.0, w)
-        self.work += 2.0 * float(np.dot(self.w_array, self.load_array))
-        self._propagate(new)
+        z = self._move(old, new)
+        self.work += 2.0 * float(np.dot(self.w_own, self.load_array[self.rows]))
+        self._propagate(z)
 
-    def _undamped(self, new: TissueState) -> None:
-        self.K.mult(new.z, self.k)
+    def _move_all(self, old: TissueState, new: TissueState) -> PETSc.Vec:
+        if new is old:
+            old.z.axpy(2.0, self.w)
+        else:
+            new.z.waxpy(2.0, self.w, old.z)
+        self._move_velocity(old, new)
+        return new.z
+
+    def _move_own(self, old: TissueState, new: TissueState) -> PETSc.Vec:
+        self.z.axpy(2.0, self.w)
+        new.array[: len(self.z_own)] = self.z_own
+        self._move_velocity(old, new)
+        return self.z
+
+    def _move_velocity(self, old: TissueState, new: TissueState) -> None:
+        if new is not old:
+            old.v.copy(new.v)
+        new.v.axpby(2 * self.s, -1.0, self.x)
+
+    def _undamped(self, z: PETSc.Vec) -> None:
+        self.K.mult(z, self.k)
         self.h.waxpy(1.0, self.load, self.r)
         self.h.axpy(-2.0, self.k)
 
-    def _proportional(self, new: TissueState) -> None:
+    def _proportional(self, z: PETSc.Vec) -> None:
         self.k, self.k_old = self.k_old, self.k
         self.k_array, self.k_old_array = self.k_old_array, self.k_array
-        self.K.mult(new.z, self.k)
+        self.K.mult(z, self.k)
         self.h.axpby(self.a, -1.0, self.r)
         self.h.axpy(-1.0 - self.b, self.k)
         self.h.axpy(self.b - 1.0, self.k_old)
-        w = self.w_array
-        wKw = (np.dot(w, self.k_array) - np.dot(w, self.k_old_array)) / 2
-        wMw = (np.dot(w, self.r_array) - (1 + self.s * self.beta) * wKw) / (self.s * (self.s + self.alpha))
+        w, rows = self.w_own, self.rows
+        wKw = (np.dot(w, self.k_array[rows]) - np.dot(w, self.k_old_array[rows])) / 2
+        wMw = (np.dot(w, self.r_array[rows]) - (1 + self.s * self.beta) * wKw) / (self.s * (self.s + self.alpha))
         self.dissipated += 2 * self.s * float(self.alpha * wMw + self.beta * wKw)
 
-    def _general(self, new: TissueState) -> None:
-        self.system.M_ee.mult(self.w, self.y)
+    def _general(self, z: PETSc.Vec) -> None:
+        self.M.mult(self.w, self.y)
         self.h.axpby(2 * self.s**2, -1.0, self.y)
         self.h.axpy(-1.0, self.k)
-        self.K.mult(new.z, self.k)
+        self.K.mult(z, self.k)
         self.h.axpy(-1.0, self.k)
-        if self.D is not None:
-            self.D.mult(self.w, self.y)
-        self.dissipated += 2 * self.s * float(np.dot(self.w_array, self.y_array))
-        if self.alpha:
-            self.system.M_ee.mult(self.w, self.y)
-            self.dissipated += 2 * self.s * self.alpha * float(np.dot(self.w_array, self.y_array))
+        self.D.mult(self.w, self.y)
+        self.dissipated += 2 * self.s * float(np.dot(self.w_own, self.y_array[self.rows]))
 
     def energy(self, state: TissueState) -> float:
         """Energy (z' K z + v' M v) / 2 [J] from the carried vectors. Collective."""
-        n = len(self.w_array)
+        n, k = len(self.w_own), self.k_array[self.rows]
         z, v = state.array[:n], state.array[n:]
-        momentum = (self.h.array_r + self.k_array) / self.s
-        local = np.array([np.dot(z, self.k_array), np.dot(v, momentum)])
+        momentum = (self.h.array_r[self.rows] + k) / self.s
+        local = np.array([np.dot(z, k), np.dot(v, momentum)])
         return float(total(self.system.layout.comm, local).sum()) / 2
 
     def balance(self) -> tuple[float, float]:
@@ -171,13 +244,14 @@ class TissueMidpoint:
         left is small against the load, not against the rounding in r.
         """
         # the array, not the vector: it is written through a view, so the norm that PETSc remembers may be an old one
-        square = total(self.system.layout.comm, np.array([np.dot(self.load_array, self.load_array)]))[0]
+        load = self.load_array[self.rows]
+        square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
         return self.solver.check(self.r, self.w, where, float(np.sqrt(square)))
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
         self.solver.destroy()
-        self.K.destroy()
-        for name in ("r", "h", "k", "w", "load", "k_old", "y"):
+        self.held.destroy()
+        for name in ("r", "h", "k", "x", "w", "load", "k_old", "y", "z", "D"):
             if hasattr(self, name):
                 getattr(self, name).destroy()

@@ -215,7 +215,7 @@ class LoopRun:
                     self._advance(ts, x, min(end, self.store.limit(self.reached)))
                     self.store.flush(self.reached)
                 if self.reached == 1:
-                    self.residual_first = self.residual()
+                    self.residual_first = self.midpoint.residual("step 1")
                 self._check_finite()
                 if self.options.frame is not None and end in frames:
                     self.options.frame(self)
@@ -254,23 +254,6 @@ class LoopRun:
             self.store.work.array[:] = self.state.array  # the TS solution is current between segments
             x.stateIncrease()
 
-    def residual(self) -> float:
-        """Residual of the last solve relative to the larger of r and the load, checked. Collective.
-
-        In equilibrium under gravity load and stiffness cancel in r, and only rounding is left of it.
-
-        Raises:
-            SolverError: the solve missed its tolerance.
-        """
-        midpoint = self.midpoint
-        size = midpoint.r.norm()
-        load = midpoint.load_array  # written through this view, so PETSc's own norm may be an old one
-        scale = max(size, float(np.sqrt(total(self.problem.layout.comm, np.array([np.dot(load, load)])).sum())))
-        value = midpoint.solver.residual(midpoint.r, midpoint.w) * (size / scale if size > 0 else 1.0)
-        if not value <= midpoint.solver.tolerance:
-            midpoint.residual()  # raises, and says what to do
-        return float(value)
-
     def _check_finite(self) -> None:
         n = self.reached
         # far above any state of use, far below overflow of the squares in cost and energy
@@ -306,7 +289,7 @@ class LoopRun:
             final=PlantState(drive.q[-1].copy(), drive.v[-1].copy(), array[:n].copy(), array[n:].copy()),
             snapshots=self.store.finish(times, drive.q, drive.v),
             saturated=saturated,
-            residuals=(self.residual_first, self.residual()),
+            residuals=(self.residual_first, self.midpoint.residual(f"step {self.reached}")),
             solver=self.solver,
             seconds={"factor": self.loop.factor_seconds, "steps": comm.allreduce(self.seconds, MPI.MAX)},
         )

@@ -39,7 +39,7 @@ class PlantStep:
         self.alpha = system.damping.alpha if system.damping.in_space else 0.0
         self.kappa = 1 + self.alpha * self.dt / 2
         self.theta = self.s**2 + self.alpha * self.s
-        self.Y = self._responses()
+        self.Y = midpoint.make_responses()
         self.GY = np.zeros((n_s, n_s))
         self.L = system.M_hand
         if system.two_way:
@@ -47,16 +47,6 @@ class PlantStep:
             self.GY = (GY + GY.T) / 2
             self.L = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
         self.inverse = np.linalg.inv(self.L)
-
-    def _responses(self) -> Array:
-        midpoint = self.midpoint
-        Y = np.empty(self.system.G.shape, order="F")
-        for j in range(Y.shape[1]):
-            midpoint.r.array_w[:] = self.system.G[:, j]
-            midpoint.solver.solve(midpoint.r, midpoint.w)
-            midpoint.solver.check(midpoint.r, midpoint.w, "the response to the hand")
-            Y[:, j] = midpoint.w.array_r
-        return Y
 
 
 class Drive(Protocol):
@@ -106,8 +96,7 @@ class ImplicitDrive:
         """One step. Collective."""
         plant, midpoint = self.plant, self.plant.midpoint
         system, q, v, n_s = plant.system, self.q[n], self.v[n], len(self.K_q)
-        midpoint.solver.solve(midpoint.h, midpoint.w)
-        x, n_local = midpoint.w.array_w, system.layout.n_local
+        x, n_local = midpoint.respond(), system.layout.n_local
         sums = self.sums
         sums[:n_s] = self.gain.K_z.T @ state.array[:n_local]
         sums[n_s : 2 * n_s] = self.N.T @ x
@@ -121,7 +110,7 @@ class ImplicitDrive:
         u_0 = self.offset + self.K_q @ (q + plant.dt / 2 * v) + self.K_v @ v
         u_0 += sums[:n_s] + sums[n_s : 2 * n_s] - self.NY @ c_0 + self.FL @ f
         u = self.input.solve(u_0)
-        finish(plant, self, n, u, plant.inverse @ (u + f), x)
+        finish(plant, self, n, u, plant.inverse @ (u + f))
 
 
 class HeldDrive:
@@ -164,24 +153,19 @@ class HeldDrive:
         u, c_0 = self.held, plant.alpha * self.v[n] - plant.g
         if not system.two_way:
             a = plant.inverse @ (u + plant.weight)
-            np.dot(system.G, -(plant.kappa * a + c_0), out=midpoint.load_array)
+            midpoint.set_load(-(plant.kappa * a + c_0))
             midpoint.solve_midpoint()
             move(self, n, u, a, plant.dt)
             return
-        midpoint.solver.solve(midpoint.h, midpoint.w)
-        x = midpoint.w.array_w
+        x = midpoint.respond()
         relative = plant.theta * x - plant.s * state.array[system.layout.n_local :]
         pull = total(plant.comm, system.G.T @ relative) - plant.theta * (plant.GY @ c_0)
-        finish(plant, self, n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull), x)
+        finish(plant, self, n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
 
 
-def finish(plant: PlantStep, drive: Drive, n: int, u: Array, a: Array, x: Array) -> None:
-    """Turn x = S^{-1} h into w for the acceleration a, set load and right-hand side, move the hand. Collective."""
-    midpoint = plant.midpoint
-    c = plant.kappa * a + plant.alpha * drive.v[n] - plant.g
-    x -= plant.Y @ c
-    np.dot(plant.system.G, -c, out=midpoint.load_array)
-    midpoint.r.waxpy(1.0, midpoint.load, midpoint.h)
+def finish(plant: PlantStep, drive: Drive, n: int, u: Array, a: Array) -> None:
+    """Turn S^{-1} h into w for the acceleration a, set load and right-hand side, move the hand. Not collective."""
+    plant.midpoint.accelerate(plant.kappa * a + plant.alpha * drive.v[n] - plant.g)
     move(drive, n, u, a, plant.dt)
 
 

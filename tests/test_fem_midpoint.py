@@ -256,7 +256,7 @@ def test_time_reversal_returns_to_the_start(comm: MPI.Intracomm) -> None:
     for order in (loads, loads[::-1]):
         midpoint.start(state)
         for a in order:
-            midpoint.load_array[:] = system.G @ a
+            midpoint.set_load(a)
             midpoint.solve_midpoint()
             midpoint.advance(state, state)
         state.v.scale(-1.0)
