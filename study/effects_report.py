@@ -204,8 +204,6 @@ def _report(
     sections += [Section("How it is judged", rows=how), Section("Made with", rows=about)]
     launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
     sets = "".join(f" --set '{o}'" for o in overrides)
-    rows = study.explanation.equation.stepped
-    text = "\n".join(f"{name}: {' + '.join(left)} = {' + '.join(right)}" for name, left, right in rows)
     return write_report(
         out / "report.html",
         title=f"{scene.name}: effects",
@@ -214,7 +212,6 @@ def _report(
         figures=[(out / "effects.png", CAPTION)],
         scene=resolved_toml(scene),
         reproduce=f"{launch}softgrasp effects {path}{sets}",
-        equation=text.replace("+ - ", "- "),
     )
 
 

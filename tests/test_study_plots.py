@@ -215,6 +215,15 @@ def test_long_moves_are_shown_faster_and_short_ones_slower() -> None:
     assert speed_up(np.array([0.0, 0.03])) == pytest.approx(0.02, rel=1e-12)  # rounding
 
 
+SCENE = """name = "s"
+tissue = { size = [1.0, 2.0], cells = [2, 4], material = { lambda = 50.0, mu = 50.0, rho = 1.0 } }
+contact = { sides = ["left"] }
+hand = { mass = 1.0 }
+motion = { target = [5.0, 3.0] }
+time = { steps = 5 }
+"""
+
+
 class Page(HTMLParser):
     """Checks that tags are balanced and collects texts and addresses."""
 
@@ -246,7 +255,7 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
     )
     path = write_report(
         tmp_path / "r.html", title="A & B", subtitle="s", tables=[("Short", [("a", 1)])], figures=[(png, "caption")],
-        sections=[table], scene="[tissue]", reproduce="softgrasp reduce x.toml",
+        sections=[table], scene=SCENE, reproduce="softgrasp reduce x.toml",
     )  # fmt: skip
     page = Page(path.read_text())
     assert not page.open
@@ -259,6 +268,8 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
         ("td", "1.25e-07"),
         ("td", "yes"),
         ("td", "a"),
+        ("h2", "Equation"),
+        ("h2", "Versions"),
     ):
         assert cell in page.cells
     with pytest.raises(ValueError, match="'Bad' has 2 columns"):
