@@ -9,16 +9,7 @@ from mpi4py import MPI
 
 from fem.layout import BlockLayout
 from fem.petsc import Array, PETSc
-from fem.solvers import SolverName
 from fem.system import BlockSystem
-
-
-def every_rank_steps_all(layout: BlockLayout, solver: SolverName, reproducible: bool) -> bool:
-    """Whether every rank holds the whole factor. It then steps the whole tissue too, without a message.
-
-    Not collective.
-    """
-    return layout.comm.size > 1 and (solver == "cholesky" or (solver == "mumps" and reproducible))
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fem.errors import SolverError
-from fem.held import every_rank_steps_all, held_operators
+from fem.held import held_operators
 from fem.petsc import Array, PETSc, total
-from fem.solvers import SolverName, TissueSolver, make_solver
+from fem.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from fem.system import BlockSystem
 
 
@@ -66,7 +66,7 @@ class TissueMidpoint:
         dt: step [s].
         solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
-        reproducible: same bits in every parallel run, see :func:`fem.solvers.make_solver`.
+        reproducible: see :func:`fem.solvers.factor_on_every_rank`.
 
     Attributes:
         held: operators on the rows held.
@@ -75,10 +75,15 @@ class TissueMidpoint:
     """
 
     def __init__(
-        self, system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: bool = False
+        self,
+        system: BlockSystem,
+        dt: float,
+        solver: SolverName,
+        rtol: float = 1e-10,
+        reproducible: Reproducible = "auto",
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
-        self.held = held_operators(system, every_rank_steps_all(system.layout, solver, reproducible))
+        self.held = held_operators(system, factor_on_every_rank(system.layout, solver, reproducible))
         self.K, self.G, self.rows = self.held.K, self.held.G, self.held.rows
         S = self.held.matrix(midpoint_matrix(system, dt))
         self.solver: TissueSolver = make_solver(S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible)

@@ -113,8 +113,10 @@ class Time(Model):
     )
     solver: Literal["auto", "cholesky", "mumps", "cg"] = Field("auto", description="linear solver [no unit]")
     rtol: Annotated[float, Field(gt=0, lt=1)] = Field(1e-10, description="relative tolerance [1], cg only")
-    reproducible: bool = Field(
-        False, description="MUMPS on every rank by itself: the same bits in every parallel run, but slower [no unit]"
+    reproducible: Literal["auto"] | bool = Field(
+        "auto",
+        description="equal bits in every run on the same number of ranks: each holds the whole factor [no unit]; "
+        "auto: on up to 4 ranks, while the factors fit",
     )
 
 

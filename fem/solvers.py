@@ -12,11 +12,16 @@ from fem.layout import BlockLayout
 from fem.petsc import PETSc, petsc_options
 
 SolverName = Literal["cholesky", "mumps", "cg"]
+Reproducible = Literal["auto"] | bool
 
 # Where each road ends on two ranks and 24 GiB: PETSc Cholesky (nested dissection) is fastest per solve in 2D but its
 # 3D factorisation is 20 times slower than that of MUMPS; beyond the last limits the factor itself no longer fits.
 CHOLESKY_LIMIT = {2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {2: 4_000_000, 3: 300_000}
+# Up to these every rank holds the whole factor of MUMPS: unknowns times ranks, about 10 GB of factors in all, and
+# ranks, for beyond a few the spread factor is several times faster
+REPEATED_LIMIT = {2: 2_500_000, 3: 450_000}
+REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
@@ -33,6 +38,21 @@ def choose_solver(layout: BlockLayout, wanted: str = "auto") -> tuple[SolverName
     if n <= DIRECT_LIMIT[d]:
         return "mumps", f"n_e = {n} <= {DIRECT_LIMIT[d]} in {d}D: the factor fits and factors fast"
     return "cg", f"n_e = {n} > {DIRECT_LIMIT[d]} in {d}D: the factor would not fit"
+
+
+def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: Reproducible) -> bool:
+    """Whether every rank factors by itself: no message in a solve, and the same bits in every run. Not collective.
+
+    The distributed factor of MUMPS needs less memory, but adds in the order messages arrive, so that its last bits
+    differ from run to run.
+    """
+    ranks = layout.comm.size
+    if ranks == 1 or solver == "cg":
+        return False
+    if reproducible == "auto":
+        small = ranks <= REPEATED_RANKS and layout.n_e * ranks <= REPEATED_LIMIT[layout.dimension]
+        return solver == "cholesky" or small
+    return solver == "cholesky" or reproducible
 
 
 @dataclass(frozen=True)
@@ -120,7 +140,12 @@ class TissueSolver:
 
 
 def make_solver(
-    S: PETSc.Mat, name: SolverName, layout: BlockLayout, prefix: str, rtol: float = 1e-10, reproducible: bool = False
+    S: PETSc.Mat,
+    name: SolverName,
+    layout: BlockLayout,
+    prefix: str,
+    rtol: float = 1e-10,
+    reproducible: Reproducible = "auto",
 ) -> TissueSolver:
     """Factor S (or set up CG with GAMG). Collective.
 
@@ -130,8 +155,7 @@ def make_solver(
         layout: sizes and node coordinates.
         prefix: PETSc options prefix.
         rtol: relative tolerance of cg.
-        reproducible: run MUMPS on every rank by itself; the distributed one adds in the order messages arrive, so
-            its last bits differ from run to run.
+        reproducible: see :func:`factor_on_every_rank`.
 
     Raises:
         SolverError: the factorisation fails.
@@ -143,7 +167,7 @@ def make_solver(
     if name == "cg":
         _set_up_cg(ksp, S, layout, prefix, rtol)
     else:
-        _set_up_direct(ksp, name, prefix, reproducible)
+        _set_up_direct(ksp, name, prefix, ksp.comm.size > 1 and factor_on_every_rank(layout, name, reproducible))
     try:
         ksp.setUp()
         if ksp.comm.size > 1 and name != "cg":
@@ -167,17 +191,16 @@ def _first_solve(ksp: PETSc.KSP, S: PETSc.Mat) -> None:
     w.destroy()
 
 
-def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str, reproducible: bool) -> None:
+def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str, repeated: bool) -> None:
     ksp.setType("preonly")
     pc = ksp.getPC()
-    if name == "mumps" and (ksp.comm.size == 1 or not reproducible):
+    if not repeated:
         pc.setType("cholesky")
-        pc.setFactorSolverType("mumps")
-    elif ksp.comm.size == 1:
-        pc.setType("cholesky")
-        pc.setFactorOrdering("nd")
+        if name == "mumps":
+            pc.setFactorSolverType("mumps")
+        else:
+            pc.setFactorOrdering("nd")
     else:
-        # every rank holds the whole factor: no messages in the triangular solves
         inner = {
             "pc_type": "redundant",
             "redundant_ksp_type": "preonly",

@@ -15,7 +15,7 @@ from fem.errors import SolverError
 from fem.midpoint import TissueMidpoint, TissueState
 from fem.petsc import Array, PETSc, total
 from fem.snapshots import NoStore, Snapshots, make_store
-from fem.solvers import choose_solver
+from fem.solvers import Reproducible, choose_solver
 from lqr.actuation import Actuation
 from lqr.checks import ControlError
 from lqr.cost import accumulated_cost
@@ -95,14 +95,19 @@ class ClosedLoop:
         dt: time step [s].
         solver: cholesky, mumps, cg or auto.
         rtol: tolerance of cg.
-        reproducible: the same bits in every parallel run, see :func:`fem.solvers.make_solver`.
+        reproducible: see :func:`fem.solvers.factor_on_every_rank`.
 
     Raises:
         SolverError: the factorisation fails.
     """
 
     def __init__(
-        self, problem: RiccatiProblem, dt: float, solver: str = "auto", rtol: float = 1e-10, reproducible: bool = False
+        self,
+        problem: RiccatiProblem,
+        dt: float,
+        solver: str = "auto",
+        rtol: float = 1e-10,
+        reproducible: Reproducible = "auto",
     ) -> None:
         if not (np.isfinite(dt) and dt > 0):
             raise ControlError(f"dt = {dt} s must be a positive number")

@@ -16,7 +16,7 @@ from fem.effects.measure import measure
 from fem.materials import young_poisson
 from fem.modes import lowest_modes
 from fem.petsc import PETSc
-from fem.solvers import DIRECT_LIMIT, choose_solver
+from fem.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
 from study.equation import Equation, equation
 
 if TYPE_CHECKING:
@@ -122,16 +122,16 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def factor_bytes(name: str, n: int, dimension: int, ranks: int) -> float:
+def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
     """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection. Not collective.
 
     nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
-    (2D) and 5e2 to 2e5 (3D) unknowns; 12 byte an entry. The small solver keeps a copy on each rank.
+    (2D) and 5e2 to 2e5 (3D) unknowns; 12 byte an entry.
     """
     if name == "cg" or n < 2:
         return 0.0
     row = 7.75 * np.log2(n) - 44 if dimension == 2 else 19.5 * n ** (1 / 3) - 85
-    return float(12 * n * np.clip(row, 1, (n + 1) / 2) * (ranks if name == "cholesky" else 1))
+    return float(12 * n * np.clip(row, 1, (n + 1) / 2) * copies)
 
 
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
@@ -154,6 +154,7 @@ def explain_model(model: Model) -> Explanation:
     layout = system.layout
     d, ranks = layout.dimension, layout.comm.size
     name, reason = choose_solver(layout, scene.time.solver)
+    copies = ranks if factor_on_every_rank(layout, name, scene.time.reproducible) else 1
     if layout.n_e <= DIRECT_LIMIT[d]:  # the modes need a factor
         omega, Phi = lowest_modes(system, min(MODES, layout.n_e))
     else:
@@ -181,7 +182,7 @@ def explain_model(model: Model) -> Explanation:
             nonzeros=int(system.K_ee.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]),
             ranks=ranks,
         ),
-        solver=SolverPlan(name, reason, factor_bytes(name, layout.n_e, d, ranks)),
+        solver=SolverPlan(name, reason, factor_bytes(name, layout.n_e, d, copies)),
         time=TimePlan(
             steps=scene.time.steps,
             dt=dt,

@@ -66,8 +66,8 @@ def test_two_way_force_restart_is_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Pat
     assert np.array_equal(whole.v_s, rest.v_s)
 
 
-def test_reproducible_mumps_restarts_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
-    extra = ("tissue.cells=[5,5,10]", "time.steps=10", "time.reproducible=true", 'time.solver="mumps"')
+def test_mumps_restarts_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    extra = ("tissue.cells=[5,5,10]", "time.steps=10", 'time.solver="mumps"')
     whole = simulate(small(comm, *extra, scene="block_3d"))
     with pytest.raises(Interrupted):
         simulate(small(comm, *extra, scene="block_3d"), RunOptions(directory=mpi_tmp_path, until=4))
