@@ -135,7 +135,7 @@ def _outward(mesh: Any, d: int, facets: npt.NDArray[np.int32]) -> npt.NDArray[np
     volume = np.linalg.det(np.concatenate([(x[nodes[:, 0]] - x[opposite])[:, None, :], edges], axis=1))
     flipped = volume < 0
     nodes[flipped] = nodes[flipped][:, ::-1]
-    return nodes
+    return np.asarray(nodes)
 
 
 def _numbered(index_map: Any, local: npt.NDArray[np.int32]) -> Integers:

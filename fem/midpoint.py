@@ -91,7 +91,7 @@ class TissueMidpoint:
         # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
         self.load_array: Array = self.load.array_w
         self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
-        self.w_own = self.w_array[self.rows]
+        self.w_own: Array = self.w_array[self.rows]
         self.x = self.w  # w as the state is distributed
         self._move = self._move_all
         if self.held.whole:
@@ -169,7 +169,7 @@ class TissueMidpoint:
             self.solver.solve(self.r, self.w)
             self.solver.check(self.r, self.w, "the response to the hand")
             self.Y[:, j] = self.w.array_r
-        return self.Y[self.rows]
+        return np.asarray(self.Y[self.rows])
 
     def accelerate(self, c: Array) -> None:
         """Turn S^{-1} h in w into S^{-1} (h - G c), and set load and right-hand side to match. Not collective."""
