@@ -26,7 +26,7 @@ class LoopQuality:
     Attributes:
         abscissa: largest real part of the closed-loop spectrum [1/s].
         cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
-        certified: the abscissa is that of the whole spectrum.
+        certified: its sign is certain: from the whole spectrum, or from :func:`lqr.spectrum.certified_abscissa`.
     """
 
     abscissa: float

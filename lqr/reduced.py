@@ -54,7 +54,7 @@ class GainReport:
         abscissa_full: largest real part of the full closed loop [1/s].
         time_are: seconds for the reduced equation.
         reason: why there is no gain; empty when there is one.
-        certified: the abscissa is that of the whole spectrum.
+        certified: the sign of the abscissa is certain, see :class:`lqr.abscissa.LoopQuality`.
     """
 
     method: str
