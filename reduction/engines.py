@@ -191,6 +191,8 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
 def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
     """QR of what each rank has, then of the stacked triangles on rank 0: for few rows."""
     Q_local, R_local = np.linalg.qr(X)
+    if comm.size == 1:
+        return np.asfortranarray(Q_local), R_local
     parts = comm.gather(R_local)
     blocks: list[Array] | None = None
     R: Array | None = None

@@ -1,21 +1,38 @@
-"""How far a reduced model is from the full one: states, deformation, energy, and the floor that its basis sets."""
+"""How far reduced models are from the full one: states, deformation, energy, and the floor that their basis sets.
+
+Everything that a model shows is linear in Y = [x; q_s; v_s], its state and its hand. With one QR factorisation V = Q R
+of what the largest model of a family shows, and snapshots X = Q C + rest,
+
+    |X - V Y|_F^2 = |rest|_F^2 + |C - R Y|_F^2
+
+for every model whose columns lie in the span of Q: no cancellation, and the snapshots are read twice for all models
+together instead of several times for each.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 import numpy as np
 from mpi4py import MPI
 
-from fem.petsc import Array, total
+from fem.petsc import Array, times_columns, total
 from fem.snapshots import Snapshots
 from fem.system import BlockSystem
+from reduction.engines import factor
 from reduction.model import ModelError, ReducedModel, SmallModel
 from reduction.online import ReducedTrajectory
 
 BLOCK = 64  # columns at a time: 64 columns of both states are a small part of the snapshots themselves
 RANK_TOLERANCE = 1e-13  # of the largest singular value: directions below are rounding of the basis
+INSIDE = 1e-9  # share of a column that may lie outside the span: far above rounding, far below any error of a model
+
+View = Literal["velocities", "momenta", "deformation"]
+"""State in which errors are measured: [q_s, v_s, q_e, v_e], [q_s, p_s, q_e, p_e] with p_e = M_ee v_z + G v_s and
+p_s = M_hand v_s, or [z, v_z] alone."""
+VIEWS: tuple[View, ...] = get_args(View)
 
 
 @dataclass(frozen=True)
@@ -24,16 +41,15 @@ class ModelErrors:
 
     Attributes:
         error: |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21].
+        error_canonical: the same of X = [q_s, p_s, q_e, p_e], which canonical bases are built from.
         error_deformation: the same of [z, v_z], after removing the rigid motion of the hand.
         error_energy: max_t |H_r - H| / max_t H of the tissue's energy relative to the hand.
-        error_displacement: |Q - Q_r|_F / |Q|_F of Q = [q_s, q_e]. In X velocities weigh omega times more; the
-            canonical state [q_s, q_e, p_s, p_e] is all but dominated by its displacements, since a nodal mass is small.
     """
 
     error: float
+    error_canonical: float
     error_deformation: float
     error_energy: float
-    error_displacement: float
 
 
 def full_energy(system: BlockSystem, snapshots: Snapshots) -> Array:
@@ -51,111 +67,185 @@ def full_energy(system: BlockSystem, snapshots: Snapshots) -> Array:
     return total(system.layout.comm, local)
 
 
-def trajectory_errors(
-    model: ReducedModel,
-    small: SmallModel,
-    run: ReducedTrajectory,
-    system: BlockSystem,
-    snapshots: Snapshots,
-    energy: Array | None = None,
-) -> ModelErrors:
-    """Compare a reduced run with snapshots of the full one, some columns at a time. Collective.
+def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array, v_s: Array) -> Array:
+    """Columns of a view from relative tissue states and the hand: local rows, those of the hand on rank 0. Collective.
 
     Args:
-        model: gives the lift.
-        small: the parameter that ran.
-        run: its trajectory, on the full model's time grid.
-        system: gives T.
-        snapshots: of the full model, at the same parameter.
-        energy: :func:`full_energy` of the snapshots, when it is known.
+        view: which state.
+        system: gives T, G and the mass.
+        z, v_z: local rows (n_local, m).
+        q_s, v_s: (n_s, m), the same on every rank.
+    """
+    if view == "deformation":
+        return np.vstack([z, v_z])
+    T, top = system.T, 1 if system.layout.comm.rank == 0 else 0  # the hand counts once
+    if view == "velocities":
+        second, p_s = v_z + T @ v_s, v_s
+    else:
+        second, p_s = times_columns(system.M_ee, v_z) + system.G @ v_s, system.M_hand @ v_s
+    count = top * len(q_s)
+    return np.vstack([q_s[:count], p_s[:count], z + T @ q_s, second])
+
+
+def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: BlockSystem) -> Array:
+    """V with V Y = what the model shows for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
+
+    Raises:
+        ModelError: the model holds no lift.
+    """
+    N, n_s = model.N, small.n_s
+    width = N + 2 * n_s
+    x, q_s, v_s = np.eye(N, width), np.eye(n_s, width, N), np.eye(n_s, width, N + n_s)
+    return state_rows(view, system, *model.reconstruct(small, x, v_s), q_s, v_s)
+
+
+@dataclass(frozen=True)
+class Span:
+    """Snapshots in the columns of one orthonormal basis, X = Q C + rest.
+
+    Attributes:
+        comm: ranks that share the rows.
+        Q: local rows (rows, k).
+        C: (k, m), on every rank.
+        rest: |X - Q C|_F^2.
+        square: |X|_F^2.
+    """
+
+    comm: MPI.Intracomm
+    Q: Array
+    C: Array
+    rest: float
+    square: float
+
+    def inside(self, V: Array) -> Array:
+        """R = Q'V for columns V, local rows, that lie in the span. Collective.
+
+        Raises:
+            ModelError: they do not.
+        """
+        R = total(self.comm, self.Q.T @ V)
+        lost = total(self.comm, np.array([((V - self.Q @ R) ** 2).sum(axis=0), (V**2).sum(axis=0)]))
+        if (lost[0] > INSIDE**2 * lost[1]).any():
+            raise ModelError("the model shows more than the one that the errors were prepared for; take the larger one")
+        return R
+
+    def error(self, R: Array, Y: Array) -> float:
+        """|X - V Y|_F / |X|_F for R from :meth:`inside`. Not collective."""
+        return ratio(self.rest + squares(self.C - R @ Y), self.square)
+
+    def floor(self, R: Array) -> float:
+        """min_Y |X - V Y|_F / |X|_F. Not collective.
+
+        Nearly dependent columns keep all their digits: no Gram matrix is formed.
+        """
+        norms = np.linalg.norm(R, axis=0)
+        U, s, _ = np.linalg.svd(R / np.where(norms > 0, norms, 1.0), full_matrices=False)
+        U = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
+        left = self.C - U @ (U.T @ self.C)
+        left -= U @ (U.T @ left)  # what rounding left of the first pass
+        return ratio(self.rest + squares(left), self.square)
+
+
+def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> Span:
+    """Factor the columns V of a view and put the snapshots into them, some columns at a time. Collective.
+
+    Raises:
+        BasisError: V is zero or not finite.
+        SolverError: the factorisation fails.
+    """
+    comm, n = system.layout.comm, system.layout.n_local
+    Q = factor(comm, V).Q
+    C, sums = [], np.zeros(2)
+    for b in column_blocks(snapshots.Z.shape[1]):
+        Z = snapshots.Z[:, b]
+        X = state_rows(view, system, Z[:n], Z[n:], snapshots.q_s[:, b], snapshots.v_s[:, b])
+        norm = squares(X)
+        C.append(total(comm, Q.T @ X))
+        X -= Q @ C[-1]
+        again = total(comm, Q.T @ X)  # what rounding left of the first pass
+        C[-1] += again
+        X -= Q @ again
+        sums += squares(X), norm
+    rest, square = total(comm, sums)
+    return Span(comm, Q, np.hstack(C), float(rest), float(square))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Errors of one model, or of a whole family of nested ones, against one full run.
+
+    Attributes:
+        model, small: the largest model of the family, at the parameter of the snapshots.
+        system: of the full run.
+        snapshots: of the full run.
+        energy: :func:`full_energy` of the snapshots.
+    """
+
+    model: ReducedModel
+    small: SmallModel
+    system: BlockSystem
+    snapshots: Snapshots
+    energy: Array
+    _spans: dict[View, Span] = field(default_factory=dict, repr=False)
+
+    def span(self, view: View) -> Span:
+        """Snapshots in what the largest model shows; factored at the first call. Collective.
+
+        Raises:
+            ModelError: the model holds no lift.
+        """
+        if view not in self._spans:
+            V = shown_rows(view, self.model, self.small, self.system)
+            self._spans[view] = span_of(view, V, self.system, self.snapshots)
+        return self._spans[view]
+
+    def state_error(self, view: View, model: ReducedModel, small: SmallModel, run: ReducedTrajectory) -> float:
+        """|X - X_r|_F / |X|_F of a run on the full model's time grid, of the largest model or a smaller. Collective.
+
+        Raises:
+            ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
+        """
+        steps = self.snapshots.steps
+        if len(run.x) <= int(steps.max(initial=0)):
+            raise ModelError(f"the reduced run has {len(run.x) - 1} steps, the snapshots reach step {int(steps.max())}")
+        span = self.span(view)
+        Y = np.vstack([run.x[steps].T, run.q_s[steps].T, run.v_s[steps].T])
+        return span.error(span.inside(shown_rows(view, model, small, self.system)), Y)
+
+    def errors(self, model: ReducedModel, small: SmallModel, run: ReducedTrajectory) -> ModelErrors:
+        """All errors of a run; see :meth:`state_error`. Collective."""
+        velocities, momenta, deformation = (self.state_error(view, model, small, run) for view in VIEWS)
+        off = np.abs(small.energy(run.x[self.snapshots.steps]) - self.energy).max(initial=0.0)
+        peak = float(self.energy.max(initial=0.0))
+        return ModelErrors(velocities, momenta, deformation, float(off) / (peak if peak > 0 else 1.0))
+
+    def floor(self, view: View, model: ReducedModel, small: SmallModel) -> float:
+        """min_Y |X - V Y|_F / |X|_F over all states V y that the model can show: the floor of its error. Collective.
+
+        The hand of V y is that of the state, q_s = S_q y and v_s = S_v y.
+
+        Raises:
+            ModelError: the model shows more than the largest.
+        """
+        span = self.span(view)
+        R = span.inside(shown_rows(view, model, small, self.system))
+        return span.floor(R @ with_hand(small))
+
+
+def with_hand(small: SmallModel) -> Array:
+    """[I; S_q; S_v]: the hand that belongs to a reduced state, (N + 2 n_s, N). Not collective."""
+    return np.vstack([np.eye(small.N), small.operators.S_q, small.operators.S_v])
+
+
+def trajectory_errors(
+    model: ReducedModel, small: SmallModel, run: ReducedTrajectory, system: BlockSystem, snapshots: Snapshots
+) -> ModelErrors:
+    """Errors of a run of one model against snapshots at the same parameter. Collective.
 
     Raises:
         ModelError: the run is shorter than the snapshots, or the model holds no lift.
     """
-    steps = snapshots.steps
-    if len(run.x) <= int(steps.max(initial=0)):
-        raise ModelError(f"the reduced run has {len(run.x) - 1} steps, the snapshots reach step {int(steps.max())}")
-    energy = full_energy(system, snapshots) if energy is None else energy
-    x, q_s, v_s = run.x[steps].T, run.q_s[steps].T, run.v_s[steps].T
-    # rows: displacement, velocity; columns: relative error, relative norm, absolute error, absolute norm
-    sums = np.zeros((2, 4))
-    for b in column_blocks(len(steps)):
-        states = model.reconstruct(small, x[:, b], v_s[:, b])
-        hands = ((q_s[:, b], snapshots.q_s[:, b]), (v_s[:, b], snapshots.v_s[:, b]))
-        for i, (own, (hand, exact)) in enumerate(zip(states, hands, strict=True)):
-            relative = snapshots.Z[i * len(own) : (i + 1) * len(own), b]
-            own -= relative
-            sums[i, :2] += squares(own), squares(relative)
-            own += system.T @ (hand - exact)
-            sums[i, 2:] += squares(own), squares(relative + system.T @ exact)
-    sums = total(system.layout.comm, sums)
-    for i, (hand, exact) in enumerate(((q_s, snapshots.q_s), (v_s, snapshots.v_s))):
-        sums[i, 2:] += squares(hand - exact), squares(exact)
-    peak = float(energy.max(initial=0.0))
-    both = sums.sum(axis=0)
-    return ModelErrors(
-        error=ratio(both[2], both[3]),
-        error_deformation=ratio(both[0], both[1]),
-        error_energy=float(np.abs(small.energy(x.T) - energy).max(initial=0.0)) / (peak if peak > 0 else 1.0),
-        error_displacement=ratio(sums[0, 2], sums[0, 3]),
-    )
-
-
-def lifted_columns(model: ReducedModel, small: SmallModel, system: BlockSystem) -> tuple[Array, Array]:
-    """Span of everything the model can show: rows of [q_s, v_s] on every rank, local rows of [q_e, v_e].
-
-    Not collective.
-
-    Raises:
-        ModelError: the model holds no lift.
-    """
-    S_q, S_v = small.operators.S_q, small.operators.S_v
-    z, v_z = model.reconstruct(small, np.eye(model.N))
-    return np.vstack([S_q, S_v]), np.vstack([z + system.T @ S_q, v_z + system.T @ S_v])
-
-
-def projection_error(model: ReducedModel, small: SmallModel, system: BlockSystem, snapshots: Snapshots) -> float:
-    """min_Y |X - V Y|_F / |X|_F over all states V y that the model can show: the floor of its error. Collective.
-
-    X = [q_s, v_s, q_e, v_e]. Momenta of a canonical basis count as the velocities they stand for.
-
-    Raises:
-        ModelError: the model holds no lift.
-    """
-    comm, T = system.layout.comm, system.T
-    root = 1.0 if comm.rank == 0 else 0.0  # the hand's rows count once
-    V = orthonormal(comm, lifted_columns(model, small, system))
-    sums = np.zeros(2)
-    for b in column_blocks(snapshots.Z.shape[1]):
-        n = system.layout.n_local
-        q_s, v_s = snapshots.q_s[:, b], snapshots.v_s[:, b]
-        X = np.vstack([root * q_s, root * v_s, snapshots.Z[:n, b] + T @ q_s, snapshots.Z[n:, b] + T @ v_s])
-        norm = squares(X)
-        for _ in range(2):  # the second pass removes what rounding left of the first
-            X -= V @ total(comm, V.T @ X)
-        sums += squares(X), norm
-    sums = total(comm, sums)
-    return ratio(sums[0], sums[1])
-
-
-def orthonormal(comm: MPI.Intracomm, columns: tuple[Array, Array]) -> Array:
-    """Orthonormal basis of distributed columns; the hand's rows are kept on rank 0 only. Collective.
-
-    Triangular factors travel, not Gram matrices: nearly dependent columns keep all their digits.
-    """
-    hand, tissue = columns
-    V = np.vstack([hand if comm.rank == 0 else np.zeros_like(hand), tissue])
-    norms = np.sqrt(total(comm, (V**2).sum(axis=0)))
-    V /= np.where(norms > 0, norms, 1.0)
-    for _ in range(2):
-        factors = comm.gather(np.linalg.qr(V, mode="r"))
-        change = None
-        if factors is not None:
-            _, s, V_t = np.linalg.svd(np.linalg.qr(np.vstack(factors), mode="r"))
-            keep = s > RANK_TOLERANCE * s.max(initial=0.0)
-            change = V_t[keep].T / s[keep]
-        V = V @ comm.bcast(change)
-    return np.asarray(V)
+    return Comparison(model, small, system, snapshots, full_energy(system, snapshots)).errors(model, small, run)
 
 
 def column_blocks(m: int) -> Iterator[slice]:

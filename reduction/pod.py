@@ -30,7 +30,8 @@ class Request:
         coordinates: "qv" or "qp".
         inner: inner product.
         engine: engine of the tall factorisation.
-        k: leading triplets that are enough, None for all.
+        count: largest N asked for, None when only shares of energy are.
+        share: smallest share of sum sigma^2 that may be dropped, None when only N are given.
     """
 
     states: States
@@ -39,7 +40,13 @@ class Request:
     coordinates: Coordinates
     inner: InnerName
     engine: EngineName
-    k: int | None
+    count: int | None
+    share: float | None
+
+    @property
+    def k(self) -> int | None:
+        """Leading triplets that are enough, None when that is not known beforehand."""
+        return self.count if self.share is None else None
 
 
 def cholesky_of(comm: MPI.Intracomm, G: Array) -> Array:

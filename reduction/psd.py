@@ -156,8 +156,7 @@ def svd_like_parts(request: Request) -> tuple[Part, ...]:
     """
     c = canonical(request)
     comm = request.states.layout.comm
-    limit = None if request.k is None else max(request.k // 2, 1)
-    S, w = svd_like_pairs(comm, np.vstack([c.C_q, c.C_y]), limit)
+    S, w = svd_like_pairs(comm, np.vstack([c.C_q, c.C_y]), (request.count or 0) // 2, request.share)
     r, half = c.C_q.shape[0], S.shape[1] // 2
 
     def columns(k: int) -> tuple[Columns, ...]:

@@ -30,7 +30,9 @@ def form(X: Array, Y: Array) -> Array:
     return X.T @ poisson(Y)
 
 
-def svd_like_pairs(comm: MPI.Intracomm, X: Array, limit: int | None = None) -> tuple[Array, Array]:
+def svd_like_pairs(
+    comm: MPI.Intracomm, X: Array, limit: int | None = None, share: float | None = None
+) -> tuple[Array, Array]:
     """Symplectic S = [s_1 .. s_k, t_1 .. t_k] that spans X, ordered by the weight of the pairs. Collective.
 
     X = S D Q with orthogonal Q; D holds sigma_i twice for every hyperbolic pair, +-i sigma_i^2 the eigenvalues of the
@@ -43,14 +45,15 @@ def svd_like_pairs(comm: MPI.Intracomm, X: Array, limit: int | None = None) -> t
         comm: ranks, all with the same X.
         X: rows (q; p), shape (2 r, m).
         limit: number of pairs that are enough; None for all.
+        share: part of |X|_F^2 that may be left out beyond the ``limit``; None sets no goal.
 
     Returns:
         S (2 r, 2 k), S' J S = J, and w (k,) descending; sum w^2 = |X|_F^2 when all are taken and have partners.
     """
-    return on_root(comm, lambda: _pairs(X, limit))
+    return on_root(comm, lambda: _pairs(X, limit, share))
 
 
-def _pairs(X: Array, limit: int | None) -> tuple[Array, Array]:
+def _pairs(X: Array, limit: int | None, share: float | None) -> tuple[Array, Array]:
     # q and p of equal size lose the fewest digits; (q / t, p t) is canonical
     r = len(X) // 2
     q, p = np.linalg.norm(X[:r]), np.linalg.norm(X[r:])
@@ -66,9 +69,11 @@ def _pairs(X: Array, limit: int | None) -> tuple[Array, Array]:
         return np.vstack([x.real * ratio, x.imag / ratio])
 
     pool = _Pool(np.vstack([Z.real, Z.imag]), lambda Y: np.linalg.norm(back(Y), axis=0))
-    pool.collect(limit)
+    pool.collect(limit, share)
     S, T = balanced(back(pool.S), back(pool.T))
     order = np.argsort(-pool.weights, kind="stable")
+    # a pair not looked for may outweigh the lightest that were found
+    order = order[pool.weights[order] > pool.unseen]
     return np.hstack([S[:, order], T[:, order]]), pool.weights[order]
 
 
@@ -81,6 +86,8 @@ class _Pool:
         self.T: Array = np.zeros((len(X), 0))
         self.weights: Array = np.zeros(0)
         self.largest = 0.0
+        self.unseen = 0.0  # largest possible weight of pairs that were not looked for
+        self.square = float(np.sum(norms(X) ** 2))
         self._compress(X)
         self.largest = self.size
 
@@ -92,10 +99,12 @@ class _Pool:
         self.rest = self.U * self.s
         self.size = float(self.s[0]) if keep.any() else 0.0
 
-    def collect(self, limit: int | None) -> None:
-        """Find pairs until the rest is rounding, or until no later pair can be among the ``limit`` heaviest."""
+    def collect(self, limit: int | None, share: float | None) -> None:
+        """Find pairs until the rest is rounding, or until no later pair can be among those that are wanted."""
         while self.size > SMALLEST * self.largest and 2 * self.S.shape[1] < len(self.S):
-            if limit is not None and self._enough(limit):
+            left = float(np.linalg.norm(self.norms(self.rest)))
+            if limit is not None and self._enough(limit, share, left):
+                self.unseen = left
                 break
             if not self._stage():
                 self._alone()
@@ -103,10 +112,13 @@ class _Pool:
         pair = _symplectic(np.hstack([self.S, self.T]))
         self.S, self.T = np.hsplit(pair, 2)
 
-    def _enough(self, limit: int) -> bool:
-        if len(self.weights) < limit:
-            return False
-        return float(np.linalg.norm(self.norms(self.rest))) < float(np.sort(self.weights)[-limit])
+    def _enough(self, limit: int, share: float | None, unseen: float) -> bool:
+        """Whether the heaviest ``limit`` pairs, or as many as leave ``share`` of the energy, are among those found."""
+        heaviest = np.sort(self.weights)[::-1]
+        if share is not None:
+            dropped = self.square - np.cumsum(heaviest**2)
+            limit = max(limit, 1 + int(np.count_nonzero(dropped > share * self.square)))
+        return len(heaviest) >= max(limit, 1) and unseen < heaviest[max(limit, 1) - 1]
 
     def _stage(self) -> bool:
         """Add the hyperbolic pairs of the rest that are large and well conditioned; whether there were any."""

@@ -12,7 +12,7 @@ import numpy as np
 from fem.build import Model, Stopwatch
 from fem.run import simulate
 from fem.system import LayerMaterial
-from reduction.errors import trajectory_errors
+from reduction.errors import Comparison
 from reduction.online import run
 from study.reduce_reference import Reference, prepare, reference
 from study.reduce_sweep import Point, Swept, nearest
@@ -85,8 +85,8 @@ def box_errors(
                 small = model.at(materials)
                 step, drive = prepare(model, small, here, system)
                 found = run(step, allow_unstable=True, **drive)
-                error = trajectory_errors(model, small, found, system, here.snapshots, here.energy).error_deformation
-            errors[swept.method.key] = float(error)
+                comparison = Comparison(model, small, system, here.snapshots, here.energy)
+                errors[swept.method.key] = comparison.state_error("deformation", model, small, found)
         result.append(BoxPoint(materials[0].lam, materials[0].mu, errors))
     return result
 

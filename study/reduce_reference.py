@@ -13,7 +13,8 @@ from fem.petsc import Array, total
 from fem.run import Trajectory
 from fem.snapshots import Snapshots
 from fem.system import BlockSystem
-from reduction.errors import full_energy, lifted_columns
+from reduction.engines import factor
+from reduction.errors import full_energy, shown_rows, state_rows, with_hand
 from reduction.model import ReducedModel, SmallModel
 from reduction.propagator import Propagator, propagator
 
@@ -101,19 +102,9 @@ def prepare(
 
 
 def nearest_state(model: ReducedModel, small: SmallModel, against: Reference, system: BlockSystem) -> Array:
-    """State x that shows the first snapshot best, min_x |V x - X_0|, (N,). Collective.
-
-    Triangular factors travel, not Gram matrices; the hand's rows count on rank 0 only.
-    """
-    comm, n, snapshots = system.layout.comm, system.layout.n_local, against.snapshots
-    root = 1.0 if comm.rank == 0 else 0.0
-    hand, tissue = lifted_columns(model, small, system)
-    q_s, v_s = snapshots.q_s[:, 0], snapshots.v_s[:, 0]
-    start = [root * q_s, root * v_s, snapshots.Z[:n, 0] + system.T @ q_s, snapshots.Z[n:, 0] + system.T @ v_s]
-    whole = np.column_stack([np.vstack([root * hand, tissue]), np.concatenate(start)])
-    factors = comm.gather(np.linalg.qr(whole, mode="r"))
-    x = None
-    if factors is not None:
-        R = np.linalg.qr(np.vstack(factors), mode="r")
-        x = np.linalg.lstsq(R[: small.N, : small.N], R[: small.N, small.N], rcond=None)[0]
-    return np.asarray(comm.bcast(x))
+    """State x that shows the first snapshot best, min_x |V x - X_0|, (N,). Collective."""
+    n, snapshots, first = system.layout.n_local, against.snapshots, slice(0, 1)
+    Z, q_s, v_s = snapshots.Z[:, first], snapshots.q_s[:, first], snapshots.v_s[:, first]
+    found = factor(system.layout.comm, shown_rows("velocities", model, small, system) @ with_hand(small))
+    start = total(system.layout.comm, found.Q.T @ state_rows("velocities", system, Z[:n], Z[n:], q_s, v_s))
+    return np.asarray(np.linalg.lstsq(found.scale * found.R, start[:, 0], rcond=None)[0])

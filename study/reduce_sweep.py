@@ -15,14 +15,13 @@ from fem.outputs import make_outputs
 from fem.scene_control import Reduction
 from fem.scene_file import scene_hash
 from reduction.basis import Basis
-from reduction.errors import projection_error, trajectory_errors
+from reduction.errors import Comparison, View
 from reduction.model import ReducedModel
 from reduction.online import run
 from reduction.project import project
 from reduction.registry import METHODS, PAPER_METHODS, Method, find_method, make_bases
 from reduction.states import BasisError, States
 from reduction.truncation import Truncation
-from study.reduce_canonical import canonical_error, canonical_floor
 from study.reduce_reference import Reference, prepare
 
 BEYOND = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
@@ -149,7 +148,7 @@ def bases_of(
     Sizes beyond the rank are noted with the reason. Collective.
     """
     method = METHODS[name]
-    inner = wanted.inner if method.snapshots else None
+    inner = None if wanted.inner == "auto" or not method.snapshots else wanted.inner
     rule = [Truncation(energy=wanted.energy)] if method.snapshots else []
     sizes = list(sizes)
     while sizes or rule:
@@ -174,31 +173,38 @@ def _median_time(work: Callable[[], object], repeats: int, comm: MPI.Intracomm) 
     return float(comm.allreduce(statistics.median(seconds), MPI.MAX))
 
 
-def measure(model: ReducedModel, against: Reference) -> Point:
-    """Run one reduced model at the scene's own parameter and compare. Collective."""
-    system, snapshots = against.model.system, against.snapshots
+def comparison_of(model: ReducedModel, against: Reference) -> Comparison:
+    """What errors of this model and of smaller ones of its family are computed from. Not collective."""
+    return Comparison(model, model.at(), against.model.system, against.snapshots, against.energy)
+
+
+def measure(model: ReducedModel, against: Reference, comparison: Comparison | None = None) -> Point:
+    """Run one reduced model at the scene's own parameter and compare. Collective.
+
+    Args:
+        model: which.
+        against: the full run.
+        comparison: of the largest model of the family; None prepares one for this model alone.
+    """
+    system = against.model.system
+    comparison = comparison or comparison_of(model, against)
     with np.errstate(all="ignore"):  # an unstable model may overflow, and is marked
         small = model.at()
         step, drive = prepare(model, small, against, system)
-        found = run(step, allow_unstable=True, **drive)
-        errors = trajectory_errors(model, small, found, system, snapshots, against.energy)
-        floor = projection_error(model, small, system, snapshots)
-        own, own_floor = errors.error, floor
-        if model.coordinates == "qp":
-            own = canonical_error(model, small, found, system, snapshots)
-            own_floor = canonical_floor(model, small, system, snapshots)
+        errors = comparison.errors(model, small, run(step, allow_unstable=True, **drive))
+        own: View = "momenta" if model.coordinates == "qp" else "velocities"
         comm = system.layout.comm
         setup = _median_time(lambda: prepare(model, model.at(), against, system), SETUPS, comm)
         online = _median_time(lambda: run(step, allow_unstable=True, **drive), REPEATS, comm)
     return Point(
         N=model.N - uncounted(METHODS[model.name], system.layout.n_s),
         columns=model.N,
-        error=own,
+        error=errors.error_canonical if own == "momenta" else errors.error,
         error_qv=errors.error,
         error_deformation=errors.error_deformation,
         error_energy=errors.error_energy,
-        projection_error=own_floor,
-        projection_error_qv=floor,
+        projection_error=comparison.floor(own, model, small),
+        projection_error_qv=comparison.floor("velocities", model, small),
         time_offline=float(comm.allreduce(sum(model.seconds.values()), MPI.MAX)),
         time_setup=setup,
         time_online=online,
@@ -221,11 +227,13 @@ def sweep(name: str, against: Reference, wanted: Reduction, progress: Progress |
     outputs, key = make_outputs(full.scene, full.system), scene_hash(full.scene)
     points: list[Point] = []
     models: dict[int, ReducedModel] = {}
+    # smaller bases are leading columns of the largest: one factorisation gives the errors of all
+    comparison = comparison_of(project(bases[-1], full.system, outputs, key), against) if bases else None
     for i, basis in enumerate(bases):
         if progress is not None:
             progress(name, i, len(bases))
         models[i] = project(basis, full.system, outputs, key)
-        points.append(measure(models[i], against))
+        points.append(measure(models[i], against, comparison))
         models = {j: models[j] for j in models if j in noted(points)}
     hand = uncounted(method, full.system.layout.n_s)
     return Swept(

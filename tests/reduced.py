@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from fem.petsc import total
 from fem.run import Trajectory, simulate
 from fem.system import BlockSystem
 from reduction.basis import Basis
-from reduction.model import ReducedModel
+from reduction.model import ReducedModel, SmallModel
 from reduction.online import ReducedTrajectory, run
 from reduction.project import project
-from tests.helpers import Array, make_scene
+from tests.helpers import Array, gather_rows, make_scene
 
 KINDS = [(c, f, s) for c in ("qv", "qp") for f in ("absolute", "relative") for s in (True, False)]
 """Every kind of model: coordinates, frame, fixed solid modes."""
@@ -89,6 +90,15 @@ def symplectic_basis(
     return joined(layout, np.asfortranarray(q), np.asfortranarray(p), rows, coordinates, frame, fixed, structure)
 
 
+def leading(basis: Basis, pairs: int) -> Basis:
+    """The hand's columns and the first pairs of a basis whose second half starts in the middle."""
+    hand = 2 * basis.layout.n_s if basis.fixed_solid else 0
+    half = (basis.N - hand) // 2
+    pick = [*range(hand + pairs), *range(hand + half, hand + half + pairs)]
+    blocks = {key: np.asfortranarray(getattr(basis, key)[:, pick]) for key in ("V_sq", "V_sv", "V_q", "V_p")}
+    return replace(basis, **blocks)
+
+
 def reduced(model: Model, basis: Basis) -> ReducedModel:
     """Project with the scene's outputs."""
     return project(basis, model.system, make_outputs(model.scene, model.system), "hash")
@@ -114,3 +124,22 @@ def distance(system: BlockSystem, a: Array, b: Array) -> float:
     """|a - b|_F / |b|_F of local rows."""
     sums = total(system.layout.comm, np.array([np.sum((a - b) ** 2), np.sum(b**2)]))
     return float(np.sqrt(sums[0] / sums[1]))
+
+
+def small_of(model: Any, kind: tuple[Any, ...] = ("qp", "relative", True), pairs: int = 4) -> SmallModel:
+    """Small model of a symplectic basis of one kind."""
+    coordinates, frame, fixed = kind
+    return reduced(model, symplectic_basis(model.system.layout, pairs, frame, fixed, coordinates)).at()
+
+
+def wiggle(steps: int, dt: float) -> Array:
+    """A force on a hand with two freedoms, (steps, 2)."""
+    t = dt * (np.arange(steps) + 0.5)
+    return np.stack([40 * np.cos(1.5 * t), 20 * np.cos(2.2 * t + 0.4)], axis=1)
+
+
+def dense_columns(model: Any, basis: Basis) -> Array:
+    """V in the rows [q_s, q_e, v_s, v_e] of :func:`tests.helpers.first_order`."""
+    layout = model.system.layout
+    rows = [basis.V_sq, gather_rows(layout, basis.V_q), basis.V_sv, gather_rows(layout, basis.V_p)]
+    return np.concatenate(rows)

@@ -256,6 +256,17 @@ def test_svd_like_stops_at_the_limit_with_the_heaviest_pairs(comm: MPI.Intracomm
         assert scipy.linalg.subspace_angles(*pairs).max() < 1e-6  # square root of rounding
 
 
+@pytest.mark.parametrize("share", [1e-3, 1e-8])
+def test_svd_like_stops_when_the_energy_is_kept(comm: MPI.Intracomm, share: float) -> None:
+    X = canonical_matrix(20, 10.0 ** -np.arange(0, 7.5, 0.5), 0)
+    w = svd_like_pairs(comm, X)[1]
+    few = svd_like_pairs(comm, X, 0, share)[1]
+    assert len(few) < len(w)
+    assert few == pytest.approx(w[: len(few)], rel=1e-6)  # the heaviest, in order; rounding over the smallest of them
+    square = float(np.sum(X**2))
+    assert needed(few, square, share) == needed(w, square, share)
+
+
 def test_svd_like_does_not_depend_on_units(comm: MPI.Intracomm) -> None:
     X = canonical_matrix(10, np.array([1.0, 0.3, 0.1, 0.01]), 0)
     t = np.repeat([1e5, 1e-5], 10)[:, None]

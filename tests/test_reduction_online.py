@@ -1,4 +1,4 @@
-"""Running, storing and judging reduced models: against pyMOR, plain loops and dense matrices."""
+"""Running and storing reduced models: against plain loops; their energy and their time."""
 
 from __future__ import annotations
 
@@ -9,36 +9,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.linalg
 from mpi4py import MPI
 
 from fem.build import build
 from fem.run import simulate
 from reduction.archive import load_model, save_model
-from reduction.errors import full_energy, projection_error, trajectory_errors
 from reduction.model import ModelError, SmallModel
 from reduction.online import Stepper, run, run_batch
 from reduction.propagator import propagator, rotation
-from tests.helpers import Array, close, gather_rows, gather_states, make_scene
+from tests.helpers import Array, close, gather_rows, make_scene
 from tests.reduced import (
     DAMPED,
-    FORCED,
     KINDS,
     TINY,
-    force_of,
     model_of,
     reduced,
+    small_of,
     step_of,
     symplectic_basis,
-    whole_basis,
+    wiggle,
 )
-
-SMALL = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
-
-
-def small_of(model: Any, kind: tuple[Any, ...] = ("qp", "relative", True), pairs: int = 4) -> SmallModel:
-    coordinates, frame, fixed = kind
-    return reduced(model, symplectic_basis(model.system.layout, pairs, frame, fixed, coordinates)).at()
 
 
 def plain_loop(small: SmallModel, dt: float, force: Array, x: Array) -> Array:
@@ -51,33 +41,7 @@ def plain_loop(small: SmallModel, dt: float, force: Array, x: Array) -> Array:
     return np.array(states)
 
 
-def wiggle(steps: int, dt: float) -> Array:
-    t = dt * (np.arange(steps) + 0.5)
-    return np.stack([40 * np.cos(1.5 * t), 20 * np.cos(2.2 * t + 0.4)], axis=1)
-
-
 # --- trajectories
-
-
-@pytest.mark.serial  # imported on several ranks, pyMOR makes all but the first wait for its orders
-def test_same_trajectory_as_pymor(comm: MPI.Intracomm) -> None:
-    timestepping = pytest.importorskip("pymor.algorithms.timestepping")
-    iosys = pytest.importorskip("pymor.models.iosys")
-    model = model_of(comm, DAMPED)
-    dt, steps = 0.01, 40
-    for kind in KINDS:
-        small = small_of(model, kind)
-        op = small.operators
-        C = small.outputs.C_z + small.outputs.C_s @ op.S_q
-        lti = iosys.LTIModel.from_matrices(
-            op.A, op.B, C, E=op.E, T=dt * steps, time_stepper=timestepping.ImplicitMidpointTimeStepper(steps)
-        )
-        theirs = lti.solve(input="[40 * cos(1.5 * t[0]), 20 * cos(2.2 * t[0] + 0.4)]").to_numpy()
-        theirs = theirs if theirs.shape[0] == steps + 1 else theirs.T
-        own = run(small, dt, wiggle(steps, dt), allow_unstable=True)
-        # rounding of 40 steps; E of canonical models has condition 1e4
-        assert close(own.x, theirs) < 1e-10, kind
-        assert close(own.outputs, theirs @ C.T) < 1e-10, kind
 
 
 @pytest.mark.parametrize("steps", [1, 7, 8, 21])
@@ -296,56 +260,3 @@ def test_files_that_do_not_fit_are_refused(comm: MPI.Intracomm, mpi_tmp_path: Pa
     save_model(load_model(path), bare)
     with pytest.raises(ModelError, match="no lift"):
         load_model(bare, model.system.layout)
-
-
-# --- errors
-
-
-def test_errors_against_dense_matrices(comm: MPI.Intracomm) -> None:
-    model = model_of(comm, SMALL, FORCED, {"output": {"every": 3}})
-    layout, system = model.system.layout, model.system
-    full, dt = simulate(model), step_of(model)
-    snapshots = full.snapshots
-    T = gather_rows(layout, system.T)
-    z, v = np.split(gather_states(layout, snapshots.Z), 2)
-    energy = full_energy(system, snapshots)
-    norm = np.linalg.norm
-    X = np.concatenate([snapshots.q_s, z + T @ snapshots.q_s, snapshots.v_s, v + T @ snapshots.v_s])
-    for kind in KINDS:
-        coordinates, frame, fixed = kind
-        rom = reduced(model, symplectic_basis(layout, 3, frame, fixed, coordinates))
-        small = rom.at()
-        own = run(small, dt, force_of(model), allow_unstable=True)
-        errors = trajectory_errors(rom, small, own, system, snapshots)
-        q_s, v_s = own.q_s[::3].T, own.v_s[::3].T
-        z_r, v_r = (gather_rows(layout, part) for part in rom.reconstruct(small, own.x[::3].T, v_s))
-        X_r = np.concatenate([q_s, z_r + T @ q_s, v_s, v_r + T @ v_s])
-        relative = norm(np.concatenate([z_r - z, v_r - v])) / norm(np.concatenate([z, v]))
-        half = len(X) // 2
-        # sums in another order
-        assert abs(errors.error / (norm(X_r - X) / norm(X)) - 1) < 1e-10
-        assert abs(errors.error_deformation / relative - 1) < 1e-10
-        assert abs(errors.error_displacement / (norm((X_r - X)[:half]) / norm(X[:half])) - 1) < 1e-10
-        peak = np.abs(small.energy(own.x[::3]) - energy).max() / energy.max()
-        assert errors.error_energy == pytest.approx(peak, rel=1e-12)
-        # everything that the model can show
-        eye = np.eye(small.N)
-        z_c, v_c = (gather_rows(layout, part) for part in rom.reconstruct(small, eye))
-        S_q, S_v = small.operators.S_q, small.operators.S_v
-        V = np.concatenate([S_q, z_c + T @ S_q, S_v, v_c + T @ S_v])
-        floor = norm(X - V @ scipy.linalg.lstsq(V, X)[0]) / norm(X)
-        assert abs(projection_error(rom, small, system, snapshots) / floor - 1) < 1e-8  # least squares of condition 1e4
-        assert errors.error > floor
-
-
-def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
-    model = model_of(comm, SMALL)
-    snapshots = simulate(model).snapshots
-    rom = reduced(model, whole_basis(model.system.layout, "qp", "absolute", True))
-    own = run(rom.at(), step_of(model), force_of(model))
-    errors = trajectory_errors(rom, rom.at(), own, model.system, snapshots)
-    # rounding of 30 steps in other coordinates
-    assert max(errors.error, errors.error_deformation, errors.error_energy) < 1e-9
-    assert projection_error(rom, rom.at(), model.system, snapshots) < 1e-13
-    with pytest.raises(ModelError, match="reach step 30"):
-        trajectory_errors(rom, rom.at(), run(rom.at(), 0.1, np.zeros((5, 2))), model.system, snapshots)
