@@ -22,12 +22,14 @@ from fem.effects.measure import rigid_inertia
 from fem.errors import ResourceError
 from fem.scene import Scene
 from fem.scene_file import load_scene_collective
-from study.effects_judge import Cost, OffProof, cost_of, judge, prove_off, quartiles
+from study.effects_elements import Elements, judge_elements
+from study.effects_judge import TIMER, Cost, OffProof, cost_of, judge, prove_off, quartiles
 from study.effects_measure import (
     Case,
     Change,
     bare_output,
     compare,
+    count_objects,
     force_of_motion,
     measure_builds,
     measure_steps,
@@ -88,6 +90,8 @@ class EffectsStudy:
         noise: step times of the scene against itself, smallest and largest paired ratio less 1 [1].
         noise_quartiles: the middle half of them [1].
         base: medians of the scene as it is: assembly, setup, step [s], and memory [byte].
+        sizes: n_s, n_e, states, steps and cells of the scene.
+        elements: what P2 changes; None unless P1 may lock.
     """
 
     findings: tuple[Finding, ...]
@@ -98,6 +102,13 @@ class EffectsStudy:
     noise: tuple[float, float]
     noise_quartiles: tuple[float, float]
     base: dict[str, float]
+    sizes: dict[str, int]
+    elements: Elements | None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What explain warns of, and what was measured about it."""
+        return (*self.explanation.warnings, *([self.elements.advice] if self.elements else []))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain tables for JSON. Not collective."""
@@ -120,7 +131,9 @@ class EffectsStudy:
             "off_is_free": all(f.proof.holds for f in self.findings if f.proof is not None),
             "missing": list(self.explanation.missing),
             "idle": list(self.explanation.idle),
-            "warnings": list(self.explanation.warnings),
+            "warnings": list(self.warnings),
+            "elements": None if self.elements is None else asdict(self.elements),
+            "sizes": self.sizes,
         }
 
 
@@ -155,13 +168,16 @@ def study_effects(
             progress(min(done, work), work)
 
     cases = measure_builds(comm, scenes, repeats, tick)
-    changes = _changes(scene, found, cases, tick)
+    changes, elements = _changes(scene, found, cases, tick)
     done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
+    count_objects(comm, cases, scenes)
     base, again = cases[SCENE], cases[AGAIN]
     ratio = np.array(again.seconds["step"]) / np.array(base.seconds["step"]) - 1
+    noise = max(TIMER, float(np.abs(ratio).max()))
+    layout, mesh = model.system.layout, explanation.sizes
     return EffectsStudy(
-        findings=tuple(_finding(s, explanation, cases, changes, scene) for s in found),
+        findings=tuple(_finding(s, explanation, cases, changes, noise) for s in found),
         explanation=explanation,
         tolerance=scene.study.tolerance,
         repeats=repeats,
@@ -170,6 +186,14 @@ def study_effects(
         noise_quartiles=quartiles(ratio),
         base={stage: float(np.median(base.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
         | {"memory": sum(base.bytes.values()), "flops": base.flops},
+        sizes={
+            "n_s": layout.n_s,
+            "n_e": layout.n_e,
+            "states": layout.states,
+            "steps": scene.time.steps,
+            "cells": mesh.cells,
+        },
+        elements=elements,
     )
 
 
@@ -187,7 +211,9 @@ def _fits(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
 Changes = dict[str, tuple[Change, float | None]]
 
 
-def _changes(scene: Scene, found: tuple[Switch, ...], cases: dict[str, Case], tick: Callable[[], None]) -> Changes:
+def _changes(
+    scene: Scene, found: tuple[Switch, ...], cases: dict[str, Case], tick: Callable[[], None]
+) -> tuple[Changes, Elements | None]:
     """Change of this run and, for effects that do not show there, under the force that would make its motion.
 
     The second only where a control problem lets a force move the hand that this run moves by itself.
@@ -206,21 +232,22 @@ def _changes(scene: Scene, found: tuple[Switch, ...], cases: dict[str, Case], ti
             forced = forced or run_case(base, force)
             control = compare(base.model, forced, case.model, run_case(case, force)).outputs
         result[s.name] = (change, control)
-    return result
+    return result, judge_elements(base.model, trajectory, scene.study.tolerance)
 
 
 def _forced_later(scene: Scene) -> bool:
     return scene.control is not None and scene.motion.drive == "motion"
 
 
-def _finding(s: Switch, explanation: Explanation, cases: dict[str, Case], changes: Changes, scene: Scene) -> Finding:
+def _finding(s: Switch, explanation: Explanation, cases: dict[str, Case], changes: Changes, noise: float) -> Finding:
+    scene = cases[SCENE].model.scene
     gate, tolerance = explanation.effects[s.name], scene.study.tolerance
     proof = None if s.on else prove_off(s.name, cases[SCENE], cases[AGAIN])
     if s.other is None:
         return Finding(s.name, s.on, s.value, gate, "not tried", f"Not tried: {s.reason}.", None, None, None, proof)
     change, control = changes[s.name]
     pair = (cases[SCENE], cases[s.name]) if s.on else (cases[s.name], cases[SCENE])
-    cost = cost_of(*pair)
+    cost = cost_of(*pair, noise)
     felt = _felt(s, control, gate, scene)
     verdict = judge(change.outputs, bool(felt), cost.any, tolerance)
     advice = _advice(s, verdict, change.outputs, felt, cost, tolerance)
@@ -298,7 +325,7 @@ def show(study: EffectsStudy, console: Console) -> None:
         "effect", "change", "deform.", "gate", "step", "memory", "verdict",
         box=None, pad_edge=False, collapse_padding=True, caption_justify="left",
         caption="change: of the outputs; deform.: relative to the hand; gate: number against threshold; "
-        f"step, memory: added; noise: {study.repeats} samples do not agree",
+        "step, memory: added; noise: as the scene against itself",
     )  # fmt: skip
     for f in study.findings:
         gate, cells = f.gate.gate, ["-"] * 4
@@ -311,12 +338,12 @@ def show(study: EffectsStudy, console: Console) -> None:
     for f in study.findings:
         value = f" ({f.value})" if f.value and f.on else f" (tried {f.value})" if f.value else ""
         console.print(Padding.indent(escape(f"{f.name}{value}: {f.advice}"), 2), highlight=False)
-    for text in study.explanation.warnings:
+    for text in study.warnings:
         console.print(Padding.indent(escape(f"look at: {text}"), 2), highlight=False)
     off = [f for f in study.findings if f.proof is not None]
     free = [f.name for f in off if f.proof is not None and f.proof.holds]
     if off:
-        shown = f"without cost, by hashes, allocations, operations and time: {', '.join(free) or 'none'}"
+        shown = f"without cost, by hashes, PETSc's objects, memory, operations and time: {', '.join(free) or 'none'}"
         console.print(f"off and {shown}")
         console.print(f"step time of the scene against itself: {study.noise[0]:+.1%} to {study.noise[1]:+.1%}")
     for f in off:
@@ -326,6 +353,6 @@ def show(study: EffectsStudy, console: Console) -> None:
 
 def failed(proof: OffProof) -> str:
     """Which parts of a proof do not hold. Not collective."""
-    names = ("same_operators", "zero_strength", "absent", "same_allocations", "declared", "same_work", "within_noise")
-    lost = [name.replace("_", " ") for name in names if getattr(proof, name) is False]
+    names = ("same_operators", "zero_strength", "absent", "same_objects", "same_allocations", "declared", "same_work")
+    lost = [name.replace("_", " ") for name in (*names, "within_noise") if getattr(proof, name) is False]
     return f"not shown: {', '.join(lost)} (step time {proof.step_ratio - 1:+.1%}, noise {proof.noise:.1%})"

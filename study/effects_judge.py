@@ -10,7 +10,8 @@ from fem.build import Model, build
 from fem.effects import EFFECTS
 from fem.petsc import Array
 from fem.run import Run, RunOptions
-from study.effects_measure import Case, fingerprint, nothing_of
+from study.effects_measure import Case, fingerprint, nothing_of, objects_of
+from study.effects_objects import difference
 from study.effects_switch import neutral
 
 COUNTED = 1e-3  # relative growth of work or memory that counts as a cost; gravity's n_s numbers do not
@@ -26,10 +27,12 @@ class Cost:
         assembly_range, setup_range: smallest and largest paired sample [s].
         step_relative: added share of a step's time [1].
         step_low, step_high: smallest and largest paired share [1].
+        step_noise: share that a step of the scene differs from itself by [1].
         step_quartiles: lower and upper quartile of the paired shares [1].
         flops: added operations of PETSc in a step [1]; flops_relative: their share.
         memory: added memory [byte]; memory_relative: its share.
         holds: names of what only the scene with the effect holds.
+        objects: what PETSc counts as created more, by class.
     """
 
     assembly: float
@@ -40,12 +43,14 @@ class Cost:
     step_relative: float
     step_low: float
     step_high: float
+    step_noise: float
     step_quartiles: tuple[float, float]
     flops: float
     flops_relative: float
     memory: float
     memory_relative: float
     holds: tuple[str, ...]
+    objects: dict[str, int]
 
     @property
     def any(self) -> bool:
@@ -54,8 +59,8 @@ class Cost:
 
     @property
     def step_shows(self) -> bool:
-        """Whether all paired samples agree that a step takes longer, or shorter."""
-        return self.step_low > 0 or self.step_high < 0
+        """Whether all paired samples agree that a step takes longer, or shorter, by more than the noise."""
+        return (self.step_low > 0 or self.step_high < 0) and abs(self.step_relative) > self.step_noise
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,8 @@ class OffProof:
         same_operators: built again after the trial with the effect on, all hashes are those from before.
         zero_strength: named with strength zero it gives the same hashes; None for effects without a strength.
         absent: operators made without its term have the same bits.
+        same_objects: PETSc's own log counts the same objects, by class, created after the trial as before, and with the
+            effect named at strength zero; and none in the steps.
         same_allocations: Inventory and held memory are those of the scene before the trial.
         declared: the Inventory holds what the effects that are on declare, and nothing more.
         same_work: as many operations in a step.
@@ -77,6 +84,7 @@ class OffProof:
     same_operators: bool
     zero_strength: bool | None
     absent: bool
+    same_objects: bool
     same_allocations: bool
     declared: bool
     same_work: bool
@@ -89,8 +97,14 @@ class OffProof:
     @property
     def holds(self) -> bool:
         """Whether the cost is zero: everything is the same but time, and time within noise."""
-        counted = self.same_operators and self.absent and self.same_allocations and self.declared and self.same_work
-        return counted and self.zero_strength is not False and self.within_noise
+        counted = self.same_operators and self.absent and self.same_objects and self.same_work
+        return (
+            counted
+            and self.same_allocations
+            and self.declared
+            and self.zero_strength is not False
+            and self.within_noise
+        )
 
 
 def judge(change: float, felt: bool, costs: bool, tolerance: float) -> str:
@@ -116,8 +130,8 @@ def quartiles(samples: Array) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def cost_of(with_: Case, without: Case) -> Cost:
-    """The differences of two cases. Not collective."""
+def cost_of(with_: Case, without: Case, noise: float = TIMER) -> Cost:
+    """The differences of two cases; ``noise`` is what a step of one scene differs from itself by. Not collective."""
 
     def added(stage: str) -> Array:
         return np.array(with_.seconds[stage]) - np.array(without.seconds[stage])
@@ -134,12 +148,14 @@ def cost_of(with_: Case, without: Case) -> Cost:
         step_relative=float(np.median(shares)),
         step_low=float(shares.min()),
         step_high=float(shares.max()),
+        step_noise=noise,
         step_quartiles=quartiles(shares),
         flops=with_.flops - without.flops,
         flops_relative=with_.flops / without.flops - 1 if without.flops else 0.0,
         memory=more - less,
         memory_relative=more / less - 1,
         holds=tuple(sorted(set(with_.bytes) - set(without.bytes))),
+        objects=difference(with_.objects, without.objects),
     )
 
 
@@ -157,17 +173,21 @@ def prove_off(name: str, before: Case, again: Case) -> OffProof:
     median, low, high = float(np.median(ratio)), float(ratio.min()), float(ratio.max())
     noise = max(TIMER, before.spread, again.spread)
     zero: bool | None = None
+    counts = [(again.objects, again.objects_in_steps)]
     with_zero = neutral(before.model.scene, name, before.model.system.layout.dimension)
     if with_zero is not None:
         model = build(with_zero, before.model.system.layout.comm)
         run = Run(model, RunOptions())
         zero = fingerprint(model, run) == before.prints
         run.midpoint.destroy()
+        if before.objects:
+            counts.append(objects_of(before.model.system.layout.comm, with_zero))
     made, new = before.model.inventory, again.model.inventory
     return OffProof(
         same_operators=again.prints == before.prints,
         zero_strength=zero,
         absent=nothing_of(name, before),
+        same_objects=not before.objects_in_steps and all(c == (before.objects, {}) for c in counts),
         same_allocations=made.forms == new.forms and made.operators == new.operators and before.bytes == again.bytes,
         declared=made.forms == ["K_mu", "K_lambda", "M_1"]
         and sorted(made.operators) == declared_operators(before.model),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
+import shlex
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from fem.errors import agree
 from fem.results import package_version, peak_memory_mb
 from fem.scene import Scene
 from fem.scene_file import resolved_toml, scene_hash
+from study.effects_objects import in_words
 from study.effects_plots import Mark, figure_effects
 from study.report import Section, write_report
 
@@ -109,12 +111,12 @@ def _csv_row(f: Finding) -> list[Any]:
 def verdict_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
     """The table of verdicts with a header row. Not collective."""
     rows: list[tuple[Any, ...]] = [
-        ("effect", "is", "outputs", "deformation", "under force", "gate", "threshold", "verdict")
+        ("effect", "is", "verdict", "outputs", "deformation", "under force", "gate", "threshold")
     ]
     for f in study.findings:
         gate, change = f.gate.gate, f.change
         cells = (None, None) if change is None else (change.outputs, change.deformation)
-        rows.append((f.name, "on" if f.on else "off", *cells, f.control, gate.number, gate.threshold, f.label))
+        rows.append((f.name, "on" if f.on else "off", f.label, *cells, f.control, gate.number, gate.threshold))
     return rows
 
 
@@ -128,7 +130,7 @@ def _seconds(median: float, spread: tuple[float, float], share: float | None = N
 
 def cost_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
     """The table of costs with a header row; the last row is the scene as it is. Not collective."""
-    rows: list[tuple[Any, ...]] = [("effect adds", "assembly", "factor", "step", "operations", "memory")]
+    rows: list[tuple[Any, ...]] = [("effect adds", "assembly", "factor", "step", "operations", "memory", "objects")]
     for f in study.findings:
         if f.cost is None:
             continue
@@ -138,21 +140,22 @@ def cost_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
                 f.name,
                 _seconds(c.assembly, c.assembly_range),
                 _seconds(c.setup, c.setup_range),
-                _seconds(c.step, (c.step_low, c.step_high), c.step_relative),
+                _seconds(c.step, (c.step_low, c.step_high), c.step_relative) if c.step_shows else "noise",
                 f"{c.flops:+.0f} ({c.flops_relative:+.1%})",
                 f"{c.memory / 1024:+.1f} KiB ({c.memory_relative:+.1%})",
+                in_words(c.objects),
             )
         )
     base = study.base
     times = [f"{1e3 * base['assembly']:.2f} ms", f"{1e3 * base['setup']:.2f} ms", f"{1e6 * base['step']:.2f} us"]
-    rows.append(("the scene", *times, f"{base['flops']:.0f}", f"{base['memory'] / 1024:.0f} KiB"))
+    rows.append(("the scene", *times, f"{base['flops']:.0f}", f"{base['memory'] / 1024:.0f} KiB", ""))
     return rows
 
 
 def proof_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
     """The table of proofs with a header row. Not collective."""
     rows: list[tuple[Any, ...]] = [
-        ("off", "operators", "strength 0", "without its term", "allocations", "operations", "step time")
+        ("off", "operators", "strength 0", "without its term", "objects", "memory", "operations", "step time")
     ]
 
     def word(value: bool | None) -> str:
@@ -164,8 +167,8 @@ def proof_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
             continue
         allocations = word(p.same_allocations and p.declared)
         span = f"{p.step_ratio - 1:+.1%}, {'noise' if p.within_noise else 'NOT noise of'} {p.noise:.1%}"
-        counted = (word(p.same_operators), word(p.zero_strength), word(p.absent), allocations, word(p.same_work))
-        rows.append((f.name, *counted, span))
+        counted = (word(p.same_operators), word(p.zero_strength), word(p.absent), word(p.same_objects))
+        rows.append((f.name, *counted, allocations, word(p.same_work), span))
     return rows
 
 
@@ -176,12 +179,13 @@ def _report(
         (f"{f.name}: {f.value}" if f.on else f"{f.name}, tried: {f.value}" if f.value else f.name, f.advice)
         for f in study.findings
     ]
-    advice += [("look at", text) for text in study.explanation.warnings]
+    advice += [("look at", text) for text in study.warnings]
     how = [
         ("tolerance", f"{study.tolerance:g}: relative change of the outputs that counts"),
         ("needed", "changes the outputs of the run by more than the tolerance"),
         ("optional", "does not, but costs nothing, or the control problem feels it"),
         ("wasted", "costs work or memory and nothing shows it"),
+        ("noise", "paired samples do not agree, or by less than steps of the scene differ from one another"),
         ("costs", "decided by counted operations and held memory; times are shown with their noise"),
         (
             "samples",
@@ -191,7 +195,8 @@ def _report(
         ("operators", "SHA-256 of all operators after the effect was on in this process is that from before"),
         ("strength 0", "the effect named with strength zero gives the same hashes"),
         ("without its term", "operators made again without the effect's term have the same bits"),
-        ("allocations", "the same matrices, vectors and arrays of the same size, and only what is declared"),
+        ("objects", "PETSc's own log counts the same matrices, vectors, index sets and solvers, and none in a step"),
+        ("memory", "the same matrices, vectors and arrays of the same size, and only what is declared"),
         ("operations", "PETSc counts as many in a step"),
     ]
     about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", str(result["ranks"]))]
@@ -201,9 +206,10 @@ def _report(
     proofs = proof_rows(study)
     if len(proofs) > 1:
         sections.append(_table("Effects that are off cost nothing", proofs))
-    sections += [Section("How it is judged", rows=how), Section("Made with", rows=about)]
+    sections += [Section("How it is judged", rows=how), Section("Size", rows=list(study.sizes.items()))]
+    sections.append(Section("Made with", rows=about))
     launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
-    sets = "".join(f" --set '{o}'" for o in overrides)
+    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
     return write_report(
         out / "report.html",
         title=f"{scene.name}: effects",
@@ -211,7 +217,7 @@ def _report(
         sections=sections,
         figures=[(out / "effects.png", CAPTION)],
         scene=resolved_toml(scene),
-        reproduce=f"{launch}softgrasp effects {path}{sets}",
+        reproduce=f"{launch}softgrasp effects {shlex.quote(str(path))}{sets}",
     )
 
 
