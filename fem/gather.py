@@ -13,6 +13,7 @@ from mpi4py import MPI
 from fem.assembly import cells_of_layers
 from fem.contact import contact_facets, rigid_modes
 from fem.fields import FullField
+from fem.geometry import cell_nodes
 from fem.petsc import Array
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def gather_picture(model: Model) -> PictureMesh | None:
     def facet_nodes(facets: npt.NDArray[np.int32]) -> Integers:
         return _numbered(nodes, _outward(mesh, d, facets))
 
-    cells = np.asarray(mesh.geometry.dofmaps[0][: mesh.topology.index_map(d).size_local])
+    cells = np.asarray(cell_nodes(mesh)[: mesh.topology.index_map(d).size_local])
     layers = np.zeros(len(cells), dtype=np.int64)
     names: tuple[str, ...] = ("tissue",)
     if model.scene.tissue.layers:
@@ -107,7 +108,7 @@ def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
     # The first d + 1 dofs of a Lagrange cell sit on its vertices, in the order of the geometry; a vertex may belong
     # to another rank as dof than as mesh node, so ghosts count too.
     node_dof = np.zeros(len(geometry.x), dtype=np.int64)
-    node_dof[geometry.dofmaps[0]] = dofmap.list[:, : d + 1]
+    node_dof[cell_nodes(space.mesh.mesh)] = dofmap.list[:, : d + 1]
     dofs = node_dof[:owned]
     full = FullField(model)
     columns = z.reshape(len(z), -1)
@@ -128,7 +129,7 @@ def _outward(mesh: Any, d: int, facets: npt.NDArray[np.int32]) -> npt.NDArray[np
         return np.zeros((0, d), dtype=np.int32)
     nodes = dolfinx.mesh.entities_to_geometry(mesh, d - 1, facets).reshape(len(facets), d)
     cells = mesh.topology.connectivity(d - 1, d)
-    inside = mesh.geometry.dofmaps[0][cells.array[cells.offsets[facets]]]
+    inside = cell_nodes(mesh)[cells.array[cells.offsets[facets]]]
     opposite = inside.sum(axis=1) - nodes.sum(axis=1)
     x = mesh.geometry.x[:, :d]
     edges = x[nodes[:, 1:]] - x[opposite][:, None, :]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import dolfinx.mesh
 import numpy as np
+import numpy.typing as npt
 from mpi4py import MPI
 
 from fem.errors import SceneError
@@ -94,3 +95,10 @@ def structured_mesh(
     else:
         mesh = dolfinx.mesh.create_box(comm, corners, list(cells))
     return TissueMesh(mesh, dimension, None, None, "structured")
+
+
+def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
+    """Local node numbers of the cells, shape (n_cells, d + 1). Not collective."""
+    geometry = mesh.geometry
+    # DOLFINx 0.10 has no list of dofmaps, 0.11 warns of the single one
+    return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)

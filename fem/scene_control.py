@@ -40,6 +40,12 @@ class Reduction(Model):
         default_factory=lambda: [20.0, 500.0], description="range of mu for tests at other parameters [Pa]"
     )
 
+    train: Literal["corners"] | list[Range] = Field(
+        "corners",
+        description="[lambda, mu] of full runs that train bases beside the scene's own, for the tests at other "
+        "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none",
+    )
+
     @model_validator(mode="after")
     def _check(self) -> Reduction:
         for key in ("lambda_range", "mu_range"):

@@ -57,10 +57,10 @@ def check_python() -> Check:
 
 
 def check_dolfinx() -> Check:
-    """DOLFINx 0.11. Not collective."""
+    """DOLFINx 0.11; 0.10 differs in nothing that is called here. Not collective."""
     version = str(importlib.import_module("dolfinx").__version__)
-    ok = version.startswith("0.11.")
-    return Check("DOLFINx", ok, version, "" if ok else "softgrasp is written for DOLFINx 0.11; install that version.")
+    ok = version.startswith(("0.10.", "0.11."))
+    return Check("DOLFINx", ok, version, "" if ok else "softgrasp needs DOLFINx 0.11 or 0.10; install one of them.")
 
 
 def check_petsc() -> Check:

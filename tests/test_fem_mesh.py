@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from fem.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from fem.errors import MeshError, SceneError
-from fem.geometry import TissueMesh, make_mesh, structured_mesh
+from fem.geometry import TissueMesh, cell_nodes, make_mesh, structured_mesh
 from fem.meshcheck import check_cells, components, signed_volumes
 from fem.meshfile import read_mesh
 from fem.scene_tissue import Contact
@@ -276,3 +276,10 @@ def test_pillow_mesh_is_readable() -> None:
     expected = np.abs(signed_volumes(raw.points, cells)).sum()
     # another order of summation over some thousand cells
     assert volume(tissue) == pytest.approx(expected, rel=1e-10)
+
+
+def test_cells_are_found_in_either_version_of_dolfinx() -> None:
+    """0.10 has one dofmap, 0.11 a list of them and a warning at the single one."""
+    nodes = np.array([[0, 1, 2]], dtype=np.int32)
+    for geometry in (SimpleNamespace(dofmap=nodes), SimpleNamespace(dofmaps=[nodes])):
+        assert np.array_equal(cell_nodes(SimpleNamespace(geometry=geometry)), nodes)

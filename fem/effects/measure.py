@@ -10,6 +10,7 @@ from fem.assembly import cells_of_layers
 from fem.contact import bounding_box
 from fem.effects.damping import ratios
 from fem.effects.gate import Problem
+from fem.geometry import cell_nodes
 from fem.petsc import Array, times_columns, total
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def rigid_inertia(model: Model) -> tuple[float, tuple[float, ...]]:
         cells = cells_of_layers(mesh, scene)
         for blocks, material in zip(model.system.layers, model.system.materials, strict=True):
             density[cells[blocks.name]] = material.rho
-    x = geometry.x[geometry.dofmaps[0][:owned], :d] - layout.reference
+    x = geometry.x[cell_nodes(mesh.mesh)[:owned], :d] - layout.reference
     edges = x[:, 1:] - x[:, :1]
     weight = density * np.abs(np.linalg.det(edges)) / (2 if d == 2 else 6) * scene.tissue.thickness
     sums = x.sum(axis=1)
