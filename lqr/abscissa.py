@@ -10,6 +10,7 @@ import scipy.linalg
 from fem.petsc import Array, times_columns, total
 from lqr.care import block_eigenvalues, lyapunov
 from lqr.dense import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
+from lqr.operators import reach
 from lqr.plant import Block
 from lqr.problem import RiccatiProblem
 from reduction.engines import on_root
@@ -123,11 +124,11 @@ def _all(problem: RiccatiProblem) -> tuple[Array, Array, ModalPlant]:
 
 
 def _lowest(problem: RiccatiProblem, k: int) -> tuple[Array, Array, ModalPlant]:
-    system, comm = problem.system, problem.layout.comm
+    comm = problem.layout.comm
     omega, Phi, massed = some_modes(problem, k)
     parts = (
         modal_damping(problem, Phi),
-        total(comm, Phi.T @ system.G),
+        reach(problem, Phi),
         total(comm, problem.C_z.T @ Phi),
     )
     return Phi, massed, modal_plant(problem, omega, Phi, massed, parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +58,10 @@ class Solution:
         )
 
 
+def _part(V: Solution, part: Callable[[Complex], Array]) -> Block:
+    return Block(part(V.hand), part(V.tall))
+
+
 def make_right(plant: Plant, tissue: ShiftedTissue, block: Block) -> Right:
     """Add a = K_ee^{-1} W_z: one factorisation and solve. Collective."""
     a = tissue.solve(0.0, block.tall[: plant.n_local])
@@ -105,8 +109,9 @@ def closed_adjoint(
 
     [L, N] = (A + pE)^{-T} [W, K'],  V = L + N (I - B'N)^{-1} B'L. Collective.
     """
-    q, s = W.columns, plant.n_s
+    q = W.columns
     both = open_adjoint(plant, tissue, p, Right.join([W, gain]), ahead)
-    B_V = plant.B.T @ both.hand[s:]
+    real, imag = (plant.felt(Block(V.hand, V.tall)) for V in (_part(both, np.real), _part(both, np.imag)))
+    B_V = (real + 1j * imag).T
     small = np.linalg.solve(np.eye(plant.inputs) - B_V[:, q:], B_V[:, :q])
     return Solution(both.hand[:, :q] + both.hand[:, q:] @ small, both.tall[:, :q] + both.tall[:, q:] @ small)

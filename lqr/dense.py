@@ -20,11 +20,12 @@ from lqr.problem import RiccatiProblem, RiccatiSolution
 
 DENSE_MODES = 600  # a tenth of a second; SLEPc on several ranks is slower there
 FACTOR_TOLERANCE = 1e-10  # of the singular values of Z, hence 1e-20 of those of X
+NOISE = 100 * EPS  # of the largest row of Z: an entry of X beside it is rounding of X
 
 
 @dataclass(frozen=True)
 class TissueMatrices:
-    """Dense copies of the operators in global numbering: M_ee, K_ee, D_ee (n_e, n_e); T, G (n_e, n_s); C_z (n_e, p)."""
+    """Dense M_ee, K_ee, D_ee (n_e, n_e); T, G (n_e, n_s); C_z (n_e, p); B_z (n_e, m), in global numbering."""
 
     M: Array
     K: Array
@@ -32,6 +33,7 @@ class TissueMatrices:
     T: Array
     G: Array
     C_z: Array
+    B_z: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class ModalPlant:
         Phi: modes, (n_e, k).
         massed: M_ee Phi, (n_e, k).
         D: Phi' D_ee Phi, (k, k).
-        g: Phi' G, (k, n_s).
+        g: Phi' G, (k, n_s); without a hand Phi' B_z, (k, m).
         c: outputs of the modes, (p, k).
         space: the matrices.
     """
@@ -92,13 +94,16 @@ def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
     matrix = system.damping.matrix
     extra = None if matrix is None else gather_matrix(layout, matrix)
     T, G, C_z = (gather_rows(layout, a) for a in (system.T, system.G, problem.C_z))
+    B_z = None if problem.B_z is None else gather_rows(layout, problem.B_z)
     if M is None or K is None or T is None or G is None or C_z is None:
         return None
     D = system.damping.alpha * M + (system.damping.beta * K if extra is None else extra)
-    return TissueMatrices(M, K, D, T, G, C_z)
+    return TissueMatrices(M, K, D, T, G, C_z, B_z)
 
 
-def assemble_space(problem: RiccatiProblem, M: Array, K: Array, D: Array, G: Array, C_z: Array) -> StateSpace:
+def assemble_space(
+    problem: RiccatiProblem, M: Array, K: Array, D: Array, G: Array, C_z: Array, B_z: Array | None = None
+) -> StateSpace:
     """E, A, B, C of x = [q_s, v_s, z, v_z] from dense blocks of the tissue in any basis of z. Not collective.
 
     With drag = "space" and two-way coupling the hand row carries alpha M_rigid and alpha G' as well.
@@ -117,8 +122,11 @@ def assemble_space(problem: RiccatiProblem, M: Array, K: Array, D: Array, G: Arr
         E[v, w] = G.T
         if system.damping.in_space:
             A[v, v], A[v, w] = -system.damping.alpha * system.M_rigid, -system.damping.alpha * G.T
-    B = np.zeros((len(E), n_s))
-    B[v] = np.eye(n_s)
+    B = np.zeros((len(E), n_s if B_z is None else B_z.shape[1]))
+    if B_z is None:
+        B[v] = np.eye(n_s)
+    else:
+        B[w] = B_z
     C = np.hstack([problem.C_s, np.zeros_like(problem.C_s), C_z.T, np.zeros_like(C_z.T)])
     return StateSpace(E, A, B, C)
 
@@ -128,7 +136,7 @@ def relative_space(problem: RiccatiProblem) -> StateSpace | None:
     tissue = gather_tissue(problem)
     if tissue is None:
         return None
-    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z)
+    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
 
 
 def modal_plant(
@@ -139,10 +147,11 @@ def modal_plant(
     Args:
         problem: weights, hand and flags.
         omega, Phi, massed: the modes.
-        parts: Phi' D_ee Phi, Phi' G and C_z' Phi.
+        parts: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi.
     """
     D, g, c = parts
-    plain = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, g, c.T)
+    G, B_z = (g, None) if problem.B_z is None else (g[:, :0], g)
+    plain = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
     n_s = problem.layout.n_s
     one = np.ones(2 * n_s)
     S = np.concatenate([one, 1 / omega, np.ones_like(omega)])
@@ -159,7 +168,8 @@ def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
     """
     squares, Phi = scipy.linalg.eigh(tissue.K, tissue.M)
     _check_held(float(squares[0]), float(squares[-1]))
-    parts = (Phi.T @ tissue.D @ Phi, Phi.T @ tissue.G, tissue.C_z.T @ Phi)
+    reach = tissue.G if tissue.B_z is None else tissue.B_z
+    parts = (Phi.T @ tissue.D @ Phi, Phi.T @ reach, tissue.C_z.T @ Phi)
     return modal_plant(problem, np.sqrt(squares), Phi, tissue.M @ Phi, parts)
 
 
@@ -194,10 +204,13 @@ def factor_psd(X: Array) -> Array:
     """Z with Z Z' = X for X symmetric positive semidefinite to rounding, columns in descending order. Not collective.
 
     Small rows keep their own relative accuracy: X is scaled to unit diagonal first. Lifting multiplies the rows of
-    fast modes by omega^2, and rounding relative to the largest entry of X would be seen in the residual.
+    fast modes by omega^2, and rounding relative to the largest entry of X would be seen in the residual. Rows of modes
+    that no output sees are nothing but rounding, which scaling would blow up: they are zero.
     """
     scale = np.sqrt(np.maximum(np.diag(X), 0.0))
-    scale[scale == 0] = 1.0
+    noise = scale <= NOISE * scale.max(initial=0.0)
+    scale[noise] = 1.0
+    X = np.where(noise[:, None] | noise, 0.0, X)
     values, vectors = np.linalg.eigh(X / scale[:, None] / scale)
     keep = values > 0.1 * len(X) * EPS * values[-1]
     Z = scale[:, None] * vectors[:, keep] * np.sqrt(values[keep])
@@ -240,7 +253,7 @@ class DenseRiccati:
             raise ResourceError(
                 f"dense: {layout.states} states are more than {self.limit}; use newton_adi, radi or galerkin instead"
             )
-        check_weights(problem.Q, problem.R, problem.C_s.shape[0], layout.n_s)
+        check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
         tissue = gather_tissue(problem)
         result: RiccatiSolution | None = None
         with agree(comm):
@@ -262,7 +275,7 @@ class DenseRiccati:
         Z = np.vstack([small[hand], plant.massed @ (plant.omega[:, None] * small[q]), plant.Phi @ small[v]])
         K_z = plant.massed @ (plant.omega[:, None] * found.K[:, q].T)
         K_v = plant.massed @ found.K[:, v].T
-        relative = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z)
+        relative = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
         residual = dense_residual(problem, relative, Z)
         if not residual <= self.tolerance:
             raise SolverError(f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.0e}")
@@ -296,5 +309,5 @@ def spread(layout: BlockLayout, result: RiccatiSolution | None) -> RiccatiSoluti
                     result.residual, result.method, result.history, result.counts, result.seconds,
                 )
             )  # fmt: skip
-    mine = layout.comm.scatter(pieces)
+    mine: RiccatiSolution = layout.comm.scatter(pieces)
     return mine

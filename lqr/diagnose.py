@@ -12,6 +12,7 @@ from lqr.abscissa import modal_damping
 from lqr.care import care
 from lqr.checks import EPS, ControlError, check_finite, check_weights, square_root
 from lqr.dense import some_modes
+from lqr.operators import reach
 from lqr.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
 from lqr.problem import RiccatiProblem
 from lqr.reduced import project
@@ -88,7 +89,7 @@ def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
     k = min(modes, system.layout.n_e)
     omega, Phi, massed = some_modes(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
-    g, c = total(comm, Phi.T @ system.G), total(comm, problem.C_z.T @ Phi)
+    g, c = reach(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c, largest=_largest_frequency(problem))
     findings += _damping(problem, rates)
     findings.sort(key=lambda f: f.kind != "error")
@@ -101,7 +102,7 @@ def _data(problem: RiccatiProblem) -> list[Finding]:
     system = problem.system
     bad: list[Finding] = []
     try:
-        check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.layout.n_s)
+        check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
     except ControlError as error:
         bad.append(Finding("error", "weights", str(error)))
     matrices = {"M_ee": system.M_ee, "K_ee": system.K_ee}
@@ -112,6 +113,7 @@ def _data(problem: RiccatiProblem) -> list[Finding]:
             G=system.G,
             T=system.T,
             M_hand=system.M_hand,
+            B_z=problem.B_z,
             **{name: np.asarray(A.getValuesCSR()[2]) for name, A in matrices.items()},
         )
     except ControlError as error:
@@ -123,10 +125,10 @@ def _data(problem: RiccatiProblem) -> list[Finding]:
 def _outputs(problem: RiccatiProblem) -> list[Finding]:
     """The free hand has a double zero eigenvalue a freedom: x_T must be seen, C x_T = C_s."""
     n_s = problem.layout.n_s
-    findings = []
+    findings: list[Finding] = []
     weighted = square_root(problem.Q) @ problem.C_s
     _, sigma, right = np.linalg.svd(np.vstack([weighted, np.zeros((n_s, n_s))]), full_matrices=False)
-    size = float(np.linalg.norm(problem.C_s, 2)) * float(np.sqrt(np.linalg.norm(problem.Q, 2)))
+    size = float(np.linalg.norm(problem.C_s)) * float(np.sqrt(np.linalg.norm(problem.Q, 2)))
     hidden = np.flatnonzero(sigma <= 1e3 * EPS * size)
     if len(hidden):
         motion = _motion(right[hidden[-1]], problem.layout.dimension)

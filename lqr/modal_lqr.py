@@ -12,6 +12,7 @@ from lqr.abscissa import modal_damping
 from lqr.care import care
 from lqr.checks import ControlError, check_weights
 from lqr.dense import factor_psd, some_modes
+from lqr.operators import reach
 from lqr.poles import closed_loop_rates
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.reduced import lift_gain, project
@@ -41,12 +42,12 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
     """
     system, comm = problem.system, problem.layout.comm
     begin = time.perf_counter()
-    check_weights(problem.Q, problem.R, problem.C_s.shape[0], system.layout.n_s)
+    check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
     if modes < 0:
         raise ControlError(f"modal_lqr: modes = {modes} must be 0 or more")
     k = min(max(candidates, modes, 1), system.layout.n_e)
     omega, Phi, massed = some_modes(problem, k)
-    g, c = total(comm, Phi.T @ system.G), total(comm, problem.C_z.T @ Phi)
+    g, c = reach(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, np.diag(modal_damping(problem, Phi)), g, c)
     good = np.flatnonzero(rates.lost == 0)
     if len(good) < modes:

@@ -64,6 +64,18 @@ def dynamics(problem: RiccatiProblem, X: Block) -> Block:
     return Block(np.concatenate([v_s, hand]), np.concatenate([v, force]))
 
 
+def inputs_adjoint(problem: RiccatiProblem, Z: Block) -> Array:
+    """B'Z, (m, k), on every rank. Collective without a hand."""
+    if problem.B_z is None:
+        return Z.hand[problem.layout.n_s :]
+    return total(problem.layout.comm, problem.B_z.T @ Z.tall[problem.layout.n_local :])
+
+
+def reach(problem: RiccatiProblem, Phi: Array) -> Array:
+    """What the inputs couple to shapes of the tissue by: Phi'G through the hand, without one Phi'B_z. Collective."""
+    return total(problem.layout.comm, Phi.T @ (problem.system.G if problem.B_z is None else problem.B_z))
+
+
 def outputs(problem: RiccatiProblem, X: Block) -> Array:
     """C X, (p, k), on every rank. Collective."""
     n_s, n = problem.layout.n_s, problem.layout.n_local

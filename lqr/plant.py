@@ -78,6 +78,7 @@ class Plant:
         A'X = [0; a_s - D_ss b_s - D_es'b; -K b; K a - D b - D_se'b_s],
 
     with H = G, D_ss = alpha M_rigid, D_se = alpha G' for two-way coupling (alpha only when damping acts in space).
+    Without a hand its rows are empty and the inputs act on the tissue, B = [0; B_z].
 
     Args:
         problem: the operators and weights.
@@ -92,10 +93,12 @@ class Plant:
         self.problem, self.system, self.layout, self.comm = problem, system, system.layout, system.layout.comm
         self.n_s, self.n_local = self.layout.n_s, self.layout.n_local
         with agree(self.comm):
-            check_weights(problem.Q, problem.R, problem.C_s.shape[0], self.n_s)
-            check_finite(C_s=problem.C_s, C_z=problem.C_z, G=system.G, M_hand=system.M_hand)
+            check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
+            check_finite(C_s=problem.C_s, C_z=problem.C_z, G=system.G, M_hand=system.M_hand, B_z=problem.B_z)
             check_finite(K_ee=_values(system.K_ee), M_ee=_values(system.M_ee))
-        self.B = np.linalg.inv(np.linalg.cholesky(problem.R)).T
+        weight = np.linalg.inv(np.linalg.cholesky(problem.R)).T
+        self.B = weight if problem.B_z is None else np.zeros((0, len(weight)))
+        self.B_z = None if problem.B_z is None else problem.B_z @ weight
         F = square_root(problem.Q)
         self.C_s, self.C_z = F @ problem.C_s, problem.C_z @ F.T
         self.M_s, self.G = problem.M_s, system.G
@@ -123,6 +126,12 @@ class Plant:
         if self.viscous is not None:
             result = result + self.viscous(b)
         return result
+
+    def felt(self, V: Block) -> Array:
+        """V'B, (k, m), on every rank. Collective without a hand."""
+        if self.B_z is None:
+            return np.asarray(V.hand[self.n_s :].T @ self.B)
+        return total(self.comm, V.tall[self.n_local :].T @ self.B_z)
 
     def outputs(self) -> Block:
         """C' as a block (z-row unscaled). Not collective."""

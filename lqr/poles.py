@@ -65,11 +65,12 @@ def closed_loop_rates(
         problem: weights and hand.
         omega: natural frequencies [1/s], (k,).
         damping: phi_k' D_ee phi_k [1/s], (k,).
-        g: Phi' G, (k, n_s).
+        g: Phi' G, (k, n_s); without a hand Phi' B_z, (k, m).
         c: C_z' Phi, (p, k).
         largest: largest frequency of the whole plant [1/s]; the largest of ``omega`` when 0.
     """
-    force = np.linalg.solve(problem.M_s, g.T)  # (n_s, k); two-way: the rigid inertia moves too
+    # (m, k); two-way: the rigid inertia moves too
+    force = np.linalg.solve(problem.M_s, g.T) if problem.B_z is None else g.T
     weighted = scipy.linalg.solve_triangular(np.linalg.cholesky(problem.R), force, lower=True)
     seen = square_root(problem.Q) @ c
     product = np.linalg.norm(weighted, axis=0) * np.linalg.norm(seen, axis=0)

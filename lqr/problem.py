@@ -15,16 +15,21 @@ class RiccatiProblem:
 
     In these coordinates (one-way; [...] two-way only)
 
-        E = [I 0 0 0; 0 M_s 0 [G']; 0 0 I 0; 0 G 0 M_ee],  A = [0 I 0 0; 0 0 0 0; 0 0 0 I; 0 -D_es -K_ee -D_ee],
-        B = [0; I; 0; 0],  M_s = M_hand [+ M_rigid],  D_es = alpha G when the damping acts in space, else 0.
+        E = [I 0 0 0; 0 M_s 0 [G']; 0 0 I 0; 0 G 0 M_ee],  B = [0; I; 0; 0],  M_s = M_hand [+ M_rigid],
+        A = [0 I 0 0; 0 [-D_ss] 0 [-D_es']; 0 0 0 I; 0 -D_es -K_ee -D_ee],
+        D_es = alpha G, [D_ss = alpha M_rigid] when the damping acts in space, else 0.
+
+    A second-order system without a hand, M_ee z'' + D_ee z' + K_ee z = B_z u, is the case n_s = 0, B = [0; B_z]; see
+    :func:`lqr.second_order.second_order`.
 
     Attributes:
         system: the operators; never a dense n x n array.
         C_s: outputs of the hand's displacement, (p, n_s), on every rank.
         C_z: outputs of the relative displacement, transposed, local rows (n_local, p).
         Q: (p, p), symmetric positive semidefinite [1/(m2 s)].
-        R: (n_s, n_s), symmetric positive definite [1/(N2 s)].
+        R: (m, m), symmetric positive definite [1/(N2 s)], m = n_s.
         names: one per output component.
+        B_z: forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None.
     """
 
     system: BlockSystem
@@ -33,6 +38,12 @@ class RiccatiProblem:
     Q: Array
     R: Array
     names: tuple[str, ...] = ()
+    B_z: Array | None = None
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs m."""
+        return self.layout.n_s if self.B_z is None else int(self.B_z.shape[1])
 
     @property
     def layout(self) -> BlockLayout:

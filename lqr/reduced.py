@@ -13,7 +13,7 @@ from lqr.abscissa import DENSE_LIMIT, LoopQuality, ModalLoop
 from lqr.checks import ControlError
 from lqr.compress import triangular
 from lqr.coordinates import costates_to_absolute, factor_of, gain_of, gain_to_absolute
-from lqr.operators import descriptor, descriptor_adjoint, dynamics, inner, outputs
+from lqr.operators import descriptor, descriptor_adjoint, dynamics, inner, inputs_adjoint, outputs
 from lqr.plant import Block
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.reduced_bases import RiccatiBasis, energy_scaled
@@ -79,7 +79,7 @@ def project(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
     return ReducedMatrices(
         E=inner(system, W, descriptor(problem, U)),
         A=inner(system, W, dynamics(problem, U)),
-        B=np.ascontiguousarray(W.hand[problem.layout.n_s :].T),
+        B=np.ascontiguousarray(inputs_adjoint(problem, W).T),
         C=outputs(problem, U),
         Q=problem.Q,
         R=problem.R,
@@ -88,7 +88,7 @@ def project(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
 
 def lift_gain(problem: RiccatiProblem, basis: RiccatiBasis, P_N: Array) -> Block:
     """K_hat' = -E'W P_N (W'B) R^{-1}, transposed, hand-relative. Collective."""
-    small = -P_N @ np.linalg.solve(problem.R, basis.W.hand[problem.layout.n_s :]).T
+    small = -P_N @ np.linalg.solve(problem.R, inputs_adjoint(problem, basis.W)).T
     return descriptor_adjoint(problem, basis.W).times(small)
 
 

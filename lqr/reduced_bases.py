@@ -18,6 +18,7 @@ from lqr.checks import ControlError
 from lqr.compress import triangular
 from lqr.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
 from lqr.dense import some_modes
+from lqr.operators import reach
 from lqr.plant import Block
 from lqr.poles import closed_loop_rates
 from lqr.problem import RiccatiProblem
@@ -220,7 +221,7 @@ STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that run
 def structured(problem: RiccatiProblem, modes: int = STRUCTURED_MODES) -> BasisFamily:
     """A priori: z = Phi eta with natural modes in the order |c_k|^2 / (|Re p_k| omega_k^2) in which they cost.
 
-    No Riccati equation is solved. States [q_s, v_s, Phi eta, Phi eta'], costates [., ., M Phi omega, Phi omega]: the
+    No Riccati equation is solved. States [q_s, v_s, Phi eta, Phi eta'], costates [q_s, v_s, M Phi omega, Phi]: the
     reduced plant is a second-order system with definite matrices, stable for every N, in energy scaling. Collective.
     """
     system = problem.system
@@ -228,7 +229,7 @@ def structured(problem: RiccatiProblem, modes: int = STRUCTURED_MODES) -> BasisF
     omega, Phi, massed = some_modes(problem, k)
     damping = np.sum(modal_damping(problem, Phi) * np.eye(k), axis=0)
     c = total(system.layout.comm, problem.C_z.T @ Phi)
-    g = total(system.layout.comm, Phi.T @ system.G)
+    g = reach(problem, Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c)
     floor = np.finfo(float).tiny
     weight = np.sum(c**2, axis=0) * np.sum(g**2, axis=1) / (np.maximum(rates.rate, floor) * omega**2)
@@ -272,7 +273,7 @@ def energy_scaled(problem: RiccatiProblem, basis: RiccatiBasis) -> RiccatiBasis:
             lower = np.linalg.cholesky((gram + gram.T) / 2 * scale[:, None] * scale)
         except np.linalg.LinAlgError:  # dependent to rounding: scaled columns must do
             return None
-        return scale[:, None] * scipy.linalg.solve_triangular(lower, np.eye(len(gram)), lower=True).T
+        return np.asarray(scale[:, None] * scipy.linalg.solve_triangular(lower, np.eye(len(gram)), lower=True).T)
 
     T = on_root(system.layout.comm, inverse)
     T = np.diag(scale) if T is None else T

@@ -53,7 +53,8 @@ def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
     a_s, b_s = candidate.Z_s[:n_s], candidate.Z_s[n_s:]
     small = np.zeros((2 * rank + p, 2 * rank + p))
     small[:rank, rank : 2 * rank] = small[rank : 2 * rank, :rank] = np.eye(rank)
-    small[rank : 2 * rank, rank : 2 * rank] = -b_s.T @ np.linalg.solve(problem.R, b_s)
+    felt = b_s if problem.B_z is None else comm.allreduce(problem.B_z.T @ candidate.Z_v)  # B'Z
+    small[rank : 2 * rank, rank : 2 * rank] = -felt.T @ np.linalg.solve(problem.R, felt)
     small[2 * rank :, 2 * rank :] = problem.Q
     U = _tissue_rows(problem, candidate)
     G_b = comm.allreduce(system.G.T @ candidate.Z_v)

@@ -20,7 +20,7 @@ METHODS: tuple[Method, ...] = ("auto", "dense", "newton_adi", "radi", "galerkin"
 DENSE_STATES = 200
 # A distributed complex factorisation a shift: beyond these sizes 100 of them take more than a quarter of an hour on two
 # ranks, and the factor of the real form of twice the order leaves 24 GiB.
-LOW_RANK_LIMIT = {2: 800_000, 3: 60_000}
+LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 60_000}  # 1: systems without a mesh
 
 
 class Solver(Protocol):
