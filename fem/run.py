@@ -16,14 +16,15 @@ from mpi4py import MPI
 from fem.build import Model
 from fem.checkpoint import read_checkpoint, write_checkpoint
 from fem.drive import Drive, Force, ForceDrive, TableDrive
-from fem.errors import Interrupted, SceneError, SoftgraspError, SolverError
-from fem.midpoint import TissueMidpoint, TissueState
+from fem.errors import Interrupted, SceneError, SolverError
+from fem.midpoint import TissueMidpoint
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
-from fem.petsc import Array, PETSc, total
+from fem.petsc import Array, total
 from fem.scene import Scene, Time
-from fem.snapshots import NoStore, Snapshots, make_store
+from fem.snapshots import Snapshots, make_store
 from fem.solvers import SolverName, choose_solver, make_solver
+from fem.stepping import Stepped, make_ts
 from fem.system import BlockSystem
 
 Observer = Callable[["Run"], None]
@@ -81,7 +82,7 @@ class Trajectory:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-class Run:
+class Run(Stepped):
     """One run in progress: the TS context and what it carries.
 
     Args:
@@ -93,24 +94,21 @@ class Run:
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
         scene, system = model.scene, model.system
         self.model = model
-        self.steps, self.end = scene.time.steps, scene.time_end
-        self.dt = self.end / self.steps
-        self.solver = choose_solver(system.layout, scene.time.solver)
+        self.end = scene.time_end
+        dt, solver = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
         with model.watch.stage("factor"):
-            self.midpoint = TissueMidpoint(system, self.dt, self.solver[0], scene.time.rtol, scene.time.reproducible)
-        self.store: NoStore = make_store(
-            system, scene.output.snapshots, self.steps, scene.output.every, options.directory, options.resume
+            midpoint = TissueMidpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
+        store = make_store(
+            system, scene.output.snapshots, scene.time.steps, scene.output.every, options.directory, options.resume
         )
-        self.state: TissueState = self.store.target(0)
+        super().__init__(system.layout, dt, scene.time.steps, midpoint, store, solver)
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
         self.recorders = self._recorders()
         self.drive: Drive = self._make_drive(force)
-        self.reached = 0
         self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = 0.0
-        self.seconds, self.counted = 0.0, 0
 
     def _recorders(self) -> list[tuple[np.ndarray, Array]]:
         """Local dofs and column block of every output that this rank has a share in."""
@@ -137,16 +135,9 @@ class Run:
             u = u + system.M_hand @ system.gravity
         return TableDrive(system, driven_table(system.M_hand, u, self.dt, zero, zero))
 
-    def step(self, ts: Any) -> None:
-        """One midpoint step, called by TS; the step number, not a summed time, picks the load. Collective."""
-        n = self.reached
+    def solve_step(self, n: int) -> None:
+        """Load of the hand's motion, or its force, and one solve. Collective."""
         self.drive.solve(n, self.midpoint, self.state)
-        new = self.store.target(n + 1)
-        self.midpoint.advance(self.state, new)
-        self.state = new
-        self.reached = n + 1
-        self.record(n + 1)
-        ts.setTime((n + 1) * self.dt)
 
     def record(self, n: int) -> None:
         """Store this rank's share of the outputs at step n. Not collective."""
@@ -164,35 +155,6 @@ class Run:
         self.record(0)
         self.initial_energy = self.midpoint.energy(self.state)
         self.peak_energy = abs(self.initial_energy)
-
-    def advance_to(self, ts: Any, x: Any, step: int) -> None:
-        """Let TS run up to a step number. Collective.
-
-        Raises:
-            SolverError: a solve failed; the message names solver, step and reason.
-        """
-        if step <= self.reached:
-            return
-        ts.setMaxSteps(step)
-        before = self.reached
-        begin = time.perf_counter()
-        try:
-            ts.solve(x)
-        except PETSc.Error as error:
-            cause = error.__cause__
-            if cause is not None and not isinstance(cause, SoftgraspError):
-                raise cause from error  # a bug, perhaps on this rank alone: the command must end all ranks
-            text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
-            raise SolverError(f"step {self.reached + 1} of {self.steps}: {text}") from error
-        if self.reached != step:
-            raise SolverError(
-                f"{self.solver[0]}: TS stopped at step {self.reached} of {step} (reason {ts.getConvergedReason()})"
-            )
-        self.seconds += time.perf_counter() - begin
-        self.counted += step - before
-        if self.state is not self.store.work:
-            self.store.work.array[:] = self.state.array  # the TS solution is current between segments
-            x.stateIncrease()
 
     def watch_energy(self) -> None:
         """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
@@ -255,18 +217,6 @@ def equilibrium(system: BlockSystem, solver: SolverName, time: Time) -> Array:
     load.destroy()
     z.destroy()
     return np.asarray(result)
-
-
-def make_ts(run: Run) -> tuple[Any, Any]:
-    """PETSc TS around a run, and its solution vector [z; v] on the work array. Collective."""
-    layout = run.model.system.layout
-    ts = PETSc.TS().createPython(run, comm=layout.comm)
-    ts.setTimeStep(run.dt)
-    ts.setMaxTime(1e300)  # stepping by time would take one step too many or change the last one
-    ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
-    x = PETSc.Vec().createWithArray(run.store.work.array, size=(2 * layout.n_local, 2 * layout.n_e), comm=layout.comm)
-    ts.setSolution(x)
-    return ts, x
 
 
 def frame_steps(scene: Scene) -> list[int]:

@@ -12,10 +12,11 @@ import numpy as np
 from mpi4py import MPI
 
 from fem.errors import SolverError
-from fem.midpoint import TissueMidpoint, TissueState
-from fem.petsc import Array, PETSc, total
-from fem.snapshots import NoStore, Snapshots, make_store
+from fem.midpoint import TissueMidpoint
+from fem.petsc import Array, total
+from fem.snapshots import Snapshots, make_store
 from fem.solvers import Reproducible, choose_solver
+from fem.stepping import Stepped, make_ts
 from lqr.actuation import Actuation
 from lqr.checks import ControlError
 from lqr.cost import accumulated_cost
@@ -151,7 +152,7 @@ class ClosedLoop:
         self.midpoint.destroy()
 
 
-class LoopRun:
+class LoopRun(Stepped):
     """One closed-loop run in progress: the TS context, with the fields that observers of a forward run read.
 
     Args:
@@ -165,13 +166,10 @@ class LoopRun:
     def __init__(self, loop: ClosedLoop, drive: Drive, start: PlantState, steps: int, options: LoopOptions) -> None:
         if steps < 1:
             raise ControlError(f"steps = {steps} must be at least 1")
-        problem, self.midpoint = loop.problem, loop.midpoint
-        self.loop, self.problem, self.drive, self.steps, self.options = loop, problem, drive, steps, options
-        self.dt, self.solver = loop.dt, loop.solver
-        self.store: NoStore = make_store(
-            problem.system, options.snapshots, steps, options.every, options.directory, False
-        )
-        self.state: TissueState = self.store.target(0)
+        problem = loop.problem
+        store = make_store(problem.system, options.snapshots, steps, options.every, options.directory, False)
+        super().__init__(problem.layout, loop.dt, steps, loop.midpoint, store, loop.solver)
+        self.loop, self.problem, self.drive, self.options = loop, problem, drive, options
         n = problem.layout.n_local
         self.state.z.array_w[:] = start.z
         self.state.v.array_w[:] = start.v_z
@@ -179,23 +177,14 @@ class LoopRun:
         self.rows = np.flatnonzero(problem.C_z.any(axis=1)) if n else np.zeros(0, dtype=int)
         self.C_rows = np.ascontiguousarray(problem.C_z[self.rows].T)
         self.seen = np.zeros((steps + 1, len(self.rows)))
-        self.reached = 0
         self.residual_first = 0.0
-        self.seconds = 0.0
         self.midpoint.work = self.midpoint.dissipated = 0.0
         self.midpoint.start(self.state)
         self.record(0)
 
-    def step(self, ts: Any) -> None:
-        """One midpoint step, called by TS. Collective."""
-        n = self.reached
+    def solve_step(self, n: int) -> None:
+        """Feedback and one solve. Collective."""
         self.drive.solve(n, self.state)
-        new = self.store.target(n + 1)
-        self.midpoint.advance(self.state, new)
-        self.state = new
-        self.reached = n + 1
-        self.record(n + 1)
-        ts.setTime((n + 1) * self.dt)
 
     def record(self, n: int) -> None:
         """Keep the entries of z that this rank gives to the outputs. Not collective."""
@@ -211,13 +200,13 @@ class LoopRun:
         frames = {int(n) for n in self.options.frames} if self.options.frame is not None else set()
         ends = set(np.linspace(0, self.steps, min(CHUNKS, self.steps) + 1).round().astype(int).tolist())
         boundaries = sorted(n for n in ends | frames | {1} if 0 < n <= self.steps)
-        ts, x = self._make_ts()
+        ts, x = make_ts(self)
         try:
             if self.options.frame is not None and 0 in frames:
                 self.options.frame(self)
             for end in boundaries:
                 while self.reached < end:
-                    self._advance(ts, x, min(end, self.store.limit(self.reached)))
+                    self.advance_to(ts, x, min(end, self.store.limit(self.reached)))
                     self.store.flush(self.reached)
                 if self.reached == 1:
                     self.residual_first = self.midpoint.residual("step 1")
@@ -229,35 +218,6 @@ class LoopRun:
         finally:
             ts.destroy()
             x.destroy()
-
-    def _make_ts(self) -> tuple[Any, Any]:
-        layout = self.problem.layout
-        ts = PETSc.TS().createPython(self, comm=layout.comm)
-        ts.setTimeStep(self.dt)
-        ts.setMaxTime(1e300)  # stepping by time would take one step too many or change the last one
-        ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
-        x = PETSc.Vec().createWithArray(
-            self.store.work.array, size=(2 * layout.n_local, 2 * layout.n_e), comm=layout.comm
-        )
-        ts.setSolution(x)
-        return ts, x
-
-    def _advance(self, ts: Any, x: Any, step: int) -> None:
-        ts.setMaxSteps(step)
-        begin = time.perf_counter()
-        try:
-            ts.solve(x)
-        except PETSc.Error as error:
-            cause = error.__cause__
-            if isinstance(cause, SolverError):
-                raise SolverError(f"step {self.reached + 1} of {self.steps}: {cause}") from error
-            raise SolverError(f"step {self.reached + 1} of {self.steps}: PETSc error {error.ierr} ({cause})") from error
-        if self.reached != step:
-            raise SolverError(f"TS stopped at step {self.reached} of {step} (reason {ts.getConvergedReason()})")
-        self.seconds += time.perf_counter() - begin
-        if self.state is not self.store.work:
-            self.store.work.array[:] = self.state.array  # the TS solution is current between segments
-            x.stateIncrease()
 
     def _check_finite(self) -> None:
         n = self.reached

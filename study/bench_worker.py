@@ -18,10 +18,11 @@ from fem.build import Model, build
 from fem.drive import TableDrive
 from fem.errors import SolverError
 from fem.midpoint import midpoint_matrix
-from fem.run import Run, RunOptions, make_ts, simulate
+from fem.run import Run, RunOptions, simulate
 from fem.scene import Scene
 from fem.scene_file import load_scene_collective, shipped_scenes
 from fem.solvers import make_solver
+from fem.stepping import make_ts
 from study.bench_peers import BareSolve, PymorLoop, ScipyLoop, TextbookLoop, has_pymor, to_scipy
 from study.workers import leave_result
 

@@ -20,8 +20,9 @@ from fem.drive import Force
 from fem.held import whole_copy
 from fem.motion import motion_table
 from fem.petsc import Array, PETSc
-from fem.run import Run, RunOptions, Trajectory, make_ts, simulate
+from fem.run import Run, RunOptions, Trajectory, simulate
 from fem.scene import Scene
+from fem.stepping import make_ts
 from study.bench_worker import interleave, medians
 from study.effects_objects import STEPS, counting
 from study.effects_switch import changed

@@ -17,8 +17,9 @@ from fem.build import Model
 from fem.contact import rigid_modes
 from fem.outputs import make_outputs
 from fem.petsc import Array, total
-from fem.run import Run, RunOptions, make_ts
+from fem.run import Run, RunOptions
 from fem.scene import Scene
+from fem.stepping import make_ts
 
 REGION_POINTS = 4  # along each axis of the box of a region output
 

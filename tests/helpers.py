@@ -17,8 +17,9 @@ from skfem.helpers import ddot, div, dot, sym_grad
 from fem.build import Model
 from fem.layout import BlockLayout
 from fem.petsc import PETSc
-from fem.run import Run, RunOptions, make_ts
+from fem.run import Run, RunOptions
 from fem.scene import Scene
+from fem.stepping import make_ts
 
 Array = NDArray[np.float64]
 

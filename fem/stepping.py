@@ -1,0 +1,107 @@
+"""PETSc TS takes the midpoint steps of a run, in segments; the forward run and the closed loop share it."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from typing import Any
+
+from fem.errors import SoftgraspError, SolverError
+from fem.layout import BlockLayout
+from fem.midpoint import TissueMidpoint, TissueState
+from fem.petsc import PETSc
+from fem.snapshots import NoStore
+from fem.solvers import SolverName
+
+
+class Stepped(ABC):
+    """A run whose steps TS counts.
+
+    Args:
+        layout: sizes and ownership.
+        dt: step [s].
+        steps: number of steps.
+        midpoint: factored step.
+        store: where the states go.
+        solver: name and reason.
+
+    Attributes:
+        state: at the last step taken.
+        reached: number of the last step taken.
+        seconds, counted: time and number of the steps taken by :meth:`advance_to`.
+    """
+
+    def __init__(
+        self,
+        layout: BlockLayout,
+        dt: float,
+        steps: int,
+        midpoint: TissueMidpoint,
+        store: NoStore,
+        solver: tuple[SolverName, str],
+    ) -> None:
+        self.layout, self.dt, self.steps = layout, dt, steps
+        self.midpoint, self.store, self.solver = midpoint, store, solver
+        self.state: TissueState = store.target(0)
+        self.reached = 0
+        self.seconds, self.counted = 0.0, 0
+
+    @abstractmethod
+    def solve_step(self, n: int) -> None:
+        """Leave w and load of step n in the midpoint, and the hand's new state in its table. Collective."""
+
+    @abstractmethod
+    def record(self, n: int) -> None:
+        """Store this rank's share of the outputs at step n. Not collective."""
+
+    def step(self, ts: Any) -> None:
+        """One midpoint step, called by TS; the step number, not a summed time, picks the load. Collective."""
+        n = self.reached
+        self.solve_step(n)
+        new = self.store.target(n + 1)
+        self.midpoint.advance(self.state, new)
+        self.state = new
+        self.reached = n + 1
+        self.record(n + 1)
+        ts.setTime((n + 1) * self.dt)
+
+    def advance_to(self, ts: Any, x: Any, step: int) -> None:
+        """Let TS run up to a step number. Collective.
+
+        Raises:
+            SolverError: a solve failed; the message names solver, step and reason.
+        """
+        if step <= self.reached:
+            return
+        ts.setMaxSteps(step)
+        before = self.reached
+        begin = time.perf_counter()
+        try:
+            ts.solve(x)
+        except PETSc.Error as error:
+            cause = error.__cause__
+            if cause is not None and not isinstance(cause, SoftgraspError):
+                raise cause from error  # a bug, perhaps on this rank alone: the command must end all ranks
+            text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
+            raise SolverError(f"step {self.reached + 1} of {self.steps}: {text}") from error
+        if self.reached != step:
+            raise SolverError(
+                f"{self.solver[0]}: TS stopped at step {self.reached} of {step} (reason {ts.getConvergedReason()})"
+            )
+        self.seconds += time.perf_counter() - begin
+        self.counted += step - before
+        if self.state is not self.store.work:
+            self.store.work.array[:] = self.state.array  # the TS solution is current between segments
+            x.stateIncrease()
+
+
+def make_ts(run: Stepped) -> tuple[Any, Any]:
+    """PETSc TS around a run, and its solution vector [z; v] on the work array. Collective."""
+    layout = run.layout
+    ts = PETSc.TS().createPython(run, comm=layout.comm)
+    ts.setTimeStep(run.dt)
+    ts.setMaxTime(1e300)  # stepping by time would take one step too many or change the last one
+    ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
+    x = PETSc.Vec().createWithArray(run.store.work.array, size=(2 * layout.n_local, 2 * layout.n_e), comm=layout.comm)
+    ts.setSolution(x)
+    return ts, x
