@@ -25,10 +25,9 @@ from reduction.online import run
 from reduction.project import project
 from reduction.registry import make_bases, make_basis
 from reduction.states import States, states_of
-from study.hard_rows import EPS, Family, Outcome, Row, make, ours, plain, thin
+from study.hard_rows import EPS, Family, Outcome, Row, make, ours, plain, qr_rounding, thin
 
-ORTHONORMAL = 1e-12
-REASON = "rounding of a QR factorisation of this size, with a margin of a hundred"
+REASON = "rounding of a QR factorisation, rows x columns x eps [H02]"
 
 
 @dataclass(frozen=True)
@@ -93,10 +92,10 @@ def sigma_rows(quick: bool) -> list[Row]:
     rows = []
     for j in thin(list(range(0, k, 8)), quick):
         i = int(j)
-        reason = "a hundred roundings of the largest singular value"
+        reason = "backward error of QR and SVD: sqrt(rows) = 20 roundings of the largest singular value"
         errors = [Outcome(float(abs(s[i] / exact[i] - 1))) for s in (mine, gram)]
         name = f"singular value {exact[i]:.0e} of the largest"
-        rows.append(Row(name, float(exact[i]), errors[0], errors[1], 100 * EPS / exact[i], reason))
+        rows.append(Row(name, float(exact[i]), errors[0], errors[1], math.sqrt(len(X)) * EPS / exact[i], reason))
     return rows
 
 
@@ -127,7 +126,7 @@ def scale_rows(quick: bool) -> list[Row]:
         unit = 10.0**power
         mine = ours(_pod_defect, _scaled(case, unit), 10)
         gram = plain(_gram_defect, unit * X, 10)
-        rows.append(Row(f"snapshots times {unit:.0e}", unit, mine, gram, ORTHONORMAL, REASON))
+        rows.append(Row(f"snapshots times {unit:.0e}", unit, mine, gram, qr_rounding(*X.shape), REASON))
     return rows
 
 
@@ -155,7 +154,7 @@ def deficient_rows(quick: bool) -> list[Row]:
         states = _columns(case, pick)
         X = stacked(states.runs[0][1], case.model.system.T)
         mine, gram = ours(_pod_defect, states, N), plain(_gram_defect, X, N)
-        bound = None if refuse else ORTHONORMAL
+        bound = None if refuse else qr_rounding(*X.shape)
         reason = "N is more than the rank" if refuse else REASON
         rows.append(Row(name, i + 1, mine, gram, bound, reason))
     return rows
@@ -169,7 +168,7 @@ def edge_rows(quick: bool) -> list[Row]:
     for N in thin([4, 12, 20, 28, 36, 44, m, m + 1], quick):
         n = int(N)
         mine, gram = ours(_pod_defect, case.states, n), plain(_gram_defect, X, n)
-        bound = ORTHONORMAL if n <= m else None
+        bound = qr_rounding(*X.shape) if n <= m else None
         reason = REASON + "; above the numerical rank a refusal is right" if bound else f"there are only {m} snapshots"
         rows.append(Row(f"N = {n}", n, mine, gram, bound, reason, may_refuse=n > m // 2))
     return rows

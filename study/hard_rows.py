@@ -171,6 +171,23 @@ def sparse(A: PETSc.Mat) -> Any:
     return scipy.sparse.csr_matrix((values, columns, indptr), shape=A.getSize())
 
 
+def scaled_condition(A: PETSc.Mat) -> float:
+    """Condition of a symmetric positive definite matrix with its diagonal scaled to one [VDS69]. Not collective.
+
+    Up to the size of the matrix it is the least that any diagonal scaling reaches, and what Cholesky's error depends
+    on. For matrices of hundreds of rows.
+    """
+    dense = np.asarray(sparse(A).toarray())
+    scale = 1 / np.sqrt(np.diag(dense))
+    values = np.linalg.eigvalsh(scale[:, None] * dense * scale)
+    return float(values[-1] / values[0])
+
+
+def qr_rounding(rows: int, columns: int) -> float:
+    """Bound on |Q'Q - I| of Householder's QR without its constant, rows x columns x eps [H02]. Not collective."""
+    return rows * columns * EPS
+
+
 def relative(a: Array, b: Array) -> float:
     """Largest difference over the largest entry of b; infinite when it is not finite. Not collective."""
     if not np.isfinite(a).all():
