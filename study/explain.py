@@ -290,7 +290,8 @@ def render(result: Explanation, console: Console) -> None:
     if result.missing or result.idle or result.warnings:
         title("Look at")
     for name in result.missing:
-        line(f"{name} is off, but the scene seems to call for it.")
+        proviso = result.effects[name].gate.proviso
+        line(f"{name} is off, but the scene seems to call for it{', ' + proviso if proviso else ''}.")
     for name in result.idle:
         line(f"{name} is on, but does not matter here.")
     for text in result.warnings:

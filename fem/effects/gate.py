@@ -20,6 +20,7 @@ class Gate:
         threshold: value above which the effect matters.
         matters: the effect changes what this scene computes; for an effect that is off: it would.
         sentence: the finding in words.
+        proviso: on what it hangs that the effect matters; empty when on nothing.
     """
 
     number: float
@@ -27,6 +28,7 @@ class Gate:
     threshold: float
     matters: bool
     sentence: str
+    proviso: str = ""
 
 
 @dataclass(frozen=True)

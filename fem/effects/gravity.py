@@ -54,4 +54,5 @@ class Gravity:
             sentence = f"Off; in SI units and with g = {EARTH} it would strain the tissue by about {number:.2g}."
         else:
             sentence = f"The weight strains the tissue by about {number:.2g}."
-        return Gate(number, "rho g L / E", threshold, matters, sentence)
+        proviso = "if its numbers are in SI units" if gravity is None else ""
+        return Gate(number, "rho g L / E", threshold, matters, sentence, proviso)

@@ -42,4 +42,5 @@ class Reaction:
             sentence = f"Off; it would take about {change:.1%} off the acceleration a force gives the hand{where}."
         else:
             sentence = "The motion of the hand is prescribed, so the reaction moves nothing."
-        return Gate(number, "tissue mass / hand mass", THRESHOLD, felt and number > THRESHOLD, sentence)
+        proviso = where.removeprefix(" ") if felt else ""
+        return Gate(number, "tissue mass / hand mass", THRESHOLD, felt and number > THRESHOLD, sentence, proviso)
