@@ -8,6 +8,18 @@
 M = blkdiag(M_hand, M_ee) and K = blkdiag(T' K_ee T, K_ee), the diagonal blocks of the coupled matrices. In canonical
 coordinates a basis can be orthonormal and symplectic at once only if the weight of p is the inverse of that of q, hence
 K^-1 in place of M^-1. The rate c [1/s or s] makes both halves of the snapshots equally large, whatever the units are.
+
+Euclidean products of q and p compare lengths with momenta, whose nodal entries shrink with the mesh. Errors in (q, p)
+on the paper's scene at N = 14, solid modes fixed:
+
+    basis                            euclidean    mass     energy
+    PSD complex SVD                   8.4e-4     6.2e-5    4.7e-5
+    PSD complex SVD, hand-relative    8.5e-4     2.5e-5    3.3e-5
+    PSD cotangent lift                9.6e-4     6.4e-5    2.7e-5
+    PSD SVD-like                      4.3e-5     4.3e-5    4.3e-5
+
+The last is symplectic, not orthonormal: its pairs hardly depend on the product. Hence canonical bases beyond the
+paper's six are built in the energy product unless another is asked for.
 """
 
 from __future__ import annotations

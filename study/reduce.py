@@ -22,19 +22,22 @@ from fem.run import Run, RunOptions, Trajectory, simulate
 from fem.scene import Scene
 from fem.scene_file import load_scene_collective
 from reduction.archive import save_model
-from study.reduce_box import BoxPoint, best_models, box_errors, outside, summary
+from study.reduce_box import Box, box_result, measure_box
 from study.reduce_reference import Reference, reference
 from study.reduce_report import draw_all, write_all
 from study.reduce_sweep import COMPARED, Swept, best, chosen_methods, sweep
 from study.reduce_tables import (
+    BOX_HEADER,
     ERROR_HEADER,
     LEVELS,
     N_NOTE,
     TIME_HEADER,
     FullTimes,
     Speed,
+    box_note,
+    box_rows,
     error_rows,
-    short,
+    inner_note,
     speed_dicts,
     speed_notes,
     speed_of,
@@ -54,18 +57,14 @@ class Reduced:
         swept: every method.
         times: of the full model.
         speeds: every method with a model against the full model.
-        chosen: methods tested over the parameter box, each with the number of its point.
-        box: errors there; empty when the scene lies outside.
-        no_box: why there are none.
+        box: errors at other parameters.
     """
 
     against: Reference
     swept: tuple[Swept, ...]
     times: FullTimes
     speeds: tuple[Speed, ...]
-    chosen: tuple[tuple[Swept, int], ...]
-    box: tuple[BoxPoint, ...]
-    no_box: str
+    box: Box
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
@@ -193,13 +192,12 @@ def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopw
             swept.append(sweep(name, against, scene.reduction, reduced))
             bar.update(task, completed=size * (k + 1))
     bar.remove_task(task)
-    no_box, chosen, box = outside(model), best_models(swept), []
-    if not no_box and chosen:
-        task = bar.add_task("other parameters", total=None)
-        with watch.stage("box"):
-            box = box_errors(against, chosen, lambda done, of: bar.update(task, completed=done, total=of))
+    task = bar.add_task("other parameters", total=None)
+    with watch.stage("box"):
+        box = measure_box(against, swept, lambda done, of: bar.update(task, completed=done, total=of))
+    bar.remove_task(task)
     speeds = tuple(s for s in (speed_of(each, times) for each in swept) if s is not None)
-    return run, Reduced(against, tuple(swept), times, speeds, tuple(chosen), tuple(box), no_box)
+    return run, Reduced(against, tuple(swept), times, speeds, box)
 
 
 def save_models(out: Path, swept: Sequence[Swept]) -> list[Path]:
@@ -223,7 +221,7 @@ def reduce_result(model: Model, run: Trajectory, found: Reduced, watch: Stopwatc
     return {
         "command": "reduce",
         **{key: whole[key] for key in kept},
-        "reduction": {"N": list(scene.N), "energy": scene.energy, "inner": scene.inner, "engine": scene.engine},
+        "reduction": scene.model_dump(mode="json"),
         "N_means": N_NOTE,
         "methods": {s.method.key: s.as_rows() for s in found.swept},
         "about": {
@@ -231,6 +229,7 @@ def reduce_result(model: Model, run: Trajectory, found: Reduced, watch: Stopwatc
                 "title": s.method.title,
                 "paper": s.method.paper,
                 "structure_preserving": s.method.preserving,
+                "inner": s.inner,
                 "N_energy": s.kept,
                 "N_refused": s.refused,
             }
@@ -238,11 +237,7 @@ def reduce_result(model: Model, run: Trajectory, found: Reduced, watch: Stopwatc
         },
         "speed": speed_dicts(found.speeds),
         "speed_notes": speed_notes(whole["n_e"], whole["steps"], found.times, found.speeds),
-        "box": {
-            "reason_for_none": found.no_box,
-            "summary": summary(found.box, found.chosen) if found.box else [],
-            "points": [{"lambda": p.lam, "mu": p.mu, "error_deformation": p.errors} for p in found.box],
-        },
+        "box": box_result(found.box),
         "time": {
             **{key: whole["time"][key] for key in ("mesh", "assembly", "factor", "steps", "per_step")},
             "full_steps_median": found.times.steps,
@@ -259,26 +254,19 @@ def show(console: Console, found: Reduced, result: dict[str, Any]) -> None:
     _print(console, (ERROR_HEADER[0], share, *ERROR_HEADER[2:]), error_rows(found.swept))
     console.print(
         f"{share}: N that keeps this energy; then errors at N = {COMPARED}; least stable N with an error up to "
-        f"{', '.join(f'{level:.0e}' for level in LEVELS)}; !: unstable; fixed: with fixed solid modes. {N_NOTE}",
+        f"{', '.join(f'{level:.0e}' for level in LEVELS)}; !: unstable; fixed: with fixed solid modes. {N_NOTE} "
+        f"{inner_note(found.swept)}",
         style="dim",
     )
     _print(console, TIME_HEADER, time_rows(found.speeds))
     for note in result["speed_notes"]:
         console.print(note)
-    if found.no_box:
-        console.print(f"no errors at other parameters: {found.no_box}")
-    if found.box:
-        titles = {s.method.key: s.method.title for s in found.swept}
-        rows = [
-            (titles[r["method"]], str(r["N"]), *(short(r[k]) for k in ("trained", "median", "largest")))
-            for r in result["box"]["summary"]
-        ]
+    if found.box.none:
+        console.print(f"no errors at other parameters: {found.box.none}")
+    else:
         ranges = found.against.model.scene.reduction
-        low, high = ranges.lambda_range, ranges.mu_range
-        console.print(
-            f"Deformation error over lambda in {low} and mu in {high}, trained at those of the scene:", markup=False
-        )
-        _print(console, ("method", "N", "trained", "median", "largest"), rows)
+        console.print(box_note(found.box, ranges.lambda_range, ranges.mu_range), markup=False)
+        _print(console, BOX_HEADER, box_rows(found.box))
 
 
 def _print(console: Console, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -1,4 +1,4 @@
-"""One parameter trains, others test: errors of reduced models over the box of lambda and mu."""
+"""Errors of reduced models over the box of lambda and mu, trained at the scene's own parameter or at several."""
 
 from __future__ import annotations
 
@@ -10,29 +10,84 @@ from typing import Any
 import numpy as np
 
 from fem.build import Model, Stopwatch
+from fem.outputs import make_outputs
 from fem.run import simulate
+from fem.snapshots import Snapshots
 from fem.system import LayerMaterial
 from reduction.errors import Comparison
+from reduction.model import ReducedModel
 from reduction.online import run
+from reduction.project import project
+from reduction.registry import Method
+from reduction.states import States
 from study.reduce_reference import Reference, prepare, reference
-from study.reduce_sweep import Point, Swept, nearest
+from study.reduce_sweep import COMPARED, LARGER, Point, Swept, bases_of, finite, nearest
 
 GRID = 3  # test values of each constant, from corner to corner of the box
+METHODS_TESTED = 4
+
+
+@dataclass(frozen=True)
+class Case:
+    """One reduced model that is tested.
+
+    Attributes:
+        method: of its basis.
+        N: its dimension.
+        several: whether runs at several parameters trained it.
+        model: itself.
+    """
+
+    method: Method
+    N: int
+    several: bool
+    model: ReducedModel
+
+    @property
+    def family(self) -> tuple[str, bool]:
+        """Cases of one family have nested bases."""
+        return self.method.key, self.several
 
 
 @dataclass(frozen=True)
 class BoxPoint:
-    """One test parameter: lambda, mu [Pa] and the deformation error of every method there."""
+    """One parameter with the deformation error of every case there.
+
+    Attributes:
+        lam, mu: of the first layer [Pa].
+        trained: a run at this parameter trained some of the bases, so that it is no test.
+        errors: one for each case.
+    """
 
     lam: float
     mu: float
-    errors: dict[str, float]
+    trained: bool
+    errors: tuple[float, ...]
 
 
-def best_models(swept: Sequence[Swept], count: int = 4) -> list[tuple[Swept, int]]:
-    """The ``count`` methods with the least deformation error of a stable model at the N that is compared."""
-    found = [(s, i) for s in swept if (i := nearest(s.points)) is not None]
-    return sorted(found, key=lambda f: _deformation(f[0].points[f[1]]))[:count]
+@dataclass(frozen=True)
+class Box:
+    """All tests at other parameters.
+
+    Attributes:
+        cases: models.
+        own: errors at the scene's own parameter.
+        points: errors over the box.
+        trained_at: [lambda, mu] of the runs that trained the cases with ``several``, the scene's own first [Pa].
+        none: why there are no tests; empty when there are.
+    """
+
+    cases: tuple[Case, ...] = ()
+    own: tuple[float, ...] = ()
+    points: tuple[BoxPoint, ...] = ()
+    trained_at: tuple[tuple[float, float], ...] = ()
+    none: str = ""
+
+
+def best_methods(swept: Sequence[Swept]) -> list[Swept]:
+    """The methods with the least deformation error of a stable model at the N that is compared."""
+    found = [(_deformation(s.points[i]), k, s) for k, s in enumerate(swept) if (i := nearest(s.points)) is not None]
+    return [s for _, _, s in sorted(found)[:METHODS_TESTED]]
 
 
 def _deformation(point: Point) -> float:
@@ -54,55 +109,156 @@ def outside(model: Model) -> str:
     return ""
 
 
-def box_materials(model: Model) -> list[tuple[LayerMaterial, ...]]:
-    """Lame constants on a grid of the scene's box, logarithmically; layers keep their ratios to the first."""
+def grid_of(model: Model) -> list[tuple[float, float]]:
+    """Lame constants on a grid of the scene's box, logarithmically."""
     ranges = model.scene.reduction
-    lam, mu = (np.geomspace(r[0], r[1], GRID) for r in (ranges.lambda_range, ranges.mu_range))
+    lam, mu = (np.geomspace(r[0], r[1], GRID).tolist() for r in (ranges.lambda_range, ranges.mu_range))
+    return [(a, b) for a in lam for b in mu]
+
+
+def training_of(model: Model) -> list[tuple[float, float]]:
+    """Lame constants of the runs that train bases beside the scene's own."""
+    wanted = model.scene.reduction
+    if wanted.train == "corners":
+        return [(a, b) for a in wanted.lambda_range for b in wanted.mu_range]
+    return [(a, b) for a, b in wanted.train]
+
+
+def materials_at(model: Model, lam: float, mu: float) -> tuple[LayerMaterial, ...]:
+    """Materials with these constants in the first layer; the others keep their ratios to it."""
     first = model.system.materials[0]
-    return [
-        tuple(replace(m, lam=m.lam * a / first.lam, mu=m.mu * b / first.mu) for m in model.system.materials)
-        for a in lam
-        for b in mu
-    ]
+    return tuple(replace(m, lam=m.lam * lam / first.lam, mu=m.mu * mu / first.mu) for m in model.system.materials)
 
 
-def box_errors(
-    against: Reference, chosen: Sequence[tuple[Swept, int]], progress: Callable[[int, int], None] | None = None
-) -> list[BoxPoint]:
-    """Full runs on the grid, and the chosen reduced models there without any new projection. Collective."""
-    cases = box_materials(against.model)
-    result = []
-    for k, materials in enumerate(cases):
+def box_materials(model: Model) -> list[tuple[LayerMaterial, ...]]:
+    """Materials at every parameter of the grid."""
+    return [materials_at(model, lam, mu) for lam, mu in grid_of(model)]
+
+
+def full_run(model: Model, lam: float, mu: float) -> Reference:
+    """The full run at other constants. Collective."""
+    system = model.system.with_materials(materials_at(model, lam, mu))
+    there = replace(model, system=system, watch=Stopwatch(system.layout.comm))
+    return reference(there, simulate(there))
+
+
+def thinned(snapshots: Snapshots, count: int) -> Snapshots:
+    """About ``count`` of the snapshots, evenly spread, first and last among them. Not collective."""
+    m = snapshots.Z.shape[1]
+    pick = np.unique(np.linspace(0, m - 1, min(count, m)).round().astype(int))
+    return replace(
+        snapshots,
+        steps=snapshots.steps[pick],
+        times=snapshots.times[pick],
+        q_s=snapshots.q_s[:, pick],
+        v_s=snapshots.v_s[:, pick],
+        Z=np.asfortranarray(snapshots.Z[:, pick]),
+    )
+
+
+def training_states(against: Reference, parameters: Sequence[tuple[float, float]]) -> States:
+    """Snapshots of the scene's own run and of runs at these, altogether as many as the own run has. Collective."""
+    system, count = against.model.system, -(-against.snapshots.Z.shape[1] // (1 + len(parameters)))
+    runs = [(system, thinned(against.snapshots, count))]
+    for lam, mu in parameters:
+        there = full_run(against.model, lam, mu)
+        runs.append((there.model.system, thinned(there.snapshots, count)))
+    return States(system, tuple(runs))
+
+
+def cases_of(against: Reference, swept: Sequence[Swept], states: States | None) -> list[Case]:
+    """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
+    full, cases = against.model, []
+    outputs = make_outputs(full.scene, full.system)
+    for s in best_methods(swept):
+        found = {nearest(s.points, N) for N in (COMPARED, LARGER)}
+        points = [(s.points[i], s.models[i]) for i in sorted(i for i in found if i is not None)]
+        cases += [Case(s.method, point.N, False, model) for point, model in points]
+        if states is None or not s.method.snapshots:
+            continue
+        sizes = [point.columns for point, _ in points]
+        bases, _ = bases_of(s.method.key, states, sizes, full.scene.reduction, {})
+        for basis, (point, _) in zip(bases, points, strict=False):
+            cases.append(Case(s.method, point.N, True, project(basis, full.system, outputs)))
+    return cases
+
+
+def errors_at(here: Reference, cases: Sequence[Case]) -> tuple[float, ...]:
+    """Deformation errors of all cases at the parameter of one full run, without any new projection. Collective."""
+    system, errors = here.model.system, []
+    largest: dict[tuple[str, bool], Case] = {}
+    for case in sorted(cases, key=lambda c: c.model.N):
+        largest[case.family] = case
+    found = {
+        family: Comparison(case.model, case.model.at(system.materials), system, here.snapshots, here.energy)
+        for family, case in largest.items()
+    }
+    for case in cases:
+        with np.errstate(all="ignore"):  # may be unstable away from the training parameter
+            small = case.model.at(system.materials)
+            step, drive = prepare(case.model, small, here, system)
+            trajectory = run(step, allow_unstable=True, **drive)
+            errors.append(found[case.family].state_error("deformation", case.model, small, trajectory))
+    return tuple(errors)
+
+
+def measure_box(against: Reference, swept: Sequence[Swept], progress: Callable[[int, int], None] | None = None) -> Box:
+    """Train, and test over the box. Collective.
+
+    Raises:
+        SolverError: a full run failed, or a factorisation did.
+        ResourceError: the snapshots do not fit.
+    """
+    model = against.model
+    reason = outside(model) or ("" if best_methods(swept) else "no method has a stable model")
+    if reason:
+        return Box(none=reason)
+    first, training, grid = model.system.materials[0], training_of(model), grid_of(model)
+    states = training_states(against, training) if training else None
+    cases = cases_of(against, swept, states)
+    trained_at = ((first.lam, first.mu), *training)
+    points = []
+    for k, (lam, mu) in enumerate(grid):
         if progress is not None:
-            progress(k, len(cases))
-        system = against.model.system.with_materials(materials)
-        there = replace(against.model, system=system, watch=Stopwatch(system.layout.comm))
-        here = reference(there, simulate(there))
-        errors = {}
-        for swept, i in chosen:
-            model = swept.models[i]
-            with np.errstate(all="ignore"):  # may be unstable away from the training parameter
-                small = model.at(materials)
-                step, drive = prepare(model, small, here, system)
-                found = run(step, allow_unstable=True, **drive)
-                comparison = Comparison(model, small, system, here.snapshots, here.energy)
-                errors[swept.method.key] = comparison.state_error("deformation", model, small, found)
-        result.append(BoxPoint(materials[0].lam, materials[0].mu, errors))
-    return result
+            progress(k, len(grid))
+        trained = any(np.allclose((lam, mu), place) for place in trained_at)
+        points.append(BoxPoint(lam, mu, trained, errors_at(full_run(model, lam, mu), cases)))
+    return Box(tuple(cases), errors_at(against, cases), tuple(points), trained_at if training else ())
 
 
-def summary(points: Sequence[BoxPoint], chosen: Sequence[tuple[Swept, int]]) -> list[dict[str, Any]]:
-    """Median and largest error of every method over the box."""
+def summary(box: Box) -> list[dict[str, Any]]:
+    """Error at the scene's own parameter, and median and largest over the parameters that trained no basis."""
+    tests = [p for p in box.points if not p.trained] or box.points
     rows = []
-    for swept, i in chosen:
-        errors = [p.errors[swept.method.key] for p in points]
+    for i, case in enumerate(box.cases if tests else ()):
+        errors = [p.errors[i] for p in tests]
         rows.append(
             {
-                "method": swept.method.key,
-                "N": swept.points[i].N,
-                "trained": swept.points[i].error_deformation,
+                "method": case.method.key,
+                "N": case.N,
+                "runs": len(box.trained_at) if case.several else int(case.method.snapshots),
+                "own": box.own[i],
                 "median": statistics.median(errors),
                 "largest": max(errors, key=lambda e: (not np.isfinite(e), e)),
             }
         )
     return rows
+
+
+def box_result(box: Box) -> dict[str, Any]:
+    """For result.json."""
+    keys = [{"method": c.method.key, "N": c.N, "several": c.several} for c in box.cases]
+    return {
+        "reason_for_none": box.none,
+        "trained_at": [list(place) for place in box.trained_at],
+        "summary": [{k: finite(v) for k, v in row.items()} for row in summary(box)],
+        "points": [
+            {
+                "lambda": p.lam,
+                "mu": p.mu,
+                "trained": p.trained,
+                "errors": [key | {"error_deformation": finite(e)} for key, e in zip(keys, p.errors, strict=True)],
+            }
+            for p in box.points
+        ],
+    }

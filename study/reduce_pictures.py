@@ -29,6 +29,8 @@ from study.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
 
 MODES = 4  # a method
 FRAMES = 30
+INSTANTS = 3  # at most, in the still picture
+ROOM = 0.25  # between two bodies there, over the size of the body
 STRETCH = 0.15  # largest displacement of a drawn mode over the size of the body
 GIF_DPI = 110
 FULL: dict[str, Any] = {"color": ORANGE, "linewidth": 1.1}
@@ -190,22 +192,39 @@ def _figure(views: Views, width: float) -> tuple[Any, list[Any], Shot]:
     return figure, axes, shot
 
 
-def _draw(ax: Any, shot: Shot, views: Views, view: View, k: int) -> None:
+def _draw(ax: Any, shot: Shot, views: Views, view: View, k: int, timed: bool = False) -> None:
     """One reduced model at one frame under the outline of the full one."""
-    q = _hands(views)[k]
-    draw_scene(ax, shot, view.states[k : k + 1], None, q[None])
+    q, times = _hands(views)[k], views.times[k : k + 1] if timed else None
+    draw_scene(ax, shot, view.states[k : k + 1], times, q[None])
     lines = LineCollection(list(_outline(views.picture, views.full[k])), zorder=7, **FULL)
     ax.add_collection(lines, autolim=False)
 
 
+def instants(views: Views) -> list[int]:
+    """Frames of large deformation and large error whose bodies do not cover each other, the most telling first."""
+    rigid = [views.picture.rigid(q) for q in _hands(views)]
+    deformation = np.array([np.abs(u - r).max() for u, r in zip(views.full, rigid, strict=True)])
+    error = np.max([np.abs(view.states - views.full).max(axis=(1, 2)) for view in views.reduced], axis=0)
+    score = sum(value / (value.max() or 1.0) for value in (deformation, np.minimum(error, deformation.max())))
+    x = views.picture.points + views.full
+    low, high = x.min(axis=1), x.max(axis=1)
+    room = ROOM * np.ptp(views.picture.points, axis=0)
+    chosen: list[int] = []
+    for k in np.argsort(-score, kind="stable").tolist():
+        if all((low[k] > high[i] + room).any() or (low[i] > high[k] + room).any() for i in chosen):
+            chosen.append(k)
+        if len(chosen) == INSTANTS:
+            break
+    return sorted(chosen)
+
+
 def figure_compare(views: Views, out_png: Path) -> tuple[Path, Path]:
     """Full outline over reduced bodies at some instants; PNG and PDF."""
-    last = len(views.times) - 1
     with paper_style():
         figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1)
         for ax, view in zip(axes, views.reduced, strict=True):
-            for k in sorted({0, round(last / 2), last}):
-                _draw(ax, shot, views, view, k)
+            for k in instants(views):
+                _draw(ax, shot, views, view, k, timed=True)
         return save(figure, out_png)
 
 
@@ -223,7 +242,7 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
                     artist.remove()
                 _draw(ax, shot, views, view, k)
             buffer = io.BytesIO()
-            figure.savefig(buffer, format="png", dpi=GIF_DPI, bbox_inches=frame)
+            figure.savefig(buffer, format="png", dpi=GIF_DPI, bbox_inches=frame, pil_kwargs={"compress_level": 1})
             images.append(Image.open(buffer).convert("RGB"))
         plt.close(figure)
     palette = _palette(images[len(images) // 2])

@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING, Any
 from fem.scene import Scene
 from fem.scene_file import resolved_toml
 from study.reduce_tables import (
+    BOX_HEADER,
     ERROR_HEADER,
     LEVELS,
     N_NOTE,
     TIME_HEADER,
+    box_note,
+    box_rows,
     error_rows,
+    inner_note,
     time_rows,
     write_csv,
 )
@@ -35,8 +39,9 @@ CAPTIONS = {
     "sigma.png": "Singular values over the first of each decomposition; thin lines are its further parts. Those of "
     "PSD are symplectic or of complex snapshots, each a pair of columns.",
     "modes.png": "First modes of the best method of the paper that keeps the hand apart, and of Craig-Bampton or the "
-    "best beyond the paper, scaled to the same largest displacement. Colour: displacement.",
-    "compare.png": "Reduced bodies under the outline of the full one, at the start, half-way and at the end.",
+    "best beyond the paper, scaled to the same largest displacement. Colour: displacement. Modes in absolute "
+    "coordinates hold the motion that the hand gives, so that the body leaves its contact.",
+    "compare.png": "Reduced bodies under the outline of the full one, at instants of large deformation or error.",
     "compare.gif": "The same in motion.",
 }
 
@@ -96,7 +101,8 @@ def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, s
     explained = (
         f"{N_NOTE}\n\n{share}: N that keeps this share of the snapshots' energy. Then errors at the N nearest "
         f"to 14, and the least N of a stable model with an error of at most {levels}. An exclamation mark: "
-        "unstable. Each method is built from the snapshots of one run and repeats it, driven by the same hand."
+        "unstable. Each method is built from the snapshots of one run and repeats it, driven by the same hand. "
+        f"{inner_note(found.swept)}"
     )
     header = (ERROR_HEADER[0], share, *ERROR_HEADER[2:])
     parts = [
@@ -107,27 +113,28 @@ def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, s
     refused = [(s.method.title, N, reason) for s in found.swept for N, reason in s.refused.items()]
     if refused:
         parts.append(Section("Refused", header=("method", "N", "reason"), rows=refused))
-    titles = {s.method.key: s.method.title for s in found.swept}
-    text = "Snapshots of one lambda and mu, test at others: error of the deformation over a grid of the box. "
-    text += "Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
-    if found.box:
-        rows = [
-            (titles[r["method"]], r["N"], r["trained"], r["median"], r["largest"]) for r in result["box"]["summary"]
-        ]
-        parts.append(
-            Section("Other parameters", text, header=("method", "N", "trained", "median", "largest"), rows=rows)
-        )
-        keys = list(found.box[0].errors)
-        parts.append(
-            Section(
-                "",
-                header=("lambda [Pa]", "mu [Pa]", *(titles[k] for k in keys)),
-                rows=[(p.lam, p.mu, *(p.errors[k] for k in keys)) for p in found.box],
-            )
-        )
-    elif found.no_box:
-        parts.append(Section("Other parameters", f"{text} Not here: {found.no_box}."))
+    parts += box_sections(found)
     about = [(key, result[key]) for key in ("n_s", "n_e", "states", "steps")]
     about += [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", result["ranks"])]
     about += [(f"time {key}", f"{value:.3g} s") for key, value in result["time"].items()]
     return [*parts, Section("Made with", rows=[*about, ("scene hash", result["scene_hash"])])]
+
+
+def box_sections(found: Reduced) -> list[Section]:
+    """Errors at other parameters: a summary, and one table for each N with a column for each basis."""
+    title, box = "Other parameters", found.box
+    if box.none:
+        return [Section(title, f"No tests at other parameters: {box.none}.")]
+    ranges = found.against.model.scene.reduction
+    text = box_note(box, ranges.lambda_range, ranges.mu_range)
+    text += " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
+    parts = [Section(title, text, header=BOX_HEADER, rows=box_rows(box))]
+    for N in sorted({case.N for case in box.cases}):
+        shown = [i for i, case in enumerate(box.cases) if case.N == N]
+        names = [box.cases[i].method.title + (", several runs" if box.cases[i].several else "") for i in shown]
+        rows = [
+            (f"{p.lam:.4g}", f"{p.mu:.4g}", "trained" if p.trained else "test", *(p.errors[i] for i in shown))
+            for p in box.points
+        ]
+        parts.append(Section("", f"All parameters, N = {N}.", header=("lambda [Pa]", "mu [Pa]", "", *names), rows=rows))
+    return parts

@@ -27,6 +27,7 @@ from study.reduce_reference import Reference, prepare
 BEYOND = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
 REPEATS, SETUPS = 15, 3  # behind each median of the online time and of the set-up
 COMPARED = 14  # N at which methods are compared: the paper's
+LARGER = 30  # N of the second model that is tested at other parameters
 
 Progress = Callable[[str, int, int], None]
 """Called with the method, what is done and what there is."""
@@ -80,6 +81,7 @@ class Swept:
         sigma: singular values of every part of the decomposition.
         refused: N asked for that the snapshots do not carry, with the reason.
         kept: N that keeps the wanted share of the energy; None without snapshots.
+        inner: inner product of the bases.
     """
 
     method: Method
@@ -88,13 +90,16 @@ class Swept:
     sigma: tuple[np.ndarray, ...]
     refused: dict[int, str] = field(default_factory=dict)
     kept: int | None = None
+    inner: str = ""
 
     def as_rows(self) -> list[dict[str, Any]]:
         """For result.json: numbers that are not finite become null, which JSON knows."""
-        return [
-            {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(p).items()}
-            for p in self.points
-        ]
+        return [{k: finite(v) for k, v in asdict(p).items()} for p in self.points]
+
+
+def finite(value: Any) -> Any:
+    """The value, or None for a number that is not finite, which JSON does not know."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def chosen_methods(wanted: Reduction) -> tuple[str, ...]:
@@ -123,7 +128,7 @@ def best(points: Sequence[Point]) -> int | None:
 
 def noted(points: Sequence[Point]) -> set[int]:
     """Points whose models are kept: the best stable one, and those that pictures and the parameter box compare."""
-    found = (best(points), nearest(points), nearest(points, stable=False))
+    found = (best(points), nearest(points), nearest(points, LARGER), nearest(points, stable=False))
     return {i for i in found if i is not None}
 
 
@@ -243,4 +248,5 @@ def sweep(name: str, against: Reference, wanted: Reduction, progress: Progress |
         sigma=bases[0].sigma if bases else (),
         refused={columns - hand: reason for columns, reason in refused.items()},
         kept=None if kept is None else kept - hand,
+        inner=bases[0].inner if bases else "",
     )

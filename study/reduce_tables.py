@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from study.reduce_box import Box, summary
 from study.reduce_sweep import COMPARED, Point, Swept, nearest
 
 LEVELS = (1e-2, 1e-3, 1e-4)  # of the error, for which the least N is named
@@ -140,6 +141,46 @@ def time_rows(speeds: Sequence[Speed]) -> list[tuple[str, ...]]:
         )
         for s in speeds
     ]
+
+
+BOX_HEADER = ("method", "N", "runs", "own", "median", "largest")
+
+
+def box_rows(box: Box) -> list[tuple[str, ...]]:
+    """Rows of the third table: errors at other parameters, trained by one run or by several."""
+    titles = {case.method.key: case.method.title for case in box.cases}
+    return [
+        (titles[r["method"]], str(r["N"]), str(r["runs"] or "-"), *(short(r[k]) for k in ("own", "median", "largest")))
+        for r in summary(box)
+    ]
+
+
+def box_note(box: Box, low: Sequence[float], high: Sequence[float]) -> str:
+    """What the third table shows, with the ranges of lambda and mu [Pa]."""
+    tests = sum(not p.trained for p in box.points)
+    text = (
+        f"Deformation error at the scene's own parameter, and median and largest over {tests} others with lambda in "
+        f"{low} and mu in {high}."
+    )
+    if not box.trained_at:
+        return f"{text} Bases: from the scene's run; set reduction.train to train them by more."
+    return (
+        f"{text} Bases: from the scene's run, or from {len(box.trained_at)} runs with as many snapshots altogether "
+        f"(reduction.train); parameters that trained one are no tests."
+    )
+
+
+def inner_note(swept: Sequence[Swept]) -> str:
+    """Which methods were built in which inner product."""
+    groups: dict[str, list[str]] = {}
+    for s in swept:
+        if s.inner:
+            groups.setdefault(s.inner, []).append(s.method.title.replace(", fixed solid modes", ", fixed"))
+    if len(groups) < 2:
+        return f"Inner product: {next(iter(groups), 'none')}."
+    most = max(groups, key=lambda inner: len(groups[inner]))
+    others = [f"{inner} for {'; '.join(titles)}" for inner, titles in groups.items() if inner != most]
+    return f"Inner product: {', '.join(others)}; else {most}."
 
 
 def break_even_mesh(n_e: int, full: FullTimes, online: float) -> float:

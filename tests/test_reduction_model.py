@@ -25,6 +25,7 @@ from tests.reduced import (
     FORCED,
     KINDS,
     TINY,
+    dense_columns,
     distance,
     force_of,
     full_and_reduced,
@@ -82,13 +83,6 @@ def test_layers_in_the_whole_space(comm: MPI.Intracomm) -> None:
 
 
 # --- dense oracles
-
-
-def dense_columns(model: Any, basis: Basis) -> Array:
-    """V in the rows [q_s, q_e, v_s, v_e] of :func:`tests.helpers.first_order`."""
-    layout = model.system.layout
-    rows = [basis.V_sq, gather_rows(layout, basis.V_q), basis.V_sv, gather_rows(layout, basis.V_p)]
-    return np.concatenate(rows)
 
 
 @pytest.mark.parametrize("fixed", [True, False])

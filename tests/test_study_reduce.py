@@ -25,13 +25,14 @@ from reduction.registry import METHODS, PAPER_METHODS, make_bases
 from reduction.states import BasisError, States
 from study.mesh_study import MeshRow, break_even, exponent, run_mesh_study
 from study.reduce import run_reduce
+from study.reduce_box import cases_of, measure_box, summary, training_of, training_states
 from study.reduce_reference import Reference, prepare, reference
 from study.reduce_sweep import BEYOND, Point, best, chosen_methods, nearest, noted, sweep
 from study.reduce_tables import FullTimes, least_size, speed_of, stability
 from tests.helpers import gather_matrix, gather_rows, gather_states, make_scene
 
 PAPER = Path(__file__).parent.parent / "demos" / "scenes" / "paper_forward.toml"
-PRESERVING = [key for key in (*PAPER_METHODS, *BEYOND) if METHODS[key].preserving]
+PRESERVING = [key for key, method in METHODS.items() if method.preserving]
 EVEN = list(range(4, 61, 2))
 SMALL = ["tissue.cells=[5,10]", "time.steps=120"]
 
@@ -191,6 +192,45 @@ def test_every_rank_count_gives_the_same(small: Reference) -> None:
                 assert getattr(p, key) == pytest.approx(getattr(q, key), rel=1e-5), (name, key)
 
 
+# --- other parameters
+
+
+def test_training_at_several_parameters_helps_at_others() -> None:
+    scene = load_scene(
+        PAPER, [*SMALL, "reduction.methods=['psd_fixed_relative', 'craig_bampton']", "reduction.N=[14,30]"]
+    )
+    against = made(scene)
+    swept = [sweep(name, against, scene.reduction) for name in scene.reduction.methods]
+    box = measure_box(against, swept)
+    assert box.trained_at == ((50.0, 50.0), (30.0, 20.0), (30.0, 500.0), (500.0, 20.0), (500.0, 500.0))
+    assert [p.trained for p in box.points] == [True, False, True, False, False, False, True, False, True]
+    rows = {(r["method"], r["N"], r["runs"]): r for r in summary(box)}
+    assert set(rows) == {("craig_bampton", N, 0) for N in (14, 30)} | {
+        ("psd_fixed_relative", N, runs) for N in (14, 30) for runs in (1, 5)
+    }
+    for s in swept:
+        for point in s.points:  # the same error by another comparison: sums in another order
+            own = rows[s.method.key, point.N, int(s.method.snapshots)]["own"]
+            assert own == pytest.approx(point.error_deformation, rel=1e-6)
+    alone, several = (rows["psd_fixed_relative", 30, runs] for runs in (1, 5))
+    assert several["median"] < alone["median"] / 3  # a factor of 6 on the paper's mesh
+    assert several["largest"] < alone["largest"] / 3
+
+
+def test_training_is_as_the_scene_says() -> None:
+    against = made(load_scene(PAPER, [*SMALL, "reduction.train=[[100, 60]]", "output.every=2"]))
+    assert training_of(against.model) == [(100.0, 60.0)]
+    states = training_states(against, training_of(against.model))
+    assert [system.materials[0].mu for system, _ in states.runs] == [50.0, 60.0]
+    assert [s.steps.tolist()[::30] for _, s in states.runs] == [[0, 120]] * 2  # 31 of 61 each, first and last
+    assert states.columns == 62
+    swept = [sweep("psd_fixed", against, wanted(against, [14]))]
+    lonely = made(load_scene(PAPER, [*SMALL, "reduction.train=[]", "output.every=2"]))
+    assert [case.several for case in cases_of(lonely, swept, None)] == [False]
+    moved = made(load_scene(PAPER, [*SMALL, "reduction.mu_range=[60, 70]"]))
+    assert "mu = 50 Pa" in measure_box(moved, swept).none
+
+
 # --- the command
 
 
@@ -290,7 +330,7 @@ def test_choice_of_points() -> None:
     assert nearest(points) == 1
     assert nearest(points, stable=False) == 2
     assert best(points) == 4
-    assert noted(points) == {1, 2, 4}
+    assert noted(points) == {1, 2, 3, 4}  # nearest to 14, all and stable, nearest to 30, best
     assert least_size(points, 1e-2) == 12
     assert least_size(points, 1e-6) is None  # an unstable model does not count
     assert stability(points) == "not 14"
