@@ -134,7 +134,7 @@ def cost_of(with_: Case, without: Case, noise: float = TIMER) -> Cost:
     """The differences of two cases; ``noise`` is what a step of one scene differs from itself by. Not collective."""
 
     def added(stage: str) -> Array:
-        return np.array(with_.seconds[stage]) - np.array(without.seconds[stage])
+        return np.asarray(np.array(with_.seconds[stage]) - np.array(without.seconds[stage]))
 
     assembly, setup, step = added("assembly"), added("setup"), added("step")
     shares = step / np.array(without.seconds["step"])

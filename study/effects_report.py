@@ -130,7 +130,7 @@ def _seconds(median: float, spread: tuple[float, float], share: float | None = N
 
 def cost_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
     """The table of costs with a header row; the last row is the scene as it is. Not collective."""
-    rows: list[tuple[Any, ...]] = [("effect adds", "assembly", "factor", "step", "operations", "memory", "objects")]
+    rows: list[tuple[Any, ...]] = [("effect adds", "assembly", "factor", "step", "operations", "memory")]
     for f in study.findings:
         if f.cost is None:
             continue
@@ -143,19 +143,18 @@ def cost_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
                 _seconds(c.step, (c.step_low, c.step_high), c.step_relative) if c.step_shows else "noise",
                 f"{c.flops:+.0f} ({c.flops_relative:+.1%})",
                 f"{c.memory / 1024:+.1f} KiB ({c.memory_relative:+.1%})",
-                in_words(c.objects),
             )
         )
     base = study.base
     times = [f"{1e3 * base['assembly']:.2f} ms", f"{1e3 * base['setup']:.2f} ms", f"{1e6 * base['step']:.2f} us"]
-    rows.append(("the scene", *times, f"{base['flops']:.0f}", f"{base['memory'] / 1024:.0f} KiB", ""))
+    rows.append(("the scene", *times, f"{base['flops']:.0f}", f"{base['memory'] / 1024:.0f} KiB"))
     return rows
 
 
 def proof_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
     """The table of proofs with a header row. Not collective."""
     rows: list[tuple[Any, ...]] = [
-        ("off", "operators", "strength 0", "without its term", "objects", "memory", "operations", "step time")
+        ("off", "operators", "strength 0", "without it", "objects", "memory", "operations", "step time")
     ]
 
     def word(value: bool | None) -> str:
@@ -194,15 +193,18 @@ def _report(
         ("factor", "factor of S and what the hand's equation solves before the first step"),
         ("operators", "SHA-256 of all operators after the effect was on in this process is that from before"),
         ("strength 0", "the effect named with strength zero gives the same hashes"),
-        ("without its term", "operators made again without the effect's term have the same bits"),
+        ("without it", "operators made again without the effect's term have the same bits"),
         ("objects", "PETSc's own log counts the same matrices, vectors, index sets and solvers, and none in a step"),
         ("memory", "the same matrices, vectors and arrays of the same size, and only what is declared"),
         ("operations", "PETSc counts as many in a step"),
     ]
-    about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", str(result["ranks"]))]
+    about = [("machine", result["machine"]), ("ranks", str(result["ranks"]))]
     about += [("scene hash", result["scene_hash"]), ("time", f"{result['time']['total']:.1f} s")]
     sections = [_table("Relative change, gate and verdict", verdict_rows(study)), Section("Advice", rows=advice)]
     sections.append(_table("Costs", cost_rows(study)))
+    text = "Objects that PETSc's own log counts as created more with the effect, up to the first step:"
+    objects = [(f.name, in_words(f.cost.objects)) for f in study.findings if f.cost is not None]
+    sections.append(Section("", text, rows=objects))
     proofs = proof_rows(study)
     if len(proofs) > 1:
         sections.append(_table("Effects that are off cost nothing", proofs))

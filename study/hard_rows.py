@@ -21,7 +21,7 @@ from fem.scene_file import load_scene, shipped_scenes
 Array = NDArray[np.float64]
 Verdict = Literal["pass", "fail", "refused"]
 EPS = float(np.finfo(float).eps)
-LENGTH = 240  # characters of a message that are kept
+LENGTH = 400  # characters of a message that are kept
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from study.report import Section, write_report
 MODULES: Any = (hard_forward, hard_motion, hard_reduction, hard_carex, hard_riccati, hard_numbers, hard_rank)
 FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for family in module.FAMILIES}
 HEADER = ("case", "bound", "ours", "textbook", "verdict", "reason of the bound")
+WORDS = 30  # letters of an outcome that a column of the report holds
 INTRO = (
     "Every case has a fixed bound with a reason. A case passes when our number keeps the bound; a refusal, "
     "one sentence that says why, counts only where the bound allows it. Beside it stands what the plain textbook way "
@@ -226,8 +227,9 @@ def write_files(
         out / "report.html",
         title="Hard cases",
         subtitle=summary(result),
-        sections=sections(findings, {name: pair[0] for name, pair in pictures.items()}, result),
+        sections=sections(findings, {name: pair[0] for name, pair in pictures.items()}),
         reproduce=f"softgrasp hardcases{options}",
+        numbers="result.json and hardcases.csv",
     )
     return [*files, page]
 
@@ -245,8 +247,8 @@ def write_csv(path: Path, findings: Sequence[Finding]) -> Path:
     return path
 
 
-def sections(findings: Sequence[Finding], pictures: dict[str, Path], result: dict[str, Any]) -> list[Section]:
-    """The parts of the report: what came out, one section a family, what it was made with. Not collective."""
+def sections(findings: Sequence[Finding], pictures: dict[str, Path]) -> list[Section]:
+    """The parts of the report: what came out, and one section a family. Not collective."""
     overview = []
     for f in findings:
         verdicts = [row.verdict for row in f.rows]
@@ -261,10 +263,33 @@ def sections(findings: Sequence[Finding], pictures: dict[str, Path], result: dic
         text = f"{f.family.lesson}\n\nMeasured: {plain_label(f.family.quantity)}. Textbook way: {f.family.plain}."
         text += f" Why these bounds: {reasons}." if reasons else ""
         shown = [(pictures[f.family.name], caption(f.family))] if f.family.name in pictures else []
-        rows = [cells_of(row)[:-1] for row in f.rows]
+        rows = [brief(row) for row in f.rows]
         parts.append(Section(f.family.title, text, header=HEADER[:-1] if rows else (), rows=rows, figures=shown))
-    about = [("softgrasp", result["version"]), ("machine", result["machine"])]
-    return [*parts, Section("Made with", rows=about)]
+        if said := sentences(f):
+            parts.append(Section("", "In their own words:", rows=said))
+    return parts
+
+
+def brief(row: Row) -> tuple[str, str, str, str, str]:
+    """A row in few letters, for the table of the report; `sentences` has the rest."""
+    case, bound, given, textbook, _, _ = cells_of(row)
+    verdict = row.verdict if row.ok else "fail, refused" if row.verdict == "refused" else "fail"
+    if len(textbook) > WORDS:
+        textbook = f"{row.plain.value:.2g}" if row.plain.value is not None else textbook.split(":")[0].split(",")[0]
+    if len(given) > WORDS:
+        given = "no number" if row.ours.value is None else f"{row.ours.value:.2g}"
+    return case, bound, given, textbook, verdict
+
+
+def sentences(finding: Finding) -> list[tuple[str, str]]:
+    """What was said at length: refusals, errors, remarks on a number; with the case and who said it."""
+    found = []
+    for row in finding.rows:
+        if row.ours.refused or len(str(row.ours)) > WORDS:
+            found.append((f"{row.case}: ours", row.ours.text))
+        if len(str(row.plain)) > WORDS:
+            found.append((f"{row.case}: textbook", row.plain.text))
+    return found
 
 
 def caption(family: Family) -> str:

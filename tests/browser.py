@@ -127,8 +127,13 @@ class Browser:
                 found.append(f"failed: {data['errorText']}")
         return found
 
-    def screenshot(self, path: Path) -> None:
-        """The whole page as PNG."""
+    def screenshot(self, path: Path, width: int, *, mobile: bool = False) -> None:
+        """The whole page as PNG, in a window as high as the page: what lies far below a lower one is not drawn."""
+        height = min(16_000, int(self.ask("document.documentElement.scrollHeight")))
+        self.send(
+            "Emulation.setDeviceMetricsOverride",
+            width=width, height=height, deviceScaleFactor=1, mobile=mobile,
+        )  # fmt: skip
         shot = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=True)
         path.write_bytes(base64.b64decode(shot["data"]))
 
