@@ -70,7 +70,8 @@ def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
     result, failure = comm.bcast(answer) if comm.size > 1 else answer
     if failure is not None:
         raise failure
-    return result
+    found: R = result
+    return found
 
 
 def magnitude(comm: MPI.Intracomm, *blocks: Array) -> float:

@@ -2,8 +2,9 @@
 
 The implicit midpoint rule of the full model, (E - dt/2 A) x_{n+1} = (E + dt/2 A) x_n + dt (B u_n + f), in coordinates
 in which the energy of the tissue is |w|^2 / 2: rounding in a step then is small against the energy, and P of a damped
-model is a contraction. An undamped structured block is turned into plane rotations [HLW06, IX.1] whose c^2 + s^2 = 1 to
-far below eps, so that the energy neither grows nor decays systematically over any number of steps.
+model is a contraction. An undamped structured model, or its tissue beside a hand of its own, is turned into plane
+rotations [HLW06, IX.1] whose c^2 + s^2 = 1 to far below eps, so that the energy neither grows nor decays systematically
+over any number of steps.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from fem.petsc import Array
 from reduction.model import ModelError, SmallModel
-from reduction.spectrum import balanced, energy_factor, is_skew, skew_modes
+from reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
 
 STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
 BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache
@@ -79,34 +80,88 @@ def rotation(angle: Array) -> tuple[Array, Array]:
     return np.where(swap, large, small), np.where(swap, small, large)
 
 
-def _coordinates(model: SmallModel, block: slice) -> tuple[Array, Array, Array]:
-    """X with x = X w, its inverse, and omega of the modes of a conservative block (empty when there is none).
+@dataclass(frozen=True)
+class _Coordinates:
+    """x = X w, with what is known of a step in w.
 
-    Modes come as pairs in the block's first coordinates.
+    Attributes:
+        X, X_inverse: x = X w and w = X_inverse x.
+        omega: frequencies of the pairs of modes that follow each other from ``first`` on.
+        first: number of the first mode.
+        still: number of coordinates after the modes that nothing moves; the modes then move each other alone. None when
+            other coordinates may move the modes.
     """
-    op, N = model.operators, model.N
-    X, X_inverse, omega = np.eye(N), np.eye(N), np.zeros(0)
-    if not model.fixed_solid:
-        return X, X_inverse, omega
-    L = energy_factor(op.energy[block, block])
+
+    X: Array
+    X_inverse: Array
+    omega: Array
+    first: int = 0
+    still: int | None = None
+
+    def fix(self, P: Array, angle: Array, often: bool) -> None:
+        """Overwrite the modes by plane rotations, well rounded ones if applied again and again."""
+        if not len(angle):
+            return
+        c, s = rotation(angle) if often else (np.cos(angle), np.sin(angle))
+        i, end = self.first + 2 * np.arange(len(angle)), self.first + 2 * len(angle)
+        if self.still is None:
+            P[self.first : end, self.first : end] = 0.0
+        else:
+            P[: end + self.still] = 0.0
+            P[end : end + self.still, end : end + self.still] = np.eye(self.still)
+        P[i, i], P[i, i + 1], P[i + 1, i], P[i + 1, i + 1] = c, -s, s, c
+
+
+def _coordinates(model: SmallModel, driven: bool) -> _Coordinates:
+    """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
+    apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
+    found = None if apart or not model.structured else _whole(model)
+    if found is not None:
+        return found
+    tissue = _tissue(model, apart) if model.fixed_solid else None
+    if driven and tissue is not None:
+        return tissue
+    X, X_inverse = np.eye(N), np.eye(N)
+    if tissue is None:
+        return _Coordinates(X, X_inverse, np.zeros(0))
+    X[k:, k:], X_inverse[k:, k:] = tissue.X, tissue.X_inverse
+    return _Coordinates(X, X_inverse, tissue.omega, k)
+
+
+def _tissue(model: SmallModel, apart: bool) -> _Coordinates:
+    """Coordinates of the tissue beside the hand's own; ``apart`` if no hand moves with it, so that it has modes."""
+    op, block = model.operators, slice(2 * model.n_s, model.N)
+    E, A, L = op.E[block, block], op.A[block, block], energy_factor(op.energy[block, block])
     if L is None:
-        return X, X_inverse, omega
-    U = np.eye(len(L))
-    if model.structured and not model.two_way:
-        S = balanced(op.E[block, block], op.A[block, block], L)
+        return _Coordinates(np.eye(len(A)), np.eye(len(A)), np.zeros(0))
+    U, omega = np.eye(len(L)), np.zeros(0)
+    if model.structured and apart:
+        S = balanced(E, A, L)
         if is_skew(S):
             U, omega = skew_modes((S - S.T) / 2)
-    X[block, block] = np.linalg.solve(L.T, U)
-    X_inverse[block, block] = U.T @ L.T
-    return X, X_inverse, omega
+    return _Coordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega)
 
 
-def _rotate(P: Array, first: int, angle: Array, often: bool) -> None:
-    """Overwrite the modes of a conservative block by plane rotations, well rounded ones if applied again and again."""
-    c, s = rotation(angle) if often else (np.cos(angle), np.sin(angle))
-    i, end = first + 2 * np.arange(len(angle)), first + 2 * len(angle)
-    P[first:end, first:end] = 0.0
-    P[i, i], P[i, i + 1], P[i + 1, i], P[i + 1, i + 1] = c, -s, s, c
+def _whole(model: SmallModel) -> _Coordinates | None:
+    """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
+
+    H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
+    skew matrix, whose null vectors stand still (a hand that coasts). The null space of H is moved but moves nothing.
+    None when the numbers do not show the structure.
+    """
+    op = model.operators
+    D = np.sqrt(np.abs(np.diag(op.total)))
+    D = np.where(D > 0, D, 1.0)
+    values, V = np.linalg.eigh(op.total / np.outer(D, D))
+    keep = values > NULL_TOLERANCE * values.max(initial=0.0)
+    root, V_r, V_0 = np.sqrt(values[keep]), V[:, keep], V[:, ~keep]
+    R, R_plus = root[:, None] * V_r.T * D, V_r / D[:, None] / root
+    S = R @ np.linalg.solve(op.E, op.A @ R_plus)
+    if not is_skew(S):
+        return None
+    U, omega = skew_modes((S - S.T) / 2)
+    X, X_inverse = np.hstack([R_plus @ U, V_0 / D[:, None]]), np.vstack([U.T @ R, V_0.T * D])
+    return _Coordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
 
 
 def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator:
@@ -125,40 +180,36 @@ def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator
     if driven and not model.fixed_solid:
         raise ModelError(f"{model.name}: the hand is inside the basis, so it cannot be prescribed; give a force")
     model.check_independent()
-    tissue = slice(k, model.N)
-    X, X_inverse, omega = _coordinates(model, tissue)
+    at, tissue = _coordinates(model, driven), slice(k, model.N)
     E, A, n_s = op.E, op.A, model.n_s
     if driven:
-        X, X_inverse, first = X[tissue, tissue], X_inverse[tissue, tissue], 0
         # E_yq q_s' with q_s' = mean v_s, E_yv v_s' with v_s' = mean a_s
         inputs = np.hstack([A[tissue, :n_s], A[tissue, n_s:k] - E[tissue, :n_s], -E[tissue, n_s:k]])
-        f = model.f[tissue]
-        E, A = E[tissue, tissue], A[tissue, tissue]
+        f, E, A = model.f[tissue], E[tissue, tissue], A[tissue, tissue]
     else:
-        first, inputs, f = k, op.B, model.f
+        inputs, f = op.B, model.f
     loads = np.hstack([inputs, f[:, None]])
-    implicit = (E - dt / 2 * A) @ X
     try:
-        matrix = np.linalg.solve(implicit, np.hstack([(E + dt / 2 * A) @ X, dt * loads]))
+        implicit = (E - dt / 2 * A) @ at.X
+        matrix = np.linalg.solve(implicit, np.hstack([(E + dt / 2 * A) @ at.X, dt * loads]))
     except np.linalg.LinAlgError as error:
         raise ModelError(f"{model.name}: E - dt/2 A is singular at dt = {dt:g} s; take another step") from error
-    angle = 2 * np.arctan(omega * dt / 2)
+    angle = 2 * np.arctan(at.omega * dt / 2)
     free = n_s if model.fixed_solid and not model.two_way and not driven else 0
 
     def exact(P: Array, steps: int) -> Array:
         """Entries of P^steps that are known: rotations, and the free hand."""
-        if len(omega):
-            _rotate(P, first, steps * angle, steps in (1, count))
+        at.fix(P, steps * angle, steps in (1, count))
         if free:
             P[:k] = 0.0
             P[:k, :k] = np.eye(k) + np.diag(np.full(free, steps * dt), free)
         return P
 
-    size = len(X)
+    size = len(at.X)
     count = int(np.clip(BLOCK_ENTRIES // max(size, 1) ** 2, 1, STEPS))
     matrix[:, :size] = exact(matrix[:, :size], 1)
     block = several(matrix, count, exact)
-    return Propagator(model, dt, np.ascontiguousarray(matrix), block, X, X_inverse, driven)
+    return Propagator(model, dt, np.ascontiguousarray(matrix), block, at.X, at.X_inverse, driven)
 
 
 def several(matrix: Array, steps: int, exact: Callable[[Array, int], Array]) -> Array:

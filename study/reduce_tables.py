@@ -16,6 +16,7 @@ from study.reduce_sweep import COMPARED, Point, Swept, nearest
 
 LEVELS = (1e-2, 1e-3, 1e-4)  # of the error, for which the least N is named
 PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
+LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 N_NOTE = (
     "N is the dimension of the reduced state. A canonical model with fixed solid modes has the hand as its input, so "
     "the 2 n_s coordinates of the hand do not count; in the (q, v) models, as in the paper, they do."
@@ -155,12 +156,12 @@ def box_rows(box: Box) -> list[tuple[str, ...]]:
     ]
 
 
-def box_note(box: Box, low: Sequence[float], high: Sequence[float]) -> str:
+def box_note(box: Box, lam: Sequence[float], mu: Sequence[float]) -> str:
     """What the third table shows, with the ranges of lambda and mu [Pa]."""
     tests = sum(not p.trained for p in box.points)
     text = (
         f"Deformation error at the scene's own parameter, and median and largest over {tests} others with lambda in "
-        f"{low} and mu in {high}."
+        f"[{lam[0]:g}, {lam[1]:g}] and mu in [{mu[0]:g}, {mu[1]:g}]."
     )
     if not box.trained_at:
         return f"{text} Bases: from the scene's run; set reduction.train to train them by more."
@@ -199,11 +200,14 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
     chosen = next((s for s in speeds if s.method == "psd_fixed"), None) or (speeds[0] if speeds else None)
     if chosen is None:
         return notes
-    mesh = break_even_mesh(n_e, full, chosen.time_online)
+    mesh, named = break_even_mesh(n_e, full, chosen.time_online), f"{chosen.title}, N = {chosen.N}"
+    found = f"at this mesh's time per unknown a full run of n_e = {mesh:.0f} takes as long as the reduced one ({named})"
+    if mesh < LEAST_MESH:
+        found = (
+            f"none, the reduced run ({named}) is faster on every mesh (by its time per unknown from n_e = {mesh:.0f})"
+        )
     notes.append(
-        f"Break-even mesh: at this mesh's time per unknown a full run of n_e = {mesh:.0f} takes as long as the reduced "
-        f"one ({chosen.title}, N = {chosen.N}); the reduced time does not grow with the mesh, see "
-        "python -m study.mesh_study."
+        f"Break-even mesh: {found}. The reduced time does not grow with the mesh, see python -m study.mesh_study."
     )
     notes.append(
         f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "

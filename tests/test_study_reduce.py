@@ -26,6 +26,7 @@ from reduction.states import BasisError, States
 from study.mesh_study import MeshRow, break_even, exponent, run_mesh_study
 from study.reduce import run_reduce
 from study.reduce_box import cases_of, measure_box, summary, training_of, training_states
+from study.reduce_pictures import gather_views, instants
 from study.reduce_reference import Reference, prepare, reference
 from study.reduce_sweep import BEYOND, Point, best, chosen_methods, nearest, noted, sweep
 from study.reduce_tables import FullTimes, least_size, speed_of, stability
@@ -276,6 +277,21 @@ def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: Referenc
     step, drive = prepare(again, one, small, small.model.system)
     assert np.abs(run(step, **drive).outputs - small.trajectory.outputs).max() < 1e-3  # m, of a way of 5 m
     assert result["methods"]["psd_fixed"][-1]["error"] < 1e-3
+
+
+def test_instants_show_large_deformations_apart_from_each_other(small: Reference) -> None:
+    views = gather_views(small.model, small, [sweep("craig_bampton", small, wanted(small, [6]))])
+    if views is None:
+        return  # rank 0 draws
+    chosen = instants(views)
+    hand = np.column_stack([np.interp(views.times, views.table[:, 0], q) for q in views.table[:, 1:].T])
+    size = [np.abs(u - views.picture.rigid(q)).max() for u, q in zip(views.full, hand, strict=True)]
+    assert chosen == sorted(chosen)
+    assert 2 <= len(chosen) <= 3
+    assert max(size[k] for k in chosen) > 0.8 * max(size)
+    boxes = [(x.min(axis=0), x.max(axis=0)) for x in (views.picture.points + views.full[k] for k in chosen)]
+    for i, (low, high) in enumerate(boxes):
+        assert all((low > top).any() or (bottom > high).any() for bottom, top in boxes[:i])
 
 
 def test_without_pictures(mpi_tmp_path: Path) -> None:
