@@ -154,6 +154,12 @@ def study(
     budget: Annotated[
         str | None, typer.Option(help="find the most accurate setting within this time per step, e.g. 1ms")
     ] = None,
+    question: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="only this question: forward, reduced, bases, riccati, reduced_riccati or loop; several with commas"
+        ),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
@@ -162,7 +168,7 @@ def study(
 
     limit = None if budget is None else parse_budget(budget)
     wanted = None if tolerance is None else parse_tolerance(tolerance)
-    run_study(scene, out, set_ or [], console(), tolerance=wanted, budget=limit, quiet=quiet)
+    run_study(scene, out, set_ or [], console(), tolerance=wanted, budget=limit, questions=question, quiet=quiet)
 
 
 @app.command()

@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 
 from reduction.registry import METHODS
 from study.reduce_plots import LOOKS, SPARE
@@ -27,19 +27,20 @@ LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorde
 Value = Callable[[WorkPoint], float]
 
 
-def _axes(ax: Any, x: str, y: str) -> None:
+def axes_log(ax: Any, x: str, y: str) -> None:
+    """Logarithmic axes with labels and a pale grid."""
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlabel(x)
     ax.set_ylabel(y)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(LogLocator(numticks=10))
-        axis.set_minor_formatter(NullFormatter())
+        axis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.0, 0.4)))  # within a decade only
     ax.grid(color="#e6e6e6", lw=0.5, zorder=0)
     ax.set_axisbelow(True)
 
 
-def _front(ax: Any, points: Sequence[WorkPoint], x: Value, y: Value) -> None:
+def draw_front(ax: Any, points: Sequence[WorkPoint], x: Value, y: Value) -> None:
     """The points that no other beats, as a thick pale line."""
     moved = [WorkPoint(p.question, p.series, p.label, x(p), y(p), p.ok) for p in points]
     front = pareto(moved)
@@ -83,8 +84,8 @@ def figure_forward(
                 )  # fmt: skip
         solvers = [p for p in usable(points) if p.series == "solver"]
         ax.plot([p.seconds for p in solvers], [p.error for p in solvers], ls="", marker="x", ms=4, color=GREEN)
-        _front(ax, points, _seconds, _error)
-        _axes(ax, "time of a run [s]", "relative error of the outputs")
+        draw_front(ax, points, _seconds, _error)
+        axes_log(ax, "time of a run [s]", "relative error of the outputs")
         handles = [_order_handle(order, plain) for order in (1, 2)]
         handles += [Line2D([], [], ls="", marker="x", ms=4, color=GREEN, label="other solvers")]
         handles += [Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)]
@@ -123,7 +124,7 @@ def _orders(space: Any, time: Any, plain: Sequence[WorkPoint], slopes: Sequence[
         label = f"P{order}" + ("" if power is None else f", slope {power:.2f}")
         x, y = [p.details["cells"][0] for p in mine], [p.error for p in mine]
         space.plot(x, y, color=colour, marker=marker, ms=3.2, lw=0.9, label=label)
-    _axes(space, "cells along an edge", "error")
+    axes_log(space, "cells along an edge", "error")
     timed = [p for p in plain if p.details.get("error_time", 0) > 0]
     names = list(dict.fromkeys(p.series for p in timed))
     for name in names:
@@ -134,7 +135,7 @@ def _orders(space: Any, time: Any, plain: Sequence[WorkPoint], slopes: Sequence[
     powers = [s.power for s in slopes if s.against == "change in time against steps"]
     if powers:
         time.plot([], [], color=BLUE, label=f"slope {np.median(powers):.2f}", **THIN)
-    _axes(time, "time steps", "change against the\nmost steps")
+    axes_log(time, "time steps", "change against the\nmost steps")
     for ax in (space, time):
         if ax.get_legend_handles_labels()[0]:
             ax.legend(loc="best", fontsize=6.5, handlelength=1.4)
@@ -174,8 +175,8 @@ def figure_reduced(points: Sequence[WorkPoint], full: float, paper: bool, out_pn
                     [x(p) for p in mine], [state(p) for p in mine], color=colour, ls=dashes, marker=marker, ms=3.2,
                     fillstyle=fill, **THIN,
                 )  # fmt: skip
-            _front(ax, points, x, state)
-            _axes(ax, label, "relative error of the state" if ax is axes[0] else "")
+            draw_front(ax, points, x, state)
+            axes_log(ax, label, "relative error of the state" if ax is axes[0] else "")
             ax.axvline(full, color="#888888", lw=0.9, ls=(0, (4, 3)), zorder=0)
         if paper:
             axes[0].plot([PAPER_REDUCED], [PAPER_ERROR], **STAR)
@@ -190,7 +191,7 @@ def figure_reduced(points: Sequence[WorkPoint], full: float, paper: bool, out_pn
             handles += [Line2D([], [], label=f"paper, N = 14: {PAPER_REDUCED} s", **STAR)]
             handles += [Line2D([], [], label=f"paper, full: {PAPER_FULL} s", **LINE)]
         rows = -(-len(handles) // 3)
-        figure.subplots_adjust(left=0.085, right=0.985, bottom=0.13, top=1 - (0.05 + 0.165 * rows) / 3.7, wspace=0.06)
+        figure.subplots_adjust(left=0.085, right=0.985, bottom=0.13, top=1 - (0.05 + 0.14 * rows) / 3.7, wspace=0.06)
         figure.legend(handles=handles, loc="upper center", ncols=3, fontsize=6.5, borderaxespad=0.0)
         return save(figure, out_png)
 
@@ -210,9 +211,9 @@ def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) ->
             for p in mine:
                 face = colour if p.ok else "none"
                 ax.plot([p.seconds], [p.error], ls="", marker=marker, ms=3.6, color=colour, mfc=face)
-        _front(ax, points, _seconds, _error)
+        draw_front(ax, points, _seconds, _error)
         ax.plot([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)
-        _axes(ax, x, y)
+        axes_log(ax, x, y)
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
         return save(figure, out_png)
 
@@ -234,6 +235,6 @@ def figure_budget(
             ax.plot([p.details["p50"] for p in good], y, ls="", marker="o", ms=2.8, color=colour, label=name)
             ax.plot([p.details["max"] for p in good], y, ls="", marker="|", ms=4, color=colour, alpha=0.6)
         ax.axvline(budget, label="the budget", **(LINE | {"zorder": 5}))
-        _axes(ax, "time of a step [s]: median, bar to 99 %, thin to the largest", "relative error of the outputs")
+        axes_log(ax, "time of a step [s]: median, bar to 99 %, thin to the largest", "relative error of the outputs")
         ax.legend(loc="best")
         return save(figure, out_png)

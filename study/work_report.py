@@ -20,14 +20,18 @@ from fem.errors import agree
 from fem.results import package_version, peak_memory_mb
 from fem.scene_file import resolved_toml, scene_hash
 from reduction.registry import METHODS
+from study.control_reduced import TITLES as BASIS_TITLES
 from study.report import Section, write_report
+from study.work_control_report import HEADERS, control_sections, draw_control, notes, rows_of_control
 from study.work_plots import PAPER_FULL, PAPER_REDUCED, figure_budget, figure_forward, figure_reduced, figure_series
 from study.wp_answer import seconds_text
 from study.wp_fit import Slope, pareto
-from study.wp_points import TITLES, Row, WorkPoint, plain
+from study.wp_points import CONTROL, TITLES, Asked, Row, WorkPoint, plain
+from study.wp_riccati import TITLES as METHOD_TITLES
 
 if TYPE_CHECKING:
     from study.work_precision import WorkStudy
+    from study.wp_reference import Reference
 
 PAPER_SCENE = "paper_forward"
 FIRST = ("question", "series", "label", "seconds", "error", "ok", "pareto")
@@ -71,14 +75,13 @@ def write_study(
     out: Path,
     overrides: list[str],
     begin: float,
-    asked: tuple[float | None, float | None],
+    asked: Asked,
 ) -> dict[str, Any]:
     """Write everything on rank 0; the result on all ranks. Collective.
 
     Raises:
         OSError: the folder cannot be written; on all ranks.
     """
-    truth = study.reference
     result: dict[str, Any] = {
         "command": "study",
         "scene": study.scene.name,
@@ -87,11 +90,8 @@ def write_study(
         "ranks": comm.size,
         "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
         "repeats": study.scene.study.repeats,
-        "reference": {
-            "note": truth.note, "error": truth.error, "error_deformation": truth.error_deformation,
-            "space": truth.space, "time": truth.time, "mixed": truth.mixed, "order": truth.order,
-            "extrapolated": truth.extrapolated, "settings": [s.label for s in truth.settings],
-        },
+        "reference": _reference(study.reference),
+        "references": study.references,
         "points": {name: rows_of(points) for name, points in study.points.items()},
         "pareto": {name: [p.label for p in pareto(points)] for name, points in study.points.items()},
         "slopes": [vars(s) for s in study.slopes],
@@ -106,13 +106,24 @@ def write_study(
     with agree(comm):
         if comm.rank == 0:
             out.mkdir(parents=True, exist_ok=True)
-            pictures = draw(study, asked[1], out)
+            pictures = draw(study, asked.budget, out)
             report = _report(study, result, path, out, overrides, asked, pictures)
             table = write_csv(result["points"], out / "points.csv")
             (out / "result.json").write_text(json.dumps(result, indent=2) + "\n")
             files = [str(f) for f in (out / "result.json", table, *pictures, report)]
     result["files"] = comm.bcast(files)
     return result
+
+
+def _reference(truth: Reference | None) -> Row | None:
+    """The reference of the forward questions for JSON. Not collective."""
+    if truth is None:
+        return None
+    return {
+        "note": truth.note, "error": truth.error, "error_deformation": truth.error_deformation,
+        "space": truth.space, "time": truth.time, "mixed": truth.mixed, "order": truth.order,
+        "extrapolated": truth.extrapolated, "settings": [s.label for s in truth.settings],
+    }  # fmt: skip
 
 
 def rows_of(points: Sequence[WorkPoint]) -> list[Row]:
@@ -136,13 +147,15 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
     """All figures that have points. Rank 0 only."""
     found: list[Path] = []
     points, paper = study.points, is_paper(study)
-    found += figure_forward(points["forward"], study.slopes, study.reference.error, paper, out / "work_forward.png")
+    if points.get("forward") and study.reference is not None:
+        found += figure_forward(points["forward"], study.slopes, study.reference.error, paper, out / "work_forward.png")
     if points.get("reduced"):
         found += figure_reduced(points["reduced"], study.full["seconds"], paper, out / "work_reduced.png")
     if points.get("bases"):
         found += figure_series(
             points["bases"], "time of the basis [s]", "left of the snapshots", out / "work_bases.png"
         )
+    found += draw_control(study.points, study.references, study.scene, out)
     if budget is not None:
         found += figure_budget(points["forward"], points.get("reduced", ()), budget, out / "work_budget.png")
     return found
@@ -184,34 +197,38 @@ def state_front(points: Sequence[WorkPoint]) -> list[WorkPoint]:
 
 def slope_rows(slopes: Sequence[Slope]) -> list[tuple[Any, ...]]:
     """Question, series, what against what, power, points. Not collective."""
+    names: dict[str, dict[str, str]] = {
+        "reduced": {key: method.title for key, method in METHODS.items()},
+        "riccati": METHOD_TITLES,
+        "reduced_riccati": BASIS_TITLES,
+    }
     return [
-        (
-            s.question,
-            METHODS[s.series].title if s.series in METHODS else s.series,
-            s.against,
-            f"{s.power:+.2f}",
-            s.count,
-        )
+        (s.question.replace("_", " "), names.get(s.question, {}).get(s.series, s.series), s.against,
+         f"{s.power:+.2f}", s.count)
         for s in slopes
-    ]
+    ]  # fmt: skip
 
 
 def show(console: Console, study: WorkStudy, result: dict[str, Any]) -> None:
     """Print fronts, slopes and answers. Rank 0 prints."""
-    console.print(study.reference.note, markup=False)
-    _print(
-        console,
-        "full model, Pareto front",
-        FORWARD_HEADER[:-1],
-        [r[:-1] for r in forward_rows(study.points["forward"], True)],
-    )
+    if study.reference is not None:
+        console.print(study.reference.note, markup=False)
+    if study.points.get("forward"):
+        rows = [r[:-1] for r in forward_rows(study.points["forward"], True)]
+        _print(console, "full model, Pareto front", FORWARD_HEADER[:-1], rows)
     if study.points.get("reduced"):
         rows = [r[:-1] for r in reduced_rows(study.points["reduced"], True)]
         _print(console, "reduced models on the scene's own mesh, Pareto front", REDUCED_HEADER[:-1], rows)
+    words = notes(study.scene, study.references)
+    for name in CONTROL:
+        if study.points.get(name):
+            console.print(words.get(name, ""), markup=False)
+            rows = [r[:-1] for r in rows_of_control(name, study.points[name], True)]
+            _print(console, f"{TITLES[name]}, Pareto front", HEADERS[name][:-1], rows)
     _print(console, "slopes, x^power", ("question", "series", "of", "power", "points"), slope_rows(study.slopes))
-    for name, reason in study.skipped.items():
-        console.print(f"{TITLES[name]}: left out, {reason}", markup=False)
-    if is_paper(study):
+    for reason, names in _left_out(study).items():
+        console.print(f"{', '.join(names)}: left out, {reason}", markup=False)
+    if is_paper(study) and study.full:
         console.print(
             f"The paper: {PAPER_FULL} s for the full run, here {study.full['seconds']:.3g} s; {PAPER_REDUCED} s and an "
             "error of about 1e-3 at N = 14.",
@@ -226,6 +243,14 @@ def show(console: Console, study: WorkStudy, result: dict[str, Any]) -> None:
     console.print("files:")
     for file in result["files"]:
         console.print(f"  {file}", soft_wrap=True, markup=False)
+
+
+def _left_out(study: WorkStudy) -> dict[str, list[str]]:
+    """Questions without points by the reason. Not collective."""
+    found: dict[str, list[str]] = {}
+    for name, reason in study.skipped.items():
+        found.setdefault(reason, []).append(TITLES[name])
+    return found
 
 
 def _print(console: Console, title: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
@@ -246,14 +271,15 @@ def _report(
     path: Path,
     out: Path,
     overrides: list[str],
-    asked: tuple[float | None, float | None],
+    asked: Asked,
     pictures: Sequence[Path],
 ) -> Path:
     drawn = {p.name for p in pictures}
     sections = [Section("Answer", text="\n\n".join(a.sentences)) for a in study.answers]
-    sections.append(Section("Reference", text=study.reference.note, rows=_reference_rows(study)))
+    if study.reference is not None:
+        sections.append(Section("Reference", text=study.reference.note, rows=_reference_rows(study.reference)))
     tables: dict[str, tuple[Sequence[str], list[tuple[Any, ...]]]] = {
-        "forward": (FORWARD_HEADER, forward_rows(study.points["forward"])),
+        "forward": (FORWARD_HEADER, forward_rows(study.points.get("forward", ()))),
         "reduced": (REDUCED_HEADER, reduced_rows(study.points.get("reduced", ()))),
         "bases": (
             ("engine", "tolerance", "vectors", "left of the snapshots", "|U'U - I|", "time [s]"),
@@ -267,11 +293,12 @@ def _report(
     for name, (header, rows) in tables.items():
         picture = f"work_{name}.png"
         figures = [(out / picture, CAPTIONS[picture])] if picture in drawn else []
-        text = f"Left out: {study.skipped[name]}." if name in study.skipped else ""
-        if rows or text:
-            sections.append(Section(TITLES[name], text=text, figures=figures))
-            if rows:
-                sections.append(Section("", header=header, rows=rows))
+        if rows:
+            sections.append(Section(TITLES[name], figures=figures))
+            sections.append(Section("", header=header, rows=rows))
+    sections += control_sections(study.points, study.references, study.scene, out, drawn)
+    for reason, names in _left_out(study).items():
+        sections.append(Section("Left out", text=f"{', '.join(names)}: {reason}."))
     if "work_budget.png" in drawn:
         sections.append(Section("Budget", figures=[(out / "work_budget.png", CAPTIONS["work_budget.png"])]))
     slopes = slope_rows(study.slopes)
@@ -279,8 +306,9 @@ def _report(
     sections.append(Section("How it is measured", rows=_how(study, result)))
     launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
     sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
-    sets += "" if asked[0] is None else f" --tolerance {asked[0]:g}"
-    sets += "" if asked[1] is None else f" --budget {asked[1]:g}s"
+    sets += "" if asked.tolerance is None else f" --tolerance {asked.tolerance:g}"
+    sets += "" if asked.budget is None else f" --budget {asked.budget:g}s"
+    sets += f" --question {','.join(asked.names)}" if asked.names else ""
     return write_report(
         out / "report.html",
         title=f"{study.scene.name}: accuracy against time",
@@ -291,8 +319,7 @@ def _report(
     )
 
 
-def _reference_rows(study: WorkStudy) -> list[tuple[Any, ...]]:
-    truth = study.reference
+def _reference_rows(truth: Reference) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = [
         (f"error estimate, {name}", f"{a:.1e} of the outputs, {b:.1e} of their deformation")
         for name, (a, b) in (("space", truth.space), ("time", truth.time), ("mixed", truth.mixed))
@@ -301,12 +328,16 @@ def _reference_rows(study: WorkStudy) -> list[tuple[Any, ...]]:
 
 
 def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
-    rows: list[tuple[Any, ...]] = [
-        ("error", "max over the run of |y - y*|, over max |y*|; y displacements at the places of the outputs"),
-        ("deformation", "the same after removing the rigid motion of the hand"),
-        ("places", "the same points of the body on every mesh, not the nearest nodes"),
-        ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
-        ("repeats", f"{study.scene.study.repeats}: the first is the whole run, the others its first steps"),
+    rows: list[tuple[Any, ...]] = []
+    if study.reference is not None:
+        rows += [
+            ("error", "max over the run of |y - y*|, over max |y*|; y displacements at the places of the outputs"),
+            ("deformation", "the same after removing the rigid motion of the hand"),
+            ("places", "the same points of the body on every mesh, not the nearest nodes"),
+            ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
+        ]
+    rows += [
+        ("repeats", f"{study.scene.study.repeats}; of a run, the first is the whole run, the others its first steps"),
         ("front", "no other point is faster and more accurate"),
     ]
     if is_paper(study):

@@ -158,7 +158,7 @@ class Asker:
         return min(held, key=lambda pair: pair[1].seconds) if held else None
 
     def _fits(self, full: WorkPoint) -> bool:
-        return 2 * full.details["n_e"] * full.details["steps"] <= SNAPSHOTS
+        return bool(2 * full.details["n_e"] * full.details["steps"] <= SNAPSHOTS)
 
     def _on(self, setting: Setting, full: WorkPoint, tolerance: float) -> list[tuple[Row, WorkPoint]]:
         """Reduced models of the two fastest bases on another mesh; N as the scene's own mesh predicts it."""
@@ -311,7 +311,7 @@ def _row(point: WorkPoint, error: float | None, seconds: float | None, overrides
     d: dict[str, Any] = point.details
     names = ("cells", "order", "steps", "solver", "method", "N")
     measured = ("error_deformation", "p50", "p99", "max", "scratch", "per_step", "error_full")
-    return plain(
+    found: Row = plain(
         {
             "label": point.label,
             "setting": {k: d[k] for k in names if d.get(k) is not None},
@@ -320,3 +320,4 @@ def _row(point: WorkPoint, error: float | None, seconds: float | None, overrides
             "measured": {"error": point.error, "seconds": point.seconds, **{k: d[k] for k in measured if k in d}},
         }
     )
+    return found

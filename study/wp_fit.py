@@ -9,6 +9,8 @@ import numpy as np
 
 from study.wp_points import WorkPoint
 
+GAIN = 0.01  # of the error: what a slower point must gain to be on the front
+
 
 @dataclass(frozen=True)
 class Slope:
@@ -34,10 +36,13 @@ def usable(points: Sequence[WorkPoint]) -> list[WorkPoint]:
 
 
 def pareto(points: Sequence[WorkPoint]) -> list[WorkPoint]:
-    """Points that no other beats in time and error at once, by time. Not collective."""
+    """Points that no other beats in time and error at once, by time; less than :data:`GAIN` counts as none.
+
+    Not collective.
+    """
     front: list[WorkPoint] = []
     for p in sorted(usable(points), key=lambda p: (p.seconds, p.error)):
-        if not front or p.error < front[-1].error:
+        if not front or p.error < (1 - GAIN) * front[-1].error:
             front.append(p)
     return front
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from fem.scene import Scene
 from study.wp_fit import Slope, interpolate, power_law
 from study.wp_full import FullRuns, errors_of, largest
-from study.wp_points import Row, Setting, WorkPoint, scene_setting
+from study.wp_points import LEAST_STEPS, Row, Setting, WorkPoint, least_steps, scene_setting
 from study.wp_reference import Reference, nested_meshes
 
 SHARES = (2.0, 1.0, 0.5, 0.25, 0.125)  # of the scene's steps
-LEAST_STEPS = 4
 CG_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 POINT_WORK = {2: 8e6, 3: 6e5}  # unknowns times steps of a point of the diagram
 LARGEST = {2: 150_000, 3: 40_000}  # unknowns of a setting that no run of the diagram tried
@@ -39,9 +38,9 @@ class Prediction:
     point: WorkPoint | None
 
 
-def step_counts(steps: int) -> list[int]:
+def step_counts(steps: int, least: int = LEAST_STEPS) -> list[int]:
     """Numbers of steps to try, most first. Not collective."""
-    return sorted({max(LEAST_STEPS, round(steps * share)) for share in SHARES}, reverse=True)
+    return sorted({max(least, round(steps * share)) for share in SHARES}, reverse=True)
 
 
 def forward_settings(scene: Scene, d: int) -> list[Setting]:
@@ -52,7 +51,7 @@ def forward_settings(scene: Scene, d: int) -> list[Setting]:
     groups += [(cells, order) for order in (1, 2) for cells in (meshes[:-1] or (None,))]
     found = []
     for cells, order in dict.fromkeys(groups):
-        for steps in step_counts(scene.time.steps):
+        for steps in step_counts(scene.time.steps, least_steps(scene)):
             setting = Setting(cells, order, steps)
             small = setting.unknowns(d) * steps <= POINT_WORK[d] or steps <= scene.time.steps / 4
             if small or (cells, order) == groups[0]:
@@ -217,7 +216,8 @@ class Predictor:
                 if cells[0] > 16 * widest:
                     break
         base = self.scene.time.steps
-        counts = sorted({max(LEAST_STEPS, round(base * 2 ** (k / 2))) for k in range(-10, 5)} | set(step_counts(base)))
+        least = least_steps(self.scene)
+        counts = sorted({max(least, round(base * 2 ** (k / 2))) for k in range(-10, 5)} | set(step_counts(base, least)))
         settings = [Setting(cells, order, steps) for cells, order in groups for steps in counts]
         return [self.predict(s) for s in settings]
 

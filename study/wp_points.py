@@ -8,14 +8,15 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
+from math import ceil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from fem.errors import Interrupted, agree
+from fem.errors import Interrupted, SceneError, agree
 from fem.petsc import Array
 from fem.results import package_version
 from fem.scene import Scene
@@ -23,13 +24,16 @@ from fem.scene_file import scene_hash
 from study.effects_switch import changed
 
 FORMAT = 1  # of the cached files
-QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati")
+LEAST_STEPS = 4  # of a run
+QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati", "loop")
+CONTROL = ("riccati", "reduced_riccati", "loop")  # of these, the ones about feedback
 TITLES = {
     "forward": "Full model: mesh, order, time step, solver",
     "reduced": "Reduced models: basis and N",
     "bases": "Bases: engine and tolerance",
     "riccati": "Riccati equation: method and tolerance",
     "reduced_riccati": "Reduced Riccati equation: basis and N",
+    "loop": "Closed loop: controller and step",
 }
 
 Row = dict[str, Any]
@@ -83,6 +87,14 @@ def scene_setting(scene: Scene) -> Setting:
     """The scene's own setting. Not collective."""
     cells = None if scene.tissue.cells is None else tuple(scene.tissue.cells)
     return Setting(cells, scene.tissue.order, scene.time.steps, scene.time.solver, scene.time.rtol)
+
+
+def least_steps(scene: Scene) -> int:
+    """Fewest steps of a run: a prescribed move needs two over its duration. Not collective."""
+    motion = scene.motion
+    if motion.drive == "motion" and motion.profile == "quintic":
+        return max(LEAST_STEPS, ceil(2 * scene.time_end / motion.duration))
+    return LEAST_STEPS
 
 
 def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: Sequence[float] | None = None) -> Scene:
@@ -146,6 +158,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return int(value) if isinstance(value, np.integer) else value
+
+
+def number(value: float | None) -> float:
+    """A number out of JSON, where None stands for one that is not finite. Not collective."""
+    return float("inf") if value is None else float(value)
 
 
 class Cache:
@@ -256,6 +273,30 @@ def interruptible(guard: Guard) -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
 
 
-def with_details(point: WorkPoint, **more: Any) -> WorkPoint:
-    """The point with more details. Not collective."""
-    return replace(point, details=point.details | more)
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a study.
+
+    Attributes:
+        tolerance: relative error of the outputs to answer for, or None.
+        budget: seconds of a step to answer for, or None.
+        names: arguments of ``--question``, each one or several with commas; empty asks all questions.
+    """
+
+    tolerance: float | None = None
+    budget: float | None = None
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        split = tuple(part.strip() for name in self.names for part in name.split(","))
+        object.__setattr__(self, "names", split)
+        unknown = [name for name in split if name not in QUESTIONS]
+        if unknown:
+            raise SceneError(f"--question {unknown[0]}: it must be one of {', '.join(QUESTIONS)}")
+        if split and not (self.tolerance is None and self.budget is None) and not {"forward", "reduced"} <= set(split):
+            raise SceneError("--tolerance and --budget need the questions forward and reduced; name both, or none")
+
+    @property
+    def questions(self) -> tuple[str, ...]:
+        """In the order of :data:`QUESTIONS`."""
+        return tuple(q for q in QUESTIONS if q in self.names or not self.names)

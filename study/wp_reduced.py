@@ -28,7 +28,7 @@ from study.reduce_reference import prepare, reference
 from study.reduce_sweep import Point, bases_of, chosen_methods, measure, sizes_for
 from study.wp_fit import Slope, power_law
 from study.wp_full import FullRuns, Series, errors_of
-from study.wp_points import Row, Setting, WorkPoint, scene_setting
+from study.wp_points import Row, Setting, WorkPoint, number, scene_setting
 from study.wp_probe import Probe, make_probe
 from study.wp_reference import Reference
 
@@ -113,11 +113,6 @@ class ReducedRuns:
         details.pop("error", None)
         label = f"{METHODS[name].title}, N = {row['N']}, {self.setting.label}"
         return WorkPoint("reduced", name, label, row["time_online"], error, bool(row["stable"]) and finite, details)
-
-
-def number(value: float | None) -> float:
-    """A number out of JSON, where None stands for one that is not finite. Not collective."""
-    return float("inf") if value is None else float(value)
 
 
 def _measured(model: ReducedModel, point: Point, against: FullRun, probe: Probe) -> Row:

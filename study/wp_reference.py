@@ -22,12 +22,13 @@ import numpy as np
 from fem.petsc import Array
 from fem.scene import Scene
 from study.wp_full import FullRuns, Series, largest
-from study.wp_points import Setting
+from study.wp_points import Setting, least_steps
 
 WORK = {2: 4e7, 3: 3e6}  # unknowns times steps of the finest run: about 10 s on a quiet core
 UNKNOWNS = {2: 150_000, 3: 40_000}
 FINER = 4.5  # the finest mesh has at most so many times the scene's cells along an edge
 FEW_STEPS = 60  # least of a run
+ROUGH = 0.05  # error of a reference that is worth a warning
 ORDERS = (0.4, 5.0)  # between which an observed order is believed
 
 
@@ -117,7 +118,7 @@ def nested_meshes(scene: Scene) -> tuple[tuple[int, ...], ...]:
 def few_steps(scene: Scene) -> int:
     """Steps of the runs on the finest meshes. Not collective."""
     n = scene.time.steps
-    return n // 2 if n >= 2 * FEW_STEPS else n
+    return n // 2 if n >= 2 * max(FEW_STEPS, least_steps(scene)) else n
 
 
 def observed_order(coarse: Array, middle: Array, fine: Array, d: int) -> float | None:
@@ -154,6 +155,9 @@ def make_reference(scene: Scene, runs: FullRuns) -> Reference:
     mixed = Setting(below.cells, below.order, 4 * base)
     found = {s: runs.series(runs.run(s, 1)) for s in (*space, *time, mixed)}
     result = combine(found, space, middle, below, base)
+    if result.error > ROUGH:
+        hint = " That is too much to judge by: the scene's steps or meshes do not resolve its motion; raise time.steps."
+        result = replace(result, note=result.note + hint)
     if all(fits(n, shares) for n, shares in zip(scene.tissue.cells or (), edges(scene), strict=True)):
         return result
     hint = " The scene's own mesh has no lines at the ends of its contact zone or layers, which adds to its error."

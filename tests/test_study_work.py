@@ -23,7 +23,8 @@ from study.work_precision import WorkStudy, run_study, study_scene
 from study.work_report import rows_of
 from study.wp_answer import parse_budget, parse_tolerance
 from study.wp_fit import interpolate, pareto, power_law
-from study.wp_points import Setting, WorkPoint, variant
+from study.wp_forward import forward_settings
+from study.wp_points import Asked, Setting, WorkPoint, least_steps, variant
 from study.wp_probe import Places, find_places, make_probe, run_probed
 from study.wp_reference import extrapolate, fitted, nested_meshes
 from tests.helpers import Array, make_scene
@@ -98,7 +99,8 @@ def result(folder: Path) -> dict[str, Any]:
 
 def again(folder: Path) -> WorkStudy:
     """The same study out of the cache."""
-    return study_scene(make_scene(SMALL, {"name": "small"}), MPI.COMM_WORLD, folder / "cache", TOLERANCE, BUDGET)
+    scene = make_scene(SMALL, {"name": "small"})
+    return study_scene(scene, MPI.COMM_WORLD, folder / "cache", Asked(TOLERANCE, BUDGET))
 
 
 def tip(comm: MPI.Intracomm, setting: Setting) -> Array:
@@ -136,7 +138,7 @@ def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dic
 def test_what_nothing_meets_is_said_with_what_came_closest(
     comm: MPI.Intracomm, result: dict[str, Any], folder: Path
 ) -> None:
-    study = study_scene(make_scene(SMALL, {"name": "small"}), comm, folder / "cache", 1e-9)
+    study = study_scene(make_scene(SMALL, {"name": "small"}), comm, folder / "cache", Asked(1e-9))
     answer = study.answers[0]
     assert not answer.met
     assert "Nothing tried meets 1e-09" in answer.sentences[0]
@@ -154,7 +156,7 @@ def test_budget_takes_the_most_accurate_that_fits(result: dict[str, Any]) -> Non
 
 
 def test_a_budget_that_nothing_fits_is_said(comm: MPI.Intracomm, result: dict[str, Any], folder: Path) -> None:
-    answer = study_scene(make_scene(SMALL, {"name": "small"}), comm, folder / "cache", None, 1e-9).answers[0]
+    answer = study_scene(make_scene(SMALL, {"name": "small"}), comm, folder / "cache", Asked(None, 1e-9)).answers[0]
     assert not answer.met
     assert answer.closest is not None
     assert answer.sentences[0].startswith("No full run fits")
@@ -205,11 +207,25 @@ def test_another_scene_uses_none_of_the_cached_points(
         stopped.append(label)
         raise Interrupted("at once")
 
-    before = len(list((folder / "cache").glob("*.json")))
+    before = len(list((folder / "cache").glob("run-*.json")))
     softer = make_scene(SMALL, {"name": "small", "tissue": {"material": {"lambda": 40.0, "mu": 50.0, "rho": 1.0}}})
     with pytest.raises(Interrupted):
         study_scene(softer, comm, folder / "cache", progress=stop)
-    assert len(list((folder / "cache").glob("*.json"))) == before
+    assert len(list((folder / "cache").glob("run-*.json"))) == before
+
+
+def test_an_undamped_scene_is_diagnosed_and_keeps_its_other_questions(result: dict[str, Any], folder: Path) -> None:
+    assert set(result["skipped"]) == {"riccati", "reduced_riccati", "loop"}
+    assert all(reason.startswith("no damping: ") for reason in result["skipped"].values())
+    assert result["points"]["forward"]
+    assert (folder / "report.html").read_text().count("no damping: ") == 1
+
+
+def test_steps_too_long_for_the_move_are_not_tried() -> None:
+    scene = make_scene(SMALL, {"time": {"steps": 64, "end": 48.0}})
+    assert least_steps(scene) == 32  # two over the three seconds of the move
+    assert {s.steps for s in forward_settings(scene, 2) if s.steps < 64} == {32}
+    assert least_steps(make_scene(SMALL)) == 4
 
 
 # --- files
