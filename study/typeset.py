@@ -13,7 +13,7 @@ GREEK = {
 NAMES = {"min", "max"}  # upright
 SYMBOL = re.compile(r"(?<![\w'&])([A-Za-z]+)(?:_(\w+))?('{1,2})?(?:\^(-?\w+))?(?!\w)")
 PRIMES = {"'": "′", "''": "″"}
-LETTERS = set("bcdefghijklmnopqrstuvwxyzBCDEFGHJKLMNOPQRSTUVWXYZ")  # not the article, nor I
+LETTERS = set("bcdefghijklmnopqrstuvwxyzABCDEFGHJKLMNOPQRSTUVWXYZ")  # not the article, nor I
 BREAKS = {"+", "-", "=", "=="}
 
 
@@ -33,14 +33,14 @@ def symbol(match: re.Match[str]) -> str:
     if below:
         inner = GREEK.get(below, below)
         text += f"<sub>{inner if inner.isdigit() or len(inner) > 2 else f'<i>{inner}</i>'}</sub>"
-    above += power.replace("-", "−") if power else ""
+    above += power.replace("-", "−").replace("T", "⊤") if power else ""
     return text + (f"<sup>{above}</sup>" if above else "")
 
 
 def formula(text: str) -> Markup:
     """A formula, or prose with formulas in it, as HTML. Not collective."""
     safe = str(escape(text)).replace("&#39;", "'")
-    marked = SYMBOL.sub(symbol, safe)
+    marked = re.sub(r"\bint ", "∫ ", SYMBOL.sub(symbol, safe).replace("&lt;", "⟨").replace("&gt;", "⟩"))
     return Markup(re.sub(r"(?<=[\s(\[])-(?=[\s\w<(])|^-", "−", marked))
 
 
@@ -52,7 +52,7 @@ def terms(text: str) -> list[Markup]:
             pieces.append(word)
         else:
             pieces[-1] += (" " if pieces[-1] else "") + word
-        depth += word.count("(") - word.count(")")
+        depth += sum(map(word.count, "(<[")) - sum(map(word.count, ")>]"))
     return [formula(" " + piece)[1:] if piece.startswith("-") else formula(piece) for piece in pieces]
 
 

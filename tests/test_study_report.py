@@ -11,6 +11,7 @@ from rich.console import Console
 
 from fem.scene_file import load_scene, resolved_toml, shipped_scenes
 from study.equation import equation
+from study.equation_control import control_text
 from study.report import Section, equation_text, of_scene, outside, versions, write_report
 from study.simulate import run_simulate
 from study.typeset import equation_html, formula, terms
@@ -29,7 +30,8 @@ def test_symbols_are_set_and_words_are_not() -> None:
     assert formula("-alpha M_hand x^3") == "−<i>α</i> <i>M</i><sub>hand</sub> <i>x</i><sup>3</sup>"
     text = "a rigid move is free: the hand's row only tells"
     assert formula(text) == text
-    assert formula("x < y & z") == "<i>x</i> &lt; <i>y</i> &amp; <i>z</i>"
+    assert formula("<u, R u> & z") == "⟨<i>u</i>, <i>R</i> <i>u</i>⟩ &amp; <i>z</i>"
+    assert formula("A^T P - R^-1") == "<i>A</i><sup>⊤</sup> <i>P</i> − <i>R</i><sup>−1</sup>"
     assert formula("min(t / duration, 1)") == "min(<i>t</i> / duration, 1)"
 
 
@@ -47,6 +49,16 @@ def test_every_symbol_of_every_scene_is_set(name: str) -> None:
     assert not any(mark in text for mark in ("_", "'", "^"))
     assert html.count("<i>") == html.count("</i>")
     assert "tissue" in html
+
+
+@pytest.mark.parametrize("name", sorted(shipped_scenes()))
+def test_control_has_its_cost_and_riccati_equation(name: str) -> None:
+    text = control_text(load_scene(shipped_scenes()[name]))
+    html = str(equation_html(text)).replace("hand's", "")
+    assert not any(mark in html for mark in ("_", "'", "^", "int "))
+    assert "prescribed" not in text  # a force moves the hand, whatever moves it in `simulate`
+    assert "hand:   M_hand q_s''" in text
+    assert text.index("Riccati") < text.index("with:")
 
 
 # --- nothing from outside
