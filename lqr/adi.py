@@ -11,7 +11,7 @@ import numpy as np
 from fem.errors import SolverError
 from fem.petsc import Array
 from lqr.adjoint import Right, Solution, closed_adjoint
-from lqr.compress import compress, triangular
+from lqr.compress import compress, gram
 from lqr.plant import Block, Plant
 from lqr.shifted import ShiftedTissue
 from lqr.shifts import WINDOW, ShiftQueue
@@ -34,8 +34,8 @@ class Columns:
     def __init__(self, plant: Plant, allowed: float, limit: int = SQUEEZE) -> None:
         self.plant, self.allowed, self.limit = plant, allowed, limit
         self.count = self.compressed_to = self.appended = 0
-        self.hand = np.empty((2 * plant.n_s, 64), order="F")
-        self.tall = np.empty((2 * plant.n_local, 64), order="F")
+        # rows side by side in memory: what the sparse products want
+        self.hand, self.tall = np.empty((2 * plant.n_s, 64)), np.empty((2 * plant.n_local, 64))
         self.widths: list[int] = []
 
     def append(self, block: Block) -> None:
@@ -54,7 +54,7 @@ class Columns:
         self.widths.append(k)
 
     def _grown(self, old: Array, room: int) -> Array:
-        new = np.empty((len(old), room), order="F")
+        new = np.empty((len(old), room))
         new[:, : self.count] = old[:, : self.count]
         return new
 
@@ -144,7 +144,7 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueu
     E_Z = plant.mass_adjoint(Z)
     a = Z.tall[: plant.n_local]
     sweep.W = sweep.W.plus(E_Z, a, small)
-    sweep.new = sweep.new.plus(E_Z, a, Z.hand[plant.n_s :].T @ plant.B)
+    sweep.new = sweep.new.plus(E_Z, a, plant.felt(Z))
     sweep.Z.append(Z)
     sweep.steps += 1
     sweep.seconds["shifts"] += middle - begin
@@ -161,11 +161,12 @@ def sweep_norms(plant: Plant, sweep: Sweep) -> tuple[float, float]:
     begin = time.perf_counter()
     W = sweep.W.block
     change = Block(sweep.new.block.hand - sweep.gain.block.hand, sweep.new.block.tall - sweep.gain.block.tall)
-    R = triangular(plant.comm, Block.join([W, change]))
-    q = W.columns
-    lyapunov = float(np.linalg.norm(R[:, :q], 2)) ** 2
+    q, both = W.columns, Block.join([W, change])
+    products = gram(plant.comm, both, both)
+    lyapunov = float(np.linalg.eigvalsh(products[:q, :q])[-1])
+    # the eigenvalues of U S U' that are not zero are those of S U'U
     signs = np.concatenate([np.ones(q), -np.ones(change.columns)])
-    riccati = float(np.abs(np.linalg.eigvalsh((R * signs) @ R.T)).max())
+    riccati = float(np.abs(np.linalg.eigvals(signs[:, None] * products)).max())
     sweep.first = max(sweep.first, lyapunov) if sweep.steps <= 1 else sweep.first
     if not lyapunov <= GROWTH * sweep.first:
         raise SolverError(

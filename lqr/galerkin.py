@@ -51,8 +51,8 @@ class Space:
         more = (columns @ S, M_columns @ S, plant.stiff(columns @ S))
         return Space(*(np.hstack([a, b]) for a, b in zip((self.V, self.M_V, self.K_V), more, strict=True)))
 
-    def ritz(self, plant: Plant) -> tuple[Space, Array]:
-        """M-orthonormal Ritz basis V'M V = I, V'K V = diag(omega^2), and omega. Collective."""
+    def ritz(self, plant: Plant) -> tuple[Space, Array, Array]:
+        """M-orthonormal Ritz basis V'M V = I, V'K V = diag(omega^2), omega, and S with new basis = V S. Collective."""
         r = self.V.shape[1]
         products = total(plant.comm, self.V.T @ np.hstack([self.M_V, self.K_V]))
         found: tuple[Array, Array] | None = None
@@ -61,7 +61,7 @@ class Space:
             squares, rotation = scipy.linalg.eigh(H, G)
             found = np.sqrt(squares), rotation
         omega, S = plant.comm.bcast(found)
-        return Space(self.V @ S, self.M_V @ S, self.K_V @ S), omega
+        return Space(self.V @ S, self.M_V @ S, self.K_V @ S), omega, S
 
 
 @dataclass(frozen=True)
@@ -88,18 +88,38 @@ def _m_norms(plant: Plant, columns: Array) -> Array:
     return np.sqrt(total(plant.comm, np.einsum("ij,ij->j", columns, plant.mass(columns))))
 
 
-def solve_level(plant: Plant, space: Space) -> tuple[Level, Space]:
-    """Project, solve and lift: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective."""
-    ritz, omega = space.ritz(plant)
+def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
+    """X of a level in the basis of the next: V_old = V_new T, T the columns of S^{-1} that the old basis filled.
+
+    Not collective.
+    """
+    s, r = 2 * plant.n_s, old.small.order
+    T = np.linalg.inv(S)[:, :r]
+    W = np.zeros((s + 2 * len(omega), s + 2 * r))
+    W[:s, :s] = np.eye(s)
+    W[s : s + len(omega), s : s + r] = omega[:, None] * T / old.small.omega
+    W[s + len(omega) :, s + r :] = T
+    return np.asarray(W @ old.solution.X @ W.T)
+
+
+def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[Level, Space]:
+    """Project, solve and lift: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
+
+    Args:
+        plant: the plant.
+        space: the Ritz basis of ``old`` and more.
+        old: the level before, near the solution.
+    """
+    ritz, omega, S = space.ritz(plant)
     small = project(plant, ritz.V, omega, ritz.M_V)
-    solution = solve_small(plant, small)
+    solution = solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
     values, vectors = np.linalg.eigh(solution.X)
     keep = values > 1e-17 * values[-1]
     root = vectors[:, keep] * np.sqrt(values[keep])
     s, r = 2 * plant.n_s, len(omega)
     q, v = root[s : s + r] / omega[:, None], root[s + r :]
     Z = Block(root[:s], np.vstack([ritz.V @ q, ritz.V @ v]))
-    small_gain = root[plant.n_s : s].T @ plant.B
+    small_gain = plant.felt(Z)
     a, b = ritz.V @ (q @ small_gain), ritz.V @ (v @ small_gain)
     hand = np.vstack([root[: plant.n_s], plant.M_s @ root[plant.n_s : s]]) @ small_gain
     hand[plant.n_s :] += total(plant.comm, plant.G.T @ b)
@@ -116,7 +136,9 @@ def gain_change(plant: Plant, new: Level, old: Level) -> float:
     def tissue(a: Array, b: Array) -> float:
         return float(np.sqrt(total(comm, np.array([np.sum(a * plant.stiff(a)) + np.sum(b * plant.mass(b))]))[0]))
 
-    hand = float(np.linalg.norm(new.gain.hand - old.gain.hand) / np.linalg.norm(new.gain.hand))
+    hand = 0.0
+    if plant.n_s:
+        hand = float(np.linalg.norm(new.gain.hand - old.gain.hand) / np.linalg.norm(new.gain.hand))
     size = tissue(new.a, new.b)
     return max(hand, tissue(new.a - old.a, new.b - old.b) / size if size > 0 else 0.0)
 
@@ -203,7 +225,8 @@ class StructuredGalerkin:
         shifts = [0.0, *(_response_shift(plant, float(w)) for w in wanted)]
         # two-way the reaction of the hand loads the tissue as well
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
-        level, change, used = solve_level(plant, space)[0], np.inf, 0
+        level, space = solve_level(plant, space)
+        change, used = np.inf, 0
         for i in range(self.max_iterations):
             take = shifts[:1] if i == 0 else shifts[used : used + self.per_step]
             for j, p in enumerate(take):
@@ -213,7 +236,7 @@ class StructuredGalerkin:
             used += len(take)
             if space.V.shape[1] < level.small.order + len(take):  # nothing new: no evidence either
                 continue
-            new, space = solve_level(plant, space)
+            new, space = solve_level(plant, space, level)
             change, level = gain_change(plant, new, level), new
             entry = {"basis": float(new.small.order), "solve": float(used), "change": change}
             history.append(entry)

@@ -5,19 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 
 from fem.errors import agree
 from fem.modes import lowest_modes
 from fem.petsc import Array, PETSc, total
 from fem.system import BlockSystem
-from lqr.care import care
+from lqr.care import care, lyapunov, riccati_residual
 from lqr.checks import ControlError
 from lqr.dense import StateSpace, assemble_space
 from lqr.plant import Block, Plant
+from lqr.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
 
 MODES = 30
 MORE_MODES = 60  # when the last of MODES is still lightly damped
 LIGHT = 0.02  # damping ratio below which it is
+CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost as much as a Schur form
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,10 @@ class SmallSolution:
     Attributes:
         X: (N, N) for E = E of the small plant.
         gain: (m, N), acting on xi.
-        poles: closed-loop poles, most important first, one of each pair, Im >= 0.
     """
 
     X: Array
     gain: Array
-    poles: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,13 @@ class ModalStart:
         small: the plant on the modes.
         solution: its Riccati equation.
         gain: K', local rows, z-row as it stands.
+        poles: its closed-loop poles, most important first, one of each pair, Im >= 0.
     """
 
     small: SmallPlant
     solution: SmallSolution
     gain: Block
+    poles: np.ndarray
 
 
 class _MovedMass:
@@ -113,12 +116,22 @@ def project(plant: Plant, V: Array, omega: Array, M_V: Array) -> SmallPlant:
     L = np.concatenate([one, omega, np.ones(r)])
     C = plain.C * S
     B = np.zeros((len(S), plant.inputs))
-    B[plant.n_s : 2 * plant.n_s] = plant.B
+    if plant.B_z is None:
+        B[plant.n_s : 2 * plant.n_s] = plant.B
+    if plant.B_z is not None:
+        B[plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
+    else:
+        B[2 * plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
     return SmallPlant(V, omega, StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, B, C))
 
 
-def solve_small(plant: Plant, small: SmallPlant) -> SmallSolution:
+def solve_small(plant: Plant, small: SmallPlant, guess: Array | None = None) -> SmallSolution:
     """Riccati equation of the small plant on rank 0, the result on all. Collective.
+
+    Args:
+        plant: the plant.
+        small: its projection.
+        guess: an X near the solution, (N, N).
 
     Raises:
         ControlError: not stabilisable or not detectable.
@@ -127,15 +140,42 @@ def solve_small(plant: Plant, small: SmallPlant) -> SmallSolution:
     with agree(plant.comm):
         if plant.comm.rank == 0:
             E, A, B, C = small.space.E, small.space.A, small.space.B, small.space.C
-            dense = care(A, B, C, np.eye(len(C)), np.eye(B.shape[1]), E)
-            gain = -dense.K
-            poles, vectors = np.linalg.eig(np.linalg.solve(E, A - B @ gain))
-            found = SmallSolution(dense.X, gain, _ordered(plant, small, poles, vectors))
-    return plant.comm.bcast(found)
+            X = None if guess is None else _corrected(small.space, guess)
+            if X is None:
+                X = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+            if X is None:
+                X = care(A, B, C, np.eye(len(C)), np.eye(B.shape[1]), E).X
+            found = SmallSolution(X, B.T @ X @ E)
+    solution: SmallSolution = plant.comm.bcast(found)
+    return solution
 
 
-def _ordered(plant: Plant, small: SmallPlant, poles: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost."""
+def _corrected(space: StateSpace, X: Array) -> Array | None:
+    """Newton's method from a stabilising X near the solution; None when it is not. Not collective."""
+    lu = scipy.linalg.lu_factor(space.E)
+    A, B = scipy.linalg.lu_solve(lu, space.A), scipy.linalg.lu_solve(lu, space.B)
+    G, H, Y = B @ B.T, space.C.T @ space.C, space.E.T @ X @ space.E
+    for _ in range(CORRECTIONS):
+        residual = riccati_residual(A, G, H, Y)
+        if np.linalg.norm(residual) <= FAST_RESIDUAL * np.linalg.norm(H):
+            half = scipy.linalg.lu_solve(lu, Y, trans=1)
+            X = scipy.linalg.lu_solve(lu, half.T, trans=1)
+            return np.asarray((X + X.T) / 2)
+        T, U = scipy.linalg.schur(A - G @ Y, output="real")
+        if not np.diag(T).max() < 0:
+            return None
+        Y = Y + lyapunov(T, U, residual)
+    return None
+
+
+def ordered_poles(plant: Plant, small: SmallPlant, solution: SmallSolution) -> np.ndarray:
+    """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost. Collective."""
+    found = _ordered(plant, small, solution.gain) if plant.comm.rank == 0 else None
+    return np.asarray(plant.comm.bcast(found))
+
+
+def _ordered(plant: Plant, small: SmallPlant, gain: Array) -> np.ndarray:
+    poles, vectors = np.linalg.eig(np.linalg.solve(small.space.E, small.space.A - small.space.B @ gain))
     kinetic = np.real(np.einsum("ij,ij->j", vectors.conj(), small.space.E @ vectors))
     s, r = plant.n_s, small.order
     potential = np.sum(np.abs(vectors[:s]) ** 2, axis=0) + np.sum(np.abs(vectors[2 * s : 2 * s + r]) ** 2, axis=0)
@@ -198,7 +238,8 @@ def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     solution = solve_small(plant, small)
     if plant.two_way:
         M_Phi = M_Phi - plant.G @ np.linalg.solve(plant.M_s, total(plant.comm, plant.G.T @ Phi))
-    return ModalStart(small, solution, lift_gain(plant, small, solution, M_Phi))
+    gain = lift_gain(plant, small, solution, M_Phi)
+    return ModalStart(small, solution, gain, ordered_poles(plant, small, solution))
 
 
 def _light(small: SmallPlant) -> bool:

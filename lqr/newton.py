@@ -71,7 +71,7 @@ class NewtonADI:
             p = plant.C_s.shape[0]
             state = Iteration(right[p:])
             state.seconds["start"] = after_start - begin
-            queue = ShiftQueue.start(shift_range(plant, start.solution.poles), start.solution.poles)
+            queue = ShiftQueue.start(shift_range(plant, start.poles), start.poles)
             sweep = self._iterate(plant, tissue, right[:p], state, queue)
             return self._finish(plant, tissue, sweep, state, begin)
         finally:

@@ -48,8 +48,10 @@ def fingerprint(plant: Plant) -> str:
         digest.update(np.ascontiguousarray(A.getValuesCSR()[2]))
     damping = plant.system.damping
     digest.update(repr((damping.alpha, damping.beta)).encode())
-    for array in (plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G):
-        digest.update(np.ascontiguousarray(array))
+    for array in (plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G, plant.B_z):
+        if array is not None:
+            digest.update(np.ascontiguousarray(array))
+    digest.update(b"" if plant.B_z is None else np.ascontiguousarray(plant.B_z))
     return digest.hexdigest()
 
 
@@ -138,7 +140,7 @@ def _restore(plant: Plant, state: Iteration, data: np.lib.npyio.NpzFile, tol: fl
     if "factor_signs" in data:
         state.factor = (Block(data["factor_hand"], data["factor_tall"]), data["factor_signs"])
     Z = Columns(plant, SHARE * tol * plant.scale)
-    Z.hand, Z.tall = np.asfortranarray(data["Z_hand"]), np.asfortranarray(data["Z_tall"])
+    Z.hand, Z.tall = np.ascontiguousarray(data["Z_hand"]), np.ascontiguousarray(data["Z_tall"])
     Z.count, Z.compressed_to = Z.hand.shape[1], int(data["compressed_to"])
     Z.appended = int(data["appended"])
     Z.widths = [int(width) for width in data["widths"]]

@@ -43,17 +43,17 @@ def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, A
     """Real columns V_1 of the update X += V_1 Y^{-1} V_1', with Y, V_1'B and the factor of W [BBKS18].
 
     s real: V_1 = sqrt(-2s) V, Y = I - V_1'B B'V_1 / (2s). s complex: V_1 = sqrt(-2 Re s) [Re V, Im V] and the Y of the
-    pair. Not collective.
+    pair. Collective.
     """
     q = V.hand.shape[1]
     one, zero = np.eye(q), np.zeros((q, q))
     c = float(np.sqrt(-2 * s.real))
     if s.imag == 0:
         columns = V.parts(c * one, zero)
-        V_B = columns.hand[plant.n_s :].T @ plant.B
+        V_B = plant.felt(columns)
         return columns, one - V_B @ V_B.T / (2 * s.real), V_B, c
     columns = V.parts(np.hstack([c * one, zero]), np.hstack([zero, c * one]))
-    V_B = columns.hand[plant.n_s :].T @ plant.B
+    V_B = plant.felt(columns)
     real, imag = V_B[:q], V_B[q:]
     a, b = s.real / abs(s), s.imag / abs(s)
     F_1 = np.vstack([-a * real - b * imag, b * real - a * imag])
@@ -122,7 +122,7 @@ class RADI:
         begin = time.perf_counter()
         plant = Plant(problem)
         start = modal_start(plant)
-        poles = start.solution.poles
+        poles = start.poles
         after_start = time.perf_counter()
         tissue = make_shifted(plant.system, self.tissue)
         try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Protocol
 
 import numpy as np
@@ -21,7 +23,8 @@ PREFIX = "softgrasp_shifted_"
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers needs less than half the time of MUMPS on the real form of twice the order. Beyond, a whole factor
 # on each rank costs too much memory and MUMPS is the faster one.
-GATHER_LIMIT = {2: 150_000, 3: 12_000}
+GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 12_000}  # 1: systems without a mesh
+AHEAD_FROM = 5_000  # n_e from which a second core, if one is idle, makes the next factor
 
 
 class ShiftedTissue(Protocol):
@@ -70,7 +73,8 @@ def make_shifted(system: BlockSystem, wanted: str = "auto") -> ShiftedTissue:
 class GatheredTissue:
     """Every rank holds all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
 
-    SuperLU in complex numbers with diagonal pivots and one fill-reducing order for all shifts.
+    SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
+    program of one rank that may use another core makes the next factor there while it works with the present one.
 
     Args:
         system: operators.
@@ -83,16 +87,20 @@ class GatheredTissue:
         self.comm, self.n_local = layout.comm, layout.n_local
         self.counts = np.array(self.comm.allgather(layout.n_local))
         K = self._gather(system.K_ee)
-        lu = scipy.sparse.linalg.splu(K, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_SYMMETRIC)
-        self.order: NDArray[np.int64] = np.argsort(lu.perm_c)
-        del lu
+        self.order = _dissection(K)
         self.K, self.M = self._permute(K), self._permute(self._gather(system.M_ee))
         damping = system.damping
         self.alpha, self.beta = damping.alpha, damping.beta
         self.D = None if damping.matrix is None else self._permute(self._gather(damping.matrix))
         parts = [self.K, self.M] + ([] if self.D is None else [self.D])
         self.same = all(np.array_equal(A.indices, self.K.indices) for A in parts)
+        # filled in turn, because making one checks its indices
+        self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(2)]
         self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
+        self.helper: ThreadPoolExecutor | None = None
+        self.next: tuple[complex, Future[scipy.sparse.linalg.SuperLU]] | None = None
+        if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and _cores() > 1:
+            self.helper = ThreadPoolExecutor(1)
         self.seconds = {"factor": 0.0, "solve": 0.0}
         self.factors = 0
 
@@ -118,10 +126,15 @@ class GatheredTissue:
         data = k * self.K.data + m * self.M.data
         if self.D is not None:
             data = data - p * self.D.data
-        return scipy.sparse.csc_matrix((data, self.K.indices, self.K.indptr), shape=self.K.shape)
+        self.shells.reverse()
+        self.shells[0].data = data
+        return self.shells[0]
 
     def _factor(self, p: complex) -> scipy.sparse.linalg.SuperLU:
-        S = self._matrix(p if p.imag else p.real)
+        return self._decompose(p, self._matrix(p if p.imag else p.real))
+
+    @staticmethod
+    def _decompose(p: complex, S: scipy.sparse.csc_matrix) -> scipy.sparse.linalg.SuperLU:
         try:
             return scipy.sparse.linalg.splu(S, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
         except RuntimeError as error:
@@ -132,13 +145,31 @@ class GatheredTissue:
         wanted = list(dict.fromkeys(shifts))[: self.comm.size]
         self.cache = {p: (rank, None) for rank, p in enumerate(wanted)}
         if self.comm.size == 1:
-            self.cache[wanted[0]] = (0, self._factor(wanted[0]))
+            self.cache[wanted[0]] = (0, self._taken(wanted[0]))
+            self._send_ahead(shifts[1:2])
         else:
             with agree(self.comm):
                 if self.comm.rank < len(wanted):
                     p = wanted[self.comm.rank]
                     self.cache[p] = (self.comm.rank, self._factor(p))
         self.factors += len(wanted)
+
+    def _taken(self, p: complex) -> scipy.sparse.linalg.SuperLU:
+        """The factor that the other core has made, or one made here."""
+        if self.next is None:
+            return self._factor(p)
+        (guess, future), self.next = self.next, None
+        if guess == p:
+            return future.result()
+        wait([future])  # it reads a shell
+        return self._factor(p)
+
+    def _send_ahead(self, shifts: Sequence[complex]) -> None:
+        """Start the next factor on the other core."""
+        if self.helper is not None and shifts:
+            p = shifts[0]
+            S = self._matrix(p if p.imag else p.real)
+            self.next = (p, self.helper.submit(self._decompose, p, S))
 
     def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
         """Local rows of S(p)^{-1} F, (n_local, k); complex even where p is real. Collective.
@@ -183,9 +214,27 @@ class GatheredTissue:
     def destroy(self) -> None:
         """Free the factors. Not collective."""
         self.cache.clear()
+        self.next = None
+        if self.helper is not None:
+            self.helper.shutdown()
 
 
 _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
+
+
+def _cores() -> int:
+    """Cores that this process may use. Not collective."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _dissection(A: scipy.sparse.csc_matrix) -> NDArray[np.int64]:
+    """Nested dissection order of a symmetric pattern. Not collective."""
+    serial = PETSc.Mat().createAIJ(A.shape, csr=(A.indptr, A.indices, A.data), comm=PETSc.COMM_SELF)
+    rows, columns = serial.getOrdering("nd")
+    order = np.array(rows.getIndices(), dtype=np.int64)
+    for item in (rows, columns, serial):
+        item.destroy()
+    return order
 
 
 def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:

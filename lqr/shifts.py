@@ -17,6 +17,7 @@ BATCH = 8  # solves between two projections
 LOWEST = 1e-2  # of the smallest closed-loop frequency: a Ritz value nearer to the hand's zero poles is spurious
 HIGHEST = 10.0  # of the largest frequency
 SHARP = 0.05  # damping ratio below which a mode needs a shift of its own; others share the Ritz values
+FLAT = 1e-7  # a pair this near to the real axis is a double real shift to rounding of 1 / Im p
 AXIS = 1e-9  # a shift keeps at least this share of its modulus away from the imaginary axis
 
 
@@ -30,13 +31,18 @@ class ShiftRange:
 
     def clip(self, p: complex) -> complex:
         """Nearest admissible shift in the left half plane, Im >= 0. Not collective."""
-        size = abs(p)
-        if not np.isfinite(size) or size == 0:
-            return complex(-self.low)
-        p = complex(-abs(p.real), abs(p.imag)) * (min(max(size, self.low), self.high) / size)
-        if p.imag <= 1e-7 * abs(p):  # a pair this flat is a double real shift to rounding of 1 / Im p
-            return complex(p.real, 0.0)
-        return complex(min(p.real, -AXIS * abs(p)), p.imag)
+        return complex(self.clip_all(np.array([p], dtype=complex))[0])
+
+    def clip_all(self, values: np.ndarray) -> np.ndarray:
+        """Nearest admissible shifts in the left half plane, Im >= 0, (k,). Not collective."""
+        size = np.abs(values)
+        usable = np.isfinite(size) & (size > 0)
+        values, size = np.where(usable, values, -self.low), np.where(usable, size, self.low)
+        factor = np.clip(size, self.low, self.high) / size
+        real, imag = -np.abs(values.real) * factor, np.abs(values.imag) * factor
+        flat = imag <= FLAT * size * factor
+        real = np.where(flat, real, np.minimum(real, -AXIS * size * factor))
+        return np.asarray(real + 1j * np.where(flat, 0.0, imag))
 
 
 def shift_range(plant: Plant, poles: Sequence[complex] | np.ndarray) -> ShiftRange:
@@ -71,20 +77,46 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
     Returns:
         The values, and the norm of the component of W along each Ritz vector.
     """
-    s, k = plant.n_s, V.columns
-    E_V, A_V = plant.mass_adjoint(V), plant.plant_adjoint(V)
-    hand, tall = A_V.hand, A_V.tall
+    nothing = Block(np.zeros((2 * plant.n_s, 0)), np.zeros((2 * plant.n_local, 0)))
+    F, G, seen, felt = energy_products(plant, V, W, nothing if gain is None else gain.block)
     if gain is not None:
-        B_V = plant.B.T @ V.hand[s:]
-        hand, tall = hand - gain.block.hand @ B_V, tall - gain.block.tall @ B_V
+        F -= felt @ plant.felt(V).T
+    pairs: tuple[np.ndarray, Array] = plant.comm.bcast(_pencil_pairs(F, G, seen) if plant.comm.rank == 0 else None)
+    return pairs
+
+
+def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, Array, Array, Array]:
+    """V'H^{-1} times A'V, E'V, W and X, from one product each with K_ee, M_ee and the matrix of the damping.
+
+    On the tissue V'H^{-1}E'V = a'K a + b'M b and V'H^{-1}A'V = b'K a - a'K b - b'D b. Collective.
+    """
+    n, s, k = plant.n_local, plant.n_s, V.columns
+    both = np.empty((n, 2 * k))
+    both[:, :k], both[:, k:] = V.tall[:n], V.tall[n:]
+    stiff, a, b, b_s = plant.stiff(both), both[:, :k], both[:, k:], V.hand[s:]
+    massed = plant.mass(b)
+    viscous = 0.0 if plant.viscous is None else b.T @ plant.viscous(b)
+    damping = plant.system.damping
+    G_M, G_K = b.T @ massed, b.T @ stiff[:, k:]
+    parts = [
+        b.T @ stiff[:, :k] - a.T @ stiff[:, k:] - damping.alpha * G_M - damping.beta * G_K - viscous,
+        a.T @ stiff[:, :k] + G_M,
+        V.tall.T @ W.tall,
+        V.tall.T @ X.tall,
+        b.T @ plant.G,
+    ]
+    widths = np.cumsum([part.shape[1] for part in parts])[:-1]
+    F, G, seen, felt, coupling = np.split(total(plant.comm, np.hstack(parts)), widths, axis=1)
+    E_hand = plant.M_s @ b_s + coupling.T
+    A_hand = V.hand[:s] - plant.drag_es * coupling.T - plant.drag_hand * (plant.system.M_rigid @ b_s)
+    if plant.two_way:  # the hand's share in the rows of the tissue
+        F, G = F - plant.drag_hand * coupling @ b_s, G + coupling @ b_s
     # H^{-1} E'V: two-way the mass blocks of hand and tissue invert together
-    test = np.vstack([V.hand[:s], V.hand[s:] if plant.two_way else np.linalg.solve(plant.M_s, E_V.hand[s:])])
-    products = total(plant.comm, V.tall.T @ np.hstack([E_V.tall, tall, W.tall]))
-    products += test.T @ np.hstack([E_V.hand, hand, W.hand])
-    found: tuple[np.ndarray, Array] | None = None
-    if plant.comm.rank == 0:
-        found = _pencil_pairs(products[:, k : 2 * k], products[:, :k], products[:, 2 * k :])
-    return plant.comm.bcast(found)
+    test_q, test_v = V.hand[:s], b_s if plant.two_way else np.linalg.solve(plant.M_s, E_hand)
+    test = np.vstack([test_q, test_v])
+    F += test_v.T @ A_hand
+    G += test_q.T @ V.hand[:s] + test_v.T @ E_hand
+    return F, G, seen + test.T @ W.hand, felt + test.T @ X.hand
 
 
 def _pencil_pairs(F: Array, G: Array, W: Array) -> tuple[np.ndarray, Array]:
@@ -148,10 +180,10 @@ class ShiftQueue:
     def refill(self, plant: Plant, recent: Block, W: Block, gain: Right | None) -> None:
         """Ritz values of the recent blocks, clipped and chosen. Collective."""
         values, sizes = ritz_pairs(plant, recent, W, gain)
-        clipped = np.array([self.limits.clip(complex(p)) for p in values])
-        weights = sizes * np.abs(clipped)  # from the energy norm to the 2-norm of the residual
         upper = values.imag >= 0
-        self.pending = choose_shifts(clipped[upper], weights[upper], BATCH)
+        clipped = self.limits.clip_all(values[upper])
+        weights = sizes[upper] * np.abs(clipped)  # from the energy norm to the 2-norm of the residual
+        self.pending = choose_shifts(clipped, weights, BATCH)
         self.projections += 1
 
     def next(self) -> tuple[complex, list[complex]]:

@@ -20,9 +20,10 @@ from lqr.tail import Tail, why_no_bound
 PREFIX = "softgrasp_spectrum_"
 TOLERANCE = 1e-9  # of 1/(sigma - lambda)
 ERROR = 1e-6  # relative residual of an eigenpair that is let pass
-GROWTH = (24, 48, 96)  # eigenvalues asked for until they cover what the bound leaves open
+GROWTH = (24, 48, 96)  # eigenvalues asked for until they cover what the bound leaves open, after a first guess
 ITERATIONS = 60  # restarts; eigenvalues that accumulate need any number, those before them few
 SAFE = 0.9  # of the small gain, for the radius that is aimed at
+ENOUGH = 0.7  # share of the radius aimed at, where the bound holds already
 SHOWN = 10  # modes that the circle should hold, so that the abscissa is that of the slowest of them
 GAP = 1e-3  # relative distance of two eigenvalues that the circle may pass between
 NEARLY = 1e-3  # share of the abscissa by which an eigenvalue outside may exceed it
@@ -84,15 +85,17 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
         return Abscissa(0.0, True, 0.0, np.inf, np.zeros(1, dtype=complex), reason)
     why = why_no_bound(problem)
     tail = None if why else Tail(problem, K)
-    wanted, shift = _circle(problem, tail)
+    wanted, shift, guess = _circle(problem, tail)
     resolvent = Resolvent(problem, K, shift)
     result: Abscissa | None = None
     try:
-        for count in GROWTH:
-            values = resolvent.nearest(min(count, problem.layout.states - 2))
+        for count in (guess, *(more for more in GROWTH if more > guess)):
+            asked = min(count, problem.layout.states - 2)
+            values = resolvent.nearest(asked)
             result = _judge(values, shift, tail, why)
-            short = len(values) < min(count, problem.layout.states - 2)  # asking for more would not help
-            if result.value >= 0 or short or why or (result.certified and (result.exact or result.radius >= wanted)):
+            short = len(values) < asked  # asking for more would not help
+            enough = result.certified and (result.exact or result.radius >= ENOUGH * wanted)
+            if result.value >= 0 or short or enough or why:
                 break
     finally:
         resolvent.free()
@@ -101,8 +104,11 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
     return result
 
 
-def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float]:
-    """Radius to cover and centre sigma of the search. Collective."""
+def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, int]:
+    """Radius to cover, centre sigma of the search, and how many eigenvalues lie there if feedback moved none.
+
+    Collective.
+    """
     k = min(SHOWN, problem.layout.n_e)
     omega = some_modes(problem, k)[0] if tail is None else tail.omega[:k]
     beta = problem.system.damping.beta if tail is None else tail.beta
@@ -112,7 +118,9 @@ def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float]:
         shown = min(shown, 1 / beta)
     radius = max(needed, shown) if np.isfinite(needed) else shown
     # of all centres beta r^2 keeps the circle farthest from -1/beta, relative to its size
-    return radius, max(radius / 4, beta * radius**2)
+    inside = int(np.sum(omega < radius)) if tail is None else int(np.sum(tail.omega < radius))
+    # the poles of the hand, and a pair a mode; one more would be sought among those that accumulate
+    return radius, max(radius / 4, beta * radius**2), min(2 * problem.layout.n_s + 2 * inside, GROWTH[-1])
 
 
 def _judge(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import os
+import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,7 +34,8 @@ solves with a complex tissue matrix, rank of Z, seconds (median) split into fact
 and shifts, products with small dense algebra and compression, and the recomputation of the residual; the true relative
 residual from Z; the relative difference of the gain to that of Newton-ADI; peak memory of all ranks. Below: SciPy,
 slycot and pyMOR on the paper's own matrices where they are installed and can run (slycot and SciPy to nx = 10, pyMOR to
-nx = 40), growth exponents over the meshes, and the goals.
+nx = 40), growth exponents over the meshes, and the goals. On one rank Newton-ADI and RADI make the next factor on a
+second core where there is one. bench_riccati.json is written after every row; --resume keeps the rows it has.
 
 Keep the machine quiet while it runs. A fast look: --sizes 10 --ranks 1 --no-peers.
 --large adds nx = {LARGEST} (2n > 1e6) on {LARGEST_RANKS} ranks by Newton-ADI and Galerkin: up to half an hour."""
@@ -54,8 +57,54 @@ def parse_meshes(text: str) -> list[int]:
 
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
-    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
-    return {"ranks": ranks} | launch_worker("study.bench_riccati", spec, ranks, WORKER_LIMIT)
+    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective.
+
+    The methods that were through when a worker ran out of time or memory keep their numbers.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        partial = Path(folder) / "partial.json"
+        extra = {"partial": str(partial)} if "methods" in spec else {}
+        row = {"ranks": ranks} | launch_worker("study.bench_riccati", spec | extra, ranks, WORKER_LIMIT)
+        if "error" in row and partial.is_file():
+            reason = row.pop("error")
+            row |= json.loads(partial.read_text())
+            row["methods"] = {name: {"error": reason} for name in spec["methods"]} | row["methods"]
+    return row
+
+
+@dataclass
+class Record:
+    """Rows as they come, in a file that outlives whatever goes wrong with the next one.
+
+    Attributes:
+        file: bench_riccati.json; None keeps nothing.
+        beta: Kelvin-Voigt time of all rows [s].
+        rows, peers: what is measured.
+    """
+
+    file: Path | None
+    beta: float
+    rows: list[Row] = field(default_factory=list)
+    peers: list[Row] = field(default_factory=list)
+
+    def resume(self) -> None:
+        """Take over the rows of an earlier run with the same damping that have no error. Not collective."""
+        if self.file is None or not self.file.is_file():
+            return
+        old = json.loads(self.file.read_text())
+        if old.get("beta") == self.beta:
+            self.rows = [row for row in old["rows"] if not any("error" in entry for entry in [row, *flat([row])])]
+            self.peers = [row for row in old["peers"] if "error" not in row and not row.get("missing")]
+
+    def save(self) -> None:
+        """Write the file. Not collective."""
+        if self.file is None:
+            return
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        reached = [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals(self.rows)]
+        report = {"command": "bench_riccati", "beta": self.beta, "rows": self.rows, "peers": self.peers}
+        report |= {"exponents": exponents(self.rows), "goals": reached}
+        self.file.write_text(json.dumps(report, indent=2) + "\n")
 
 
 def flat(rows: Sequence[Row]) -> list[Row]:
@@ -131,6 +180,8 @@ def peer_line(peer: Row) -> str:
     label = f"{peer['peer']}, nx = {peer['nx']}"
     if peer.get("missing"):
         return f"{label}: not installed"
+    if "skipped" in peer:
+        return f"{label}: left out, {peer['skipped']}"
     if "error" in peer:
         return f"{label}: failed, {peer['error']}"
     return (
@@ -207,33 +258,47 @@ def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, P
         return save(figure, path)
 
 
-def collect(console: Console, meshes: list[int], ranks: list[int], beta: float, repeats: int, large: bool) -> list[Row]:
-    """Launch all workers one after the other. Not collective."""
+def collect(
+    console: Console, meshes: list[int], ranks: list[int], repeats: int, large: bool, record: Record
+) -> list[Row]:
+    """Launch all workers one after the other, the largest last. Not collective."""
     every = ["newton_adi", "radi", "galerkin"]
     jobs = [(nx, k, every, repeats) for nx in meshes for k in ranks]
     if large:
         jobs.append((LARGEST, LARGEST_RANKS, ["newton_adi", "galerkin"], 1))
-    rows: list[Row] = []
-    for nx, k, methods, count in jobs:
-        with console.status(f"nx = {nx}, {k} rank(s)"):
-            row = launch({"nx": nx, "beta": beta, "methods": methods, "repeats": count}, k)
-        rows.append(row | {"nx": nx})
-    return rows
+    known = {(row["nx"], row["ranks"]): row for row in record.rows}
+    record.rows = [known[job[:2]] for job in jobs if job[:2] in known]
+    for i, (nx, k, methods, count) in enumerate(jobs):
+        if (nx, k) in known:
+            console.print(f"row {i + 1} of {len(jobs)}, nx = {nx}, {k} rank(s): kept")
+            continue
+        with console.status(f"row {i + 1} of {len(jobs)}, nx = {nx}, {k} rank(s)"):
+            row = launch({"nx": nx, "beta": record.beta, "methods": methods, "repeats": count}, k) | {"nx": nx}
+        record.rows.append(row)
+        record.save()
+        times = [f"{e['method']} {'failed' if 'error' in e else _number(e['seconds']) + ' s'}" for e in flat([row])]
+        console.print(f"row {i + 1} of {len(jobs)}, nx = {nx}, {k} rank(s): {', '.join(times) or 'failed'}")
+    return record.rows
 
 
-def collect_peers(console: Console, meshes: list[int], beta: float) -> list[Row]:
+def collect_peers(console: Console, meshes: list[int], record: Record) -> list[Row]:
     """The peers on the meshes they can do, one rank. Not collective."""
-    result = []
+    known = {(row["peer"], row["nx"]): row for row in record.peers}
+    record.peers = []
     for peer, limit in PEER_LIMIT.items():
         for nx in meshes:
-            if nx > limit:
-                continue
-            with console.status(f"{peer}, nx = {nx}"):
-                row = launch({"nx": nx, "beta": beta, "peer": peer}, 1)
-            result.append(row | {"nx": nx, "peer": peer})
+            if (peer, nx) in known:
+                row = known[peer, nx]
+            elif nx > limit:
+                row = {"skipped": f"it takes many minutes or too much memory beyond nx = {limit}"}
+            else:
+                with console.status(f"{peer}, nx = {nx}"):
+                    row = launch({"nx": nx, "beta": record.beta, "peer": peer}, 1)
+            record.peers.append(row | {"nx": nx, "peer": peer})
+            record.save()
             if row.get("missing"):
                 break
-    return result
+    return record.peers
 
 
 @app.command(help=HELP)
@@ -245,6 +310,7 @@ def main(
     out: Annotated[Path, typer.Option(help="folder for bench_riccati.json, .csv, .md, .png and .pdf")] = Path("out"),
     peers: Annotated[bool, typer.Option(help="also SciPy, slycot and pyMOR")] = True,
     large: Annotated[bool, typer.Option("--large", help=f"also nx = {LARGEST}, 2n > 1e6")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="keep the good rows of bench_riccati.json in --out")] = False,
     worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",
 ) -> None:
     """See HELP."""
@@ -258,14 +324,13 @@ def main(
         raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
     terminal = Console(highlight=False)
     console = Console(highlight=False, width=max(terminal.width, 160), soft_wrap=True)
-    rows = collect(console, meshes, counts, beta, repeats, large)
-    others = collect_peers(console, meshes, beta) if peers else []
+    record = Record(out / "bench_riccati.json", beta)
+    if resume:
+        record.resume()
+    rows = collect(console, meshes, counts, repeats, large, record)
+    others = collect_peers(console, meshes, record) if peers else record.peers
+    record.save()
     show(console, rows, others)
-    out.mkdir(parents=True, exist_ok=True)
-    reached = [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals(rows)]
-    report = {"command": "bench_riccati", "beta": beta, "rows": rows, "peers": others}
-    report |= {"exponents": exponents(rows), "goals": reached}
-    (out / "bench_riccati.json").write_text(json.dumps(report, indent=2) + "\n")
     files = [*write_tables(out, rows, others), *draw(out / "bench_riccati.png", rows, others)]
     for file in (out / "bench_riccati.json", *files):
         console.print(f"  {file}")

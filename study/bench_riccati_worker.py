@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,8 +95,16 @@ def describe(solution: RiccatiSolution, seconds: float, base: float, memory: flo
     }
 
 
-def measure(nx: int, beta: float, methods: list[str], repeats: int) -> dict[str, Any]:
-    """All methods on one mesh; gains are compared with the first one. Collective."""
+def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str = "") -> dict[str, Any]:
+    """All methods on one mesh; gains are compared with the first one. Collective.
+
+    Args:
+        nx: cells across.
+        beta: Kelvin-Voigt time [s].
+        methods: names in :data:`METHODS`.
+        repeats: runs behind each median.
+        partial: file that keeps the methods done so far.
+    """
     comm = MPI.COMM_WORLD
     problem = problem_for(comm, nx, beta)
     base = peak_mb(comm)
@@ -113,6 +123,8 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int) -> dict[str,
             reference = gain
         else:
             rows[name]["gain_difference"] = gain_difference(problem, gain, reference)
+        if partial and comm.rank == 0:
+            Path(partial).write_text(json.dumps(result | {"methods": rows}))
     return result | {"methods": rows}
 
 

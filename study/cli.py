@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+import time
 import traceback
 from pathlib import Path
 from typing import Annotated
@@ -208,6 +209,7 @@ def main() -> None:
         traceback.print_exc()
         sys.stderr.flush()
         if comm.size > 1:
+            time.sleep(0.5)  # the launcher must have passed the text on before it ends
             comm.Abort(1)
         sys.exit(2)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -126,13 +127,14 @@ def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
     return problem, diagnosis, modal
 
 
-def design(model: Model, watch: Stopwatch, progress: Progress | None = None) -> Design:
+def design(model: Model, watch: Stopwatch, progress: Progress | None = None, checkpoint: Path | None = None) -> Design:
     """Solve the Riccati equation of a scene and judge the gain. Collective.
 
     Args:
         model: the built scene.
         watch: takes the seconds of "diagnosis", "are" and "judge".
         progress: called after every step of the solver with its history entry.
+        checkpoint: folder for the solver's restart files.
 
     Raises:
         SoftgraspError: no solution, not converged, or a gain that does not stabilise the full plant.
@@ -142,7 +144,7 @@ def design(model: Model, watch: Stopwatch, progress: Progress | None = None) -> 
         target = hand_target(problem, scene_target(model))
         start = rest(problem.system, deformed=model.scene.time.start == "equilibrium")
     with watch.stage("are"):
-        solution = _modal(problem, diagnosis) if modal else _solve(model, problem, progress)
+        solution = _modal(problem, diagnosis) if modal else _solve(model, problem, progress, checkpoint)
     with watch.stage("judge"):
         error = difference(start, target.state)
         judge, quality = _judge(problem, solution, error)
@@ -161,7 +163,9 @@ def _modal(problem: RiccatiProblem, diagnosis: Diagnosis) -> RiccatiSolution:
     return modal_lqr(problem, min(MODAL_MODES, good), MODAL_CANDIDATES)
 
 
-def _solve(model: Model, problem: RiccatiProblem, progress: Progress | None) -> RiccatiSolution:
+def _solve(
+    model: Model, problem: RiccatiProblem, progress: Progress | None, checkpoint: Path | None
+) -> RiccatiSolution:
     control = model.scene.control
     wanted = NAMES["auto" if control is None else control.method]
     tol = None
@@ -169,7 +173,7 @@ def _solve(model: Model, problem: RiccatiProblem, progress: Progress | None) -> 
     if control is not None and "tolerance" in control.model_fields_set and choose(problem, wanted).method != "galerkin":
         tol = control.tolerance
     try:
-        return solve(problem, wanted, tol, progress)
+        return solve(problem, wanted, tol, progress, checkpoint)
     except (ControlError, SolverError) as error:
         raise type(error)(scene_words(str(error))) from error
 

@@ -28,7 +28,7 @@ from lqr.plant import Block, Plant
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.radi import RADI
 from lqr.shifted import make_shifted
-from lqr.shifts import ShiftRange, choose_shifts, ritz_pairs
+from lqr.shifts import ShiftRange, choose_shifts, energy_products, ritz_pairs
 from lqr.solve import choose, solve
 from study.control_problem import make_problem
 from tests.helpers import CUBE, LAYERS, gather_matrix, gather_rows, local_rows, make_scene
@@ -209,6 +209,26 @@ def test_undamped_is_refused_with_the_way_out() -> None:
             method.solve(problem)
 
 
+def test_large_undamped_scene_is_diagnosed_not_refused_for_its_size() -> None:
+    """What is wrong with it is the damping, not the memory of the dense method."""
+    problem = paper("tissue.cells=[18,36]", "effects.damping.beta=0.0")
+    assert problem.layout.states > DenseRiccati().limit
+    with pytest.raises(ControlError, match=r"no damping: .* all 1366 modes, .*beta >= .* method modal_lqr"):
+        solve(problem)
+
+
+def test_inputs_on_the_tissue_without_a_hand() -> None:
+    """n_s = 0, B = [0; B_z]: all three methods against the dense oracle."""
+    problem = problem_of("one_way")
+    layout = replace(problem.layout, n_s=0)
+    none, thin = np.zeros((0, 0)), np.zeros((layout.n_local, 0))
+    system = replace(problem.system, layout=layout, M_hand=none, M_rigid=none, G=thin, T=thin)
+    bare = replace(problem, system=system, C_s=np.zeros((2, 0)), B_z=np.array(problem.system.G), R=np.eye(2))
+    reference = DenseRiccati().solve(bare)
+    for method, bound in ((NewtonADI(), 1e-9), (RADI(), 1e-9), (StructuredGalerkin(), 1e-5)):
+        assert gain_error(bare, method.solve(bare), reference) < bound  # galerkin: 1e-6 in the energy norm
+
+
 def test_bad_weights_and_numbers_are_refused() -> None:
     problem = problem_of("one_way")
     C_z = problem.C_z.copy()
@@ -335,6 +355,14 @@ def test_ritz_values_of_the_open_plant_are_stable_and_true() -> None:
     values, sizes = ritz_pairs(plant, V, V[:2], None)
     assert (values.real < 0).all()  # dissipation in the energy product
     assert sizes.shape == values.shape
+    # with feedback, against the products written out
+    W, gain = Block(V.hand[:, :2], np.sin(V.tall[:, :2])), Block(np.ones((2 * layout.n_s, 2)), np.cos(V.tall[:, 2:4]))
+    F, G, seen, felt = energy_products(plant, V, W, gain)
+    E_V, A_V = plant.mass_adjoint(V), plant.plant_adjoint(V)
+    test = np.vstack([V.hand[: layout.n_s], np.linalg.solve(plant.M_s, E_V.hand[layout.n_s :])])
+    for ours, X in ((F, A_V), (G, E_V), (seen, W), (felt, gain)):
+        direct = total(layout.comm, V.tall.T @ X.tall) + test.T @ X.hand
+        assert np.allclose(ours, direct, rtol=0, atol=1e-12 * np.abs(direct).max())  # rounding
     # span of whole state blocks of one eigenvector: its Ritz value is the eigenvalue
     start = modal_start(plant, 3)
     phi, omega = start.small.V[:, :1], start.small.omega[0]
