@@ -118,8 +118,6 @@ def project(plant: Plant, V: Array, omega: Array, M_V: Array) -> SmallPlant:
     B = np.zeros((len(S), plant.inputs))
     if plant.B_z is None:
         B[plant.n_s : 2 * plant.n_s] = plant.B
-    if plant.B_z is not None:
-        B[plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
     else:
         B[2 * plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
     return SmallPlant(V, omega, StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, B, C))

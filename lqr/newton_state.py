@@ -48,9 +48,8 @@ def fingerprint(plant: Plant) -> str:
         digest.update(np.ascontiguousarray(A.getValuesCSR()[2]))
     damping = plant.system.damping
     digest.update(repr((damping.alpha, damping.beta)).encode())
-    for array in (plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G, plant.B_z):
-        if array is not None:
-            digest.update(np.ascontiguousarray(array))
+    for array in (plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G):
+        digest.update(np.ascontiguousarray(array))
     digest.update(b"" if plant.B_z is None else np.ascontiguousarray(plant.B_z))
     return digest.hexdigest()
 
