@@ -58,7 +58,7 @@ class LoopTrajectory:
         times: grid [s], (steps + 1,).
         q_s, v_s: hand, (steps + 1, n_s).
         inputs: u of each step [N, N m], (steps, n_s).
-        outputs: y = C_s q_s + C_z' z [m], (steps + 1, p).
+        outputs: y = C_s q_s + C_z' z [m, rad], (steps + 1, p).
         outputs_rigid: C_s q_s, the same without deformation, (steps + 1, p).
         output_names: one per component.
         cost: J up to each grid point, (steps + 1,).
@@ -99,6 +99,7 @@ class ClosedLoop:
         reproducible: see :func:`fem.solvers.factor_on_every_rank`.
 
     Raises:
+        ControlError: dt is not a positive number.
         SolverError: the factorisation fails.
     """
 

@@ -50,9 +50,10 @@ class Controller:
     A robot measures its hand, not the tissue. ``step`` therefore carries eta itself, without an observer: the tissue
     hangs on the hand, so the measured hand motion drives the model's tissue by the midpoint rule,
 
-        M eta'' + D eta' + K eta = -G (a - g),   a = (v_k - v_{k-1}) / period,
+        M eta'' + D eta' + K eta = -G (a - g) [- alpha G v],   a = (v_k - v_{k-1}) / period,
 
-    and what is wrong at the start decays with the tissue's own damping. Nothing here talks to MPI or PETSc.
+    ([...] where damping drags in space), and what is wrong at the start decays with the tissue's own damping. Nothing
+    here talks to MPI or PETSc.
 
     Attributes:
         K: (n_s, N).
@@ -63,6 +64,9 @@ class Controller:
         limits: bounds on |u| [N, N m], (n_s,), inf for none.
         scene_hash, layout_hash: of the scene and the mesh it was made for.
         about: free text: method, weights, output names.
+
+    Raises:
+        ControlError: a shape is wrong, the plant does not begin with the hand, or the period is not positive.
     """
 
     K: Array
@@ -135,7 +139,11 @@ class Controller:
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
-        """The same gain with another target of the hand. Not collective."""
+        """The same gain with another target of the hand. Not collective.
+
+        Raises:
+            ControlError: the plant has no state of rest there.
+        """
         x_bar, u_bar = self.plant.rest_at(q_bar)
         return replace(self, x_bar=x_bar, u_bar=u_bar)
 

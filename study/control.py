@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,13 +13,14 @@ import numpy as np
 from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskProgressColumn
 from rich.table import Table
 
-from fem.build import Model, Stopwatch, build
+from fem.build import Model, Stopwatch
 from fem.outputs import make_outputs
 from fem.scene_control import Control, ControlOutput
-from fem.scene_file import load_scene_collective
+from fem.scene_file import scene_hash
+from study.command import list_files, open_model, open_scene, progress_bar
 from study.control_loop import make_controller, plan, run_loops, save_controllers
 from study.control_reduced import Retuned, SweptBasis, orders, retune, sweep
 from study.control_report import Found, control_result, summary_rows, write_all
@@ -26,6 +28,7 @@ from study.control_solve import design
 from study.frames import Frames
 
 GOAL = 1e-10  # of the solver when the scene names none: the right end of its progress bar
+RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
 
 def run_control(
@@ -39,7 +42,8 @@ def run_control(
 ) -> dict[str, Any]:
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
-    Nothing is written before the Riccati equation is solved.
+    Nothing is written before the Riccati equation is solved, but restart files of a large plant: the next call with
+    the same scene, folder and rank count goes on from them; they are removed at the end.
 
     Args:
         path: scene file.
@@ -57,19 +61,16 @@ def run_control(
     """
     begin = time.perf_counter()
     comm = MPI.COMM_WORLD
-    scene = load_scene_collective(comm, path, overrides)
-    console.print(f"[bold]{scene.name}[/bold]: {scene.description}", soft_wrap=True)
-    model, note = with_control(build(scene, comm))
-    layout = model.system.layout
-    console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {comm.size} rank(s)")
+    model, note = with_control(open_model(open_scene(path, overrides, console), console))
     if note:
         console.print(note, soft_wrap=True, markup=False)
     watch = Stopwatch(comm)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("left"))
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console, disable=quiet or not console.is_terminal, transient=True
-    ) as bar:
-        found, frames = control_model(model, out, watch, bar, [note] if note else [], pictures)
+    with progress_bar(console, TaskProgressColumn(), quiet=quiet) as bar:
+        restart = restart_folder(model, out)
+        if restart is not None:
+            word = "going on from" if comm.bcast(restart.exists()) else "interrupted, the same command goes on from"
+            console.print(f"{word} {restart}", soft_wrap=True, markup=False)
+        found, frames = control_model(model, out, watch, bar, [note] if note else [], pictures, restart)
     files = frames.close()
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
@@ -91,11 +92,19 @@ def run_control(
         result["time"] |= {"pictures": now - drawing, "total": now - begin}
         files = [*write_all(out, path, overrides, model, found, result, drawn), *files]
         show(console, found, result)
-        console.print("files:")
-        for file in files:
-            console.print(f"  {file}", soft_wrap=True)
+        list_files(console, files)
+        if restart is not None:
+            shutil.rmtree(restart, ignore_errors=True)
     comm.Barrier()
     return result
+
+
+def restart_folder(model: Model, out: Path) -> Path | None:
+    """Where the solver keeps restart files: one folder a scene and rank count; None for small plants."""
+    layout = model.system.layout
+    if layout.states < RESTART_STATES:
+        return None
+    return out / f"restart-{scene_hash(model.scene)[:12]}-{layout.comm.size}"
 
 
 def with_control(model: Model) -> tuple[Model, str]:
@@ -118,7 +127,13 @@ def with_control(model: Model) -> tuple[Model, str]:
 
 
 def control_model(
-    model: Model, out: Path, watch: Stopwatch, bar: Progress, notes: list[str], pictures: bool
+    model: Model,
+    out: Path,
+    watch: Stopwatch,
+    bar: Progress,
+    notes: list[str],
+    pictures: bool,
+    restart: Path | None = None,
 ) -> tuple[Found, Frames]:
     """Solve, reduce, re-tune and close the loop. Collective.
 
@@ -129,12 +144,13 @@ def control_model(
         bar: shows what is done.
         notes: what is to be said in the report; more is added to the result.
         pictures: keep frames.
+        restart: folder for the solver's restart files.
 
     Raises:
         SoftgraspError: with one sentence.
     """
     own_end = not notes  # a scene made for control says how long its loop runs
-    solved = design(model, watch, solver_bar(bar, model))
+    solved = design(model, watch, solver_bar(bar, model), restart)
     swept: tuple[SweptBasis, ...] = ()
     retuned: tuple[Retuned, ...] = ()
     notes = list(notes)

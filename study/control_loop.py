@@ -28,6 +28,7 @@ from study.control_reduced import MANY_STATES, SweptBasis, fast_order
 from study.control_solve import Design, actuation
 from study.frames import Frames
 from study.loop_plots import move_steps
+from study.outputs_named import farthest
 
 SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
 LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle
@@ -245,8 +246,8 @@ def small_run(
 
 
 def distance(run: LoopTrajectory | ReducedTrajectory, found: Design) -> Array:
-    """|y - y_bar| at every instant [m], (steps + 1,). Not collective."""
-    return np.asarray(np.linalg.norm(run.outputs - found.target.y, axis=1))
+    """Distance of the farthest output to its target at every instant [m], (steps + 1,). Not collective."""
+    return farthest(run.outputs, found.target.y, found.problem.names)
 
 
 def open_loop(found: Design) -> Block:

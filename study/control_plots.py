@@ -156,7 +156,10 @@ def pole_sets(found: Design, swept: Sequence[SweptBasis]) -> dict[str, Poles]:
     """Poles with the optimal and the a-priori gain and without any, on the lowest modes. Collective."""
     loop: ModalLoop = found.judge.loop
     K = gain_of(found.solution)
-    sets = {"without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))), "optimal gain": loop.poles(K)}
+    sets = {
+        "without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))),
+        ("modal gain" if found.modal else "optimal gain"): loop.poles(K),
+    }
     basis = next((s for s in swept if s.name == "structured"), None)
     best = None if basis is None else basis.best(fast_order(found.problem.layout.n_s))
     if basis is not None and best is not None:

@@ -22,6 +22,7 @@ from study.animation import speed_up
 from study.control_loop import LoopRuns, MadeController, distance
 from study.control_reduced import TITLES, Retuned, SweptBasis, report_dict
 from study.control_solve import Design, scene_words
+from study.equation_control import control_text
 from study.report import Section, write_report
 
 Row = tuple[Any, ...]
@@ -31,8 +32,8 @@ LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal
 CAPTIONS = {
     "move.png": "The move to the target at some instants, full plant under the optimal gain.",
     "move.gif": "The move in motion{speed}.",
-    "histories.png": "Outputs, force on the hand, and the distance of the outputs to the target, on the full "
-    "plant; dashed and dash-dotted under the a-priori gain and the dearest of the paper's.",
+    "histories.png": "Outputs, force on the hand, and the distance of the farthest output to the target, on the "
+    "full plant; dashed and dash-dotted under the a-priori gain and the dearest of the paper's.",
     "errors.png": "Reduced Riccati equations: relative error of P, relative error of the gain and excess cost against "
     "N. Errors above 100 % are not drawn, excess cost below 1e-12 at 1e-12. Red crosses: gains that leave the full "
     "plant unstable or without certificate; on the upper edge those with an error above 100 %.",
@@ -195,18 +196,20 @@ def summary_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     word = "" if result["closed_loop_certified"] else ", not certified for the modes left out"
     word = word if result["stable"] or word else ": not stable"
+    if word and "stay on the imaginary axis" in result["method"]:
+        word = ": that of the modes left out, zero to rounding"
     rows.append(("closed-loop spectral abscissa", f"{result['closed_loop_abscissa']:.4g} 1/s{word}"))
     for label, key in (("gain, body displaced", "gain_translation"), ("gain, body moving", "gain_rigid_velocity")):
         rows.append((label, "; ".join(" ".join(f"{v:.5g}" for v in row) for row in np.array(result[key]))))
     rows.append(
         (
             "distance to the target",
-            f"{loop['distance_first']:.3g} m at first, {loop['distance_final']:.2e} m at the end",
+            f"{loop['distance_first']:.3g} m at first, {loop['distance_final']:.3g} m at the end",
         )
     )
     when = "not within the run" if loop["settled"] is None else f"{loop['settled']:.4g} s"
     rows.append(("within 1 % for good after", when))
-    rows.append(("cost of the run + still to come", f"{loop['cost']:.6g} + {loop['cost_to_come']:.2e}"))
+    rows.append(("cost of the run + still to come", f"{loop['cost']:.6g} + {loop['cost_to_come']:.3g}"))
     if loop["saturated"]:
         rows.append(("steps with a load at its limit", f"{100 * loop['saturated']:.3g} %"))
     made = result["controller"]
@@ -323,7 +326,7 @@ def write_all(
         out / "report.html",
         title=f"{model.scene.name}: optimal feedback",
         subtitle=model.scene.description,
-        sections=sections(found, result, figures),
+        sections=sections(found, result, figures, control_text(model.scene)),
         scene=resolved_toml(model.scene),
         reproduce=f"{launch}softgrasp control {shlex.quote(path.name)}{sets}",
     )
@@ -332,13 +335,14 @@ def write_all(
     return [numbers, *files, toml, *drawn, report]
 
 
-def sections(found: Found, result: dict[str, Any], figures: list[tuple[Path, str]]) -> list[Section]:
+def sections(found: Found, result: dict[str, Any], figures: list[tuple[Path, str]], equation: str) -> list[Section]:
     """Parts of the page."""
     moving = [f for f in figures if f[0].name in ("move.png", "move.gif", "histories.png", "decay.png")]
     by_name = {f[0].name: f for f in figures}
     parts = [
         Section("", text="\n\n".join((*result["findings"], *found.notes)), figures=moving[:2]),
         Section("Result", rows=summary_rows(result), figures=moving[2:]),
+        Section("Equation", code=equation),
     ]
     if found.swept:
         text = (

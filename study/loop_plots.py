@@ -5,7 +5,7 @@ Everything comes in as arrays; nothing here computes a simulation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.lines import Line2D
 
+from study.outputs_named import AXES, TURNS, farthest, turns
 from study.plots import figure_move
 from study.shapes import pick_instants
 from study.style import CYCLE, OUTLINE, TARGET, WIDTH, length_unit, paper_style, save
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Poles = npt.NDArray[np.complex128]
 
+COLOURS = (*CYCLE, "#E69F00", "#56B4E9", "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "^", "s", "D", "v", "P")
 FLOOR = 1e-16  # smallest distance to the target that a double of order one can show
@@ -54,9 +56,9 @@ def figure_histories(
 
     Args:
         times: grid, shape (m + 1,) [s].
-        outputs: shape (m + 1, p) [m].
+        outputs: shape (m + 1, p) [m, rad].
         inputs: constant in each step, shape (m, n_s) [N, N m].
-        names: one per output.
+        names: one per output; those that end in rx, ry, rz are rotations and get axes of their own.
         out_png: name of the picture; the PDF gets its stem.
         target: outputs aimed at, shape (p,).
         limits: bounds on the inputs, shape (n_s,); drawn when finite.
@@ -70,40 +72,52 @@ def figure_histories(
     aim = None if target is None else np.asarray(target, dtype=np.float64)
     d = inputs.shape[1] if dimension is None else min(dimension, inputs.shape[1])
     runs = {"": (outputs, inputs), **(others or {})}
-    rows = 2 + (aim is not None) + (d < inputs.shape[1])
-    unit = length_unit(float(np.abs(outputs).max(initial=0.0)))
+    angles = turns(names)
+    lengths = [j for j in range(outputs.shape[1]) if j not in angles]
+    panels = [p for p in (lengths, angles) if p]
+    first = len(panels)
+    rows = first + 1 + (aim is not None) + (d < inputs.shape[1])
+    unit = length_unit(float(np.abs(outputs[:, lengths]).max(initial=0.0)))
     with paper_style():
         figure, axes = plt.subplots(rows, 1, figsize=(WIDTH * 0.8, 1.15 + 1.5 * rows), layout="constrained")
         for number, (y, u) in enumerate(runs.values()):
             look: dict[str, Any] = {"ls": STYLES[number % len(STYLES)], "lw": 1.4 if number == 0 else 1.0}
-            _lines(axes[0], times, unit[0] * y, look)
-            _steps(axes[1], times, u[:, :d], look)
+            for ax, part in zip(axes, panels, strict=False):
+                _lines(ax, times, (unit[0] if part is lengths else 1.0) * y[:, part], look)
+            _steps(axes[first], times, u[:, :d], look)
             if d < u.shape[1]:
-                _steps(axes[2], times, u[:, d:], look)
+                _steps(axes[first + 1], times, u[:, d:], look)
             if aim is not None:
                 # the last swings have no later ones to be compared with
                 keep = slice(0, max(2, int(0.97 * len(times))), _thin(len(times)).step)
-                axes[-1].semilogy(times[keep], still_to_come(y, aim)[keep], color=OUTLINE, **look)
+                axes[-1].semilogy(times[keep], still_to_come(y, aim, names)[keep], color=OUTLINE, **look)
         if aim is not None:
-            for value in dict.fromkeys(aim.tolist()):
-                axes[0].axhline(unit[0] * value, color=TARGET, lw=1.0, ls=(0, (1, 1.2)), zorder=0)
+            for ax, part in zip(axes, panels, strict=False):
+                for value in dict.fromkeys(aim[part].tolist()):
+                    height = (unit[0] if part is lengths else 1.0) * value
+                    ax.axhline(height, color=TARGET, lw=1.0, ls=(0, (1, 1.2)), zorder=0)
             axes[-1].set_ylabel("distance to target,\nlargest from then on [m]")
-        _limits(axes[1], limits, d)
-        axes[0].set_ylabel(f"outputs [{unit[1]}]")
-        axes[1].set_ylabel("force [N]")
+        _limits(axes[first], limits, d)
+        for ax, part in zip(axes, panels, strict=False):
+            ax.set_ylabel(f"outputs [{unit[1]}]" if part is lengths else "rotation [rad]")
+        axes[first].set_ylabel("force [N]")
         if d < inputs.shape[1]:
-            axes[2].set_ylabel("torque [N m]")
+            axes[first + 1].set_ylabel("torque [N m]")
         whole = axes[-1:] if aim is not None else []
         for ax in axes:
             ax.set_xlim(0.0, float(times[-1]) if settle is None or ax in whole else min(settle, float(times[-1])))
         axes[-1].set_xlabel("time [s]")
-        _legends(axes, names, inputs.shape[1], d, list(runs), aim is not None)
+        labels = [[names[j] for j in part] for part in panels]
+        _legends(axes, labels, inputs.shape[1], d, list(runs), aim is not None)
         return save(figure, out_png)
 
 
-def still_to_come(outputs: Array, target: Array) -> Array:
-    """Largest |y - y_bar| from each instant on: how well the outputs have settled, without the swings. Shape (m,)."""
-    distance = np.maximum(np.linalg.norm(outputs - target, axis=1), FLOOR)
+def still_to_come(outputs: Array, target: Array, names: Sequence[str] = ()) -> Array:
+    """Largest distance from each instant on: how well the outputs have settled, without the swings. Shape (m,).
+
+    Args and distance as in :func:`study.outputs_named.farthest`.
+    """
+    distance = np.maximum(farthest(outputs, target, names), FLOOR)
     return np.asarray(np.maximum.accumulate(distance[::-1])[::-1])
 
 
@@ -114,7 +128,7 @@ def _thin(count: int) -> slice:
 def _lines(ax: Any, times: Array, values: Array, look: dict[str, Any]) -> None:
     keep = _thin(len(times))
     for j, column in enumerate(values.T):
-        ax.plot(times[keep], column[keep], color=CYCLE[j % len(CYCLE)], **look)
+        ax.plot(times[keep], column[keep], color=COLOURS[j % len(COLOURS)], **look)
 
 
 def _steps(ax: Any, times: Array, values: Array, look: dict[str, Any]) -> None:
@@ -136,20 +150,23 @@ def _limits(ax: Any, limits: npt.ArrayLike | None, d: int) -> None:
     ax.margins(y=0.08)
 
 
-def _legends(axes: Any, names: tuple[str, ...], inputs: int, d: int, runs: list[str], aimed: bool) -> None:
+def _legends(axes: Any, names: list[list[str]], inputs: int, d: int, runs: list[str], aimed: bool) -> None:
     """Colours name components, line styles name runs; beside the axes, where they hide nothing."""
     place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "handlelength": 1.6}
 
     def colours(labels: list[str]) -> list[Line2D]:
-        return [Line2D([], [], color=CYCLE[j % len(CYCLE)], label=label) for j, label in enumerate(labels)]
+        return [Line2D([], [], color=COLOURS[j % len(COLOURS)], label=label) for j, label in enumerate(labels)]
 
-    shown = colours([_pretty(name) for name in names])
-    if aimed:
-        shown.append(Line2D([], [], color=TARGET, lw=1.0, ls=(0, (1, 1.2)), label="target"))
-    axes[0].legend(handles=shown, **place)
-    axes[1].legend(handles=colours([f"$u_{'xyz'[j] if d <= 3 else j + 1}$" for j in range(d)]), **place)
+    for ax, part in zip(axes, names, strict=False):
+        shown = colours([_pretty(name) for name in part])
+        if aimed:
+            shown.append(Line2D([], [], color=TARGET, lw=1.0, ls=(0, (1, 1.2)), label="target"))
+        ax.legend(handles=shown, **place)
+    first = len(names)
+    axes[first].legend(handles=colours([f"$u_{'xyz'[j] if d <= 3 else j + 1}$" for j in range(d)]), **place)
     if d < inputs:
-        axes[2].legend(handles=colours([f"torque {j + 1}" for j in range(inputs - d)]), **place)
+        about = ["z"] if inputs - d == 1 else ["x", "y", "z", *map(str, range(4, inputs - d + 1))]
+        axes[first + 1].legend(handles=colours([f"torque, ${a}$" for a in about[: inputs - d]]), **place)
     if len(runs) > 1:
         entries = [
             Line2D([], [], color=OUTLINE, ls=STYLES[i % len(STYLES)], label=name or "full order")
@@ -160,7 +177,9 @@ def _legends(axes: Any, names: tuple[str, ...], inputs: int, d: int, runs: list[
 
 def _pretty(name: str) -> str:
     stem, _, axis = name.rpartition("_")
-    return f"{stem}, ${axis}$" if stem and axis in ("x", "y", "z") else name
+    if stem and axis in TURNS:
+        return f"{stem}, about ${axis[1]}$"
+    return f"{stem}, ${axis}$" if stem and axis in AXES else name
 
 
 def figure_loop_move(

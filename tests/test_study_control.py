@@ -96,6 +96,45 @@ def test_the_loop_costs_what_the_riccati_equation_says(result: dict[str, Any]) -
         assert run["cost"] >= loop["cost"] * (1 - 1e-4)  # no gain beats the optimal one but for the cost to come
 
 
+class _StopError(Exception):
+    pass
+
+
+def test_an_interrupted_run_goes_on(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, result: dict[str, Any]
+) -> None:
+    """Stopped after 30 solves, the second call starts at 26 and ends with the gain of an undisturbed run."""
+    folder, solves = common(tmp_path_factory.mktemp("restart")), []
+
+    def bar(stop: float) -> Any:
+        def note(entry: dict[str, float]) -> None:
+            solves.append(entry["solve"])
+            if entry["solve"] == stop:
+                raise _StopError
+
+        return lambda *_: note
+
+    def run() -> str:
+        text = io.StringIO()
+        overrides = [*SMALL, "control.method='newton-adi'", "control.N=[4]"]
+        run_control(SCENES / "paper_lqr.toml", folder, overrides, Console(file=text, width=200), pictures=False)
+        return text.getvalue()
+
+    monkeypatch.setattr("study.control.RESTART_STATES", 0)
+    monkeypatch.setattr("study.control.solver_bar", bar(30))
+    with pytest.raises(_StopError):
+        run()
+    assert len(list(folder.glob("restart-*/newton-rank*.npz"))) == MPI.COMM_WORLD.size
+    solves.clear()
+    monkeypatch.setattr("study.control.solver_bar", bar(-1))
+    assert "going on from" in run()
+    assert solves[0] == 26
+    assert not list(folder.glob("restart-*"))
+    again = json.loads((folder / "result.json").read_text())
+    assert again["solves"] == result["solves"]
+    assert np.abs(np.array(again["gain_translation"]) - result["gain_translation"]).max() < 1e-12  # the same solves
+
+
 def test_marks_follow_the_spectrum(result: dict[str, Any]) -> None:
     for points in result["reduced"].values():
         for p in points:

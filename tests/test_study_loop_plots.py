@@ -12,6 +12,7 @@ from PIL import Image
 
 from study import loop_plots
 from study.loop_plots import figure_decay, figure_histories, move_steps, still_to_come
+from study.outputs_named import farthest
 
 pytestmark = pytest.mark.serial
 
@@ -101,3 +102,23 @@ def test_decay_marks_every_pole(tmp_path: Path, drawn: list[Any]) -> None:
 @pytest.mark.parametrize("poles", [np.array([-1.0 + 0.0j]), np.array([-1.0 + 2.0j]), np.array([1.0 + 0.0j])])
 def test_decay_of_few_poles(tmp_path: Path, poles: np.ndarray) -> None:
     assert figure_decay({"one": poles}, tmp_path / "one.png")[0].exists()
+
+
+def test_rotations_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None:
+    """Radians are not drawn as metres, and no two outputs of one panel share a colour."""
+    names = (*(f"tip_{a}" for a in "xyz"), *(f"hand_{a}" for a in "xyz"), *(f"hand_r{a}" for a in "xyz"))
+    y = np.outer(1 - np.exp(-TIMES), np.arange(1.0, 10.0))
+    figure_histories(TIMES, y, U, names, tmp_path / "r.png", target=np.arange(1.0, 10.0))
+    top, turn, force, _ = drawn[0].axes
+    assert [ax.get_ylabel() for ax in (top, turn, force)] == ["outputs [m]", "rotation [rad]", "force [N]"]
+    assert len({line.get_color() for line in top.lines[:6]}) == 6
+    assert np.array_equal(turn.lines[0].get_ydata(), y[:, 6])
+    texts = [t.get_text() for t in turn.get_legend().get_texts()]
+    assert texts == ["hand, about $x$", "hand, about $y$", "hand, about $z$", "target"]
+
+
+def test_distance_is_that_of_the_farthest_output() -> None:
+    y, names = np.array([[3.0, 4.0, 6.0, 0.0, 9.0]]), ("tip.x", "tip.y", "hand.x", "hand.y", "hand.rz")
+    assert farthest(y, np.zeros(5), names).tolist() == [6.0]
+    assert farthest(y[:, 4:], np.zeros(1), names[4:]).tolist() == [9.0]  # nothing but a rotation
+    assert farthest(y[:, :2], np.zeros(2), ("a", "b")).tolist() == [5.0]

@@ -1,0 +1,56 @@
+"""What the commands say alike: the scene and its size at the start, progress, the files at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mpi4py import MPI
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+
+from fem.build import Model, build
+from fem.scene import Scene
+from fem.scene_file import load_scene_collective
+
+
+def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
+    """Load a scene file and print its name and description. Collective.
+
+    Raises:
+        SceneError: the file or a key is wrong.
+    """
+    scene = load_scene_collective(MPI.COMM_WORLD, path, overrides)
+    console.print(f"[bold]{scene.name}[/bold]: {scene.description}", soft_wrap=True)
+    return scene
+
+
+def open_model(scene: Scene, console: Console) -> Model:
+    """Build a scene and print its size. Collective.
+
+    Raises:
+        SoftgraspError: the scene cannot be built.
+    """
+    model = build(scene, MPI.COMM_WORLD)
+    layout = model.system.layout
+    console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
+    return model
+
+
+def progress_bar(console: Console, count: ProgressColumn, *, quiet: bool = False) -> Progress:
+    """Bars with the time left, in a terminal only. Not collective.
+
+    Args:
+        console: where they go; a rank that prints nothing has none.
+        count: how far a task is, a share or m of n.
+        quiet: no bars.
+    """
+    columns = (TextColumn("{task.description}"), BarColumn(), count, TextColumn("left"), TimeRemainingColumn())
+    return Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True)
+
+
+def list_files(console: Console, files: Sequence[Path]) -> None:
+    """Print what was written, one a line. Not collective."""
+    console.print("files:")
+    for file in files:
+        console.print(f"  {file}", soft_wrap=True)
