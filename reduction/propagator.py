@@ -156,7 +156,8 @@ def _whole(model: SmallModel) -> _Coordinates | None:
     keep = values > NULL_TOLERANCE * values.max(initial=0.0)
     root, V_r, V_0 = np.sqrt(values[keep]), V[:, keep], V[:, ~keep]
     R, R_plus = root[:, None] * V_r.T * D, V_r / D[:, None] / root
-    S = R @ np.linalg.solve(op.E, op.A @ R_plus)
+    # A = R'R of a canonical model: A R^+ = R', without the rounding of A over a small root
+    S = R @ np.linalg.solve(op.E, R.T if np.array_equal(op.A, op.total) else op.A @ R_plus)
     if not is_skew(S):
         return None
     U, omega = skew_modes((S - S.T) / 2)

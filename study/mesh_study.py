@@ -147,15 +147,15 @@ def findings(rows: Sequence[MeshRow]) -> dict[str, Any]:
 
 def show(console: Console, rows: Sequence[MeshRow], found: dict[str, Any], title: str) -> None:
     """Print table and exponents."""
-    header = ("n_e", "factor [s]", "full [s]", "offline [s]", "online [ms]", "speed-up", "error", "deformation")
-    console.print(title)
+    header = ("n_e", "factor", "full", "offline", "online", "speed-up", "error", "deform.")
+    console.print(f"{title}; seconds, online in milliseconds")
     table = Table(box=None, pad_edge=False)
     for name in header:
         table.add_column(escape(name), no_wrap=True)
     for row in rows:
         table.add_row(
             str(row.n_e), f"{row.time_factor:.3g}", f"{row.time_full:.3g}", f"{row.time_offline:.3g}",
-            f"{1e3 * row.time_online:.3g}", f"{row.time_full / row.time_online:.3g}", f"{row.error:.1e}",
+            f"{1e3 * row.time_online:.3g}", f"{row.time_full / row.time_online:.0f}", f"{row.error:.1e}",
             f"{row.error_deformation:.1e}" + ("" if row.stable else " !"),
         )  # fmt: skip
     console.print(table)
@@ -167,7 +167,7 @@ def show(console: Console, rows: Sequence[MeshRow], found: dict[str, Any], title
     )
     if found["break_even_n_e"] is not None:
         console.print(
-            f"break-even mesh: a reduced run is faster than a full one from n_e = {found['break_even_n_e']:.3g}"
+            f"break-even mesh: a reduced run is faster than a full one from n_e = {found['break_even_n_e']:.0f}"
         )
 
 

@@ -178,13 +178,13 @@ def _hands(views: Views) -> Array:
     return np.column_stack([np.interp(views.times, views.table[:, 0], q) for q in views.table[:, 1:].T])
 
 
-def _figure(views: Views, width: float) -> tuple[Any, list[Any], Shot]:
+def _figure(views: Views, width: float, note: str = "") -> tuple[Any, list[Any], Shot]:
     """Axes for every reduced model in the frame of the full one, so that one that grew does not shrink the picture."""
     shot = make_shot(views.picture, views.full, views.times, views.table, None)
     figure, axes = make_axes(shot, len(views.reduced), captions=True, width=width, tallest=3.6)
     for ax, view in zip(axes, views.reduced, strict=True):
         state = "" if view.stable else ", unstable"
-        ax.set_title(f"{view.title}{state}\ndeformation error {view.error:.1e}", pad=3, fontsize=7)
+        ax.set_title(f"{view.title}{state}\ndeformation error {view.error:.1e}{note}", pad=3, fontsize=7)
     entries: list[Any] = [Patch(color=HAND, label="hand"), Line2D([], [], label="outline of the full model", **FULL)]
     top = max(ax.get_position().y1 for ax in axes) + 0.36 / figure.get_figheight()
     figure.legend(handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=2, borderaxespad=0.0)
@@ -192,10 +192,10 @@ def _figure(views: Views, width: float) -> tuple[Any, list[Any], Shot]:
     return figure, axes, shot
 
 
-def _draw(ax: Any, shot: Shot, views: Views, view: View, k: int, timed: bool = False) -> None:
+def _draw(ax: Any, shot: Shot, views: Views, view: View, k: int) -> None:
     """One reduced model at one frame under the outline of the full one."""
-    q, times = _hands(views)[k], views.times[k : k + 1] if timed else None
-    draw_scene(ax, shot, view.states[k : k + 1], times, q[None])
+    q = _hands(views)[k]
+    draw_scene(ax, shot, view.states[k : k + 1], None, q[None])
     lines = LineCollection(list(_outline(views.picture, views.full[k])), zorder=7, **FULL)
     ax.add_collection(lines, autolim=False)
 
@@ -220,11 +220,13 @@ def instants(views: Views) -> list[int]:
 
 def figure_compare(views: Views, out_png: Path) -> tuple[Path, Path]:
     """Full outline over reduced bodies at some instants; PNG and PDF."""
+    shown = instants(views)
+    note = f"; shown: $t$ = {', '.join(f'{views.times[k]:.2g}' for k in shown)} s"
     with paper_style():
-        figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1)
+        figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1, note)
         for ax, view in zip(axes, views.reduced, strict=True):
-            for k in instants(views):
-                _draw(ax, shot, views, view, k, timed=True)
+            for k in shown:
+                _draw(ax, shot, views, view, k)
         return save(figure, out_png)
 
 
