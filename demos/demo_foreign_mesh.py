@@ -2,7 +2,8 @@
 # # A mesh from elsewhere
 # The small pillow of deformable-gym (BSD-3-Clause, licence beside the mesh): tetrahedra that nobody here made, gripped
 # at the waist, hanging under gravity, lifted; Kelvin-Voigt damping takes the vibration out.
-# Then the same body with marks, cell tags for a stiff core along its length and facet tags for the grip, from `.msh` and from `.vtu`.
+# Then the same body with marks, cell tags for a stiff core along its length and facet tags for the grip, from `.msh`
+# and from `.vtu`.
 
 # %%
 from pathlib import Path
