@@ -19,6 +19,7 @@ from lqr.shifted import ShiftedTissue, make_shifted
 from lqr.shifts import shift_range
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
+ROUNDING = 1e-13  # of a Gram matrix: columns independent to 3e-7
 BUDGET = 0.45  # share of omega at which a response's damping ratio is held below critical
 
 
@@ -38,17 +39,15 @@ class Space:
         """With the parts of more columns that are new: M-orthogonal to V, which is M-orthonormal. Collective."""
         comm, size = plant.comm, _m_norms(plant, columns)
         columns = columns / np.where(size > 0, size, 1.0)
-        for _ in range(2):  # twice is enough for orthogonality to rounding
-            columns = columns - self.V @ total(comm, self.M_V.T @ columns)
-        M_columns = plant.mass(columns)
-        gram = total(comm, columns.T @ M_columns)
-        basis: Array | None = None
-        if comm.rank == 0:
-            sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
-            keep = sizes > NEW**2
-            basis = vectors[:, keep] / np.sqrt(sizes[keep])
-        S = comm.bcast(basis)
-        more = (columns @ S, M_columns @ S, plant.stiff(columns @ S))
+        M_columns = columns
+        for _ in range(2):  # a small part is orthogonal to rounding only after it is scaled to 1
+            for _ in range(2):  # twice is enough for orthogonality to rounding
+                columns = columns - self.V @ total(comm, self.M_V.T @ columns)
+            M_columns = plant.mass(columns)
+            gram = total(comm, columns.T @ M_columns)
+            S: Array = comm.bcast(_normalising(gram) if comm.rank == 0 else None)
+            columns, M_columns = columns @ S, M_columns @ S
+        more = (columns, M_columns, plant.stiff(columns))
         return Space(*(np.hstack([a, b]) for a, b in zip((self.V, self.M_V, self.K_V), more, strict=True)))
 
     def ritz(self, plant: Plant) -> tuple[Space, Array, Array]:
@@ -82,6 +81,13 @@ class Level:
     a: Array
     b: Array
     gain: Block
+
+
+def _normalising(gram: Array) -> Array:
+    """S with S'gram S = I on the part of gram that is not rounding. Not collective."""
+    sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
+    keep = sizes > max(NEW**2, ROUNDING * float(sizes.max(initial=0.0)))
+    return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
 
 
 def _m_norms(plant: Plant, columns: Array) -> Array:

@@ -19,9 +19,9 @@ Method = Literal["auto", "dense", "newton_adi", "radi", "galerkin"]
 METHODS: tuple[Method, ...] = ("auto", "dense", "newton_adi", "radi", "galerkin")
 # Up to here all modes cost less than the low-rank machinery (measured: 0.1 s at 200 states).
 DENSE_STATES = 200
-# A distributed complex factorisation a shift: beyond these sizes 100 of them take more than a quarter of an hour on two
-# ranks, and the factor of the real form of twice the order leaves 24 GiB.
-LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 60_000}  # 1: systems without a mesh
+# A complex factorisation a shift: beyond these sizes 70 to 100 of them take more than a quarter of an hour on two ranks
+# (3D, n_e = 38 931: 13 s each by SuperLU; 52 857: 47 s by MUMPS), while Galerkin needs about 5.
+LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 40_000}  # 1: systems without a mesh
 
 
 class Solver(Protocol):
@@ -109,7 +109,7 @@ def solve(
     Raises:
         ControlError: weights or data are refused, or some mode cannot be stabilised.
         SolverError: not converged, or the true residual misses the tolerance.
-        ResourceError: dense was asked for at a size that would not fit.
+        ResourceError: dense was asked for at a size that would not fit, or the factor of a shift does not fit.
     """
     choice = choose(problem, method)
     if method == "auto" and choice.method == "dense" and problem.layout.states > DenseRiccati().limit:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from mpi4py import MPI
 
 from fem.build import build
-from fem.errors import CheckpointError, SolverError
+from fem.errors import CheckpointError, ResourceError, SolverError
 from fem.petsc import Array, total
 from fem.scene_file import load_scene
 from fem.system import BlockSystem
@@ -27,7 +28,7 @@ from lqr.newton import NewtonADI
 from lqr.plant import Block, Plant
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.radi import RADI
-from lqr.shifted import make_shifted
+from lqr.shifted import factor_bytes, make_shifted
 from lqr.shifts import ShiftRange, choose_shifts, energy_products, ritz_pairs
 from lqr.solve import choose, solve
 from study.control_problem import make_problem
@@ -106,7 +107,7 @@ def test_newton_and_radi_equal_the_dense_oracle(name: str) -> None:
         assert found.rank < problem.layout.states
 
 
-@pytest.mark.parametrize("name", ["one_way", "two_way", "two_way_drag_in_space", "layers", "cube"])
+@pytest.mark.parametrize("name", ["one_way", "two_way", "two_way_drag_in_space", "layers", "cube", "cube_two_way"])
 def test_galerkin_gain_is_as_good_as_it_says(name: str) -> None:
     problem = problem_of(name)
     found = StructuredGalerkin().solve(problem)
@@ -215,6 +216,18 @@ def test_large_undamped_scene_is_diagnosed_not_refused_for_its_size() -> None:
     assert problem.layout.states > DenseRiccati().limit
     with pytest.raises(ControlError, match=r"no damping: .* all 1366 modes, .*beta >= .* method modal_lqr"):
         solve(problem)
+
+
+def test_factor_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = problem_of("cube")
+    needed = factor_bytes(problem.layout.n_e, 3)
+    for free, fits in ((1.01 * needed, True), (0.99 * needed, False)):
+        monkeypatch.setattr("psutil.virtual_memory", lambda free=free: SimpleNamespace(available=free))
+        if fits:
+            make_shifted(problem.system, "distributed").destroy()
+        else:
+            with pytest.raises(ResourceError, match=r"n_e = \d+ in 3D\) needs about .* GiB are free"):
+                make_shifted(problem.system, "distributed")
 
 
 def test_inputs_on_the_tissue_without_a_hand() -> None:
