@@ -91,7 +91,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         comm: ranks that share the rows.
         X: local rows (n_local, c); read only.
         engine: see the module.
-        k: number of leading triplets that are enough; only ``svd`` uses it.
+        k: number of leading triplets that are enough; ``tsqr`` makes all the same.
 
     Raises:
         BasisError: the engine is unknown, X holds NaN or infinity, or X is zero.
@@ -108,7 +108,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         raise BasisError("all snapshots are zero; there is nothing to build a basis from")
     rows = int(comm.allreduce(X.shape[0]))
     if engine == "gram":
-        Q, R, floor = *_gram(comm, X), GRAM_FLOOR
+        Q, R, floor = *_gram(comm, X, k), GRAM_FLOOR
     else:
         # LAPACK's own bound on an absolute error in sigma, with its usual factor sqrt of the size
         floor = EPS * max(X.shape[1], 100) ** 0.5
@@ -119,7 +119,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
             Q, R = _tsqr(comm, X, rows)
         else:
             Q, R = _svd(comm, X, rows, k)
-    partial = engine == "svd" and k is not None and Q.shape[1] < min(rows, X.shape[1])
+    partial = engine != "tsqr" and k is not None and Q.shape[1] < min(rows, X.shape[1])
     return Factor(Q, R, scale, floor, partial, square)
 
 
@@ -212,12 +212,14 @@ def _triangle(comm: MPI.Intracomm, X: Array) -> Array:
     return on_root(comm, lambda: np.linalg.qr(np.vstack(parts or []), mode="r"))
 
 
-def _gram(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
-    """Method of snapshots: X'X = V S^2 V', U = X V / s."""
+def _gram(comm: MPI.Intracomm, X: Array, k: int | None) -> tuple[Array, Array]:
+    """Method of snapshots: X'X = V S^2 V', U = X V / s; for k triplets a few more than k."""
     C = total(comm, X.T @ X)
     s2, V = on_root(comm, lambda: scipy.linalg.eigh(C))
     s, V = np.sqrt(np.maximum(s2[::-1], 0.0)), V[:, ::-1]
     keep = s > GRAM_FLOOR * s[0]
+    if k is not None:
+        keep[k + k // 2 + 10 :] = False  # the last of those kept are not converged by the Rayleigh-Ritz step
     U = X @ (V[:, keep] / s[keep])
     # U is orthonormal to eps (sigma_1 / sigma_r)^2 only; dividing by its triangle keeps the nested spans
     Q = np.asfortranarray(scipy.linalg.solve_triangular(_triangle(comm, U), U.T, trans="T", check_finite=False).T)
