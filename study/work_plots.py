@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogFormatterSciNotation, LogLocator
+from matplotlib.ticker import Formatter, LogLocator
 
 from reduction.registry import METHODS
 from study.reduce_plots import LOOKS, SPARE
@@ -27,6 +27,19 @@ LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorde
 Value = Callable[[WorkPoint], float]
 
 
+class Between(Formatter):
+    """Labels 2 and 5 between powers of ten, on axes that show at most one power."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """The label of a tick; empty for none."""
+        if self.axis is None or not x > 0:
+            return ""
+        low, high = sorted(self.axis.get_view_interval())
+        powers = np.floor(np.log10(high)) - np.ceil(np.log10(low)) + 1
+        digit = round(x / 10.0 ** np.floor(np.log10(x) + 1e-9))
+        return f"{x:g}" if powers <= 1 and digit in (2, 5) else ""
+
+
 def axes_log(ax: Any, x: str, y: str) -> None:
     """Logarithmic axes with labels and a pale grid."""
     ax.set_xscale("log")
@@ -35,7 +48,7 @@ def axes_log(ax: Any, x: str, y: str) -> None:
     ax.set_ylabel(y)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(LogLocator(numticks=10))
-        axis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.0, 0.4)))  # within a decade only
+        axis.set_minor_formatter(Between())
     ax.grid(color="#e6e6e6", lw=0.5, zorder=0)
     ax.set_axisbelow(True)
 

@@ -67,8 +67,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 # Thousands of small collective calls: minutes on more ranks than cores. Three ranks run their rank-count tests alone.
 CHATTY = {
-    "test_lqr_large", "test_lqr_reduced", "test_study_bench", "test_study_control", "test_study_effects",
-    "test_study_reduce", "test_study_work",
+    "test_lqr_large", "test_lqr_reduced", "test_lqr_second_order", "test_lqr_spectrum", "test_study_bench",
+    "test_study_control", "test_study_effects", "test_study_reduce", "test_study_work", "test_study_work_control",
+    "test_study_work_tolerance",
 }  # fmt: skip
 
 
