@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import dolfinx.fem
-import dolfinx.fem.petsc
 import numpy as np
+import scipy.sparse
 import ufl
+from mpi4py import MPI
 
 from fem.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from fem.errors import MeshError, SceneError
@@ -151,27 +152,39 @@ def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple
         # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
         owned = np.arange(domain.topology.index_map(space.mesh.dimension).size_local, dtype=np.int32)
         whole = ufl.Measure("dx", domain=domain, subdomain_data=[(1, owned)])(1)
-        pattern = dolfinx.fem.petsc.assemble_matrix(dolfinx.fem.form(forms["M_1"](whole)))
-        pattern.assemble()
-        pattern.zeroEntries()
+        pattern = dolfinx.fem.create_matrix(dolfinx.fem.form(forms["M_1"](whole)))
     result = []
     for name, cells in layers.items():
         dx = ufl.dx(domain) if cells is None else ufl.Measure("dx", domain=domain, subdomain_data=[(1, cells)])(1)
         parts = {}
         for key, form in forms.items():
             compiled = dolfinx.fem.form(form(dx))
-            if pattern is None:
-                A = dolfinx.fem.petsc.assemble_matrix(compiled)
-            else:
-                A = pattern.copy()
-                dolfinx.fem.petsc.assemble_matrix(A, compiled)
-            A.assemble()
-            parts[key] = _component(space, A, scene.tissue.thickness)
+            csr = dolfinx.fem.create_matrix(compiled) if pattern is None else pattern
+            parts[key] = _component(space, _assembled(domain.comm, csr, compiled), scene.tissue.thickness)
             inventory.operators.append(f"{key}[{name}]")
         result.append(LayerBlocks(name, **parts))
-    if pattern is not None:
-        pattern.destroy()
     return tuple(result)
+
+
+def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
+    """The form's matrix as PETSc AIJ, with the same bits in every run on the same number of ranks. Collective.
+
+    PETSc adds what other ranks give to a row in the order their messages arrive; DOLFINx's own matrix adds it in the
+    order of the ranks.
+    """
+    csr.set_value(0.0)
+    dolfinx.fem.assemble_matrix(csr, form)
+    csr.scatter_reverse()
+    rows, columns, d = csr.index_map(0), csr.index_map(1), csr.block_size[0]
+    n = rows.size_local
+    used = csr.indptr[n]
+    numbers = columns.local_to_global(csr.indices[:used].astype(np.int32))
+    blocks = csr.data[: used * d * d].reshape(-1, d, d)
+    A = scipy.sparse.bsr_matrix((blocks, numbers, csr.indptr[: n + 1]), shape=(n * d, columns.size_global * d)).tocsr()
+    A.sort_indices()
+    size = ((n * d, rows.size_global * d), (columns.size_local * d, columns.size_global * d))
+    entries = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
+    return PETSc.Mat().createAIJ(size, bsize=d, csr=entries, comm=comm)
 
 
 def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:

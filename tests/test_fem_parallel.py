@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,9 @@ from helpers import (
 from mpi4py import MPI
 
 from fem.build import Model, build
-from fem.run import simulate
+from fem.run import Run, RunOptions, simulate
+from fem.solvers import factor_on_every_rank
+from fem.stepping import make_ts
 
 # relative; both runs carry the rounding of 60 solves with a matrix of condition 1e4
 SAME = 1e-10
@@ -46,6 +49,13 @@ CASES: dict[str, list[dict[str, Any]]] = {
     "p2": [{"tissue": {"order": 2}, "control": OUTPUTS}],
     "everything": [
         {"tissue": {"layers": LAYERS}, "effects": EVERYTHING, "motion": {"drive": "force"}, "control": OUTPUTS}
+    ],
+    "layered damping": [
+        {
+            "tissue": {"layers": LAYERS},
+            "effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}},
+            "control": OUTPUTS,
+        }
     ],
     "3d": [CUBE, {"effects": EVERYTHING | {"gravity": {"g": [0.0, 1.0, -9.0]}}, "time": {"start": "equilibrium"}}],
 }
@@ -70,6 +80,15 @@ def test_blocks_do_not_depend_on_the_ranks(comm: MPI.Intracomm, name: str) -> No
     np.testing.assert_allclose(together.layout.reference, alone.layout.reference, rtol=0, atol=1e-14)
 
 
+def test_assembly_has_the_same_bits_every_time(comm: MPI.Intracomm) -> None:
+    """Nodes where three ranks meet get three contributions, whose order of arrival differs from run to run."""
+    found = set()
+    for _ in range(6):
+        system = build(make_scene({"tissue": {"cells": [20, 40]}}), comm).system
+        found.add(b"".join(A.getValuesCSR()[2].tobytes() for A in (system.K_ee, system.M_ee)))
+    assert max(comm.allgather(len(found))) == 1
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_runs_do_not_depend_on_the_ranks(comm: MPI.Intracomm, name: str) -> None:
     together, alone = both(comm, *CASES[name])
@@ -83,6 +102,20 @@ def test_runs_do_not_depend_on_the_ranks(comm: MPI.Intracomm, name: str) -> None
     assert close(mine[:n], theirs[:n]) < SAME
     assert close(mine[n:], theirs[n:]) < SAME
     assert close(gather_states(together.system.layout, a.final[:, None])[:, 0], mine[:, -1]) == 0
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_energy_does_not_depend_on_the_ranks(comm: MPI.Intracomm, name: str) -> None:
+    """Energy, work and dissipation at the end, from the carried vectors."""
+    found = []
+    for model in both(comm, *CASES[name]):
+        run = Run(model, RunOptions())
+        ts, x = make_ts(run)
+        run.start()
+        run.advance_to(ts, x, 20)
+        found.append(np.array([run.midpoint.energy(run.state), *run.midpoint.balance()]))
+    together, alone = found
+    assert abs(together - alone).max() < SAME * abs(alone).max()
 
 
 @pytest.mark.parametrize("solver", ["cholesky", "mumps", "cg"])
@@ -100,6 +133,18 @@ def test_solvers_agree(comm: MPI.Intracomm, solver: str, changes: list[dict[str,
     assert max(a.residuals) < 1e-12  # ten times the recursive residual of cg; rounding of a direct solve
     assert close(a.q_s, b.q_s) < SAME
     assert close(a.outputs, b.outputs) < SAME
+
+
+def test_reproducible_overrules_what_the_size_says(comm: MPI.Intracomm) -> None:
+    layout = build(make_scene(), comm).system.layout
+    several = comm.size > 1
+    assert factor_on_every_rank(layout, "mumps", "auto") == several
+    assert factor_on_every_rank(layout, "mumps", True) == several
+    assert not factor_on_every_rank(layout, "mumps", False)
+    assert not factor_on_every_rank(layout, "cg", True)
+    large = replace(layout, n_e=10**7)
+    assert not factor_on_every_rank(large, "mumps", "auto")
+    assert factor_on_every_rank(large, "mumps", True) == several
 
 
 def test_layout_covers_every_unknown_once(comm: MPI.Intracomm) -> None:
