@@ -41,22 +41,30 @@ def write_checkpoint(run: Run, directory: Path) -> Path:
             raise CheckpointError(
                 f"{directory}: the restart file cannot be written ({error}); free the disk"
             ) from error
-    if comm.rank == 0:
-        entry = {
-            "format": FORMAT,
-            "scene_hash": scene_hash(run.model.scene),
-            "ranks": comm.size,
-            "step": run.reached,
-            "steps": run.steps,
-        }
+    with agree(comm):
+        if comm.rank == 0:
+            _write_manifest(run, directory, manifest)
+    return manifest
+
+
+def _write_manifest(run: Run, directory: Path, manifest: Path) -> None:
+    """Put the new manifest in place of the old one and remove older states. Rank 0 only."""
+    entry = {
+        "format": FORMAT,
+        "scene_hash": scene_hash(run.model.scene),
+        "ranks": run.layout.comm.size,
+        "step": run.reached,
+        "steps": run.steps,
+    }
+    try:
         fresh = manifest.with_suffix(".new")
         fresh.write_text(json.dumps(entry, indent=2) + "\n")
         fresh.replace(manifest)
-        for old in directory.glob("step*-rank*.h5"):
-            if not old.name.startswith(f"step{run.reached}-"):
-                old.unlink(missing_ok=True)
-    comm.Barrier()
-    return manifest
+    except OSError as error:
+        raise CheckpointError(f"{manifest} cannot be written ({error}); free the disk") from error
+    for old in directory.glob("step*-rank*.h5"):
+        if not old.name.startswith(f"step{run.reached}-"):
+            old.unlink(missing_ok=True)
 
 
 def _write_rank(run: Run, path: Path) -> None:

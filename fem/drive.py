@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from fem.errors import SceneError
 from fem.midpoint import TissueMidpoint, TissueState
 from fem.motion import HandTable
 from fem.petsc import Array, total
@@ -59,7 +60,8 @@ class ForceDrive:
         self, system: BlockSystem, force: Force, midpoint: TissueMidpoint, steps: int, q0: Array, v0: Array
     ) -> None:
         n_s = system.layout.n_s
-        self.system, self.force, self.dt = system, force, midpoint.dt
+        self.system, self.dt = system, midpoint.dt
+        self.force: Force = self._checked(force)
         self.q, self.v = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s))
         self.q[0], self.v[0] = q0, v0
         self.g = np.zeros(n_s) if system.gravity is None else system.gravity
@@ -76,6 +78,19 @@ class ForceDrive:
             self.lhs = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
         self.inverse = np.linalg.inv(self.lhs)
         self.solve = self._two_way if system.two_way else self._one_way  # chosen once, not in every step
+
+    def _checked(self, force: Force) -> Force:
+        """The force, with a look at the shape of its first value. Not collective."""
+        n_s = self.system.layout.n_s
+
+        def first(n: int, t: float, q: Array, v: Array) -> Array:
+            u = np.asarray(force(n, t, q, v), dtype=float)
+            if u.shape != (n_s,):
+                raise SceneError(f"the force has shape {u.shape}; return {n_s} numbers, one per hand degree of freedom")
+            self.force = force
+            return u
+
+        return first
 
     def _one_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One solve. Collective."""

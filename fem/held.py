@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 
+from fem.errors import agree
 from fem.layout import BlockLayout
 from fem.petsc import Array, PETSc
 from fem.system import BlockSystem
@@ -33,6 +35,13 @@ class Held:
     G: Array
     D: PETSc.Mat | None
     M: PETSc.Mat | None
+
+    def agree(self) -> AbstractContextManager[None]:
+        """Guard of a block that is a rank's own affair when it holds everything, and collective otherwise. Collective.
+
+        The block must not communicate by itself.
+        """
+        return agree(self.layout.comm) if self.whole else nullcontext()
 
     def gather(self, local: Array) -> Array:
         """Rows held of a vector given by its owned rows. Collective."""

@@ -1,4 +1,4 @@
-"""Implicit midpoint rule in momentum form: one solve and one product with K a step.
+"""Implicit midpoint rule in momentum form: one solve and one product with K a step (layered damping: K, M and D).
 
 With s = 2/dt, w = z_mid - z_n, momentum pi = M_ee v and l the load at the midpoint,
 
@@ -58,8 +58,8 @@ def state_on(array: Array, system: BlockSystem) -> TissueState:
 class TissueMidpoint:
     """The tissue half of the step, for a load known at the midpoint.
 
-    When every rank holds the whole factor it holds the vectors whole as well, and a step sends no message: all ranks
-    compute the same numbers and each writes its own rows into the state.
+    When every rank holds the whole factor it holds the vectors whole as well, and these calls send no message: all
+    ranks compute the same numbers and each writes its own rows into the state.
 
     Args:
         system: operators.
@@ -86,7 +86,8 @@ class TissueMidpoint:
         self.held = held_operators(system, factor_on_every_rank(system.layout, solver, reproducible))
         self.K, self.G, self.rows = self.held.K, self.held.G, self.held.rows
         S = self.held.matrix(midpoint_matrix(system, dt))
-        self.solver: TissueSolver = make_solver(S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible)
+        with self.held.agree():
+            self.solver: TissueSolver = make_solver(S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible)
         self.r, self.h, self.k, self.w, self.load = (self.K.createVecLeft() for _ in range(5))
         # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
         self.load_array: Array = self.load.array_w
@@ -164,11 +165,12 @@ class TissueMidpoint:
             SolverError: a solve missed its tolerance.
         """
         self.Y = np.empty(self.G.shape, order="F")
-        for j in range(self.Y.shape[1]):
-            self.r.array_w[:] = self.G[:, j]
-            self.solver.solve(self.r, self.w)
-            self.solver.check(self.r, self.w, "the response to the hand")
-            self.Y[:, j] = self.w.array_r
+        with self.held.agree():
+            for j in range(self.Y.shape[1]):
+                self.r.array_w[:] = self.G[:, j]
+                self.solver.solve(self.r, self.w)
+                self.solver.check(self.r, self.w, "the response to the hand")
+                self.Y[:, j] = self.w.array_r
         return np.asarray(self.Y[self.rows])
 
     def accelerate(self, c: Array) -> None:
@@ -195,6 +197,7 @@ class TissueMidpoint:
     def _move_own(self, old: TissueState, new: TissueState) -> PETSc.Vec:
         self.z.axpy(2.0, self.w)
         new.array[: len(self.z_own)] = self.z_own
+        new.z.stateIncrease()
         self._move_velocity(old, new)
         return self.z
 
@@ -251,7 +254,8 @@ class TissueMidpoint:
         # the array, not the vector: it is written through a view, so the norm that PETSc remembers may be an old one
         load = self.load_array[self.rows]
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
-        return self.solver.check(self.r, self.w, where, float(np.sqrt(square)))
+        with self.held.agree():
+            return self.solver.check(self.r, self.w, where, float(np.sqrt(square)))
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Output:
-    """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m].
+    """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m; angles rad].
 
     Attributes:
         name: label in tables and files.
@@ -26,6 +26,7 @@ class Output:
         weight: every listed dof enters with this factor.
         C_s: rigid part, (size, n_s), on every rank.
         point: coordinates [m] of the node, or of the centre of the region.
+        axes: of the components, see :func:`hand_axes`.
     """
 
     name: str
@@ -34,6 +35,26 @@ class Output:
     weight: float
     C_s: Array
     point: tuple[float, ...] = ()
+    axes: tuple[str, ...] = ("x", "y", "z")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One per component: the label and its axis."""
+        return tuple(f"{self.name}_{axis}" for axis in self.axes[: self.size])
+
+
+def hand_axes(n_s: int, dimension: int) -> tuple[str, ...]:
+    """Axes of the hand's degrees of freedom: x, y (z), then the rotations rz in the plane, rx, ry, rz in space.
+
+    Not collective.
+    """
+    turns = ("rz",) if dimension == 2 else ("rx", "ry", "rz")
+    return (*("x", "y", "z")[:dimension], *turns)[:n_s]
+
+
+def unit(name: str, rate: bool = False) -> str:
+    """Unit of a component by the axis that ends its name; of its rate of change on request. Not collective."""
+    return ("rad" if name.replace(".", "_").rsplit("_", 1)[-1].startswith("r") else "m") + ("/s" if rate else "")
 
 
 def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
@@ -49,14 +70,19 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     for i, output in enumerate(wanted):
         name = output.name or f"y{i + 1}"
         if output.kind == "hand":
-            n_s = system.layout.n_s
-            result.append(Output(name, n_s, np.zeros((0, n_s), int), 0.0, np.eye(n_s)))
+            result.append(_hand(system, name))
         elif output.kind == "region":
             result.append(_region(system, name, np.asarray(output.box, dtype=float), i))
         else:
             _inside(system, output.point or [], i)
             result.append(_node(system, name, np.asarray(output.point, dtype=float)))
     return tuple(result)
+
+
+def _hand(system: BlockSystem, name: str) -> Output:
+    n_s = system.layout.n_s
+    none = np.zeros((0, n_s), int)
+    return Output(name, n_s, none, 0.0, np.eye(n_s), axes=hand_axes(n_s, system.layout.dimension))
 
 
 def _node(system: BlockSystem, name: str, point: Array) -> Output:

@@ -6,6 +6,7 @@ import csv
 import json
 import platform
 import resource
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from fem.build import Model
+from fem.outputs import hand_axes, unit
 from fem.run import Trajectory
 from fem.scene_file import resolved_toml, scene_hash
 
@@ -69,20 +71,28 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
     }
 
 
+def trajectory_header(n_s: int, dimension: int, outputs: Sequence[str], velocity: bool) -> list[str]:
+    """Columns of trajectory.csv with their units: time, hand, its velocity on request, outputs. Not collective."""
+    hand = [f"hand_{axis}" for axis in hand_axes(n_s, dimension)]
+    columns = ["t [s]", *(f"{name} [{unit(name)}]" for name in hand)]
+    if velocity:
+        rates = [f"hand_velocity_{axis}" for axis in hand_axes(n_s, dimension)]
+        columns += [f"{name} [{unit(name, rate=True)}]" for name in rates]
+    for name in outputs:
+        column = f"{name} [{unit(name)}]"
+        columns.append(column if column not in columns else f"output_{column}")
+    return columns
+
+
 def write_results(directory: Path, model: Model, run: Trajectory, result: dict[str, Any]) -> list[Path]:
     """Write result.json, trajectory.csv and scene.toml. Rank 0 only."""
     directory.mkdir(parents=True, exist_ok=True)
     table = directory / "trajectory.csv"
-    n_s = run.q_s.shape[1]
-    header = [
-        "t [s]",
-        *(f"hand_{i + 1}" for i in range(n_s)),
-        *(f"hand_velocity_{i + 1}" for i in range(n_s)),
-    ]
+    header = trajectory_header(run.q_s.shape[1], model.system.layout.dimension, run.output_names, velocity=True)
     rows = np.column_stack([run.times, run.q_s, run.v_s, run.outputs])
     with table.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow([*header, *run.output_names])
+        writer.writerow(header)
         writer.writerows([f"{x:.17g}" for x in row] for row in rows)
     scene = directory / "scene.toml"
     scene.write_text(resolved_toml(model.scene))

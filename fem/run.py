@@ -179,7 +179,7 @@ class Run(Stepped):
         y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
         rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
         y += rigid
-        names = tuple(f"{o.name}_{'xyz'[i] if o.size <= 3 else i + 1}" for o in outputs for i in range(o.size))
+        names = tuple(name for o in outputs for name in o.names)
         times = self.end * np.arange(self.steps + 1) / self.steps
         snapshots = self.store.finish(times, self.drive.q, self.drive.v)
         spent = comm.allreduce(self.seconds, MPI.MAX)

@@ -145,6 +145,7 @@ class Hdf5Store(NoStore):
                         f"{self.needed} bytes and {free} are free in {directory}; set output.every to a larger number"
                     )
         self.steps = np.arange(0, steps + 1, every)
+        self.resume = resume
         rows = 2 * layout.n_local
         fit = max(1, BUFFER_BYTES // max(8 * rows, 1))
         self.width = min(layout.comm.allreduce(fit, min), len(self.steps))
@@ -153,18 +154,28 @@ class Hdf5Store(NoStore):
         self.index = {int(s): j for j, s in enumerate(self.steps)}
         self.written = 0
         with agree(layout.comm):
-            self._open(rows, resume)
+            self._open(rows)
 
-    def _open(self, rows: int, resume: bool) -> None:
-        path = self._file(self.system.layout.comm.rank)
+    def _open(self, rows: int) -> None:
+        path, shape = self._file(self.system.layout.comm.rank), (len(self.steps), rows)
+        if not self.resume:
+            try:
+                with h5py.File(path, "w") as file:
+                    file.create_dataset("Z", shape, dtype="f8", chunks=(1, max(rows, 1)))
+                    file.attrs["written"] = 0
+            except OSError as error:
+                raise ResourceError(f"{path} cannot be written ({error}); choose another --out") from error
+            return
         try:
-            with h5py.File(path, "a" if resume else "w") as file:
-                file.require_dataset("Z", (len(self.steps), rows), dtype="f8", chunks=(1, max(rows, 1)))
-        except (OSError, TypeError) as error:
+            with h5py.File(path, "r+") as file:
+                found, self.on_file = file["Z"].shape, int(file.attrs["written"])
+        except (OSError, KeyError) as error:
+            raise CheckpointError(f"{path} cannot be read ({error}); run again without --resume") from error
+        if found != shape:
             raise CheckpointError(
-                f"{path} does not fit this run ({error}); resume with the same scene and rank count, or run again "
-                "without --resume"
-            ) from error
+                f"{path} holds {found} numbers, this run needs {shape}; resume with the same scene and rank count, or "
+                "run again without --resume"
+            )
 
     def _file(self, rank: int) -> Path:
         return self.directory / f"snapshots-rank{rank}.h5"
@@ -180,17 +191,32 @@ class Hdf5Store(NoStore):
         return int(self.steps[j]) if j < len(self.steps) else 2**62
 
     def flush(self, step: int) -> None:
-        """Append the filled slots to this rank's file."""
+        """Append the filled slots to this rank's file. Collective."""
         end = int(np.searchsorted(self.steps, step, side="right"))
+        path = self._file(self.system.layout.comm.rank)
         if end > self.written:
-            with h5py.File(self._file(self.system.layout.comm.rank), "a") as file:
-                for j in range(self.written, end):
-                    file["Z"][j] = self.buffer[:, j % self.width]
+            with agree(self.system.layout.comm):
+                try:
+                    with h5py.File(path, "r+") as file:
+                        for j in range(self.written, end):
+                            file["Z"][j] = self.buffer[:, j % self.width]
+                        file.attrs["written"] = end
+                except OSError as error:
+                    raise ResourceError(f"{path} cannot be written ({error}); free the disk") from error
             self.written = end
 
     def restore(self, columns: Array, step: int) -> None:
-        """Go on behind what is already in the file."""
+        """Go on behind what is already in the file.
+
+        Raises:
+            CheckpointError: the file holds less.
+        """
         self.written = int(np.searchsorted(self.steps, step, side="right"))
+        if self.on_file < self.written:
+            path = self._file(self.system.layout.comm.rank)
+            raise CheckpointError(
+                f"{path} holds {self.on_file} snapshots, step {step} needs {self.written}; run again without --resume"
+            )
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
         """Write ``snapshots.h5`` over the rank files. Collective."""

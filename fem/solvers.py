@@ -151,7 +151,7 @@ def make_solver(
 
     Args:
         S: symmetric positive definite, owned by the solver from here on.
-        name: cholesky (PETSc, every rank by itself), mumps (distributed) or cg (GAMG [VMB96]).
+        name: cholesky (PETSc, every rank by itself), mumps (see ``reproducible``) or cg (GAMG [VMB96]).
         layout: sizes and node coordinates.
         prefix: PETSc options prefix.
         rtol: relative tolerance of cg.

@@ -82,6 +82,8 @@ class Stepped(ABC):
             cause = error.__cause__
             if cause is not None and not isinstance(cause, SoftgraspError):
                 raise cause from error  # a bug, perhaps on this rank alone: the command must end all ranks
+            if cause is None and self.midpoint.held.whole and self.layout.comm.size > 1:
+                raise  # of this rank alone, while the others step on: the command must end all ranks
             text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
             raise SolverError(f"step {self.reached + 1} of {self.steps}: {text}") from error
         if self.reached != step:

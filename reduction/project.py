@@ -21,8 +21,8 @@ class OutputLike(Protocol):
     """What an output needs to be projected; :class:`fem.outputs.Output` has it."""
 
     @property
-    def name(self) -> str:
-        """Label."""
+    def names(self) -> tuple[str, ...]:
+        """One label per component."""
 
     @property
     def size(self) -> int:
@@ -105,5 +105,5 @@ def project_outputs(outputs: Sequence[OutputLike], lift: Lift) -> Outputs:
     local = np.concatenate(rows) if rows else np.zeros((0, N))
     C_z = lift.layout.comm.bcast(total(lift.layout.comm, local))
     C_s = np.vstack([o.C_s for o in outputs]) if rows else np.zeros((0, n_s))
-    names = tuple(f"{o.name}_{'xyz'[i] if o.size <= 3 else i + 1}" for o in outputs for i in range(o.size))
+    names = tuple(name for o in outputs for name in o.names)
     return Outputs(C_z, C_s, names)

@@ -194,6 +194,14 @@ def hardcases(
     raise typer.Exit(0 if result["ok"] else 1)
 
 
+def _end_all(comm: MPI.Intracomm) -> None:
+    """End the other ranks, which may wait for this one. Not collective."""
+    sys.stderr.flush()
+    if comm.size > 1:
+        time.sleep(0.5)  # the launcher must have passed the text on before it ends
+        comm.Abort(1)
+
+
 def main() -> None:
     """Entry point: one sentence and status 1 for a user's error; a bug on one rank ends all ranks."""
     comm = MPI.COMM_WORLD
@@ -205,12 +213,14 @@ def main() -> None:
         sys.exit(1)
     except (SystemExit, KeyboardInterrupt):
         raise
+    except OSError as error:  # a folder that cannot be made, a full disk: of one rank, so it must end all
+        name = f"{error.filename}: " if error.filename else ""
+        sys.stderr.write(f"error: {name}{error.strerror or error}; check --out, its permissions and the free disk\n")
+        _end_all(comm)
+        sys.exit(1)
     except BaseException:
         traceback.print_exc()
-        sys.stderr.flush()
-        if comm.size > 1:
-            time.sleep(0.5)  # the launcher must have passed the text on before it ends
-            comm.Abort(1)
+        _end_all(comm)
         sys.exit(2)
 
 

@@ -9,7 +9,6 @@ from fem.errors import SceneError
 from fem.outputs import make_outputs
 from fem.petsc import Array
 from lqr.problem import RiccatiProblem
-from study.outputs_named import component
 
 
 def weight(value: float | list[list[float]], size: int, key: str) -> Array:
@@ -48,7 +47,7 @@ def make_problem(model: Model) -> RiccatiProblem:
         for c in range(output.size):
             # every listed dof enters with the weight of the output; a dof is listed once
             C_z[output.dofs[:, c], first + c] = output.weight
-            names.append(f"{output.name}.{component(c, system.layout.dimension)}")
+            names.append(f"{output.name}.{output.axes[c]}")
         first += output.size
     control = scene.control
     Q = weight(1.0 if control is None else control.Q, p, "control.Q")

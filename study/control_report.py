@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from fem.build import Model, Stopwatch
-from fem.results import package_version, peak_memory_mb
+from fem.outputs import hand_axes
+from fem.results import package_version, peak_memory_mb, trajectory_header
 from fem.scene_file import resolved_toml, scene_hash
 from lqr.closed_loop import LoopTrajectory
 from lqr.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
@@ -291,8 +292,9 @@ def write_tables(out: Path, found: Found) -> list[Path]:
     full, files = found.runs.full, []
     inputs = np.vstack([full.inputs, full.inputs[-1:]])
     n_s = full.q_s.shape[1]
-    names = ["t [s]", *(f"hand_{i + 1}" for i in range(n_s)), *full.output_names]
-    names += [*(f"u_{i + 1}" for i in range(n_s)), "cost"]
+    names = trajectory_header(n_s, found.design.problem.layout.dimension, full.output_names, velocity=False)
+    forces = hand_axes(n_s, found.design.problem.layout.dimension)
+    names += [*(f"u_{axis} [{'N m' if axis.startswith('r') else 'N'}]" for axis in forces), "cost"]
     data = np.column_stack([full.times, full.q_s, full.outputs, inputs, full.cost])
     tables: dict[str, tuple[Sequence[str], list[Row]]] = {"trajectory.csv": (names, [tuple(row) for row in data])}
     if found.swept:

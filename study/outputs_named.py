@@ -13,13 +13,6 @@ AXES = ("x", "y", "z")
 TURNS = ("rx", "ry", "rz")
 
 
-def component(number: int, dimension: int) -> str:
-    """Axis of the hand's degree of freedom: x, y, z, then rx, ry, rz; in the plane the only rotation is rz."""
-    if number < dimension:
-        return AXES[number]
-    return TURNS[number - dimension] if dimension == 3 else TURNS[2]
-
-
 def turns(names: Sequence[str]) -> list[int]:
     """Numbers of the outputs that are rotations [rad]."""
     return [i for i, name in enumerate(names) if _split(name)[1] in TURNS]

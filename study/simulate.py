@@ -15,6 +15,7 @@ from rich.table import Table
 
 from fem.build import build
 from fem.effects import EFFECTS
+from fem.outputs import unit
 from fem.results import simulate_result, write_results
 from fem.run import Run, RunOptions, simulate
 from fem.scene import Scene
@@ -80,7 +81,8 @@ def result_rows(result: dict[str, Any]) -> Rows:
     seconds = result["time"]
     rows = [("hand at the end", "(" + ", ".join(f"{v:.6g}" for v in result["hand_final"]) + ")")]
     rows += [
-        (name, f"{value:.6g} m") for name, value in zip(result["output_names"], result["output_final"], strict=True)
+        (name, f"{value:.6g} {unit(name)}")
+        for name, value in zip(result["output_names"], result["output_final"], strict=True)
     ]
     return [
         *rows,

@@ -40,7 +40,8 @@ def figure_traces(
         Names of PNG and PDF.
     """
     d = dimension or min(q_s.shape[1], 3)
-    axes_of = ["xyz".find(name.rsplit("_", 1)[-1][-1:]) for name in names]
+    ends = [name.rsplit("_", 1)[-1] for name in names]
+    axes_of = ["xyz".find(end) if len(end) == 1 else -1 for end in ends]  # rotations have a panel of their own
     shown = [i for i, axis in enumerate(axes_of) if 0 <= axis < d]
     moving = np.stack([q_s[:, axes_of[i]] for i in shown], axis=1) if rigid is None else rigid[:, shown]
     relative = outputs[:, shown] - moving

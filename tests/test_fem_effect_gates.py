@@ -58,6 +58,9 @@ def test_gravity() -> None:
     off = EFFECTS["gravity"].gate(problem_of(scene_of()))
     assert off.number == pytest.approx(9.81 * 2 / 125, rel=4 * EPS)  # a handful of roundings
     assert off.sentence.startswith("Off")
+    layers = (LayerMaterial(50.0, 50.0, 1.0), LayerMaterial(500.0, 500.0, 1.0))
+    both = EFFECTS["gravity"].gate(problem_of(scene_of(), materials=layers))
+    assert both.number == off.number  # the softest layer decides
 
 
 def test_damping() -> None:
