@@ -119,7 +119,7 @@ def _inside(system: BlockSystem, point: list[float], i: int) -> None:
     if (p < low - slack).any() or (p > high + slack).any():
         raise SceneError(
             f"control.outputs[{i}].point = {list(point)} lies outside the body, which spans "
-            f"{np.round(low, 6).tolist()} to {np.round(high, 6).tolist()} m"
+            f"{(np.round(low, 6) + 0.0).tolist()} to {(np.round(high, 6) + 0.0).tolist()} m"  # + 0: no -0.0
         )
 
 

@@ -330,7 +330,7 @@ def write_all(
         subtitle=model.scene.description,
         sections=sections(found, result, figures, control_text(model.scene)),
         scene=resolved_toml(model.scene),
-        reproduce=f"{launch}softgrasp control {shlex.quote(path.name)}{sets}",
+        reproduce=f"{launch}softgrasp control {shlex.quote(str(path))}{sets}",
     )
     numbers = out / "result.json"
     numbers.write_text(json.dumps(plain(result), indent=2) + "\n")

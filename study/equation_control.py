@@ -15,14 +15,14 @@ FEEDBACK = """controlled by:
   output: y = C x
   cost:   J = int <y - y_target, Q (y - y_target)> + <u, R u> dt
   Riccati: A^T P E + E^T P A - E^T P B R^-1 B^T P E + C^T Q C = 0
-  gain:   u = K (x - x_target), K = -R^-1 B^T P E
+  gain:   u = u_target + K (x - x_target), K = -R^-1 B^T P E
 """
 
 
 def control_text(scene: Scene) -> str:
     """The scene's equation with a force on the hand, then cost, Riccati equation and gain. Not collective.
 
-    Weight and other steady loads shift the state of rest only, so the feedback does not hold them.
+    u_target holds the body at rest at the target: the hand's weight, else nothing.
     """
     free = scene.model_copy(update={"motion": scene.motion.model_copy(update={"drive": "force", "profile": "hold"})})
     plant, with_, symbols = equation_text(equation(free)).partition("with:\n")

@@ -265,6 +265,21 @@ def _print(console: Console, title: str, header: Sequence[str], rows: Sequence[S
 # --- report
 
 
+def _sizes(study: WorkStudy) -> list[tuple[str, Any]]:
+    """The scene's own mesh and steps, and the span of what was tried. Rank 0 only."""
+    tissue, time = study.scene.tissue, study.scene.time
+    rows: list[tuple[str, Any]] = [
+        ("cells", " x ".join(str(n) for n in tissue.cells) if tissue.cells else tissue.mesh),
+        ("element", f"P{tissue.order}"),
+        ("steps", f"{time.steps} to {study.scene.time_end:.6g} s"),
+        ("layers", len(tissue.layers)),
+    ]
+    tried = sorted({int(p.details["n_e"]) for p in study.points.get("forward", ()) if p.details.get("n_e")})
+    if tried:
+        rows.append(("tissue n_e, settings tried", f"{tried[0]} to {tried[-1]}"))
+    return [row for row in rows if row[1]]
+
+
 def _report(
     study: WorkStudy,
     result: dict[str, Any],
@@ -278,6 +293,7 @@ def _report(
     sections = [Section("Answer", text="\n\n".join(a.sentences)) for a in study.answers]
     if study.reference is not None:
         sections.append(Section("Reference", text=study.reference.note, rows=_reference_rows(study.reference)))
+    sections.append(Section("Size", rows=_sizes(study)))
     tables: dict[str, tuple[Sequence[str], list[tuple[Any, ...]]]] = {
         "forward": (FORWARD_HEADER, forward_rows(study.points.get("forward", ()))),
         "reduced": (REDUCED_HEADER, reduced_rows(study.points.get("reduced", ()))),
@@ -315,7 +331,7 @@ def _report(
         subtitle=study.scene.description,
         sections=sections,
         scene=resolved_toml(study.scene),
-        reproduce=f"{launch}softgrasp study {shlex.quote(path.name)}{sets}",
+        reproduce=f"{launch}softgrasp study {shlex.quote(str(path))}{sets}",
     )
 
 

@@ -25,7 +25,7 @@ from reduction.registry import METHODS
 from reduction.states import States
 from study.reduce_reference import Reference as FullRun
 from study.reduce_reference import prepare, reference
-from study.reduce_sweep import Point, bases_of, chosen_methods, measure, sizes_for
+from study.reduce_sweep import Point, bases_of, chosen_methods, comparison_of, measure, sizes_for
 from study.wp_fit import Slope, power_law
 from study.wp_full import FullRuns, Series, errors_of
 from study.wp_points import Row, Setting, WorkPoint, number, scene_setting
@@ -77,10 +77,9 @@ class ReducedRuns:
             found = sizes_for(METHODS[name], model.system.layout.n_s, wanted.N)
             bases, _ = bases_of(name, states, found, wanted, refused)
             outputs, key = make_outputs(model.scene, model.system), scene_hash(model.scene)
-            rows = []
-            for basis in bases:
-                reduced = project(basis, model.system, outputs, key)
-                rows.append(_measured(reduced, measure(reduced, against), against, probe))
+            models = [project(basis, model.system, outputs, key) for basis in bases]
+            shared = comparison_of(models[-1], against) if models else None  # the largest holds the others
+            rows = [_measured(m, measure(m, against, shared), against, probe) for m in models]
             return {"rows": rows, "refused": {str(k): v for k, v in refused.items()}}
 
         return list(self.runs.cache.get("reduced", key, sweep)["rows"])

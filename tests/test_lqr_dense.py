@@ -179,7 +179,7 @@ def test_random_with_descriptor_against_scipy(seed: int) -> None:
 
 
 def triple_chain(k: int, alpha: float, beta: float) -> tuple[Array, Array, Array, Array]:
-    """Three chains of k masses tied to one more (Truhar and Veselic 2009): E, A, B, C."""
+    """Three chains of k masses tied to one more [TV09]: E, A, B, C."""
     n = 3 * k + 1
     M = np.diag(np.repeat([1.0, 2.0, 3.0, 10.0], [k, k, k, 1]))
     stiffness = [10.0, 20.0, 1.0]

@@ -75,7 +75,7 @@ def distributed(A: sp.csr_matrix) -> PETSc.Mat:
 
 
 def triple_chain(n_1: int, alpha: float, beta: float, viscosity: float) -> Example:
-    """Three chains of n_1 masses tied to one end mass (Truhar and Veselic 2009), forced and seen everywhere."""
+    """Three chains of n_1 masses tied to one end mass [TV09], forced and seen everywhere."""
     masses, springs, m_0, k_0 = (1.0, 2.0, 3.0), (10.0, 20.0, 1.0), 10.0, 50.0
     n = 3 * n_1 + 1
     M = sp.diags(np.append(np.repeat(masses, n_1), m_0)).tocsr()
