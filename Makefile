@@ -38,8 +38,12 @@ bench: $(STAMP) ## print the table of costs of the forward run
 paper: $(STAMP) ## every figure and table of the paper, and a page that compares
 	$(BIN)/python -m study.paper --out out/paper
 
-pictures: demo ## make the README's picture again
+pictures: demo ## make the README's pictures again
 	cp out/move.png docs/paper_forward.png
+	$(BIN)/softgrasp reduce demos/scenes/paper_forward.toml --out out/reduce
+	cp out/reduce/errors.png docs/reduce_errors.png
+	$(BIN)/softgrasp control demos/scenes/paper_lqr.toml --out out/control
+	cp out/control/errors.png docs/control_errors.png
 
 clean: ## remove .venv, out and caches
 	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache
