@@ -65,10 +65,13 @@ def pytest_configure(config: pytest.Config) -> None:
         reporter._tw._file = open(os.devnull, "w")  # noqa: SIM115  (lives as long as the process)
 
 
-# Thousands of small collective calls: minutes on more ranks than cores. Three ranks run their rank-count tests alone.
+# Thousands of small collective calls: minutes on more ranks than cores. Three ranks run their tests of ranks alone.
 CHATTY = {
-    "test_lqr_large", "test_lqr_reduced", "test_lqr_second_order", "test_lqr_spectrum", "test_study_bench",
-    "test_study_control", "test_study_effects", "test_study_reduce", "test_study_work", "test_study_work_control",
+    "test_fem_effects", "test_fem_effect_gates", "test_lqr_large", "test_lqr_reduced",
+    "test_lqr_second_order", "test_lqr_spectrum", "test_reduction_model", "test_reduction_online",
+    "test_reduction_pymor", "test_reduction_snapshots", "test_study_bench", "test_study_cli",
+    "test_study_control", "test_study_effects", "test_study_explain", "test_study_hardcases", "test_study_loop_plots",
+    "test_study_plots", "test_study_reduce", "test_study_report", "test_study_work", "test_study_work_control",
     "test_study_work_tolerance",
 }  # fmt: skip
 
@@ -77,7 +80,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if OWN.size > 1 and item.get_closest_marker("serial"):
             item.add_marker(pytest.mark.skip(reason="runs on one rank only"))
-        elif OWN.size > 2 and item.path.stem in CHATTY and "rank_count" not in item.name:
+        elif OWN.size > 2 and item.path.stem in CHATTY and "rank" not in item.name.partition("[")[0]:
             item.add_marker(pytest.mark.skip(reason="runs on one and two ranks"))
 
 
