@@ -125,7 +125,7 @@ class GatheredTissue:
         self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(2)]
         self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
         self.helper: ThreadPoolExecutor | None = None
-        self.next: tuple[complex, Future[scipy.sparse.linalg.SuperLU]] | None = None
+        self.next: list[tuple[complex, Future[scipy.sparse.linalg.SuperLU]]] = []
         if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and _cores() > 1:
             self.helper = ThreadPoolExecutor(1)
         self.seconds = {"factor": 0.0, "solve": 0.0}
@@ -158,7 +158,8 @@ class GatheredTissue:
         return self.shells[0]
 
     def _factor(self, p: complex) -> scipy.sparse.linalg.SuperLU:
-        return self._decompose(p, self._matrix(p if p.imag else p.real))
+        S = self._matrix(p if p.imag else p.real)
+        return self._decompose(p, S) if self.helper is None else self.helper.submit(self._decompose, p, S).result()
 
     @staticmethod
     def _decompose(p: complex, S: scipy.sparse.csc_matrix) -> scipy.sparse.linalg.SuperLU:
@@ -170,11 +171,13 @@ class GatheredTissue:
     def _prepare(self, shifts: Sequence[complex]) -> None:
         """Factor up to one shift a rank. Collective."""
         wanted = list(dict.fromkeys(shifts))[: self.comm.size]
-        self.cache = {p: (rank, None) for rank, p in enumerate(wanted)}
         if self.comm.size == 1:
-            self.cache[wanted[0]] = (0, self._taken(wanted[0]))
+            lu = self._taken(wanted[0])
+            self._forget()
+            self.cache[wanted[0]] = (0, lu)
             self._send_ahead(shifts[1:2])
         else:
+            self.cache = {p: (rank, None) for rank, p in enumerate(wanted)}
             with agree(self.comm):
                 if self.comm.rank < len(wanted):
                     p = wanted[self.comm.rank]
@@ -183,20 +186,26 @@ class GatheredTissue:
 
     def _taken(self, p: complex) -> scipy.sparse.linalg.SuperLU:
         """The factor that the other core has made, or one made here."""
-        if self.next is None:
-            return self._factor(p)
-        (guess, future), self.next = self.next, None
-        if guess == p:
-            return future.result()
-        wait([future])  # it reads a shell
+        stale, self.next = self.next, []
+        if stale and stale[0][0] == p:
+            return stale[0][1].result()
+        if stale and self.helper is not None:
+            wait([stale[0][1]])  # it reads a shell
+            self.helper.submit(stale.clear)
         return self._factor(p)
+
+    def _forget(self) -> None:
+        """Let the factors go, in the thread that made them: SciPy frees the memory of a factor in no other."""
+        old, self.cache = self.cache, {}
+        if self.helper is not None:
+            self.helper.submit(old.clear)
 
     def _send_ahead(self, shifts: Sequence[complex]) -> None:
         """Start the next factor on the other core."""
         if self.helper is not None and shifts:
             p = shifts[0]
             S = self._matrix(p if p.imag else p.real)
-            self.next = (p, self.helper.submit(self._decompose, p, S))
+            self.next = [(p, self.helper.submit(self._decompose, p, S))]
 
     def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
         """Local rows of S(p)^{-1} F, (n_local, k); complex even where p is real. Collective.
@@ -240,9 +249,9 @@ class GatheredTissue:
 
     def destroy(self) -> None:
         """Free the factors. Not collective."""
-        self.cache.clear()
-        self.next = None
+        self._forget()
         if self.helper is not None:
+            self.helper.submit(self.next.clear)
             self.helper.shutdown()
 
 
