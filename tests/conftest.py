@@ -84,6 +84,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="runs on one and two ranks"))
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """What the imports made stays: without it the collection after each test looks through it every time."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def _collect_petsc_objects() -> Iterator[None]:
     """Free collective objects at the same place on all ranks, after each test."""
