@@ -13,6 +13,7 @@ from petsc4py import PETSc as PETSc
 from fem import _stack as _stack
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
 
 

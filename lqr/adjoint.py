@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fem.petsc import Array, total
+from fem.petsc import Array, Complex, total
 from lqr.plant import Block, Plant
-from lqr.shifted import Complex, ShiftedTissue
+from lqr.shifted import ShiftedTissue
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
-from fem.petsc import Array
+from fem.petsc import Array, Complex
 from lqr.checks import EPS, ControlError, check_finite, check_weights, square_root
 
-Complex = NDArray[np.complex128]
 NEWTON_STEPS = 6  # two are enough after a Schur form; more means that nothing is gained any more
 PBH_LIMIT = 12  # eigenvalues that are examined one by one, each by an SVD of order n
 

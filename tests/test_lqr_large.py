@@ -4,94 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 from mpi4py import MPI
 
 from fem.build import build
 from fem.errors import CheckpointError, ResourceError, SolverError
-from fem.petsc import Array, total
-from fem.scene_file import load_scene
-from fem.system import BlockSystem
-from lqr.adjoint import closed_adjoint, make_right
 from lqr.checks import ControlError
-from lqr.dense import DenseRiccati, relative_space
-from lqr.galerkin import StructuredGalerkin, frequencies
-from lqr.line_search import best_step, mixed_residual
-from lqr.modal_start import modal_start
+from lqr.dense import DenseRiccati
+from lqr.galerkin import StructuredGalerkin
 from lqr.newton import NewtonADI
-from lqr.plant import Block, Plant
-from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.radi import RADI
-from lqr.shifted import GatheredTissue, factor_bytes, make_shifted
-from lqr.shifts import ShiftRange, choose_shifts, energy_products, ritz_pairs
+from lqr.shifted import factor_bytes, make_shifted
 from lqr.solve import choose, solve
 from study.control_problem import make_problem
-from tests.helpers import CUBE, LAYERS, gather_matrix, gather_rows, local_rows, make_scene
-
-SCENE = Path(__file__).parents[1] / "demos" / "scenes" / "paper_lqr.toml"
-NODE = {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}
-KELVIN = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.003}}, "control": NODE}
-DRAG = {"effects": {"damping": {"kind": "rayleigh", "alpha": 0.05, "beta": 0.003, "drag": "space"}}}
-REGION = [{"kind": "region", "box": [[0.0, 0.0], [0.6, 0.6]]}, {"kind": "hand"}]
-CUBE_NODE = {"control": {"outputs": [{"kind": "node", "point": [0.9, 0.7, 0.1]}]}}
-CASES: dict[str, tuple[dict[str, Any], ...]] = {
-    "one_way": (KELVIN,),
-    "two_way": (KELVIN, {"effects": {"reaction": True}}),
-    "drag_in_space": (KELVIN, DRAG),
-    "two_way_drag_in_space": (KELVIN, DRAG, {"effects": {"reaction": True}}),
-    "layers": (KELVIN, {"tissue": {"layers": LAYERS}}),
-    "cube": (CUBE, KELVIN, CUBE_NODE),
-    "cube_two_way": (CUBE, KELVIN, CUBE_NODE, {"effects": {"reaction": True}}),
-    "region_hand_weights": (
-        KELVIN,
-        {"control": {"outputs": REGION, "Q": np.diag([9.0, 1.0, 4.0, 0.0]).tolist(), "R": [[2.0, 0.5], [0.5, 1.0]]}},
-    ),
-}
-
-
-@cache
-def problem_of(name: str) -> RiccatiProblem:
-    return make_problem(build(make_scene(*CASES[name]), MPI.COMM_WORLD))
-
-
-@cache
-def oracle(name: str) -> RiccatiSolution:
-    return DenseRiccati().solve(problem_of(name))
-
-
-@cache
-def paper(*changes: str) -> RiccatiProblem:
-    return make_problem(build(load_scene(SCENE, ["tissue.cells=[5,10]", *changes]), MPI.COMM_WORLD))
-
-
-def gain(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
-    """The gain in node order, (2n, m), on every rank."""
-    layout = problem.layout
-    return np.vstack([solution.K_s.T, gather_rows(layout, solution.K_z), gather_rows(layout, solution.K_v)])
-
-
-def gain_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSolution) -> float:
-    a, b = gain(problem, ours), gain(problem, theirs)
-    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
-
-
-def factor(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
-    """Z in node order, on every rank."""
-    layout = problem.layout
-    return np.vstack([solution.Z_s, gather_rows(layout, solution.Z_z), gather_rows(layout, solution.Z_v)])
-
-
-def x_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSolution) -> float:
-    a, b = factor(problem, ours), factor(problem, theirs)
-    return float(np.linalg.norm(a @ a.T - b @ b.T, 2) / np.linalg.norm(b @ b.T, 2))
-
+from tests.helpers import make_scene
+from tests.riccati_helpers import CASES, NODE, gain, gain_error, oracle, paper, problem_of, x_error
 
 # --- the solution
 
@@ -297,160 +228,3 @@ def test_choice_names_its_reason() -> None:
     assert "(chosen: asked for)" in solve(small, "galerkin").method
     with pytest.raises(SolverError, match="unknown"):
         solve(small, "magic")  # type: ignore[arg-type]
-
-
-# --- the parts
-
-
-@pytest.mark.parametrize("name", ["one_way", "two_way_drag_in_space", "layers"])
-@pytest.mark.parametrize("tissue", ["gathered", "distributed"])
-def test_shifted_adjoint_solve_is_the_dense_one(name: str, tissue: str) -> None:
-    problem = problem_of(name)
-    plant, layout = Plant(problem), problem.layout
-    space = relative_space(problem)
-    space = layout.comm.bcast(space)
-    rng = np.random.default_rng(3)
-    full = rng.standard_normal((layout.states, 3))
-    n, s = layout.n_local, layout.n_s
-    own = slice(2 * s + layout.start, 2 * s + layout.start + n)
-    below = slice(own.start + layout.n_e, own.stop + layout.n_e)
-    local = Block(full[: 2 * s], np.vstack([full[own], full[below]]))
-    solver = make_shifted(plant.system, tissue)
-    right = make_right(plant, solver, local)
-    W_full, K_full = full[:, :1], full[:, 1:].T
-    for p in (-0.7, -0.3 + 4.0j, -2.0 + 30.0j):
-        V = closed_adjoint(plant, solver, p, right[:1], right[1:])
-        B = space.B @ plant.B
-        dense = np.linalg.solve((space.A - B @ K_full + p * space.E).T, W_full)
-        stiff = plant.stiff(np.hstack([V.tall[:n].real, V.tall[:n].imag]))
-        ours = np.vstack([V.hand, stiff[:, :1] + 1j * stiff[:, 1:], V.tall[n:]])
-        theirs = np.vstack([dense[: 2 * s], dense[own], dense[below]])
-        scale = np.abs(dense).max()
-        assert np.abs(ours - theirs).max() < 1e-9 * scale  # condition of the dense matrix times rounding
-    solver.destroy()
-
-
-def test_modal_start_stabilises_and_leaves_other_modes_alone() -> None:
-    for name in ("one_way", "two_way"):
-        problem = problem_of(name)
-        plant, layout = Plant(problem), problem.layout
-        start = modal_start(plant, 5)
-        n = layout.n_local
-        K = np.vstack(
-            [start.gain.hand, gather_rows(layout, start.gain.tall[:n]), gather_rows(layout, start.gain.tall[n:])]
-        )
-        space = layout.comm.bcast(relative_space(problem))
-        E, A, B = (ordered(problem, M) for M in (space.E, space.A, space.B @ plant.B))
-        closed = np.linalg.eigvals(np.linalg.solve(E, A - B @ K.T))
-        free = np.linalg.eigvals(np.linalg.solve(E, A))
-        assert closed.real.max() < 0
-        distance = np.abs(closed[:, None] - free[None, :]).min(axis=1)
-        # 5 pairs and the hand's 4 poles move, the rest stays to rounding of the eigenvalues
-        assert (distance < 1e-5 * np.abs(closed)).sum() >= layout.states - 14
-
-
-def ordered(problem: RiccatiProblem, M: Array) -> Array:
-    """Dense rows (and columns) in global numbering to node order."""
-    layout = problem.layout
-    numbers = gather_rows(layout, np.arange(layout.start, layout.start + layout.n_local, dtype=float)[:, None])
-    at = numbers[:, 0].astype(int)
-    s, n_e = 2 * layout.n_s, layout.n_e
-    index = np.concatenate([np.arange(s), s + at, s + n_e + at])
-    return M[index][:, index] if M.shape[1] == len(index) else M[index]
-
-
-def test_ritz_values_of_the_open_plant_are_stable_and_true() -> None:
-    problem = problem_of("one_way")
-    plant, layout = Plant(problem), problem.layout
-    rng = np.random.default_rng(5)
-    tall = rng.standard_normal((2 * layout.n_e, 10))
-    local = np.vstack([local_rows(layout, tall[: layout.n_e]), local_rows(layout, tall[layout.n_e :])])
-    V = Block(np.zeros((2 * layout.n_s, 10)), local)
-    values, sizes = ritz_pairs(plant, V, V[:2], None)
-    assert (values.real < 0).all()  # dissipation in the energy product
-    assert sizes.shape == values.shape
-    # with feedback, against the products written out
-    W, gain = Block(V.hand[:, :2], np.sin(V.tall[:, :2])), Block(np.ones((2 * layout.n_s, 2)), np.cos(V.tall[:, 2:4]))
-    F, G, seen, felt = energy_products(plant, V, W, gain)
-    E_V, A_V = plant.mass_adjoint(V), plant.plant_adjoint(V)
-    test = np.vstack([V.hand[: layout.n_s], np.linalg.solve(plant.M_s, E_V.hand[layout.n_s :])])
-    for ours, X in ((F, A_V), (G, E_V), (seen, W), (felt, gain)):
-        direct = total(layout.comm, V.tall.T @ X.tall) + test.T @ X.hand
-        assert np.allclose(ours, direct, rtol=0, atol=1e-12 * np.abs(direct).max())  # rounding
-    # span of whole state blocks of one eigenvector: its Ritz value is the eigenvalue
-    start = modal_start(plant, 3)
-    phi, omega = start.small.V[:, :1], start.small.omega[0]
-    pair = np.zeros((2 * layout.n_local, 2))
-    pair[: layout.n_local, :1], pair[layout.n_local :, 1:] = phi, phi
-    hand = np.zeros((4, 2))
-    hand[2:, 1:] = -np.linalg.solve(plant.M_s, total(layout.comm, plant.G.T @ phi))  # E'V has no row of the hand
-    found, _ = ritz_pairs(plant, Block(hand, pair), Block(hand, pair), None)
-    assert np.allclose(found.real, -0.003 * omega**2 / 2, rtol=1e-6)
-    assert np.allclose(np.abs(found), omega, rtol=1e-6)
-
-
-def test_clip_and_choice_of_shifts() -> None:
-    limits = ShiftRange(0.01, 100.0, 50.0)
-    assert limits.clip(-5.6e-11 + 0j) == -0.01  # the spurious Ritz value of the hand's zero poles
-    assert abs(limits.clip(-1e4 + 1e4j)) == pytest.approx(100.0)
-    assert limits.clip(2.0 - 3.0j) == pytest.approx(-2.0 + 3.0j)
-    assert limits.clip(-0.0 + 5.0j).real < 0
-    candidates = np.array([-1.0 + 0j, -1.0 + 10j, -1.0 + 20j])
-    chosen = choose_shifts(candidates, np.array([1.0, 5.0, 3.0]), 3)
-    assert chosen[0] == candidates[1]
-    assert set(chosen) == set(candidates.tolist())
-
-
-def test_line_search_finds_the_minimum_of_the_dense_residual(comm: MPI.Intracomm) -> None:
-    rng = np.random.default_rng(9)
-    U, W, change = (rng.standard_normal((12, k)) * f for k, f in ((3, 1.0), (2, 0.3), (2, 2.0)))
-    signs = np.array([1.0, 1.0, -1.0])
-    mine = slice(12 * comm.rank // comm.size, 12 * (comm.rank + 1) // comm.size)
-    blocks = [Block(np.zeros((0, X.shape[1])), X[mine]) for X in (U, W, change)]
-    t, before, after = best_step(comm, (blocks[0], signs), blocks[1], blocks[2])
-
-    def residual(step: float) -> float:
-        R = (1 - step) * (U * signs) @ U.T + step * W @ W.T - step**2 * change @ change.T
-        return float(np.linalg.norm(R))
-
-    grid = np.linspace(0.01, 1, 2000)
-    assert residual(t) <= min(residual(s) for s in grid) * (1 + 1e-9)
-    assert (before, after) == (pytest.approx(residual(0.0)), pytest.approx(residual(1.0)))
-    mixed, weights = mixed_residual((blocks[0], signs), blocks[1], blocks[2], t)
-    whole = np.vstack(comm.allgather(mixed.tall))
-    assert np.linalg.norm((whole * weights) @ whole.T) == pytest.approx(residual(t))
-
-
-def test_frequencies_fill_the_range() -> None:
-    points = np.sort(frequencies(1.0, 100.0, 7))
-    assert np.allclose(np.diff(np.log(points)), np.log(100.0) / 8)  # 7 inner points of 8 equal parts
-
-
-def test_symmetric_sparse_copy_is_the_matrix() -> None:
-    """Rows serve as columns in the gathered solver: that needs a symmetric matrix."""
-    system: BlockSystem = problem_of("layers").system
-    for A in (system.K_ee, system.M_ee, system.damping.matrix):
-        whole = gather_matrix(system.layout, A)
-        assert abs(whole - whole.T).max() < 1e-12 * abs(whole).max()  # order of summation in assembly
-
-
-@pytest.mark.serial
-def test_factors_of_a_helper_thread_are_freed() -> None:
-    """SciPy frees the memory of a factor only in the thread that made it; forty of them hold 500 MB."""
-    system = build(load_scene(SCENE, ["tissue.cells=[40,80]"]), MPI.COMM_SELF).system
-    tissue = GatheredTissue(system)
-    F = np.ones((system.layout.n_local, 1))
-    shifts = [complex(-1.0 - 0.1 * i, 2.0 + i) for i in range(44)]
-
-    def work(i: int) -> None:
-        guess = shifts[i + 1] if i % 5 else shifts[0]  # now and then another one than announced
-        tissue.solve(shifts[i], F, [guess])
-
-    for i in range(3):
-        work(i)
-    before = psutil.Process().memory_info().rss
-    for i in range(3, 43):
-        work(i)
-    grown = psutil.Process().memory_info().rss - before
-    tissue.destroy()
-    assert grown < 50e6  # a few factors and the heap's slack

@@ -1,0 +1,210 @@
+"""S(p) with whole matrices on every rank: SuperLU in complex numbers, each rank another shift."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from fem.errors import SolverError, agree
+from fem.petsc import Array, Complex, PETSc
+from fem.system import BlockSystem
+
+AHEAD_FROM = 5_000  # n_e from which a second core, if one is idle, makes the next factor
+
+
+class GatheredTissue:
+    """Every rank holds all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
+
+    SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
+    program of one rank that may use another core makes the next factor there while it works with the present one.
+
+    Args:
+        system: operators.
+    """
+
+    name = "gathered"
+
+    def __init__(self, system: BlockSystem) -> None:
+        layout = system.layout
+        self.comm, self.n_local = layout.comm, layout.n_local
+        self.counts = np.array(self.comm.allgather(layout.n_local))
+        K = self._gather(system.K_ee)
+        self.order = _dissection(K)
+        self.K, self.M = self._permute(K), self._permute(self._gather(system.M_ee))
+        damping = system.damping
+        self.alpha, self.beta = damping.alpha, damping.beta
+        self.D = None if damping.matrix is None else self._permute(self._gather(damping.matrix))
+        parts = [self.K, self.M] + ([] if self.D is None else [self.D])
+        self.same = all(np.array_equal(A.indices, self.K.indices) for A in parts)
+        # filled in turn, because making one checks its indices
+        self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(2)]
+        self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
+        self.helper: ThreadPoolExecutor | None = None
+        self.next: list[tuple[complex, Future[scipy.sparse.linalg.SuperLU]]] = []
+        if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and _cores() > 1:
+            self.helper = ThreadPoolExecutor(1)
+        self.seconds = {"factor": 0.0, "solve": 0.0}
+        self.factors = 0
+
+    def _gather(self, A: PETSc.Mat) -> scipy.sparse.csc_matrix:
+        """All rows on every rank; the matrix is symmetric, so its rows serve as columns."""
+        indptr, columns, values = A.getValuesCSR()
+        parts = self.comm.allgather((np.diff(indptr), columns, values))
+        lengths, columns, values = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+        n = len(lengths)
+        return scipy.sparse.csc_matrix((values, columns.astype(np.int32), indptr), shape=(n, n))
+
+    def _permute(self, A: scipy.sparse.csc_matrix) -> scipy.sparse.csc_matrix:
+        result = A[self.order][:, self.order].tocsc()
+        result.sort_indices()
+        return result
+
+    def _matrix(self, p: complex) -> scipy.sparse.csc_matrix:
+        m, k = p * p - p * self.alpha, 1.0 - p * self.beta
+        if not self.same:
+            S = k * self.K + m * self.M
+            return (S if self.D is None else S - p * self.D).tocsc()
+        data = k * self.K.data + m * self.M.data
+        if self.D is not None:
+            data = data - p * self.D.data
+        self.shells.reverse()
+        self.shells[0].data = data
+        return self.shells[0]
+
+    def _factor(self, p: complex) -> scipy.sparse.linalg.SuperLU:
+        S = self._matrix(p if p.imag else p.real)
+        return self._decompose(p, S) if self.helper is None else self.helper.submit(self._decompose, p, S).result()
+
+    @staticmethod
+    def _decompose(p: complex, S: scipy.sparse.csc_matrix) -> scipy.sparse.linalg.SuperLU:
+        try:
+            return scipy.sparse.linalg.splu(S, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
+        except RuntimeError as error:
+            raise SolverError(f"the factorisation of S(p) failed at the shift p = {p:.4g} ({error})") from error
+
+    def _prepare(self, shifts: Sequence[complex]) -> None:
+        """Factor up to one shift a rank. Collective."""
+        wanted = list(dict.fromkeys(shifts))[: self.comm.size]
+        if self.comm.size == 1:
+            lu = self._taken(wanted[0])
+            self._forget()
+            self.cache[wanted[0]] = (0, lu)
+            self._send_ahead(shifts[1:2])
+        else:
+            self.cache = {p: (rank, None) for rank, p in enumerate(wanted)}
+            with agree(self.comm):
+                if self.comm.rank < len(wanted):
+                    p = wanted[self.comm.rank]
+                    self.cache[p] = (self.comm.rank, self._factor(p))
+        self.factors += len(wanted)
+
+    def _taken(self, p: complex) -> scipy.sparse.linalg.SuperLU:
+        """The factor that the other core has made, or one made here."""
+        stale, self.next = self.next, []
+        if stale and stale[0][0] == p:
+            return stale[0][1].result()
+        if stale and self.helper is not None:
+            wait([stale[0][1]])  # it reads a shell
+            self.helper.submit(stale.clear)
+        return self._factor(p)
+
+    def _forget(self) -> None:
+        """Let the factors go, in the thread that made them: SciPy frees the memory of a factor in no other."""
+        old, self.cache = self.cache, {}
+        if self.helper is not None:
+            self.helper.submit(old.clear)
+
+    def _send_ahead(self, shifts: Sequence[complex]) -> None:
+        """Start the next factor on the other core."""
+        if self.helper is not None and shifts:
+            p = shifts[0]
+            S = self._matrix(p if p.imag else p.real)
+            self.next = [(p, self.helper.submit(self._decompose, p, S))]
+
+    def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
+        """Local rows of S(p)^{-1} F, (n_local, k); complex even where p is real. Collective.
+
+        Args:
+            p: shift; 0 gives K_ee^{-1}.
+            F: local rows.
+            ahead: shifts that will probably come next, for the other ranks.
+
+        Raises:
+            SolverError: a pivot vanishes.
+        """
+        p = complex(p)
+        begin = time.perf_counter()
+        if p not in self.cache:
+            self._prepare([p, *(complex(q) for q in ahead)])
+        middle = time.perf_counter()
+        owner, lu = self.cache[p]
+        result = (
+            _lu_solve(lu, F, self.order, p.imag == 0)
+            if self.comm.size == 1
+            else self._solve_on(owner, lu, F, p.imag == 0)
+        )
+        self.seconds["factor"] += middle - begin
+        self.seconds["solve"] += time.perf_counter() - middle
+        return result
+
+    def _solve_on(self, owner: int, lu: scipy.sparse.linalg.SuperLU | None, F: Array | Complex, real: bool) -> Complex:
+        """Rows to the owner of the factor, solve there, rows back. Collective."""
+        k = F.shape[1]
+        local = np.ascontiguousarray(F, dtype=complex)
+        mine = self.comm.rank == owner
+        whole = np.empty((int(self.counts.sum()), k), dtype=complex) if mine else None
+        sizes = self.counts * k
+        self.comm.Gatherv(local, None if whole is None else [whole, sizes], root=owner)
+        if whole is not None and lu is not None:
+            whole = np.ascontiguousarray(_lu_solve(lu, whole, self.order, real))
+        result = np.empty((self.n_local, k), dtype=complex)
+        self.comm.Scatterv(None if whole is None else [whole, sizes], result, root=owner)
+        return result
+
+    def destroy(self) -> None:
+        """Free the factors. Not collective."""
+        self._forget()
+        if self.helper is not None:
+            self.helper.submit(self.next.clear)
+            self.helper.shutdown()
+
+
+_SYMMETRIC = {"SymmetricMode": True, "Equil": False}
+
+
+def _cores() -> int:
+    """Cores that this process may use. Not collective."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _dissection(A: scipy.sparse.csc_matrix) -> NDArray[np.int64]:
+    """Nested dissection order of a symmetric pattern. Not collective."""
+    serial = PETSc.Mat().createAIJ(A.shape, csr=(A.indptr, A.indices, A.data), comm=PETSc.COMM_SELF)
+    rows, columns = serial.getOrdering("nd")
+    order = np.array(rows.getIndices(), dtype=np.int64)
+    for item in (rows, columns, serial):
+        item.destroy()
+    return order
+
+
+def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:
+    """Solve with a factor of the permuted matrix; real factors take real and imaginary part one after the other."""
+    right = F[order]
+    result = np.empty(F.shape, dtype=complex)
+    if not real:
+        result[order] = lu.solve(np.asfortranarray(right, dtype=complex))
+    elif np.iscomplexobj(right):
+        result.real[order] = lu.solve(np.asfortranarray(right.real))
+        result.imag[order] = lu.solve(np.asfortranarray(right.imag))
+    else:
+        result[order] = lu.solve(np.asfortranarray(right))
+    return result
