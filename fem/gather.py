@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from fem.assembly import cells_of_layers
 from fem.contact import contact_facets, rigid_modes
 from fem.fields import FullField
 from fem.geometry import cell_nodes
-from fem.petsc import Array
+from fem.petsc import Array, rows_on_root
 
 if TYPE_CHECKING:
     from fem.build import Model
@@ -83,7 +82,7 @@ def gather_picture(model: Model) -> PictureMesh | None:
     held = contact_facets(tissue, model.scene.contact)
     points = np.ascontiguousarray(mesh.geometry.x[: nodes.size_local, :d])
     parts = [points, _numbered(nodes, cells), facet_nodes(outer), facet_nodes(held), layers]
-    whole = [rows for rows in (_rows(comm, part) for part in parts) if rows is not None]
+    whole = [rows for rows in (rows_on_root(comm, part) for part in parts) if rows is not None]
     if not whole:
         return None
     return PictureMesh(whole[0], whole[1], whole[2], whole[3], whole[4], names, layout.reference, layout.n_s)
@@ -117,7 +116,7 @@ def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
     for j in range(columns.shape[1]):
         values = full.fill(columns[:, j], hands[:, j]).x.array.reshape(-1, d)
         local[:, j * d : (j + 1) * d] = values[dofs]
-    gathered = _rows(space.layout.comm, local)
+    gathered = rows_on_root(space.layout.comm, local)
     if gathered is None or z.ndim == 1:
         return gathered
     return np.ascontiguousarray(gathered.reshape(len(gathered), -1, d).transpose(1, 0, 2))
@@ -143,15 +142,3 @@ def _numbered(index_map: Any, local: npt.NDArray[np.int32]) -> Integers:
     """Global node numbers of local ones, same shape."""
     flat = np.ascontiguousarray(local, dtype=np.int32).ravel()
     return np.asarray(index_map.local_to_global(flat), dtype=np.int64).reshape(local.shape)
-
-
-def _rows(comm: MPI.Intracomm, local: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
-    """Stack the rows of all ranks on rank 0; None elsewhere. Collective."""
-    local = np.ascontiguousarray(local)
-    counts = comm.gather(local.size)
-    if counts is None:
-        comm.Gatherv(local, None)
-        return None
-    whole = np.empty((sum(counts) // max(1, int(np.prod(local.shape[1:]))), *local.shape[1:]), dtype=local.dtype)
-    comm.Gatherv(local, (whole, counts))
-    return whole

@@ -6,11 +6,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 
 from fem.errors import agree
 from fem.layout import BlockLayout
-from fem.petsc import Array, PETSc
+from fem.petsc import Array, PETSc, rows_on_all
 from fem.system import BlockSystem
 
 
@@ -45,7 +44,7 @@ class Held:
 
     def gather(self, local: Array) -> Array:
         """Rows held of a vector given by its owned rows. Collective."""
-        return gather_rows(self.layout.comm, local) if self.whole else local
+        return rows_on_all(self.layout.comm, local) if self.whole else local
 
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
         """The matrix on the rows held; consumes A. Collective."""
@@ -70,7 +69,7 @@ def held_operators(system: BlockSystem, whole: bool) -> Held:
     M = None if D is None else system.M_ee
     if whole:
         rows = slice(layout.start, layout.start + layout.n_local)
-        G = np.asfortranarray(gather_rows(layout.comm, system.G))
+        G = np.asfortranarray(rows_on_all(layout.comm, system.G))
         K = whole_copy(system.K_ee)
         D, M = (None if A is None else whole_copy(A) for A in (D, M))
     else:
@@ -89,12 +88,3 @@ def whole_copy(A: PETSc.Mat) -> PETSc.Mat:
     copy.setOption(PETSc.Mat.Option.SPD, bool(A.isSymmetricKnown()[1]))
     every.destroy()
     return copy
-
-
-def gather_rows(comm: MPI.Intracomm, local: Array) -> Array:
-    """Rows of all ranks, in their order, on every rank. Collective."""
-    local = np.ascontiguousarray(local)
-    counts = comm.allgather(local.size)
-    result = np.empty((sum(counts) // max(1, int(np.prod(local.shape[1:]))), *local.shape[1:]))
-    comm.Allgatherv(local, [result, counts])
-    return result

@@ -119,7 +119,7 @@ class TissueMidpoint:
 
     def _prepare_general(self) -> None:
         """The damping matrix with its mass-proportional part, so that a step needs one product with it. Collective."""
-        self.k_old, self.y = self.k.duplicate(), self.k.duplicate()
+        self.y = self.k.duplicate()
         self.y_array = self.y.array_r
         if self.held.D is None or self.held.M is None:
             raise SolverError("a damping matrix is missing")

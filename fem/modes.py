@@ -7,8 +7,8 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from fem.errors import SolverError
-from fem.petsc import Array, PETSc, petsc_options
-from fem.solvers import CHOLESKY_LIMIT
+from fem.petsc import Array, PETSc
+from fem.solvers import CHOLESKY_LIMIT, set_up_repeated
 from fem.system import BlockSystem
 
 PREFIX = "softgrasp_modes_"
@@ -88,15 +88,7 @@ def _make_eps(system: BlockSystem) -> SLEPc.EPS:
     elif system.layout.comm.size == 1:
         pc.setFactorOrdering("nd")
     else:
-        # every rank holds the whole factor: one message a solve
-        inner: dict[str, object] = {
-            "pc_type": "redundant",
-            "redundant_ksp_type": "preonly",
-            "redundant_pc_type": "cholesky",
-            "redundant_pc_factor_mat_ordering_type": "nd",
-        }
-        with petsc_options(ksp.getOptionsPrefix(), inner):
-            ksp.setFromOptions()
+        set_up_repeated(ksp, "cholesky", ksp.getOptionsPrefix())
     return eps
 
 

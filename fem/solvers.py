@@ -49,10 +49,9 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
     ranks = layout.comm.size
     if ranks == 1 or solver == "cg":
         return False
-    if reproducible == "auto":
-        small = ranks <= REPEATED_RANKS and layout.n_e * ranks <= REPEATED_LIMIT[layout.dimension]
-        return solver == "cholesky" or small
-    return solver == "cholesky" or reproducible
+    if solver == "cholesky" or reproducible != "auto":
+        return solver == "cholesky" or bool(reproducible)
+    return ranks <= REPEATED_RANKS and layout.n_e * ranks <= REPEATED_LIMIT[layout.dimension]
 
 
 @dataclass(frozen=True)
@@ -194,24 +193,29 @@ def _first_solve(ksp: PETSc.KSP, S: PETSc.Mat) -> None:
 def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str, repeated: bool) -> None:
     ksp.setType("preonly")
     pc = ksp.getPC()
-    if not repeated:
-        pc.setType("cholesky")
-        if name == "mumps":
-            pc.setFactorSolverType("mumps")
-        else:
-            pc.setFactorOrdering("nd")
+    if repeated:
+        set_up_repeated(ksp, name, prefix)
+        return
+    pc.setType("cholesky")
+    if name == "mumps":
+        pc.setFactorSolverType("mumps")
     else:
-        inner = {
-            "pc_type": "redundant",
-            "redundant_ksp_type": "preonly",
-            "redundant_pc_type": "cholesky",
-        }
-        if name == "mumps":
-            inner["redundant_pc_factor_mat_solver_type"] = "mumps"
-        else:
-            inner["redundant_pc_factor_mat_ordering_type"] = "nd"
-        with petsc_options(prefix, dict(inner)):
-            ksp.setFromOptions()
+        pc.setFactorOrdering("nd")
+
+
+def set_up_repeated(ksp: PETSc.KSP, name: SolverName, prefix: str) -> None:
+    """Every rank holds the whole Cholesky factor: one gather a solve. Collective."""
+    options: dict[str, object] = {
+        "pc_type": "redundant",
+        "redundant_ksp_type": "preonly",
+        "redundant_pc_type": "cholesky",
+    }
+    if name == "mumps":
+        options["redundant_pc_factor_mat_solver_type"] = "mumps"
+    else:
+        options["redundant_pc_factor_mat_ordering_type"] = "nd"
+    with petsc_options(prefix, options):
+        ksp.setFromOptions()
 
 
 def _set_up_cg(ksp: PETSc.KSP, S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> None:
