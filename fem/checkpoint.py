@@ -72,7 +72,6 @@ def _write_rank(run: Run, path: Path) -> None:
     with h5py.File(path, "w") as file:
         file["state"] = run.state.array
         file["h"] = midpoint.h.array_r
-        file["k"] = midpoint.k.array_r
         file["hand_q"] = run.drive.q[: n + 1]
         file["hand_v"] = run.drive.v[: n + 1]
         file["outputs"] = run.local_outputs[: n + 1]
@@ -96,9 +95,9 @@ def read_checkpoint(run: Run, directory: Path) -> None:
                 _restore(run, file, entry["step"])
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
-    run.midpoint.join(run.state)
-    for vector in (run.state.z, run.state.v, run.midpoint.h, run.midpoint.k):
+    for vector in (run.state.z, run.state.v, run.midpoint.h):
         vector.stateIncrease()
+    run.midpoint.join(run.state)
 
 
 def _manifest(run: Run, directory: Path) -> dict[str, int]:
@@ -126,7 +125,6 @@ def _restore(run: Run, file: h5py.File, step: int) -> None:
     run.state = run.store.target(step)
     run.state.array[:] = file["state"][:]
     run.midpoint.h.array_w[:] = file["h"][:]
-    run.midpoint.k.array_w[:] = file["k"][:]
     run.drive.q[:n] = file["hand_q"][:]
     run.drive.v[:n] = file["hand_v"][:]
     run.local_outputs[:n] = file["outputs"][:]

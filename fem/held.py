@@ -21,7 +21,7 @@ class Held:
         layout: sizes and ownership.
         whole: all rows are here, on a communicator of this rank alone.
         rows: the owned rows among those held.
-        K: stiffness, in blocks of d x d on one rank: a quarter less memory traffic than single entries.
+        K: stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries.
         G: coupling to the hand, (rows held, n_s).
         D: damping matrix, or None.
         M: mass, only beside D.

@@ -70,7 +70,9 @@ class TissueMidpoint:
 
     Attributes:
         held: operators on the rows held.
-        r, h, k, w, load: vectors on the rows held; ``load_array``, ``w_array`` ... their arrays.
+        r, h, w, load: vectors on the rows held; ``load_array``, ``w_array`` ... their arrays.
+        K2: -2 K, whose product one call adds to h.
+        k: K2 z; a step carries it where damping needs the old one.
         w_own: the rows of w that this rank owns, an array.
     """
 
@@ -84,11 +86,13 @@ class TissueMidpoint:
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
         self.held = held_operators(system, factor_on_every_rank(system.layout, solver, reproducible))
-        self.K, self.G, self.rows = self.held.K, self.held.G, self.held.rows
+        self.G, self.rows = self.held.G, self.held.rows
+        self.K2 = self.held.K
+        self.K2.scale(-2.0)
         S = self.held.matrix(midpoint_matrix(system, dt))
         with self.held.agree():
             self.solver: TissueSolver = make_solver(S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible)
-        self.r, self.h, self.k, self.w, self.load = (self.K.createVecLeft() for _ in range(5))
+        self.r, self.h, self.k, self.w, self.load = (self.K2.createVecLeft() for _ in range(5))
         # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
         self.load_array: Array = self.load.array_w
         self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
@@ -128,21 +132,23 @@ class TissueMidpoint:
         self._propagate = self._general
 
     def start(self, state: TissueState) -> None:
-        """Set the carried vectors k = K z and h = s M v - K z. Collective."""
+        """Set the carried vectors k = -2 K z and h = s M v - K z. Collective."""
         self.join(state)
-        K, M, y = self.system.K_ee, self.system.M_ee, state.z.duplicate()
-        K.mult(state.z, y)
-        self.k.array_w[:] = self.held.gather(y.array_r)
-        M.mult(state.v, y)
+        y = state.z.duplicate()
+        self.system.M_ee.mult(state.v, y)
         self.h.array_w[:] = self.held.gather(y.array_r)
-        self.h.scale(self.s)
-        self.h.axpy(-1.0, self.k)
         y.destroy()
+        self.h.scale(self.s)
+        self.h.axpy(0.5, self.k)
 
     def join(self, state: TissueState) -> None:
-        """Take a state over whose carried vectors are set. Collective."""
+        """Take a state over whose h is set. Collective."""
         if self.held.whole:
             self.z.array_w[:] = self.held.gather(state.z.array_r)
+        self.K2.mult(self._held_z(state), self.k)
+
+    def _held_z(self, state: TissueState) -> PETSc.Vec:
+        return self.z if self.held.whole else state.z
 
     def set_load(self, c: Array) -> None:
         """Load G c of the midpoint for c of shape (n_s,). Not collective."""
@@ -207,34 +213,34 @@ class TissueMidpoint:
         new.v.axpby(2 * self.s, -1.0, self.x)
 
     def _undamped(self, z: PETSc.Vec) -> None:
-        self.K.mult(z, self.k)
         self.h.waxpy(1.0, self.load, self.r)
-        self.h.axpy(-2.0, self.k)
+        self.K2.multAdd(z, self.h, self.h)
 
     def _proportional(self, z: PETSc.Vec) -> None:
         self.k, self.k_old = self.k_old, self.k
         self.k_array, self.k_old_array = self.k_old_array, self.k_array
-        self.K.mult(z, self.k)
+        self.K2.mult(z, self.k)
         self.h.axpby(self.a, -1.0, self.r)
-        self.h.axpy(-1.0 - self.b, self.k)
-        self.h.axpy(self.b - 1.0, self.k_old)
+        self.h.axpy((1 + self.b) / 2, self.k)
+        self.h.axpy((1 - self.b) / 2, self.k_old)
         w, rows = self.w_own, self.rows
-        wKw = (np.dot(w, self.k_array[rows]) - np.dot(w, self.k_old_array[rows])) / 2
+        wKw = (np.dot(w, self.k_old_array[rows]) - np.dot(w, self.k_array[rows])) / 4
         wMw = (np.dot(w, self.r_array[rows]) - (1 + self.s * self.beta) * wKw) / (self.s * (self.s + self.alpha))
         self.dissipated += 2 * self.s * float(self.alpha * wMw + self.beta * wKw)
 
     def _general(self, z: PETSc.Vec) -> None:
         self.M.mult(self.w, self.y)
         self.h.axpby(2 * self.s**2, -1.0, self.y)
-        self.h.axpy(-1.0, self.k)
-        self.K.mult(z, self.k)
-        self.h.axpy(-1.0, self.k)
+        self.h.axpy(0.5, self.k)
+        self.K2.mult(z, self.k)
+        self.h.axpy(0.5, self.k)
         self.D.mult(self.w, self.y)
         self.dissipated += 2 * self.s * float(np.dot(self.w_own, self.y_array[self.rows]))
 
     def energy(self, state: TissueState) -> float:
-        """Energy (z' K z + v' M v) / 2 [J] from the carried vectors. Collective."""
-        n, k = len(self.w_own), self.k_array[self.rows]
+        """Energy (z' K z + v' M v) / 2 [J] of the state just reached, from the carried momentum. Collective."""
+        self.K2.mult(self._held_z(state), self.k)
+        n, k = len(self.w_own), self.k_array[self.rows] / -2
         z, v = state.array[:n], state.array[n:]
         momentum = (self.h.array_r[self.rows] + k) / self.s
         local = np.array([np.dot(z, k), np.dot(v, momentum)])

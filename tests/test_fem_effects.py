@@ -118,7 +118,8 @@ def test_petsc_counts_no_object_made_in_a_step(comm: MPI.Intracomm) -> None:
 
 def work_of_a_run(model: Model) -> dict[str, int]:
     """Calls of PETSc operations in the run, as PETSc itself counts them."""
-    events = [PETSc.Log.Event(name) for name in ("MatMult", "MatSolve", "VecAXPY", "VecAYPX", "VecWAXPY", "VecAXPBYCZ")]
+    names = ("MatMult", "MatMultAdd", "MatSolve", "VecAXPY", "VecAYPX", "VecWAXPY", "VecAXPBYCZ")
+    events = [PETSc.Log.Event(name) for name in names]
     before = [event.getPerfInfo()["count"] for event in events]
     simulate(model)
     return {e.name: e.getPerfInfo()["count"] - b for e, b in zip(events, before, strict=True)}
@@ -137,7 +138,7 @@ def test_off_takes_no_branch_in_the_loop_and_gravity_costs_nothing(comm: MPI.Int
 
     for effects in ({}, OFF, GRAVITY, WEIGHT):
         assert extra(effects, "MatSolve") == 1
-        assert extra(effects, "MatMult") == 1
+        assert extra(effects, "MatMult") + extra(effects, "MatMultAdd") == 1
         assert extra(effects, "VecAXPY") == extra({}, "VecAXPY")
     assert extra(RAYLEIGH, "MatSolve") == 1
     assert extra(RAYLEIGH, "MatMult") == 1
