@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from fem.petsc import Array, times_columns, total
+from fem.petsc import Array, total
 from lqr.care import block_eigenvalues, lyapunov
 from lqr.dense import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
-from lqr.operators import reach
+from lqr.operators import damp, reach
 from lqr.plant import Block
 from lqr.problem import RiccatiProblem
 from reduction.engines import on_root
@@ -25,7 +25,8 @@ class LoopQuality:
     """The full plant under one gain.
 
     Attributes:
-        abscissa: largest real part of the closed-loop spectrum [1/s].
+        abscissa: largest real part of the closed-loop spectrum [1/s]; from :func:`lqr.spectrum.certified_abscissa` that
+            of the eigenvalues it found, a lower bound.
         cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
         certified: its sign is certain: from the whole spectrum, or from :func:`lqr.spectrum.certified_abscissa`.
     """
@@ -136,9 +137,4 @@ def _lowest(problem: RiccatiProblem, k: int) -> tuple[Array, Array, ModalPlant]:
 
 def modal_damping(problem: RiccatiProblem, Phi: Array) -> Array:
     """Phi' D_ee Phi. Collective."""
-    system = problem.system
-    damping, comm = system.damping, system.layout.comm
-    D = damping.alpha * total(comm, Phi.T @ times_columns(system.M_ee, Phi))
-    if damping.matrix is not None:
-        return D + total(comm, Phi.T @ times_columns(damping.matrix, Phi))
-    return D + damping.beta * total(comm, Phi.T @ times_columns(system.K_ee, Phi))
+    return total(problem.layout.comm, Phi.T @ damp(problem.system, Phi))

@@ -10,9 +10,9 @@ from lqr.plant import Block
 from lqr.problem import RiccatiProblem
 
 
-def inner(system: BlockSystem, X: Block, Y: Block) -> Array:
-    """X'Y, the same on every rank. Collective."""
-    return X.hand.T @ Y.hand + total(system.layout.comm, X.tall.T @ Y.tall)
+def modes_couple(system: BlockSystem) -> bool:
+    """Whether the damping couples the modes of the coupled free motion. Not collective."""
+    return system.damping.matrix is not None or (system.two_way and system.damping.alpha > 0)
 
 
 def damp(system: BlockSystem, X: Array) -> Array:

@@ -11,9 +11,9 @@ import numpy as np
 from fem.petsc import Array, total
 from lqr.abscissa import DENSE_LIMIT, LoopQuality, ModalLoop
 from lqr.checks import ControlError
-from lqr.compress import triangular
+from lqr.compress import gram, triangular
 from lqr.coordinates import costates_to_absolute, factor_of, gain_of, gain_to_absolute
-from lqr.operators import descriptor, descriptor_adjoint, dynamics, inner, inputs_adjoint, outputs
+from lqr.operators import descriptor, descriptor_adjoint, dynamics, inputs_adjoint, outputs
 from lqr.plant import Block
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.reduced_bases import RiccatiBasis, energy_scaled
@@ -75,10 +75,10 @@ class GainReport:
 
 def project(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
     """E_N = W'EU, A_N = W'AU, B_N = W'B, C_N = CU. Collective."""
-    system, W, U = problem.system, basis.W, basis.U
+    comm, W, U = problem.layout.comm, basis.W, basis.U
     return ReducedMatrices(
-        E=inner(system, W, descriptor(problem, U)),
-        A=inner(system, W, dynamics(problem, U)),
+        E=gram(comm, W, descriptor(problem, U)),
+        A=gram(comm, W, dynamics(problem, U)),
         B=np.ascontiguousarray(inputs_adjoint(problem, W).T),
         C=outputs(problem, U),
         Q=problem.Q,
@@ -154,7 +154,7 @@ class GainJudge:
         self.start = start
         self.loop = ModalLoop(problem) if loop is None else loop
         self.whole: ModalLoop | None = None
-        self.optimal = float(np.sum(inner(problem.system, self.Z, descriptor(problem, start)) ** 2))
+        self.optimal = float(np.sum(gram(problem.layout.comm, self.Z, descriptor(problem, start)) ** 2))
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
 

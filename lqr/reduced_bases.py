@@ -15,7 +15,7 @@ import scipy.linalg
 from fem.petsc import Array, times_columns, total
 from lqr.abscissa import modal_damping
 from lqr.checks import ControlError
-from lqr.compress import triangular
+from lqr.compress import gram, triangular
 from lqr.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
 from lqr.dense import some_modes
 from lqr.operators import reach
@@ -162,10 +162,10 @@ def weighted_pod(problem: RiccatiProblem, Z: Block) -> BasisFamily:
     comm = problem.layout.comm
     Q, _ = left_singular(problem, Z)
     weighted = weight_times(problem, Q)
-    gram = Q.hand.T @ weighted.hand + total(comm, Q.tall.T @ weighted.tall)
-    lower = np.linalg.cholesky((gram + gram.T) / 2)
+    G = gram(comm, Q, weighted)
+    lower = np.linalg.cholesky((G + G.T) / 2)
     R_Z = triangular(comm, Z)
-    coordinates = (Q.hand.T @ Z.hand + total(comm, Q.tall.T @ Z.tall)) @ R_Z.T
+    coordinates = gram(comm, Q, Z) @ R_Z.T
     u, s, _ = small_svd(comm, lower.T @ coordinates)
     keep = s > 100 * EPS * s[0]
     V = Q.times(scipy.linalg.solve_triangular(lower.T, u[:, keep]))
@@ -218,16 +218,16 @@ def pod_decomposed(problem: RiccatiProblem, Z: Block) -> BasisFamily:
 STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
 
 
-def structured(problem: RiccatiProblem, modes: int = STRUCTURED_MODES) -> BasisFamily:
+def structured(problem: RiccatiProblem) -> BasisFamily:
     """A priori: z = Phi eta with natural modes in the order |c_k|^2 / (|Re p_k| omega_k^2) in which they cost.
 
     No Riccati equation is solved. States [q_s, v_s, Phi eta, Phi eta'], costates [q_s, v_s, M Phi omega, Phi]: the
     reduced plant is a second-order system with definite matrices, stable for every N, in energy scaling. Collective.
     """
     system = problem.system
-    k = min(modes, system.layout.n_e)
+    k = min(STRUCTURED_MODES, system.layout.n_e)
     omega, Phi, massed = some_modes(problem, k)
-    damping = np.sum(modal_damping(problem, Phi) * np.eye(k), axis=0)
+    damping = np.diag(modal_damping(problem, Phi))
     c = total(system.layout.comm, problem.C_z.T @ Phi)
     g = reach(problem, Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c)
@@ -265,15 +265,15 @@ def energy_scaled(problem: RiccatiProblem, basis: RiccatiBasis) -> RiccatiBasis:
     spring = np.sqrt(np.linalg.norm(problem.C_s.T @ problem.Q @ problem.C_s, 2)) or 1.0
     hand = np.concatenate([spring * U.hand[:n_s], problem.M_s @ U.hand[n_s:]])
     tall = np.concatenate([times_columns(system.K_ee, U.tall[:n]), times_columns(system.M_ee, U.tall[n:])])
-    gram = U.hand.T @ hand + total(system.layout.comm, U.tall.T @ tall)
-    scale = 1 / np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    G = gram(system.layout.comm, U, Block(hand, tall))
+    scale = 1 / np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
 
     def inverse() -> Array | None:
         try:
-            lower = np.linalg.cholesky((gram + gram.T) / 2 * scale[:, None] * scale)
+            lower = np.linalg.cholesky((G + G.T) / 2 * scale[:, None] * scale)
         except np.linalg.LinAlgError:  # dependent to rounding: scaled columns must do
             return None
-        return np.asarray(scale[:, None] * scipy.linalg.solve_triangular(lower, np.eye(len(gram)), lower=True).T)
+        return np.asarray(scale[:, None] * scipy.linalg.solve_triangular(lower, np.eye(len(G)), lower=True).T)
 
     T = on_root(system.layout.comm, inverse)
     T = np.diag(scale) if T is None else T

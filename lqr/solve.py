@@ -12,6 +12,7 @@ from lqr.dense import DenseRiccati
 from lqr.diagnose import diagnose
 from lqr.galerkin import StructuredGalerkin
 from lqr.newton import NewtonADI
+from lqr.operators import modes_couple
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.radi import RADI
 
@@ -62,8 +63,7 @@ def choose(problem: RiccatiProblem, wanted: Method = "auto") -> Choice:
     limit = LOW_RANK_LIMIT[layout.dimension]
     if layout.n_e > limit:
         return Choice("galerkin", f"n_e = {layout.n_e} > {limit} in {layout.dimension}D: few factorisations fit")
-    coupled = damping.matrix is not None or (problem.system.two_way and damping.alpha > 0)
-    if coupled:
+    if modes_couple(problem.system):
         return Choice("radi", "damping couples the modes: the modal start of Newton's method is not known to stabilise")
     return Choice("newton_adi", f"{layout.states} states, modes decoupled: modal start and usually one Newton step")
 

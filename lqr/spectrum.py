@@ -8,9 +8,9 @@ import numpy as np
 from slepc4py import SLEPc
 
 from fem.errors import SolverError
-from fem.petsc import PETSc, total
+from fem.petsc import PETSc, combine, total
 from fem.solvers import TissueSolver, choose_solver, make_solver
-from lqr.checks import EPS
+from lqr.checks import EPS, ControlError
 from lqr.dense import some_modes
 from lqr.operators import damp, descriptor
 from lqr.plant import Block
@@ -34,10 +34,11 @@ class Abscissa:
     """Largest real part of the closed-loop spectrum.
 
     Attributes:
-        value: over the eigenvalues found, which hold all with |s| <= radius right of it [1/s]; a lower bound of the
-            abscissa when it is >= 0.
-        certified: no eigenvalue with Re s >= 0 lies outside the radius, so that the sign of ``value`` is right.
-        radius: [1/s].
+        value: over the eigenvalues found [1/s]: a lower bound of the abscissa, which exceeds it by at most a thousandth
+            where ``exact``.
+        certified: the sign of ``value`` is that of the abscissa: it is >= 0, or no eigenvalue with Re s >= 0 lies
+            outside the radius.
+        radius: all eigenvalues with Re s >= 0 and |s| <= radius are among those found [1/s].
         bound: of |K (sE - A)^{-1} B| over Re s >= 0, |s| >= radius; below 1 it excludes eigenvalues there.
         eigenvalues: those found, nearest to ``shift`` first, (k,).
         reason: why it is not certified; empty when it is.
@@ -76,31 +77,32 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
         K: gain, transposed, hand-relative.
 
     Raises:
+        ControlError: the plant has no hand.
         SolverError: no eigenvalue converges.
     """
     n_s = problem.layout.n_s
+    if n_s == 0:
+        raise ControlError("the certified abscissa belongs to a hand; without one take lqr.abscissa.ModalLoop")
     K_q = K.hand[:n_s].T
     if not np.linalg.svd(K_q, compute_uv=False)[-1] > 100 * EPS * np.linalg.norm(K.hand):
         reason = "the gain on a rigid displacement is singular: the hand is not held"
         return Abscissa(0.0, True, 0.0, np.inf, np.zeros(1, dtype=complex), reason)
     why = why_no_bound(problem)
     tail = None if why else Tail(problem, K)
-    wanted, shift, guess = _circle(problem, tail)
+    # the same bits on every rank: they decide how often all search
+    wanted, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
     resolvent = Resolvent(problem, K, shift)
-    result: Abscissa | None = None
     try:
         for count in (guess, *(more for more in GROWTH if more > guess)):
             asked = min(count, problem.layout.states - 2)
             values = resolvent.nearest(asked)
-            result = _judge(values, shift, tail, why)
+            result: Abscissa = problem.layout.comm.bcast(_judge(values, shift, tail, why))
             short = len(values) < asked  # asking for more would not help
             enough = result.certified and (result.exact or result.radius >= ENOUGH * wanted)
             if result.value >= 0 or short or enough or why:
                 break
     finally:
         resolvent.free()
-    if result is None:
-        raise SolverError("the closed-loop spectrum was not computed; the plant has no tissue")
     return result
 
 
@@ -157,20 +159,20 @@ class Resolvent:
         self.n_s, self.n = self.layout.n_s, self.layout.n_local
         damping = self.system.damping
         self.drag = damping.alpha if damping.in_space else 0.0
-        S = self.system.K_ee.copy()
-        S.scale(1 + shift * damping.beta)
-        same = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
-        S.axpy(shift**2 + shift * damping.alpha, self.system.M_ee, same)
-        if damping.matrix is not None:
-            S.axpy(shift, damping.matrix, same)
+        terms = [(1 + shift * damping.beta, self.system.K_ee), (shift * (shift + damping.alpha), self.system.M_ee)]
+        S = combine(terms + ([] if damping.matrix is None else [(shift, damping.matrix)]))
         name = choose_solver(self.layout)[0]
-        self.solver: TissueSolver = make_solver(S, name, self.layout, "softgrasp_spectrum_", rtol=1e-12)
+        self.solver: TissueSolver = make_solver(S, name, self.layout, PREFIX, rtol=1e-12)
         self.r, self.w = self.system.K_ee.createVecs()
         self.extra = 2 * self.n_s if self.comm.rank == 0 else 0
-        self._prepare()
         local = 2 * self.n + self.extra
         self.shell = PETSc.Mat().createPython(((local, self.layout.states),) * 2, self, comm=self.comm)
         self.shell.setUp()
+        try:
+            self._prepare()
+        except Exception:
+            self.free()
+            raise
 
     def _prepare(self) -> None:
         """The hand's Schur complement, and the inputs' columns for the feedback. Collective."""

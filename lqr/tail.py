@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from fem.petsc import Array, times_columns, total
-from lqr.checks import EPS
 from lqr.dense import some_modes
 from lqr.modal_start import plant_modes
+from lqr.operators import modes_couple
 from lqr.plant import Block, Plant
 from lqr.problem import RiccatiProblem
 from reduction.inner import solve_columns
@@ -38,18 +38,24 @@ def least_beta(problem: RiccatiProblem) -> float:
 class Tail:
     """Bound of |h(s)|, h(s) = K (sE - A)^{-1} B, for Re s >= -a, |s| >= r: an eigenvalue of A + B K needs |h(s)| >= 1.
 
-    h is analytic there, so that its bound on the boundary of the region holds inside too. One-way, with the modes
-    phi_k of the clamped tissue,
+    Where the bound is finite, A itself has no eigenvalue. One-way, with the modes phi_k of the clamped tissue,
 
         |h| <= |K_q M_s^{-1}| / r^2 + |K_v M_s^{-1}| / r + sum_k (|K_zk| / r + |K_vk|) |g_k M_s^{-1}| b_k,
-        b_k = min((1 + a / (r - a)) / (2 delta_k - 2 a), r / (r - omega_k)^2),
+        b_k = min((1 + a / (r - a)) / (2 delta_k - 2 a), r / (r - omega_k)^2) >= |s| / |s^2 + 2 delta_k s + omega_k^2|,
 
-    2 delta_k = alpha + beta omega_k^2; the second only for r > omega_k and underdamped modes. The sum runs over the
-    lowest modes; Cauchy-Schwarz with 2 delta_k >= (beta - 2 a / omega^2) omega_k^2 bounds the rest. Two-way the same
-    holds in the modes of the tissue with the hand floating, where q_s = M_s^{-1}(u / s^2 - G'z) adds to the gain on z.
+    2 delta_k = alpha + beta omega_k^2; the second only for r > omega_k and underdamped modes. The first holds at once
+    for a = 0, |s + 2 delta + omega^2 / s| >= 2 delta; for a > 0 on the line Re s = -a and on the circle |s| = r, hence
+    everywhere between them and infinity, where s / (s^2 + 2 delta s + omega^2) is analytic: r > a leaves out the slow
+    pole of an overdamped mode right of the line. The sum runs over the lowest modes; Cauchy-Schwarz with
+    2 delta_k - 2 a >= (beta - 2 a / omega^2) omega_k^2, omega the last of them, bounds the rest. Two-way the same holds
+    in the modes of the tissue with the hand floating, where q_s = M_s^{-1}(u / s^2 - G'z) adds to the gain on z.
 
     Where damping couples the modes (layers; two-way with alpha > 0), D >= W = alpha M + beta_min K still gives
-    |x*(s^2 M + s D + K) x| >= |s| x*Wx for Re s >= 0, hence |k'S^{-1}g| <= |k|_{W^{-1}} |g|_{W^{-1}} / |s|; a = 0 only.
+    Re x*(s M + D + K / s) x >= x*Wx for Re s >= 0, hence |k'S^{-1}g| <= |k|_{W^{-1}} |g|_{W^{-1}} / |s|; a = 0 only.
+
+    Assumptions: M_ee and, two-way, M_ee - G M_s^{-1} G' positive definite, the stiffness of every layer semidefinite,
+    that of the whole definite, D symmetric, and the modes are the lowest. Rounding and the residual of the modes (1e-8)
+    are not bounded.
 
     Args:
         problem: the plant; :func:`why_no_bound` must be empty.
@@ -63,32 +69,22 @@ class Tail:
         hand_q, hand_v = K.hand[:n_s], K.hand[n_s:]
         self.K_q, self.K_v = (float(np.linalg.norm(k.T @ inverse, 2)) for k in (hand_q, hand_v))
         self.alpha, self.beta = system.damping.alpha, least_beta(problem)
-        self.coupled = system.damping.matrix is not None or (system.two_way and system.damping.alpha > 0)
+        self.coupled = modes_couple(system)
         self.drag = self.alpha if system.damping.in_space else 0.0
         force = system.G @ inverse
         gain_z, gain_v = K.tall[:n], K.tall[n:]
         if system.two_way:  # the hand gives way: q_s = M_s^{-1} (u / s^2 - G'z)
             gain_z, gain_v = gain_z - force @ hand_q, gain_v - force @ hand_v
         k = min(MODES, problem.layout.n_e)
-        omega, Phi = plant_modes(Plant(problem), k) if system.two_way else some_modes(problem, k)[:2]
-        size = total(comm, np.stack([Phi.T @ gain_z, Phi.T @ gain_v, Phi.T @ force]))
-        self.omega, self.modes = omega, np.linalg.norm(size, axis=2)
-        static = solve_columns(system.K_ee, problem.layout, force)
-        products = _inverse_mass(problem, np.hstack([gain_z, gain_v, force]))
-        self.rest_z, self.rest_v, self.rest_force = (
-            self._rest(total(comm, X.T @ products[:, i * n_s : (i + 1) * n_s]), self.modes[i])
-            for i, X in enumerate((gain_z, gain_v, force))
-        )
-        moved = times_columns(system.M_ee, static)
-        if system.two_way:
-            moved -= force @ total(comm, system.G.T @ static)
-        self.rest_static = self._rest(total(comm, static.T @ moved), self.modes[2] / omega**2)
-
-    @staticmethod
-    def _rest(gram: Array, part: Array) -> float:
-        """Frobenius norm of what the modes leave over; rounding counts as left over."""
-        whole = float(np.trace(gram))
-        return float(np.sqrt(max(whole - float(np.sum(part**2)), 100 * EPS * whole)))
+        self.omega, Phi = plant_modes(Plant(problem), k) if system.two_way else some_modes(problem, k)[:2]
+        columns = np.hstack([gain_z, gain_v, force])
+        size = total(comm, Phi.T @ columns)
+        self.modes = np.linalg.norm(np.stack(np.hsplit(size, 3)), axis=2)
+        # the rest itself: as a difference of norms it would lose half the digits
+        rest = columns - _moved_mass(problem, Phi) @ size
+        self.rest_z, self.rest_v, self.rest_force = _norms(problem, rest, _inverse_mass(problem, rest), 3)
+        static = solve_columns(system.K_ee, problem.layout, rest[:, 2 * n_s :])
+        (self.rest_static,) = _norms(problem, static, _moved_mass(problem, static), 1)
 
     def bound(self, r: float, a: float = 0.0) -> float:
         """The bound at radius r for Re s >= -a, 0 <= a < r; infinite where it says nothing. Not collective."""
@@ -101,18 +97,21 @@ class Tail:
     def _decoupled(self, r: float, a: float) -> float:
         last, far = float(self.omega[-1]), 1 + a / (r - a)
         twice = self.alpha + self.beta * self.omega**2
-        gap = np.maximum(r - self.omega, 1e-9 * r)  # modes beyond r: the other bound is the smaller one
         # |s - p| |s - p'| >= (|s| - omega)^2 for a pair of complex poles
-        near = np.where((twice < 2 * self.omega) & (self.omega < r), r / gap**2, np.inf)
+        inside = (twice < 2 * self.omega) & (self.omega < (1 - 1e-9) * r)
+        near = np.where(inside, r / np.where(inside, r - self.omega, 1.0) ** 2, np.inf)
         margin = twice - 2 * a
         decay = np.where(margin > 0, far / np.where(margin > 0, margin, 1.0), np.inf)
         each = np.minimum(near, decay)
-        K_z, K_v, force = self.modes
         # 1 / (2 delta_k - 2 a) <= 1 / ((beta - 2 a / omega^2) omega_k^2) or <= 1 / (alpha - 2 a)
         beta, alpha = self.beta - 2 * a / last**2, self.alpha - 2 * a
         by_beta = self.rest_static / beta if beta > 0 else np.inf
         by_alpha = self.rest_force / alpha if alpha > 0 else np.inf
-        rest = (self.rest_z / r + self.rest_v) * far * min(by_beta, by_alpha)
+        beyond = min(by_beta, by_alpha)
+        if not np.isfinite([*each, beyond]).all():
+            return np.inf
+        K_z, K_v, force = self.modes
+        rest = (self.rest_z / r + self.rest_v) * far * beyond
         return float(np.sum((K_z / r + K_v) * force * each)) + rest
 
     def _coupled(self, r: float) -> float:
@@ -129,6 +128,21 @@ class Tail:
         grid = float(self.omega[0]) * 1e-3 * 1.1 ** np.arange(145)  # to 1000 omega_1
         good = [r for r in grid if self.bound(r) < wanted]
         return float(min(good, default=np.inf))
+
+
+def _norms(problem: RiccatiProblem, X: Array, W_X: Array, parts: int) -> list[float]:
+    """Norms |X_i|_W of equally wide parts of X. Collective."""
+    squares = total(problem.layout.comm, np.einsum("ij,ij->j", X, W_X))
+    return [float(np.sqrt(max(part.sum(), 0.0))) for part in np.split(squares, parts)]
+
+
+def _moved_mass(problem: RiccatiProblem, X: Array) -> Array:
+    """M_ee X, two-way (M_ee - G M_s^{-1} G') X, local rows. Collective."""
+    system = problem.system
+    result = times_columns(system.M_ee, X)
+    if system.two_way:
+        result -= system.G @ np.linalg.solve(problem.M_s, total(problem.layout.comm, system.G.T @ X))
+    return result
 
 
 def _inverse_mass(problem: RiccatiProblem, X: Array) -> Array:
