@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from fem.petsc import Array, total
+from fem.petsc import Array
+from lqr.compress import gram
+from lqr.coordinates import factor_of
 from lqr.gain import PlantState
+from lqr.operators import descriptor
+from lqr.plant import Block
 from lqr.problem import RiccatiProblem, RiccatiSolution
 
 
@@ -35,25 +39,8 @@ def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: floa
     return np.concatenate([[0.0], dt * np.cumsum(rate)])
 
 
-def descriptor_times(problem: RiccatiProblem, x: PlantState) -> tuple[Array, Array]:
-    """E x as hand rows (2 n_s,) and local tissue rows (2 n_local,). Collective."""
-    system = problem.system
-    hand = problem.M_s @ x.v_s
-    if system.two_way:
-        hand = hand + total(problem.layout.comm, system.G.T @ x.v_z)
-    v, y = system.M_ee.createVecs()
-    v.array_w[:] = x.v_z
-    system.M_ee.mult(v, y)
-    momentum = np.array(y.array_r) + system.G @ x.v_s
-    v.destroy()
-    y.destroy()
-    return np.concatenate([x.q_s, hand]), np.concatenate([x.z, momentum])
-
-
 def predicted_cost(problem: RiccatiProblem, solution: RiccatiSolution, error: PlantState) -> float:
     """V = e'E'XE e = |Z'E e|^2 for e = x - x_bar: the cost from here to infinity. Collective."""
-    hand, tissue = descriptor_times(problem, error)
-    n = problem.layout.n_local
-    product = total(problem.layout.comm, solution.Z_z.T @ tissue[:n] + solution.Z_v.T @ tissue[n:])
-    product += solution.Z_s.T @ hand
-    return float(product @ product)
+    hand, tall = np.concatenate([error.q_s, error.v_s]), np.concatenate([error.z, error.v_z])
+    moved = descriptor(problem, Block(hand[:, None], tall[:, None]))
+    return float(np.sum(gram(problem.layout.comm, factor_of(solution), moved) ** 2))

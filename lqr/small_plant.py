@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from fem.petsc import Array, PETSc, times_columns, total
 from lqr.checks import ControlError
+from lqr.dense import assemble_space
 from lqr.gain import Gain, PlantState
+from lqr.operators import damp
 from lqr.problem import RiccatiProblem
 from lqr.target import steady_input
+from reduction.engines import on_root
 
 
 @dataclass(frozen=True)
@@ -105,42 +109,33 @@ def project(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
     """
     system, comm = problem.system, problem.layout.comm
     M_V, K_V = times_columns(system.M_ee, V), times_columns(system.K_ee, V)
-    D_V = system.damping.alpha * M_V + system.damping.beta * K_V
-    if system.damping.matrix is not None:
-        D_V += times_columns(system.damping.matrix, V)
+    D_V = damp(system, V)
     k, n_s = V.shape[1], problem.layout.n_s
     small = total(comm, np.stack([V.T @ M_V, V.T @ K_V, V.T @ D_V]))
     M, K, D = (small + small.transpose(0, 2, 1)) / 2
-    G, C_z = total(comm, V.T @ system.G), total(comm, problem.C_z.T @ V)
+    G, C_z = total(comm, V.T @ system.G), total(comm, V.T @ problem.C_z)
     values = np.linalg.eigvalsh(M / np.sqrt(np.outer(np.diag(M), np.diag(M)))) if (np.diag(M) > 0).all() else [0.0]
     if not values[0] > 1e-12:  # rounding of the products is about 1e-15 k
         raise ControlError(f"the {k} shapes of the tissue are linearly dependent; orthonormalise them first")
-    N = 2 * (n_s + k)
-    q, v = slice(0, n_s), slice(n_s, 2 * n_s)
-    z, w = slice(2 * n_s, 2 * n_s + k), slice(2 * n_s + k, N)
-    E, A, f = np.eye(N), np.zeros((N, N)), np.zeros(N)
-    E[v, v], E[w, w], E[w, v] = problem.M_s, M, G
-    A[q, v], A[z, w], A[w, z], A[w, w] = np.eye(n_s), np.eye(k), -K, -D
-    if system.two_way:
-        E[v, w] = G.T
-    if system.damping.in_space:
-        A[w, v] = -system.damping.alpha * G
-        if system.two_way:
-            A[v, v], A[v, w] = -system.damping.alpha * system.M_rigid, -system.damping.alpha * G.T
+    space = assemble_space(problem, M, K, D, G, C_z)
+    f = np.zeros(len(space.E))
     if system.gravity is not None:
-        f[w] = G @ system.gravity
-    f[v] = -steady_input(system)
-    S = np.eye(N)
-    C = np.hstack([problem.C_s, np.zeros_like(problem.C_s), C_z, np.zeros_like(C_z)])
-    plant = SmallPlant(E, A, np.ascontiguousarray(S[:, v]), C, f, S[q], S[v], problem.names)
+        f[2 * n_s + k :] = G @ system.gravity
+    f[n_s : 2 * n_s] = -steady_input(system)
+    S = np.eye(2 * n_s, len(f))
+    plant = SmallPlant(space.E, space.A, space.B, space.C, f, S[:n_s], S[n_s:], problem.names)
     return plant, Shapes(V, np.linalg.solve(M, M_V.T).T)
 
 
 def m_orthonormal(M: PETSc.Mat, V: Array, tolerance: float = 1e-10) -> Array:
     """Columns that span V with V' M V = I; directions below ``tolerance`` of the largest are dropped. Collective."""
-    for _ in range(2):  # the second pass repairs what rounding left after the first
-        gram = total(M.comm.tompi4py(), V.T @ times_columns(M, V))
+    comm = M.comm.tompi4py()
+
+    def normalising(gram: Array) -> Array:
         values, vectors = np.linalg.eigh((gram + gram.T) / 2)
         keep = values > tolerance**2 * values[-1]
-        V = V @ (vectors[:, keep] / np.sqrt(values[keep]))
+        return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
+
+    for _ in range(2):  # the second pass repairs what rounding left after the first
+        V = V @ on_root(comm, partial(normalising, total(comm, V.T @ times_columns(M, V))))
     return np.asfortranarray(V)

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fem.petsc import Array, total
-from fem.solvers import choose_solver, make_solver
 from fem.system import BlockSystem
 from lqr.checks import ControlError
 from lqr.gain import PlantState
 from lqr.problem import RiccatiProblem
+from reduction.inner import solve_columns
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,8 @@ def sag(system: BlockSystem) -> Array:
     """
     if system.gravity is None:
         return np.zeros(system.layout.n_local)
-    load, z = system.K_ee.createVecLeft(), system.K_ee.createVecRight()
-    load.array_w[:] = system.G @ system.gravity
-    solver = make_solver(system.K_ee.copy(), choose_solver(system.layout)[0], system.layout, "softgrasp_sag_")
-    solver.solve(load, z)
-    solver.check(load, z, "the equilibrium of the target")
-    result = np.array(z.array_r)
-    solver.destroy()
-    load.destroy()
-    z.destroy()
-    return result
+    load = (system.G @ system.gravity)[:, None]
+    return solve_columns(system.K_ee, system.layout, load, "the equilibrium of the target")[:, 0]
 
 
 def steady_input(system: BlockSystem) -> Array:
@@ -68,11 +60,10 @@ def steady_input(system: BlockSystem) -> Array:
     return u
 
 
-def rest(system: BlockSystem, q_s: Array | None = None, *, deformed: bool = True) -> PlantState:
-    """The plant at rest with the hand at q_s (default 0), in equilibrium or undeformed. Collective."""
+def rest(system: BlockSystem, *, deformed: bool = True) -> PlantState:
+    """The plant at rest with the hand at 0, in equilibrium or undeformed. Collective."""
     n_s, n = system.layout.n_s, system.layout.n_local
-    q = np.zeros(n_s) if q_s is None else np.array(q_s, dtype=np.float64)
-    return PlantState(q, np.zeros(n_s), sag(system) if deformed else np.zeros(n), np.zeros(n))
+    return PlantState(np.zeros(n_s), np.zeros(n_s), sag(system) if deformed else np.zeros(n), np.zeros(n))
 
 
 def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
@@ -110,9 +101,8 @@ def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
     right = wanted - total(problem.layout.comm, problem.C_z.T @ z)
     q = np.linalg.lstsq(C_s, right)[0]
     miss = float(np.abs(C_s @ q - right).max())
-    if miss > 1e-9 * (
-        1.0 + float(np.abs(right).max())
-    ):  # rounding of the least squares, far below any length that counts
+    # rounding of the least squares, far below any length that counts
+    if miss > 1e-9 * (1.0 + float(np.abs(right).max())):
         raise ControlError(
             f"no position of the hand brings the outputs to {wanted.tolist()}, the nearest misses by {miss:.3g} m; "
             "give a target that the body reaches at rest"

@@ -36,19 +36,19 @@ def save_model(model: ReducedModel, path: Path) -> None:
     partial = path.with_name(path.name + ".part")
     if lift is None or comm is None:
         _write_small(model, partial)
-    else:
-        with agree(comm):
-            if comm.rank == 0:
-                _write_small(model, partial)
-        for rank in range(comm.size):
-            # one file, one writer at a time: the file library here is not a parallel one
-            with agree(comm):
-                if comm.rank == rank:
-                    _write_rows(lift, partial)
-    if comm is None or comm.rank == 0:
         partial.replace(path)
-    if comm is not None:
-        comm.Barrier()
+        return
+    with agree(comm):
+        if comm.rank == 0:
+            _write_small(model, partial)
+    for rank in range(comm.size):
+        # one file, one writer at a time: the file library here is not a parallel one
+        with agree(comm):
+            if comm.rank == rank:
+                _write_rows(lift, partial)
+    with agree(comm):
+        if comm.rank == 0:
+            partial.replace(path)
 
 
 def _write_small(model: ReducedModel, path: Path) -> None:

@@ -28,10 +28,10 @@ import numpy as np
 
 from fem.errors import SoftgraspError
 from fem.petsc import Array, times_columns, total
-from fem.solvers import choose_solver, make_solver
 from fem.system import BlockSystem
 from reduction.basis import Basis
 from reduction.galerkin import symmetric
+from reduction.inner import solve_columns
 from reduction.small import Operators, Parameters, Parts
 
 MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inherits it
@@ -58,25 +58,8 @@ def mass_solve(system: BlockSystem, *blocks: Array) -> list[Array]:
     Raises:
         SolverError: the factorisation fails or a residual is too large.
     """
-    name = choose_solver(system.layout)[0]
-    solver = make_solver(system.M_ee.copy(), name, system.layout, "softgrasp_mass_", MASS_RTOL)
-    r, w = system.M_ee.createVecs()
-    results = []
-    try:
-        for X in blocks:
-            result = np.zeros(X.shape, order="F")
-            empty = total(system.layout.comm, np.abs(X).sum(axis=0)) == 0
-            for j in np.flatnonzero(~empty):
-                r.array_w[:] = X[:, j]
-                solver.solve(r, w)
-                solver.check(r, w, "the momentum of a basis vector")
-                result[:, j] = w.array_r
-            results.append(result)
-    finally:
-        solver.destroy()
-        r.destroy()
-        w.destroy()
-    return results
+    X, ends = np.hstack(blocks), np.cumsum([block.shape[1] for block in blocks])[:-1]
+    return np.split(solve_columns(system.M_ee, system.layout, X, "the momentum of a basis vector", MASS_RTOL), ends, 1)
 
 
 def _rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array, Array]:
