@@ -15,6 +15,7 @@ from lqr.compress import compress, gram
 from lqr.plant import Block, Plant
 from lqr.shifted import ShiftedTissue
 from lqr.shifts import WINDOW, ShiftQueue
+from reduction.engines import on_root
 
 Progress = Callable[[dict[str, float]], None]
 SQUEEZE = 480  # columns of Z from which it is compressed on the way: memory of a large scene
@@ -63,9 +64,9 @@ class Columns:
         """All columns (views)."""
         return Block(self.hand[:, : self.count], self.tall[:, : self.count])
 
-    def recent(self, blocks: int = WINDOW) -> Block:
-        """Columns of the last blocks (views)."""
-        first = self.count - min(sum(self.widths[-blocks:]), self.count)
+    def recent(self) -> Block:
+        """Columns of the last :data:`lqr.shifts.WINDOW` blocks (views)."""
+        first = self.count - min(sum(self.widths[-WINDOW:]), self.count)
         return Block(self.hand[:, first : self.count], self.tall[:, first : self.count])
 
     def squeeze(self) -> None:
@@ -163,10 +164,14 @@ def sweep_norms(plant: Plant, sweep: Sweep) -> tuple[float, float]:
     change = Block(sweep.new.block.hand - sweep.gain.block.hand, sweep.new.block.tall - sweep.gain.block.tall)
     q, both = W.columns, Block.join([W, change])
     products = gram(plant.comm, both, both)
-    lyapunov = float(np.linalg.eigvalsh(products[:q, :q])[-1])
     # the eigenvalues of U S U' that are not zero are those of S U'U
     signs = np.concatenate([np.ones(q), -np.ones(change.columns)])
-    riccati = float(np.abs(np.linalg.eigvals(signs[:, None] * products)).max())
+
+    def norms() -> tuple[float, float]:
+        riccati = float(np.abs(np.linalg.eigvals(signs[:, None] * products)).max())
+        return float(np.linalg.eigvalsh(products[:q, :q])[-1]), riccati
+
+    lyapunov, riccati = on_root(plant.comm, norms)  # the same bits on every rank: they decide when all stop
     sweep.first = max(sweep.first, lyapunov) if sweep.steps <= 1 else sweep.first
     if not lyapunov <= GROWTH * sweep.first:
         raise SolverError(

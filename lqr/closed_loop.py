@@ -117,7 +117,11 @@ class ClosedLoop:
         self.solver = choose_solver(problem.layout, solver)
         begin = time.perf_counter()
         self.midpoint = TissueMidpoint(problem.system, dt, self.solver[0], rtol, reproducible)
-        self.plant = PlantStep(problem.system, self.midpoint)
+        try:
+            self.plant = PlantStep(problem.system, self.midpoint)
+        except Exception:
+            self.midpoint.destroy()
+            raise
         self.factor_seconds = problem.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)
 
     def run(

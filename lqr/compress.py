@@ -9,6 +9,7 @@ from mpi4py import MPI
 from fem.petsc import Array, total
 from lqr.checks import EPS, ControlError
 from lqr.plant import Block, Plant
+from reduction.engines import on_root
 
 COLUMNS = 64  # columns whose products are held at a time
 CHUNK = 20_000  # rows a QR takes at once; LAPACK copies its argument
@@ -69,11 +70,8 @@ def compress(plant: Plant, Z: Block, allowed: float) -> Block:
     linearly, so rounding of the Gram matrix is rounding of X.
     """
     G_A, G_E = residual_weights(plant, Z)
-    basis = None
-    if plant.comm.rank == 0:
-        ratio = np.sqrt(max(np.trace(G_A), 1e-300) / max(np.trace(G_E), 1e-300))
-        basis = _leading(G_A / ratio + G_E * ratio, allowed)
-    return Z.times(plant.comm.bcast(basis))
+    ratio = np.sqrt(max(np.trace(G_A), 1e-300) / max(np.trace(G_E), 1e-300))
+    return Z.times(on_root(plant.comm, lambda: _leading(G_A / ratio + G_E * ratio, allowed)))
 
 
 def _leading(G: Array, allowed: float) -> Array:

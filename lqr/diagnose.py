@@ -177,7 +177,7 @@ def _damping(problem: RiccatiProblem, rates: ModeRates) -> list[Finding]:
             )
         ]
     if lost:
-        return [Finding("error", "damping", lost_sentence(rates, len(rates.omega)))]
+        return [Finding("error", "damping", lost_sentence(rates))]
     zeta = float(rates.own[0] / rates.omega[0])
     if zeta < WEAK:
         return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -17,6 +18,7 @@ from lqr.plant import Block, Plant
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.shifted import ShiftedTissue, make_shifted
 from lqr.shifts import shift_range
+from reduction.engines import on_root
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
 ROUNDING = 1e-13  # of a Gram matrix: columns independent to 3e-7
@@ -45,7 +47,7 @@ class Space:
                 columns = columns - self.V @ total(comm, self.M_V.T @ columns)
             M_columns = plant.mass(columns)
             gram = total(comm, columns.T @ M_columns)
-            S: Array = comm.bcast(_normalising(gram) if comm.rank == 0 else None)
+            S: Array = on_root(comm, partial(_normalising, gram))
             columns, M_columns = columns @ S, M_columns @ S
         more = (columns, M_columns, plant.stiff(columns))
         return Space(*(np.hstack([a, b]) for a, b in zip((self.V, self.M_V, self.K_V), more, strict=True)))
@@ -54,12 +56,13 @@ class Space:
         """M-orthonormal Ritz basis V'M V = I, V'K V = diag(omega^2), omega, and S with new basis = V S. Collective."""
         r = self.V.shape[1]
         products = total(plant.comm, self.V.T @ np.hstack([self.M_V, self.K_V]))
-        found: tuple[Array, Array] | None = None
-        if plant.comm.rank == 0:
+
+        def rotate() -> tuple[Array, Array]:
             G, H = ((P + P.T) / 2 for P in (products[:, :r], products[:, r:]))
             squares, rotation = scipy.linalg.eigh(H, G)
-            found = np.sqrt(squares), rotation
-        omega, S = plant.comm.bcast(found)
+            return np.sqrt(squares), rotation
+
+        omega, S = on_root(plant.comm, rotate)
         return Space(self.V @ S, self.M_V @ S, self.K_V @ S), omega, S
 
 
@@ -146,7 +149,8 @@ def gain_change(plant: Plant, new: Level, old: Level) -> float:
     if plant.n_s:
         hand = float(np.linalg.norm(new.gain.hand - old.gain.hand) / np.linalg.norm(new.gain.hand))
     size = tissue(new.a, new.b)
-    return max(hand, tissue(new.a - old.a, new.b - old.b) / size if size > 0 else 0.0)
+    change = max(hand, tissue(new.a - old.a, new.b - old.b) / size if size > 0 else 0.0)
+    return float(comm.bcast(change))  # the same bits on every rank: they decide when all stop
 
 
 def frequencies(low: float, high: float, count: int) -> Array:

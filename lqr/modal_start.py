@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from fem.errors import agree
 from fem.modes import lowest_modes
 from fem.petsc import Array, PETSc, total
 from fem.system import BlockSystem
@@ -16,6 +15,7 @@ from lqr.checks import ControlError
 from lqr.dense import StateSpace, assemble_space
 from lqr.plant import Block, Plant
 from lqr.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
+from reduction.engines import on_root
 
 MODES = 30
 MORE_MODES = 60  # when the last of MODES is still lightly damped
@@ -134,18 +134,17 @@ def solve_small(plant: Plant, small: SmallPlant, guess: Array | None = None) -> 
     Raises:
         ControlError: not stabilisable or not detectable.
     """
-    found: SmallSolution | None = None
-    with agree(plant.comm):
-        if plant.comm.rank == 0:
-            E, A, B, C = small.space.E, small.space.A, small.space.B, small.space.C
-            X = None if guess is None else _corrected(small.space, guess)
-            if X is None:
-                X = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
-            if X is None:
-                X = care(A, B, C, np.eye(len(C)), np.eye(B.shape[1]), E).X
-            found = SmallSolution(X, B.T @ X @ E)
-    solution: SmallSolution = plant.comm.bcast(found)
-    return solution
+
+    def solve() -> SmallSolution:
+        E, A, B, C = small.space.E, small.space.A, small.space.B, small.space.C
+        X = None if guess is None else _corrected(small.space, guess)
+        if X is None:
+            X = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+        if X is None:
+            X = care(A, B, C, np.eye(len(C)), np.eye(B.shape[1]), E).X
+        return SmallSolution(X, B.T @ X @ E)
+
+    return on_root(plant.comm, solve)
 
 
 def _corrected(space: StateSpace, X: Array) -> Array | None:
@@ -168,8 +167,7 @@ def _corrected(space: StateSpace, X: Array) -> Array | None:
 
 def ordered_poles(plant: Plant, small: SmallPlant, solution: SmallSolution) -> np.ndarray:
     """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost. Collective."""
-    found = _ordered(plant, small, solution.gain) if plant.comm.rank == 0 else None
-    return np.asarray(plant.comm.bcast(found))
+    return on_root(plant.comm, lambda: _ordered(plant, small, solution.gain))
 
 
 def _ordered(plant: Plant, small: SmallPlant, gain: Array) -> np.ndarray:

@@ -36,12 +36,13 @@ class NewtonADI:
 
     Attributes:
         tol: bound on the true relative residual, 2-norm, hand-relative coordinates.
-        max_iterations: bound on Newton steps times solves of a sweep: steps.
+        max_iterations: bound on the Newton steps.
         max_solves: bound on the solves of one sweep.
         modes: modes of the start; 0 starts from the hand alone, None chooses.
         tissue: gathered, distributed or auto, see :mod:`lqr.shifted`.
         progress: called on every rank after each solve with the history entry.
         checkpoint: folder for restart files, one a rank; an existing one is resumed.
+        checkpoint_every: solves between two restart files.
     """
 
     tol: float = 1e-10

@@ -48,6 +48,7 @@ def fingerprint(plant: Plant) -> str:
         digest.update(np.ascontiguousarray(A.getValuesCSR()[2]))
     damping = plant.system.damping
     digest.update(repr((damping.alpha, damping.beta)).encode())
+    digest.update(b"" if damping.matrix is None else np.ascontiguousarray(damping.matrix.getValuesCSR()[2]))
     for array in (plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G):
         digest.update(np.ascontiguousarray(array))
     digest.update(b"" if plant.B_z is None else np.ascontiguousarray(plant.B_z))
@@ -94,14 +95,17 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> No
         entries |= {"factor_hand": U.hand, "factor_tall": U.tall, "factor_signs": signs}
     path = _file(folder, plant)
     fresh = path.with_suffix(".new.npz")
-    with agree(plant.comm):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            np.savez(fresh, allow_pickle=False, **entries)
-        except OSError as error:
-            raise CheckpointError(f"{fresh}: the restart file cannot be written ({error}); free the disk") from error
-    fresh.replace(path)
-    plant.comm.Barrier()
+
+    def write() -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez(fresh, allow_pickle=False, **entries)
+
+    for act in (write, lambda: fresh.replace(path)):  # no rank replaces its file before all have written theirs
+        with agree(plant.comm):
+            try:
+                act()
+            except OSError as error:
+                raise CheckpointError(f"{path}: the restart file cannot be written ({error}); free the disk") from error
 
 
 def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> Sweep | None:

@@ -149,22 +149,6 @@ class Plant:
             tall[n:] += self.G @ b_s
         return Block(np.vstack([V.hand[:s], self.M_s @ b_s + total(self.comm, self.G.T @ b)]), tall)
 
-    def plant_adjoint(self, V: Block) -> Block:
-        """A'V of a costate block; the z-row of the result is unscaled. Collective."""
-        n, s = self.n_local, self.n_s
-        a, b, b_s = V.tall[:n], V.tall[n:], V.hand[s:]
-        tall = np.empty(V.tall.shape, order="F")
-        K_b = self.stiff(b)
-        tall[:n] = -K_b
-        tall[n:] = self.stiff(a) - self.damp(b, K_b=K_b)
-        v_s = V.hand[:s].copy()
-        if self.drag_es:
-            v_s -= self.drag_es * total(self.comm, self.G.T @ b)
-        if self.drag_hand:
-            v_s -= self.drag_hand * (self.system.M_rigid @ b_s)
-            tall[n:] -= self.drag_hand * (self.G @ b_s)
-        return Block(np.vstack([np.zeros_like(v_s), v_s]), tall)
-
 
 def _values(A: PETSc.Mat) -> Array:
     return np.asarray(A.getValuesCSR()[2])

@@ -91,17 +91,17 @@ def check_poles(rates: ModeRates) -> None:
     """
     lost = np.flatnonzero(rates.lost)
     if len(lost):
-        raise ControlError(lost_sentence(rates, len(rates.omega)))
+        raise ControlError(lost_sentence(rates))
 
 
-def lost_sentence(rates: ModeRates, total_modes: int) -> str:
+def lost_sentence(rates: ModeRates) -> str:
     """The sentence about the modes that feedback cannot stabilise. Not collective."""
     lost = np.flatnonzero(rates.lost)
     shown = ", ".join(f"{i + 1} (omega = {rates.omega[i]:.4g}/s)" for i in lost[:3])
     more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
     return (
-        f"{len(lost)} of {total_modes} modes cannot be stabilised in double precision, mode {shown}{more}: they are "
-        "neither damped nor both reached by the hand and seen by the outputs; set effects.damping.beta >= "
+        f"{len(lost)} of {len(rates.omega)} modes cannot be stabilised in double precision, mode {shown}{more}: they "
+        "are neither damped nor both reached by the hand and seen by the outputs; set effects.damping.beta >= "
         f"{enough_damping(rates):.2g} s, or control only the lowest modes with the method modal_lqr"
     )
 

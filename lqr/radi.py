@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from lqr.plant import Block, Plant
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.shifted import ShiftedTissue, make_shifted
 from lqr.shifts import ShiftQueue, shift_range
+from reduction.engines import on_root
 
 
 @dataclass
@@ -156,8 +158,9 @@ class RADI:
         while state.solves < self.max_iterations:
             s = radi_step(plant, tissue, state, queue)
             begin = time.perf_counter()
-            W = state.W.block
-            relative = float(np.linalg.norm(gram(plant.comm, W, W), 2)) / plant.scale
+            products = gram(plant.comm, state.W.block, state.W.block)
+            # the same bits on every rank: they decide when all stop
+            relative = on_root(plant.comm, partial(np.linalg.norm, products, 2)) / plant.scale
             state.seconds["small"] += time.perf_counter() - begin
             entry = {"solve": float(state.solves), "shift_re": s.real, "shift_im": s.imag, "residual": relative}
             state.history.append(entry)

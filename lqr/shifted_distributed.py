@@ -106,7 +106,7 @@ class DistributedTissue:
             ahead: not used.
 
         Raises:
-            SolverError: the factorisation fails.
+            SolverError: the factorisation or the solve fails.
         """
         p = complex(p)
         begin = time.perf_counter()
@@ -120,10 +120,14 @@ class DistributedTissue:
         answer = np.zeros((2 * n, k), order="F")
         B = PETSc.Mat().createDense(sizes, array=right, comm=self.S.comm)
         X = PETSc.Mat().createDense(sizes, array=answer, comm=self.S.comm)
-        self.ksp.getPC().getFactorMatrix().matSolve(B, X)
+        try:
+            self.ksp.getPC().getFactorMatrix().matSolve(B, X)
+        except PETSc.Error as error:
+            raise SolverError(f"MUMPS failed to solve at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
+        finally:
+            B.destroy()
+            X.destroy()
         result = answer[0::2] + 1j * answer[1::2]
-        B.destroy()
-        X.destroy()
         self.seconds["factor"] += middle - begin
         self.seconds["solve"] += time.perf_counter() - middle
         return result

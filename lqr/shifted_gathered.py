@@ -43,7 +43,9 @@ class GatheredTissue:
         self.alpha, self.beta = damping.alpha, damping.beta
         self.D = None if damping.matrix is None else self._permute(self._gather(damping.matrix))
         parts = [self.K, self.M] + ([] if self.D is None else [self.D])
-        self.same = all(np.array_equal(A.indices, self.K.indices) for A in parts)
+        self.same = all(
+            np.array_equal(A.indptr, self.K.indptr) and np.array_equal(A.indices, self.K.indices) for A in parts
+        )
         # filled in turn, because making one checks its indices
         self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(2)]
         self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from fem.petsc import Array, total
 from lqr.adjoint import Right
 from lqr.plant import Block, Plant
+from reduction.engines import on_root
 
 WINDOW = 12  # blocks of Z whose Ritz values give the next shifts
 BATCH = 8  # solves between two projections
@@ -81,8 +82,7 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
     F, G, seen, felt = energy_products(plant, V, W, nothing if gain is None else gain.block)
     if gain is not None:
         F -= felt @ plant.felt(V).T
-    pairs: tuple[np.ndarray, Array] = plant.comm.bcast(_pencil_pairs(F, G, seen) if plant.comm.rank == 0 else None)
-    return pairs
+    return on_root(plant.comm, lambda: _pencil_pairs(F, G, seen))
 
 
 def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, Array, Array, Array]:

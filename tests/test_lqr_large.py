@@ -213,10 +213,15 @@ def test_resume_goes_on_where_it_stopped(mpi_tmp_path: Path) -> None:
 
 
 def test_foreign_restart_file_is_refused(mpi_tmp_path: Path) -> None:
-    with pytest.raises(_StopError):
-        NewtonADI(checkpoint=mpi_tmp_path, checkpoint_every=5, progress=_stop_at(8)).solve(problem_of("one_way"))
-    with pytest.raises(CheckpointError, match="another control problem"):
-        NewtonADI(checkpoint=mpi_tmp_path).solve(problem_of("two_way"))
+    layers = problem_of("layers")
+    tougher = tuple(replace(m, beta=1.1 * m.beta) for m in layers.system.materials)
+    other = replace(layers, system=layers.system.with_materials(tougher))
+    for name, mine, foreign in (("hand", problem_of("one_way"), problem_of("two_way")), ("layers", layers, other)):
+        folder = mpi_tmp_path / name
+        with pytest.raises(_StopError):
+            NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(8)).solve(mine)
+        with pytest.raises(CheckpointError, match="another control problem"):
+            NewtonADI(checkpoint=folder).solve(foreign)
 
 
 def test_choice_names_its_reason() -> None:

@@ -1,4 +1,4 @@
-"""Bases against dense oracles, which do not depend on the rank count, and against pyMOR."""
+"""Bases against dense oracles, which do not depend on the rank count."""
 
 from __future__ import annotations
 
