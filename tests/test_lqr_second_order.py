@@ -149,7 +149,7 @@ def oracle(example: Example) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("name", list(CASES))
 def test_newton_radi_and_dense_agree(name: str) -> None:
-    """Three roads and SciPy: the same X and the same gain; residuals from matrices of this file."""
+    """Three roads and SciPy, on any rank count: the same X and gain; residuals from matrices of this file."""
     example = CASES[name]
     problem = example.problem()
     X, K = oracle(example)
@@ -186,15 +186,6 @@ def test_long_chain_without_a_dense_matrix() -> None:
         assert np.linalg.norm(r @ S @ r.T, 2) < 2e-8 * example.n  # twice the tolerance; |C'C| = n
         gains.append(gain)
     assert np.linalg.norm(gains[0] - gains[1]) < 1e-6 * np.linalg.norm(gains[0])
-
-
-def test_rank_count_does_not_change_the_gain() -> None:
-    example = CASES["chain-dampers"]
-    _, gain = whole(NewtonADI(tol=1e-9).solve(example.problem()))
-    _, again = whole(RADI(tol=1e-9).solve(example.problem()))
-    _, K = oracle(example)
-    assert np.linalg.norm(gain - K) < 1e-6 * np.linalg.norm(K)
-    assert np.linalg.norm(gain - again) < 1e-6 * np.linalg.norm(K)
 
 
 def test_galerkin_of_the_chain() -> None:
