@@ -168,18 +168,29 @@ def make_solver(
     else:
         _set_up_direct(ksp, name, prefix, ksp.comm.size > 1 and factor_on_every_rank(layout, name, reproducible))
     try:
+        _factor(ksp, S, name)
+    except SolverError:
+        ksp.destroy()
+        S.destroy()
+        raise
+    factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
+    return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol), factor)
+
+
+def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
+    """The set-up, and what PETSc leaves of it to the first solve. Collective."""
+    try:
         ksp.setUp()
         if ksp.comm.size > 1 and name != "cg":
             _first_solve(ksp, S)
     except PETSc.Error as error:
         raise SolverError(
-            f"{name}: the factorisation of the tissue matrix (n_e = {layout.n_e}) failed (PETSc error {error.ierr}); "
-            "check material and mesh, or try time.solver = 'mumps'"
+            f"{name}: the factorisation of the tissue matrix (n_e = {S.getSize()[0]}) failed (PETSc error "
+            f"{error.ierr}); check material and mesh, or try time.solver = 'mumps'"
         ) from error
-    if ksp.getPC().getFailedReason():
-        raise SolverError(f"{name}: set-up failed (reason {ksp.getPC().getFailedReason()}); the matrix is not definite")
-    factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
-    return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol), factor)
+    reason = ksp.getPC().getFailedReason()
+    if reason:
+        raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
 
 
 def _first_solve(ksp: PETSc.KSP, S: PETSc.Mat) -> None:
