@@ -25,15 +25,16 @@ class LoopQuality:
     """The full plant under one gain.
 
     Attributes:
-        abscissa: largest real part of the closed-loop spectrum [1/s]; from :func:`lqr.spectrum.certified_abscissa` that
-            of the eigenvalues it found, a lower bound.
+        abscissa: largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``.
         cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
         certified: its sign is certain: from the whole spectrum, or from :func:`lqr.spectrum.certified_abscissa`.
+        exact: the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth.
     """
 
     abscissa: float
     cost_excess: float
     certified: bool = True
+    exact: bool = True
 
     @property
     def stable(self) -> bool:

@@ -173,7 +173,7 @@ class GainJudge:
             return self.whole.quality(gain, self.K, self.start, self.optimal)
         found = self.loop.quality(gain, self.K, self.start, self.optimal)
         excess = found.cost_excess if spectrum.value < 0 else np.inf
-        return LoopQuality(spectrum.value, excess, spectrum.certified)
+        return LoopQuality(spectrum.value, excess, spectrum.certified, spectrum.exact)
 
     def report(self, basis: RiccatiBasis) -> GainReport:
         """All figures of one basis; a reduced equation without solution is reported, not raised. Collective."""

@@ -83,12 +83,13 @@ def explain(
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
     from fem.scene_file import load_scene_collective
+    from study.command import write_json
     from study.explain import run_explain
 
     found = run_explain(load_scene_collective(MPI.COMM_WORLD, scene, set_ or []), MPI.COMM_WORLD, console())
     if out is not None and MPI.COMM_WORLD.rank == 0:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "result.json").write_text(json.dumps({"command": "explain", **found.to_dict()}, indent=2) + "\n")
+        write_json(out / "result.json", {"command": "explain", **found.to_dict()})
 
 
 @app.command()

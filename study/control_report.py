@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import platform
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,16 +12,17 @@ import numpy as np
 
 from fem.build import Model, Stopwatch
 from fem.outputs import hand_axes
-from fem.results import package_version, peak_memory_mb, trajectory_header
-from fem.scene_file import resolved_toml, scene_hash
+from fem.results import peak_memory_mb, trajectory_header
+from fem.scene_file import resolved_toml
 from lqr.closed_loop import LoopTrajectory
 from lqr.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
 from study.animation import speed_up
+from study.command import origin, write_json, write_scene
 from study.control_loop import LoopRuns, MadeController, distance
 from study.control_reduced import TITLES, Retuned, SweptBasis, report_dict
 from study.control_solve import Design, scene_words
 from study.equation_control import control_text
-from study.report import Section, write_report
+from study.report import Section, command_line, made_with, write_report
 
 Row = tuple[Any, ...]
 REDUCED_HEADER = ("basis", "N", "error of P", "error of K", "excess cost", "abscissa [1/s]", "reduced ARE [ms]", "gain")
@@ -71,11 +69,7 @@ def control_result(model: Model, found: Found, watch: Stopwatch) -> dict[str, An
     problem, solution = d.problem, d.solution
     return {
         "command": "control",
-        "scene": model.scene.name,
-        "scene_hash": scene_hash(model.scene),
-        "version": package_version(),
-        "ranks": layout.comm.size,
-        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        **origin(model.scene, layout.comm.size),
         "n_s": layout.n_s,
         "n_e": layout.n_e,
         "states": layout.states,
@@ -170,17 +164,6 @@ def settled(times: np.ndarray, far: np.ndarray, share: float = 0.01) -> float | 
     if len(outside) == 0:
         return float(times[0])
     return None if outside[-1] + 1 >= len(times) else float(times[outside[-1] + 1])
-
-
-def plain(value: Any) -> Any:
-    """JSON knows no nan and no inf: null instead."""
-    if isinstance(value, dict):
-        return {key: plain(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
 
 
 # --- tables
@@ -316,10 +299,6 @@ def write_all(
 ) -> list[Path]:
     """Tables, resolved scene, report, and result.json last. Rank 0 only."""
     files = write_tables(out, found)
-    toml = out / "scene.toml"
-    toml.write_text(resolved_toml(model.scene))
-    launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
-    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
     names = {file.name for file in drawn}
     faster = speed_up(np.array([0.0, found.runs.plan.settle]))
     speed = "" if faster == 1 else f" at {faster:g} times its speed"
@@ -330,11 +309,9 @@ def write_all(
         subtitle=model.scene.description,
         sections=sections(found, result, figures, control_text(model.scene)),
         scene=resolved_toml(model.scene),
-        reproduce=f"{launch}softgrasp control {shlex.quote(str(path))}{sets}",
+        reproduce=command_line("control", path, overrides, result["ranks"]),
     )
-    numbers = out / "result.json"
-    numbers.write_text(json.dumps(plain(result), indent=2) + "\n")
-    return [numbers, *files, toml, *drawn, report]
+    return [write_json(out / "result.json", result), *files, write_scene(out, model.scene), *drawn, report]
 
 
 def sections(found: Found, result: dict[str, Any], figures: list[tuple[Path, str]], equation: str) -> list[Section]:
@@ -364,7 +341,7 @@ def sections(found: Found, result: dict[str, Any], figures: list[tuple[Path, str
         text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
         own = [by_name["retune.png"]] if i == 0 and "retune.png" in by_name else []
         parts.append(Section("" if i else "Re-tuning", text, header=BOX_HEADER, rows=box_rows(r), figures=own))
-    about = [(key, result[key]) for key in ("n_s", "n_e", "states", "version", "machine", "ranks")]
+    about = [(key, result[key]) for key in ("n_s", "n_e", "states")] + made_with(result)
     about += [(f"time {k}", f"{v:.3g} s") for k, v in result["time"].items() if isinstance(v, float)]
     about += [(f"solver {k}", f"{v:.3g} s") for k, v in result["time"]["solver"].items()]
-    return [*parts, Section("Made with", rows=[*about, ("scene hash", result["scene_hash"])])]
+    return [*parts, Section("Made with", rows=about)]

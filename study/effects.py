@@ -14,14 +14,14 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
 from fem.build import build
 from fem.effects.measure import rigid_inertia
 from fem.errors import ResourceError
 from fem.scene import Scene
-from fem.scene_file import load_scene_collective
+from study.command import list_files, open_scene, progress_bar
 from study.effects_elements import Elements, judge_elements
 from study.effects_judge import TIMER, Cost, OffProof, cost_of, judge, prove_off, quartiles
 from study.effects_measure import (
@@ -304,18 +304,15 @@ def run_effects(
         SoftgraspError: with one sentence.
     """
     comm, begin = MPI.COMM_WORLD, time.perf_counter()
-    scene = load_scene_collective(comm, path, overrides)
-    console.print(f"[bold]{escape(scene.name)}[/bold]: effects at the tolerance {scene.study.tolerance:g}")
-    columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
+    scene = open_scene(path, overrides, console)
+    console.print(f"effects at the tolerance {scene.study.tolerance:g}")
+    with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
         task = bar.add_task("runs", total=None)
         study = study_effects(scene, comm, lambda done, work: bar.update(task, completed=done, total=work))
     result, files = write_effects(study, scene, comm, path, out, overrides, begin)
     if comm.rank == 0:
         show(study, console)
-        console.print("files:")
-        for file in files:
-            console.print(f"  {file}", soft_wrap=True)
+        list_files(console, files)
     return result
 
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import platform
-import shlex
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from fem.errors import agree
-from fem.results import package_version, peak_memory_mb
+from fem.results import peak_memory_mb
 from fem.scene import Scene
-from fem.scene_file import resolved_toml, scene_hash
+from fem.scene_file import resolved_toml
+from study.command import origin, write_json, write_scene
 from study.effects_objects import in_words
 from study.effects_plots import Mark, figure_effects
-from study.report import Section, write_report
+from study.report import Section, command_line, made_with, write_report
 
 if TYPE_CHECKING:
     from study.effects import EffectsStudy, Finding
@@ -40,13 +38,9 @@ def write_effects(
     Raises:
         OSError: the folder cannot be written; on all ranks.
     """
-    result = {
+    result: dict[str, Any] = {
         "command": "effects",
-        "scene": scene.name,
-        "scene_hash": scene_hash(scene),
-        "version": package_version(),
-        "ranks": comm.size,
-        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        **origin(scene, comm.size),
         **study.to_dict(),
         "memory_peak_mb": peak_memory_mb(comm),
         "time": {"total": comm.allreduce(time.perf_counter() - begin, MPI.MAX)},
@@ -55,8 +49,11 @@ def write_effects(
     with agree(comm):
         if comm.rank == 0:
             out.mkdir(parents=True, exist_ok=True)
-            files = [out / "result.json", write_csv(study, out / "effects.csv")]
-            files[0].write_text(json.dumps(result, indent=2) + "\n")
+            files = [
+                write_json(out / "result.json", result),
+                write_csv(study, out / "effects.csv"),
+                write_scene(out, scene),
+            ]
             files += figure_effects(marks(study), study.tolerance, study.noise_quartiles, out / "effects.png")
             files.append(_report(study, scene, result, path, overrides, out))
     return result, files
@@ -198,8 +195,7 @@ def _report(
         ("memory", "the same matrices, vectors and arrays of the same size, and only what is declared"),
         ("operations", "PETSc counts as many in a step"),
     ]
-    about = [("machine", result["machine"]), ("ranks", str(result["ranks"]))]
-    about += [("scene hash", result["scene_hash"]), ("time", f"{result['time']['total']:.1f} s")]
+    about = [*made_with(result), ("time", f"{result['time']['total']:.1f} s")]
     sections = [_table("Relative change, gate and verdict", verdict_rows(study)), Section("Advice", rows=advice)]
     sections.append(_table("Costs", cost_rows(study)))
     text = "Objects that PETSc's own log counts as created more with the effect, up to the first step:"
@@ -210,8 +206,6 @@ def _report(
         sections.append(_table("Effects that are off cost nothing", proofs))
     sections += [Section("How it is judged", rows=how), Section("Size", rows=list(study.sizes.items()))]
     sections.append(Section("Made with", rows=about))
-    launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
-    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
     return write_report(
         out / "report.html",
         title=f"{scene.name}: effects",
@@ -219,7 +213,7 @@ def _report(
         sections=sections,
         figures=[(out / "effects.png", CAPTION)],
         scene=resolved_toml(scene),
-        reproduce=f"{launch}softgrasp effects {shlex.quote(str(path))}{sets}",
+        reproduce=command_line("effects", path, overrides, result["ranks"]),
     )
 
 

@@ -17,6 +17,7 @@ from fem.materials import young_poisson
 from fem.modes import lowest_modes
 from fem.petsc import PETSc
 from fem.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
+from study.command import plain
 from study.equation import Equation, equation
 
 if TYPE_CHECKING:
@@ -110,16 +111,8 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None. Not collective."""
-        result: dict[str, Any] = _plain(asdict(self))
+        result: dict[str, Any] = plain(asdict(self))
         return result
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:

@@ -12,20 +12,23 @@ from collections.abc import Callable
 from typing import Any
 
 from study.doctor import IN_MPI_JOB, find_mpiexec, run_limited
-from study.hard_rows import Family, Outcome, Row, plain
+from study.hard_rows import LENGTH, Family, Outcome, Row, plain
 
-FAULTS: dict[str, tuple[str, str]] = {
-    "disk": ("rank 1 cannot write its restart file", "cannot be written"),
-    "bug": ("a bug raises on rank 1 in the middle of the run", "RuntimeError"),
-    "nan": ("the state of rank 1 turns NaN", "not finite"),
-    "killed": ("rank 1 is killed by the system", ""),
+# what happens, what must be said, and the same in a bare script
+FAULTS: dict[str, tuple[str, str, str]] = {
+    "disk": ("rank 1 cannot write its restart file", "cannot be written", 'raise OSError("disk full")'),
+    "bug": ("a bug raises on rank 1 in the middle of the run", "RuntimeError", 'raise RuntimeError("a bug")'),
+    "nan": ("the state of rank 1 turns NaN", "not finite", 'x = float("nan")'),
+    "killed": ("rank 1 is killed by the system", "", "os.kill(os.getpid(), signal.SIGKILL)"),
 }
 LIMIT = {True: 20.0, False: 30.0}  # [s] of the job, start included; MPI starts in 1 to 3 s
 BARE = """
+import os, signal
 from mpi4py import MPI
+x = 1.0
 if MPI.COMM_WORLD.rank == 1:
-    raise OSError("disk full")
-MPI.COMM_WORLD.allreduce(1)
+    {fault}
+print(MPI.COMM_WORLD.allreduce(x))
 """
 WORKER = "import sys; sys.path[:] = {path!r}; from study.hard_rank import worker; worker(*sys.argv[1:])"
 
@@ -84,11 +87,11 @@ def job(command: list[str], limit: float, sentence: str) -> Outcome:
     if status is None:
         return Outcome(float("inf"), f"hangs, still waiting after {limit:g} s")
     if status == 0:
-        return Outcome(None, "ended with status 0 as if nothing had happened")
+        return Outcome(None, "ended with status 0, nobody noticed")
     if sentence not in output:
         return Outcome(None, f"ended without saying '{sentence}'")
     said = next((line.strip() for line in output.splitlines() if sentence and sentence in line), f"status {status}")
-    return Outcome(seconds, re.sub(r"/\S*/(?=[^/\s])", "", said)[:80])
+    return Outcome(seconds, re.sub(r"/\S*/(?=[^/\s])", "", said)[:LENGTH])
 
 
 def rank_rows(quick: bool) -> list[Row]:
@@ -96,12 +99,12 @@ def rank_rows(quick: bool) -> list[Row]:
     if any(variable in os.environ for variable in IN_MPI_JOB):
         return []  # an MPI job cannot start another one
     rows, limit = [], LIMIT[quick]
-    bare = plain(job, ["-c", BARE], 5.0 if quick else 10.0, "")
     reason = "start of the job and a few seconds: nobody waits for the rank that is gone"
     for i, fault in enumerate(["disk"] if quick else list(FAULTS)):
-        text, sentence = FAULTS[fault]
+        text, sentence, same = FAULTS[fault]
         with tempfile.TemporaryDirectory() as folder:
             found = job(["-c", WORKER.format(path=sys.path), fault, folder], limit, sentence)
+        bare = plain(job, ["-c", BARE.format(fault=same)], 5.0 if quick else 10.0, "")
         rows.append(Row(text, i + 1, found, bare, limit, reason))
     return rows
 
@@ -109,6 +112,7 @@ def rank_rows(quick: bool) -> list[Row]:
 FAMILIES = (
     Family("rank", "A rank that fails alone", "fault", "seconds until all ranks have ended",
            "bare mpi4py script",
-           "In a bare script the healthy rank waits for ever; here all ranks agree on the failure or are ended.",
+           "In a bare script the healthy rank waits for ever, or goes on with the NaN of the other; here all ranks "
+           "agree on the failure or are ended.",
            rank_rows, axis="listed"),
 )  # fmt: skip

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import math
-import platform
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +12,13 @@ from typing import Any
 from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
 from fem.errors import SoftgraspError
 from fem.results import package_version
 from study import hard_carex, hard_forward, hard_motion, hard_numbers, hard_rank, hard_reduction, hard_riccati
+from study.command import list_files, machine, plain, progress_bar, write_json
 from study.hard_rows import Family, Outcome, Row
 from study.hardcases_plots import figure_family
 from study.report import Section, write_report
@@ -93,17 +91,10 @@ def run_hardcases(
     families = choose(family)
     out.mkdir(parents=True, exist_ok=True)
     findings = []
-    columns = (
-        TextColumn("hard cases"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[at]}"),
-    )
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("families", total=len(families), at="")
+    with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
+        task = bar.add_task("hard cases", total=len(families))
         for chosen in families:
-            bar.update(task, at=chosen.title)
+            bar.update(task, description=chosen.title)
             begin = time.perf_counter()
             rows = tuple(chosen.rows(quick))
             findings.append(Finding(chosen, rows, time.perf_counter() - begin))
@@ -112,9 +103,7 @@ def run_hardcases(
     result = result_of(findings, quick)
     files = write_files(out, findings, result, family, pictures)
     console.print(summary(result), soft_wrap=True)
-    console.print("files:")
-    for file in files:
-        console.print(f"  {file}", soft_wrap=True)
+    list_files(console, files)
     return result
 
 
@@ -143,13 +132,8 @@ def plain_label(text: str) -> str:
     return text.replace("$", "").replace("\\nu", "nu")
 
 
-def _number(value: float | None) -> float | None:
-    """JSON has no infinity and no NaN; the text beside it says which."""
-    return value if value is not None and math.isfinite(value) else None
-
-
 def _outcome(outcome: Outcome) -> dict[str, Any]:
-    return {"value": _number(outcome.value), "text": outcome.text, "refused": outcome.refused}
+    return {"value": plain(outcome.value), "text": outcome.text, "refused": outcome.refused}
 
 
 def result_of(findings: Sequence[Finding], quick: bool) -> dict[str, Any]:
@@ -167,9 +151,9 @@ def result_of(findings: Sequence[Finding], quick: bool) -> dict[str, Any]:
             "rows": [
                 {
                     "case": row.case,
-                    "x": _number(row.x),
+                    "x": plain(row.x),
                     "group": row.group,
-                    "bound": _number(row.bound),
+                    "bound": plain(row.bound),
                     "must_be_refused": row.bound is None,
                     "may_be_refused": row.may_refuse,
                     "reason": row.reason,
@@ -186,7 +170,7 @@ def result_of(findings: Sequence[Finding], quick: bool) -> dict[str, Any]:
     return {
         "command": "hardcases",
         "version": package_version(),
-        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        "machine": machine(),
         "quick": quick,
         "ok": all(f.ok for f in findings),
         "cases": len(rows),
@@ -211,14 +195,12 @@ def write_files(
     out: Path, findings: Sequence[Finding], result: dict[str, Any], family: str | None, draw: bool
 ) -> list[Path]:
     """Write result.json, hardcases.csv, one picture a family and report.html. Not collective."""
-    numbers = out / "result.json"
-    numbers.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
     pictures = {}
     for f in findings:
         if draw and f.rows:
             pictures[f.family.name] = figure_family(f.family, f.rows, out / f"hard_{f.family.name}.png")
     files = [
-        numbers,
+        write_json(out / "result.json", result),
         write_csv(out / "hardcases.csv", findings),
         *(file for pair in pictures.values() for file in pair),
     ]
@@ -254,7 +236,7 @@ def sections(findings: Sequence[Finding], pictures: dict[str, Path]) -> list[Sec
         verdicts = [row.verdict for row in f.rows]
         failed = sum(not row.ok for row in f.rows)
         refused = sum(row.ok for row in f.rows if row.verdict == "refused")
-        overview.append((f.family.title, len(f.rows), verdicts.count("pass"), refused, failed, f"{f.seconds:.1f}"))
+        overview.append((f.family.title, len(f.rows), verdicts.count("pass"), refused, failed, round(f.seconds, 1)))
     parts = [
         Section("Overview", INTRO, header=("family", "cases", "pass", "refused", "fail", "seconds"), rows=overview)
     ]

@@ -163,9 +163,9 @@ def _legends(axes: Any, names: list[list[str]], inputs: int, d: int, runs: list[
             shown.append(Line2D([], [], color=TARGET, lw=1.0, ls=(0, (1, 1.2)), label="target"))
         ax.legend(handles=shown, **place)
     first = len(names)
-    axes[first].legend(handles=colours([f"$u_{'xyz'[j] if d <= 3 else j + 1}$" for j in range(d)]), **place)
+    axes[first].legend(handles=colours([f"$u_{AXES[j] if d <= len(AXES) else j + 1}$" for j in range(d)]), **place)
     if d < inputs:
-        about = ["z"] if inputs - d == 1 else ["x", "y", "z", *map(str, range(4, inputs - d + 1))]
+        about = ["z"] if inputs - d == 1 else [*AXES, *map(str, range(4, inputs - d + 1))]
         axes[first + 1].legend(handles=colours([f"torque, ${a}$" for a in about[: inputs - d]]), **place)
     if len(runs) > 1:
         entries = [

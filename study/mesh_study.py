@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,6 +22,7 @@ from fem.results import package_version
 from fem.run import simulate
 from fem.scene import Scene
 from reduction.registry import METHODS, find_method
+from study.command import list_files, machine, write_json
 from study.reduce_reference import reference
 from study.reduce_sweep import Point, sweep
 
@@ -220,15 +219,14 @@ def run_mesh_study(
         "steps": steps,
         "version": package_version(),
         "ranks": comm.size,
-        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        "machine": machine(),
         "rows": [asdict(row) for row in rows],
         **found,
     }
     if comm.rank == 0:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "mesh_study.json").write_text(json.dumps(result, indent=2) + "\n")
-        for file in (out / "mesh_study.json", *draw(out / "mesh_study.png", rows, found)):
-            console.print(f"  {file}", soft_wrap=True)
+        numbers = write_json(out / "mesh_study.json", result)
+        list_files(console, [numbers, *draw(out / "mesh_study.png", rows, found)])
     comm.Barrier()
     return result
 

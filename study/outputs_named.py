@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from fem.outputs import hand_axes
+
 Array = npt.NDArray[np.float64]
 
-AXES = ("x", "y", "z")
-TURNS = ("rx", "ry", "rz")
+AXES, TURNS = hand_axes(3, 3), hand_axes(6, 3)[3:]
 
 
 def turns(names: Sequence[str]) -> list[int]:

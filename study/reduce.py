@@ -12,16 +12,16 @@ from typing import Any
 from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
-from fem.build import Model, Stopwatch, build
+from fem.build import Model, Stopwatch
 from fem.errors import SceneError
 from fem.results import peak_memory_mb, simulate_result
 from fem.run import Run, RunOptions, Trajectory, simulate
 from fem.scene import Scene
-from fem.scene_file import load_scene_collective
 from reduction.archive import save_model
+from study.command import list_files, open_model, open_scene, progress_bar
 from study.reduce_box import Box, box_result, measure_box
 from study.reduce_reference import Reference, reference
 from study.reduce_report import draw_all, write_all
@@ -121,17 +121,11 @@ def run_reduce(
     """
     begin = time.perf_counter()
     comm = MPI.COMM_WORLD
-    scene = load_scene_collective(comm, path, overrides)
+    scene = open_scene(path, overrides, console)
     names = check_scene(scene)
-    console.print(f"[bold]{scene.name}[/bold]: {scene.description}", soft_wrap=True)
-    model = build(scene, comm)
-    layout = model.system.layout
-    console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {comm.size} rank(s)")
+    model = open_model(scene, console)
     watch = Stopwatch(comm)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("left"))
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console, disable=quiet or not console.is_terminal, transient=True
-    ) as bar:
+    with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
         run, found = reduce_model(model, names, bar, watch)
     with watch.stage("models"):
         files = save_models(out, found.swept)
@@ -149,9 +143,7 @@ def run_reduce(
         result["time"] |= {"pictures": now - drawing, "total": now - begin}
         files = [*write_all(out, path, overrides, scene, found, result, drawn), *files]
         show(console, found, result)
-        console.print("files:")
-        for file in files:
-            console.print(f"  {file}", soft_wrap=True)
+        list_files(console, files)
     comm.Barrier()
     return result
 

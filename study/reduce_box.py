@@ -20,8 +20,9 @@ from reduction.online import run
 from reduction.project import project
 from reduction.registry import Method
 from reduction.states import States
+from study.command import plain
 from study.reduce_reference import Reference, prepare, reference
-from study.reduce_sweep import COMPARED, LARGER, Point, Swept, bases_of, finite, nearest
+from study.reduce_sweep import COMPARED, LARGER, Point, Swept, bases_of, nearest
 
 GRID = 3  # test values of each constant, from corner to corner of the box
 METHODS_TESTED = 4
@@ -251,13 +252,13 @@ def box_result(box: Box) -> dict[str, Any]:
     return {
         "reason_for_none": box.none,
         "trained_at": [list(place) for place in box.trained_at],
-        "summary": [{k: finite(v) for k, v in row.items()} for row in summary(box)],
+        "summary": plain(summary(box)),
         "points": [
             {
                 "lambda": p.lam,
                 "mu": p.mu,
                 "trained": p.trained,
-                "errors": [key | {"error_deformation": finite(e)} for key, e in zip(keys, p.errors, strict=True)],
+                "errors": [key | {"error_deformation": plain(e)} for key, e in zip(keys, p.errors, strict=True)],
             }
             for p in box.points
         ],

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fem.scene import Scene
 from fem.scene_file import resolved_toml
+from study.command import write_json, write_scene
 from study.reduce_tables import (
     BOX_HEADER,
     ERROR_HEADER,
@@ -22,7 +21,7 @@ from study.reduce_tables import (
     time_rows,
     write_csv,
 )
-from study.report import Section, write_report
+from study.report import Section, command_line, made_with, write_report
 
 if TYPE_CHECKING:
     from study.reduce import Reduced
@@ -73,8 +72,6 @@ def write_all(
 ) -> list[Path]:
     """Numbers and report beside the figures that are there. Rank 0 only."""
     table = write_csv(out / "points.csv", found.swept)
-    toml = out / "scene.toml"
-    toml.write_text(resolved_toml(scene))
     drawn = {file.name for file in files}
     report = write_report(
         out / "report.html",
@@ -82,17 +79,9 @@ def write_all(
         subtitle=scene.description,
         sections=sections(found, result, [(out / name, text) for name, text in CAPTIONS.items() if name in drawn]),
         scene=resolved_toml(scene),
-        reproduce=reproduce(result["ranks"], path, overrides),
+        reproduce=command_line("reduce", path, overrides, result["ranks"]),
     )
-    numbers = out / "result.json"
-    numbers.write_text(json.dumps(result, indent=2) + "\n")
-    return [numbers, table, toml, *files, report]
-
-
-def reproduce(ranks: int, path: Path, overrides: list[str]) -> str:
-    """The command."""
-    launch = f"mpiexec -n {ranks} " if ranks > 1 else ""
-    return f"{launch}softgrasp reduce {shlex.quote(str(path))}" + "".join(f" --set {shlex.quote(o)}" for o in overrides)
+    return [write_json(out / "result.json", result), table, write_scene(out, scene), *files, report]
 
 
 def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, str]]) -> list[Section]:
@@ -115,9 +104,8 @@ def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, s
         parts.append(Section("Refused", header=("method", "N", "reason"), rows=refused))
     parts += box_sections(found)
     about = [(key, result[key]) for key in ("n_s", "n_e", "states", "steps")]
-    about += [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", result["ranks"])]
-    about += [(f"time {key}", f"{value:.3g} s") for key, value in result["time"].items()]
-    return [*parts, Section("Made with", rows=[*about, ("scene hash", result["scene_hash"])])]
+    about += [*made_with(result), *((f"time {key}", f"{value:.3g} s") for key, value in result["time"].items())]
+    return [*parts, Section("Made with", rows=about)]
 
 
 def box_sections(found: Reduced) -> list[Section]:

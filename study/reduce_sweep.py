@@ -22,6 +22,7 @@ from reduction.project import project
 from reduction.registry import METHODS, PAPER_METHODS, Method, find_method, make_bases
 from reduction.states import BasisError, States
 from reduction.truncation import Truncation
+from study.command import plain
 from study.reduce_reference import Reference, prepare
 
 BEYOND = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
@@ -94,12 +95,7 @@ class Swept:
 
     def as_rows(self) -> list[dict[str, Any]]:
         """For result.json: numbers that are not finite become null, which JSON knows."""
-        return [{k: finite(v) for k, v in asdict(p).items()} for p in self.points]
-
-
-def finite(value: Any) -> Any:
-    """The value, or None for a number that is not finite, which JSON does not know."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        return [plain(asdict(p)) for p in self.points]
 
 
 def chosen_methods(wanted: Reduction) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import platform
 import re
+import shlex
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -156,6 +157,19 @@ def of_scene(scene: str) -> Section:
         pydantic.ValidationError: the text is no scene.
     """
     return Section(EQUATION, code=equation_text(equation(Scene.model_validate(tomllib.loads(scene)))))
+
+
+def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int, options: str = "") -> str:
+    """How a page about a scene is made again: the command as it is typed. Not collective."""
+    launch = f"mpiexec -n {ranks} " if ranks > 1 else ""
+    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
+    return f"{launch}softgrasp {command} {shlex.quote(str(path))}{sets}{options}"
+
+
+def made_with(result: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Rows on where the numbers of a result come from, see :func:`study.command.origin`. Not collective."""
+    names = {"version": "softgrasp", "machine": "machine", "ranks": "ranks", "scene_hash": "scene hash"}
+    return [(name, result[key]) for key, name in names.items()]
 
 
 def versions() -> list[tuple[str, str]]:

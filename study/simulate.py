@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -10,19 +9,19 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
-from fem.build import build
 from fem.effects import EFFECTS
 from fem.outputs import unit
 from fem.results import simulate_result, write_results
 from fem.run import Run, RunOptions, simulate
 from fem.scene import Scene
-from fem.scene_file import load_scene_collective, resolved_toml
+from fem.scene_file import resolved_toml
+from study.command import list_files, open_model, open_scene, progress_bar
 from study.equation import equation
 from study.frames import Frames
-from study.report import Section, equation_text, write_report
+from study.report import Section, command_line, equation_text, made_with, write_report
 
 Rows = list[tuple[str, str]]
 
@@ -44,16 +43,12 @@ def run_simulate(
         SoftgraspError: with one sentence.
     """
     comm = MPI.COMM_WORLD
-    scene = load_scene_collective(comm, path, overrides)
-    console.print(f"[bold]{scene.name}[/bold]: {scene.description}", soft_wrap=True)
-    model = build(scene, comm)
-    layout = model.system.layout
-    console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {comm.size} rank(s)")
+    scene = open_scene(path, overrides, console)
+    model = open_model(scene, console)
     frames = Frames(model, out, pictures, "fields-resumed" if resume else "fields")
     if resume:
         console.print("resumed: fields-resumed and the pictures begin where the run was stopped", soft_wrap=True)
-    columns = (TextColumn("steps"), BarColumn(), MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
+    with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
         task = bar.add_task("steps", total=scene.time.steps)
 
         def progress(run: Run) -> None:
@@ -69,9 +64,7 @@ def run_simulate(
         files.append(_report(out, scene, result, rows, path, overrides))
         result["time"]["pictures"] = time.perf_counter() - begin
         show(console, rows)
-        console.print("files:")
-        for file in files:
-            console.print(f"  {file}", soft_wrap=True)
+        list_files(console, files)
     comm.Barrier()
     return result
 
@@ -127,10 +120,6 @@ def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: P
         (name, effect.active(scene), *((effect.term, effect.cost) if effect.active(scene) else ("", "")))
         for name, effect in EFFECTS.items()
     ]
-    about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", result["ranks"])]
-    about.append(("scene hash", result["scene_hash"]))
-    launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
-    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
     return write_report(
         out / "report.html",
         title=scene.name,
@@ -141,8 +130,8 @@ def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: P
             Section("Equation", code=equation_text(equation(scene))),
             Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
             Section("Size", rows=sizes),
-            Section("Made with", rows=about),
+            Section("Made with", rows=made_with(result)),
         ],
         scene=resolved_toml(scene),
-        reproduce=f"{launch}softgrasp simulate {shlex.quote(str(path))}{sets}",
+        reproduce=command_line("simulate", path, overrides, result["ranks"]),
     )

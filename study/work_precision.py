@@ -10,14 +10,15 @@ from typing import Any
 
 from mpi4py import MPI
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import TaskProgressColumn
 
 from fem.build import build
 from fem.errors import ResourceError, SolverError
 from fem.scene import Scene
-from fem.scene_file import load_scene_collective
 from lqr.checks import ControlError
 from lqr.reduced_bases import BASES
+from reduction.engines import ENGINES
+from study.command import open_scene, progress_bar
 from study.reduce_sweep import chosen_methods
 from study.wp_answer import Answer, Asker
 from study.wp_fit import Slope
@@ -26,7 +27,7 @@ from study.wp_full import FullRuns
 from study.wp_loop import CONTROLLERS, Controller, Feedback, LoopRuns, controller_work, loop_slopes, sweep_loop
 from study.wp_points import CONTROL, QUESTIONS, Asked, Cache, Guard, Row, WorkPoint, interruptible, number, variant
 from study.wp_probe import find_places
-from study.wp_reduced import own_setting, reduced_slopes, sweep_bases, sweep_reduced
+from study.wp_reduced import bases_slopes, engine_work, own_setting, reduced_slopes, sweep_bases, sweep_reduced
 from study.wp_reference import Reference, make_reference, nested_meshes
 from study.wp_riccati import SECOND, ControlRuns, riccati_slopes, riccati_work, sweep_riccati
 from study.wp_riccati_reduced import basis_work, reduced_riccati_slopes, reference_note, sweep_riccati_reduced
@@ -48,6 +49,7 @@ class WorkStudy:
         full: row of the full run behind the reduced models; empty without them.
         references: of the questions of control, see :func:`study.wp_riccati.sweep_riccati` and its kin.
         answers: to a tolerance and a budget.
+        tried: points that were measured for the answers.
         measured, cached: runs made now and taken from the cache.
     """
 
@@ -59,6 +61,7 @@ class WorkStudy:
     full: Row
     references: dict[str, Row]
     answers: tuple[Answer, ...]
+    tried: tuple[WorkPoint, ...]
     measured: int
     cached: int
 
@@ -94,12 +97,8 @@ def run_study(
     begin = time.perf_counter()
     comm = MPI.COMM_WORLD
     asked = Asked(tolerance, budget, tuple(questions or ()))
-    scene = load_scene_collective(comm, path, overrides)
-    console.print(f"[bold]{scene.name}[/bold]: {scene.description}", soft_wrap=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("left"))
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console, disable=quiet or not console.is_terminal, transient=True
-    ) as bar:
+    scene = open_scene(path, overrides, console)
+    with progress_bar(console, TaskProgressColumn(), quiet=quiet) as bar:
         task = bar.add_task("study", total=1.0)
 
         def progress(label: str, share: float) -> None:
@@ -150,6 +149,7 @@ def study_scene(
     with interruptible(guard):
         if set(wanted) - set(CONTROL):
             guard.work += _expected(scene, runs, len(chosen_methods(scene.reduction)), model.system.layout.dimension)
+            guard.work += sum(engine_work(scene, engine) for engine in ENGINES) if "bases" in wanted else 0.0
             forward_questions(scene, runs, asked, found)
         if control is not None and not refused:
             control_questions(control, wanted, found)
@@ -162,6 +162,7 @@ def study_scene(
         full=found.full,
         references=found.references,
         answers=tuple(found.answers),
+        tried=tuple(found.tried),
         measured=store.misses,
         cached=store.hits,
     )
@@ -178,6 +179,7 @@ class Found:
     full: Row = field(default_factory=dict)
     references: dict[str, Row] = field(default_factory=dict)
     answers: list[Answer] = field(default_factory=list)
+    tried: list[WorkPoint] = field(default_factory=list)
 
 
 def forward_questions(scene: Scene, runs: FullRuns, asked: Asked, found: Found) -> None:
@@ -198,6 +200,7 @@ def forward_questions(scene: Scene, runs: FullRuns, asked: Asked, found: Found) 
                 found.slopes += reduced_slopes(found.points["reduced"])
             if "bases" in wanted:
                 found.points["bases"] = sweep_bases(scene, runs, truth)
+                found.slopes += bases_slopes(found.points["bases"])
     if asked.tolerance is None and asked.budget is None:
         return
     asker = Asker(scene, runs, truth, found.points["forward"], found.points.get("reduced", []))
@@ -205,6 +208,7 @@ def forward_questions(scene: Scene, runs: FullRuns, asked: Asked, found: Found) 
         found.answers.append(asker.tolerance(asked.tolerance))
     if asked.budget is not None:
         found.answers.append(asker.budget(asked.budget))
+    found.tried += asker.tried
 
 
 def control_questions(control: ControlRuns, wanted: Sequence[str], found: Found) -> None:

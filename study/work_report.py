@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import csv
-import json
-import platform
-import shlex
 import time
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +15,18 @@ from rich.markup import escape
 from rich.table import Table
 
 from fem.errors import agree
-from fem.results import package_version, peak_memory_mb
-from fem.scene_file import resolved_toml, scene_hash
+from fem.results import peak_memory_mb
+from fem.scene_file import resolved_toml
 from reduction.registry import METHODS
+from study.command import list_files, origin, plain, write_json, write_scene
 from study.control_reduced import TITLES as BASIS_TITLES
-from study.report import Section, write_report
+from study.reduce_tables import PAPER_FULL, PAPER_REDUCED
+from study.report import Section, command_line, made_with, write_report
 from study.work_control_report import HEADERS, control_sections, draw_control, notes, rows_of_control
-from study.work_plots import PAPER_FULL, PAPER_REDUCED, figure_budget, figure_forward, figure_reduced, figure_series
+from study.work_plots import figure_budget, figure_forward, figure_reduced, figure_series
 from study.wp_answer import seconds_text
 from study.wp_fit import Slope, pareto
-from study.wp_points import CONTROL, TITLES, Asked, Row, WorkPoint, plain
+from study.wp_points import CONTROL, TITLES, Asked, Row, WorkPoint
 from study.wp_riccati import TITLES as METHOD_TITLES
 
 if TYPE_CHECKING:
@@ -84,11 +84,7 @@ def write_study(
     """
     result: dict[str, Any] = {
         "command": "study",
-        "scene": study.scene.name,
-        "scene_hash": scene_hash(study.scene),
-        "version": package_version(),
-        "ranks": comm.size,
-        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        **origin(study.scene, comm.size),
         "repeats": study.scene.study.repeats,
         "reference": _reference(study.reference),
         "references": study.references,
@@ -97,6 +93,7 @@ def write_study(
         "slopes": [vars(s) for s in study.slopes],
         "skipped": study.skipped,
         "answers": [a.to_dict() for a in study.answers],
+        "measured_for_the_answers": [p.to_row() for p in study.tried],
         "runs": {"measured": study.measured, "cached": study.cached},
         "memory_peak_mb": peak_memory_mb(comm),
         "time": {"total": comm.allreduce(time.perf_counter() - begin, MPI.MAX)},
@@ -108,9 +105,10 @@ def write_study(
             out.mkdir(parents=True, exist_ok=True)
             pictures = draw(study, asked.budget, out)
             report = _report(study, result, path, out, overrides, asked, pictures)
-            table = write_csv(result["points"], out / "points.csv")
-            (out / "result.json").write_text(json.dumps(result, indent=2) + "\n")
-            files = [str(f) for f in (out / "result.json", table, *pictures, report)]
+            rows = [*chain(*result["points"].values()), *result["measured_for_the_answers"]]
+            table = write_csv(rows, out / "points.csv")
+            numbers, scene = write_json(out / "result.json", result), write_scene(out, study.scene)
+            files = [str(f) for f in (numbers, table, scene, *pictures, report)]
     result["files"] = comm.bcast(files)
     return result
 
@@ -132,9 +130,11 @@ def rows_of(points: Sequence[WorkPoint]) -> list[Row]:
     return [p.to_row() | {"pareto": p in front} for p in points]
 
 
-def write_csv(points: dict[str, list[Row]], path: Path) -> Path:
-    """All points of all questions in one table, numbers in full. Rank 0 only."""
-    rows = [row for each in points.values() for row in each]
+def write_csv(rows: Sequence[Row], path: Path) -> Path:
+    """All points of all questions in one table, numbers in full; no mark for the front where there is no diagram.
+
+    Rank 0 only.
+    """
     more = list(dict.fromkeys(key for row in rows for key in row if key not in FIRST))
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, [*FIRST, *more], restval="")
@@ -157,7 +157,8 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
         )
     found += draw_control(study.points, study.references, study.scene, out)
     if budget is not None:
-        found += figure_budget(points["forward"], points.get("reduced", ()), budget, out / "work_budget.png")
+        every = {q: [*points.get(q, ()), *(p for p in study.tried if p.question == q)] for q in ("forward", "reduced")}
+        found += figure_budget(every["forward"], every["reduced"], budget, out / "work_budget.png")
     return found
 
 
@@ -240,9 +241,7 @@ def show(console: Console, study: WorkStudy, result: dict[str, Any]) -> None:
             console.print(sentence, style=style if k == 0 else None, markup=False, soft_wrap=True)
     runs = result["runs"]
     console.print(f"{runs['measured']} runs measured, {runs['cached']} from the cache", style="dim")
-    console.print("files:")
-    for file in result["files"]:
-        console.print(f"  {file}", soft_wrap=True, markup=False)
+    list_files(console, [Path(file) for file in result["files"]])
 
 
 def _left_out(study: WorkStudy) -> dict[str, list[str]]:
@@ -320,18 +319,16 @@ def _report(
     slopes = slope_rows(study.slopes)
     sections.append(Section("Slopes", header=("question", "series", "of", "power", "points"), rows=slopes))
     sections.append(Section("How it is measured", rows=_how(study, result)))
-    launch = f"mpiexec -n {result['ranks']} " if result["ranks"] > 1 else ""
-    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
-    sets += "" if asked.tolerance is None else f" --tolerance {asked.tolerance:g}"
-    sets += "" if asked.budget is None else f" --budget {asked.budget:g}s"
-    sets += f" --question {','.join(asked.names)}" if asked.names else ""
+    options = "" if asked.tolerance is None else f" --tolerance {asked.tolerance!r}"
+    options += "" if asked.budget is None else f" --budget {asked.budget!r}s"
+    options += f" --question {','.join(asked.names)}" if asked.names else ""
     return write_report(
         out / "report.html",
         title=f"{study.scene.name}: accuracy against time",
         subtitle=study.scene.description,
         sections=sections,
         scene=resolved_toml(study.scene),
-        reproduce=f"{launch}softgrasp study {shlex.quote(str(path))}{sets}",
+        reproduce=command_line("study", path, overrides, result["ranks"], options),
     )
 
 
@@ -361,5 +358,4 @@ def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
             ("the paper", f"{PAPER_FULL} s full, {PAPER_REDUCED} s and about 1e-3 at N = 14, on its own machine")
         )
     seconds = seconds_text(result["time"]["total"])
-    about = [("softgrasp", result["version"]), ("machine", result["machine"]), ("ranks", str(result["ranks"]))]
-    return [*rows, *about, ("scene hash", result["scene_hash"]), ("time of this study", seconds)]
+    return [*rows, *made_with(result), ("time of this study", seconds)]

@@ -9,10 +9,11 @@ from typing import Any
 
 from fem.errors import SceneError
 from fem.scene import Scene
+from study.command import plain
 from study.wp_fit import usable
 from study.wp_forward import SAFETY, Prediction, Predictor, setting_of, to_point
 from study.wp_full import FullRuns
-from study.wp_points import Row, Setting, WorkPoint, plain
+from study.wp_points import Row, Setting, WorkPoint
 from study.wp_reduced import ReducedRuns
 from study.wp_reference import Reference
 
@@ -65,7 +66,6 @@ class Answer:
         sentences: the answer in words.
         found: by kind of model, "full" and "reduced": setting, predicted and measured numbers.
         closest: when nothing meets it.
-        tried: points that were measured for the answer.
     """
 
     kind: str
@@ -74,13 +74,12 @@ class Answer:
     sentences: tuple[str, ...]
     found: dict[str, Row] = field(default_factory=dict)
     closest: Row | None = None
-    tried: tuple[WorkPoint, ...] = ()
 
     def to_dict(self) -> Row:
         """For JSON. Not collective."""
         return {
             "kind": self.kind, "asked": self.asked, "met": self.met, "sentences": list(self.sentences),
-            **self.found, "closest": self.closest, "measured_for_the_answer": [p.to_row() for p in self.tried],
+            **self.found, "closest": self.closest,
         }  # fmt: skip
 
 
@@ -95,7 +94,7 @@ def seconds_text(value: float | None) -> str:
 
 
 class Asker:
-    """Answers for one study. Its methods are collective.
+    """Answers for one study; ``tried`` are the points that were measured for them. Its methods are collective.
 
     Args:
         scene: the study's scene.
@@ -231,7 +230,7 @@ class Asker:
             f"The reference's own error, {self.truth.error:.1e}, is added to every measured error before comparing."
         )
         words += self._against_own_mesh(tolerance)
-        return Answer("tolerance", tolerance, bool(found), tuple(words), found, closest, tuple(self.tried))
+        return Answer("tolerance", tolerance, bool(found), tuple(words), found, closest)
 
     def _missed(self, tolerance: float) -> tuple[Row, list[str]]:
         """What came closest, and what would be needed."""
@@ -293,7 +292,7 @@ class Asker:
                 f"Single steps of the {' and '.join(over)} model took longer than the line; on a robot, give the "
                 "loop a core of its own."
             )
-        return Answer("budget", seconds, bool(found), tuple(words), found, closest, tuple(self.tried))
+        return Answer("budget", seconds, bool(found), tuple(words), found, closest)
 
 
 def _name(kind: str) -> str:

@@ -21,6 +21,7 @@ from fem.petsc import Array
 from fem.results import package_version
 from fem.scene import Scene
 from fem.scene_file import scene_hash
+from study.command import plain
 from study.effects_switch import changed
 
 FORMAT = 1  # of the cached files
@@ -145,19 +146,6 @@ class WorkPoint:
         """A flat table row; numbers that are not finite become None. Not collective."""
         row = asdict(self)
         return {k: plain(v) for k, v in (row | row.pop("details")).items()}
-
-
-def plain(value: Any) -> Any:
-    """A value that JSON can hold: what is not finite becomes None. Not collective."""
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [plain(v) for v in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
 
 
 def number(value: float | None) -> float:

@@ -34,6 +34,7 @@ from study.wp_reference import Reference
 
 CALLS = 2_000  # single steps of a reduced model that are timed
 ENGINE_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
+ENGINE_WORK = {"tsqr": 2e-3, "svd": 2e-2, "gram": 1e-3}  # of one basis, in the unit of the guard, over rows x columns^2
 WIDEST = 2e8  # entries of the snapshots beyond which the slower engines are left out
 
 
@@ -96,14 +97,9 @@ class ReducedRuns:
         scratch = row["time_offline"] + row["time_setup"] + row["time_online"]
         scratch += full["seconds"] if METHODS[name].snapshots else full["mesh"] + full["assembly"]
         kept = {k: v for k, v in row.items() if k not in ("times", "values")}
-        details = {
-            "method": name,
-            **kept,
-            "error_full": number(row["error"]),
-            "error_full_deformation": number(row["error_deformation"]),
-        }
         gap = errors_of(series, self.runs.series(full))[0] if finite else float("inf")
-        details |= {
+        details = {
+            "method": name, **kept,
             "error_full": number(row["error"]), "error_full_deformation": number(row["error_deformation"]),
             "error_outputs_full": gap, "error_deformation": deformation, "scratch": scratch, "mesh": self.setting.mesh,
             "steps": self.setting.steps, "cells": None if self.setting.cells is None else list(self.setting.cells),
@@ -198,7 +194,7 @@ def sweep_bases(scene: Scene, runs: FullRuns, truth: Reference) -> list[WorkPoin
     made, comm = ReducedRuns(scene, own_setting(scene), runs, truth), runs.cache.comm
     points: list[WorkPoint] = []
     for engine in ENGINES:
-        runs.guard.next(f"engine {engine}", 2e5)
+        runs.guard.next(f"engine {engine}", engine_work(scene, engine))
         s = made.setting
         key = {"engine": engine, "setting": [s.cells, s.order, s.steps], "repeats": scene.study.repeats}
 
@@ -213,6 +209,30 @@ def sweep_bases(scene: Scene, runs: FullRuns, truth: Reference) -> list[WorkPoin
             ok = row["error"] is not None and row["error"] <= 1.1 * row["tolerance"]
             points.append(WorkPoint("bases", engine, label, row["seconds"], row["error"], ok, row))
     return points
+
+
+def engine_work(scene: Scene, engine: str) -> float:
+    """Expected work of one engine at all tolerances, in the unit of the guard. Not collective."""
+    own, d = own_setting(scene), scene.dimension or 3
+    rows, columns = 2.0 * max(own.unknowns(d), 300), own.steps + 1
+    if rows * columns > WIDEST and engine == "svd":
+        return 0.0
+    return len(ENGINE_TOLERANCES) * (1 + scene.study.repeats) * ENGINE_WORK[engine] * rows * columns**2
+
+
+def bases_slopes(points: Sequence[WorkPoint]) -> list[Slope]:
+    """Slope of what is left of the snapshots, and of the seconds, against the vectors; every engine. Not collective."""
+    found = []
+    for name in dict.fromkeys(p.series for p in points):
+        mine = [p for p in points if p.series == name and p.ok]
+        for against, values in (
+            ("left of the snapshots against vectors", [p.error for p in mine]),
+            ("seconds against vectors", [p.seconds for p in mine]),
+        ):
+            power = power_law([p.details["columns"] for p in mine], values)
+            if power is not None:
+                found.append(Slope("bases", name, against, power, len(mine)))
+    return found
 
 
 def _engine(comm: MPI.Intracomm, X: Array, engine: Any, tolerance: float, repeats: int) -> Row:

@@ -14,8 +14,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import pytest
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 LIMIT = 30.0  # [s] for one answer
+PHONE, DESK = 390, 1280  # [px]
+LEAST = 300  # [px] of a figure
+NARROW = """[...document.querySelectorAll('body *')].filter(e => !e.closest('.wide')
+  && e.getBoundingClientRect().right > document.documentElement.clientWidth + 1).map(e => e.tagName + e.textContent)"""
+FIGURES = "[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])"
 ONE_PROCESS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run")
 
 
@@ -141,3 +148,25 @@ class Browser:
         """The page as it is printed on A4."""
         sheet = self.send("Page.printToPDF", paperWidth=8.27, paperHeight=11.69, preferCSSPageSize=True)
         path.write_bytes(base64.b64decode(sheet["data"]))
+
+
+def faults(browser: Browser, page: Path, width: int, figures: int) -> list[str]:
+    """What is wrong with a page in a window of this width [px], that of a telephone or of a desk."""
+    browser.open(page, width, mobile=width == PHONE)
+    found = browser.complaints()
+    if browser.ask("document.documentElement.scrollWidth") > width:
+        found.append("wider than the window")
+    found += [f"cut off: {text[:60]}" for text in browser.ask(NARROW)]  # figures and tables may scroll
+    shown = browser.ask(FIGURES)
+    if len(shown) != figures:
+        found.append(f"{len(shown)} figures instead of {figures}")
+    return found + [f"a figure {wide} px wide of {own}" for own, wide in shown if not (own > 0 and wide > LEAST)]
+
+
+def look(page: Path, figures: int) -> list[str]:
+    """Faults of a page on a telephone and on a desk; skips the test where no browser is."""
+    program = find_chromium()
+    if program is None:
+        pytest.skip("no Chromium here")
+    with Browser(program) as browser:
+        return [*faults(browser, page, PHONE, figures), *faults(browser, page, DESK, figures)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from fem.layout import BlockLayout
 from fem.petsc import PETSc
 from fem.run import Run, RunOptions
 from fem.scene import Scene
+from fem.scene_file import resolved_toml
 from fem.stepping import make_ts
 
 Array = NDArray[np.float64]
@@ -65,6 +67,16 @@ def make_scene(*changes: dict[str, Any], **tables: Any) -> Scene:
     if target and data.get("effects", {}).get("rotation") and len(target) == d:
         data = merged(data, {"motion": {"target": [*target, *[0.0] * (d * (d - 1) // 2)]}})
     return Scene.model_validate(data)
+
+
+def write_scene(comm: MPI.Intracomm, folder: Path, scene: Scene) -> Path:
+    """The scene as a file of its name. Collective."""
+    file = folder / f"{scene.name}.toml"
+    if comm.rank == 0:
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(resolved_toml(scene))
+    comm.Barrier()
+    return file
 
 
 # --- one order of nodes for every rank count
@@ -352,6 +364,16 @@ def run_from(model: Model, z: Array, v: Array, v_s: Array | None = None, force: 
     run.advance_to(ts, x, run.steps)
     ts.destroy()
     return run
+
+
+def rough_save(figure: Any, out_png: Path) -> tuple[Path, Path]:
+    """In place of `study.style.save`, for tests that look at no more than the existence of a picture."""
+    import matplotlib.pyplot as plt
+
+    figure.set_layout_engine("none")  # seconds a figure
+    figure.savefig(out_png, dpi=30)
+    plt.close(figure)
+    return out_png, out_png
 
 
 def close(a: Any, b: Any) -> float:

@@ -21,11 +21,13 @@ from fem.scene_file import load_scene
 from lqr.checks import ControlError
 from lqr.controller import Controller, load_gain
 from lqr.reduced import GainReport
+from study.command import plain
 from study.control import run_control, with_control
 from study.control_plots import drawn, figure_reduced, unstable
 from study.control_reduced import SweptBasis
-from study.control_report import plain, settled
+from study.control_report import settled
 from study.control_solve import scene_words
+from tests.browser import look
 
 SCENES = Path(__file__).parent.parent / "demos" / "scenes"
 SMALL = ["tissue.cells=[4,8]", "control.N=[4,8,12]", "output.fields='none'", "reduction.lambda_range=[50.0,50.0]"]
@@ -153,6 +155,11 @@ def test_re_tuning_covers_the_box(result: dict[str, Any]) -> None:
     mu = {p["mu"] for p in tuned["structured"]["points"]}
     assert [min(mu), max(mu)] == pytest.approx([20.0, 500.0])
     assert all(p["stable"] and p["cost_excess"] < 1e-3 for p in tuned["structured"]["points"])  # measured 4e-6
+
+
+@pytest.mark.serial
+def test_page_in_a_browser(result: dict[str, Any], out: Path) -> None:
+    assert look(out / "report.html", figures=0) == []
 
 
 def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:

@@ -21,6 +21,7 @@ from study import hard_carex, hard_numbers
 from study.hard_plain import leapfrog, textbook_midpoint
 from study.hard_rows import Family, Outcome, Row, ours, plain
 from study.hardcases import FAMILIES, choose, run_hardcases
+from tests.browser import look
 
 pytestmark = pytest.mark.serial
 
@@ -40,6 +41,8 @@ def test_every_case_keeps_its_bound_or_is_refused(result: tuple[dict[str, Any], 
     family = result[0]["families"][name]
     assert family["rows"]
     assert [row for row in family["rows"] if not row["ok"]] == []
+    # beside each stands what the textbook way gives, a number or a sentence
+    assert all(row["plain"]["text"] or row["plain"]["value"] is not None for row in family["rows"])
 
 
 @pytest.mark.parametrize("name", [n for n in FAMILIES if n not in ("restart", "numbers", "outputs")])
@@ -63,6 +66,10 @@ def test_files_hold_every_case(result: tuple[dict[str, Any], Path]) -> None:
     page = (out / "report.html").read_text()
     assert all(family.title in page for family in FAMILIES.values())
     assert "/tmp" not in page  # messages carry no folder of this machine
+
+
+def test_page_in_a_browser(result: tuple[dict[str, Any], Path]) -> None:
+    assert look(result[1] / "report.html", figures=0) == []
 
 
 @pytest.mark.parametrize("name", ["sigma", "edge", "deficient"])

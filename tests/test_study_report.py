@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from browser import Browser, find_chromium
+from browser import DESK, PHONE, Browser, faults, find_chromium
 from rich.console import Console
 
 from fem.scene_file import load_scene, resolved_toml, shipped_scenes
@@ -17,7 +17,6 @@ from study.simulate import run_simulate
 from study.typeset import equation_html, formula, terms
 
 pytestmark = pytest.mark.serial
-PHONE, DESK = 390, 1280  # [px]
 
 
 # --- equations
@@ -97,10 +96,6 @@ def test_the_equation_comes_from_the_scene(tmp_path: Path) -> None:
 
 # --- a real browser
 
-NARROW = """[...document.querySelectorAll('body *')].filter(e => !e.closest('.wide')
-  && e.getBoundingClientRect().right > document.documentElement.clientWidth + 1).map(e => e.tagName + e.textContent)"""
-FIGURES = "[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])"
-
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -122,13 +117,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.mark.parametrize("width", [PHONE, DESK])
 def test_browser_shows_the_page_without_complaint(browser: Browser, page: Path, width: int) -> None:
-    browser.open(page, width, mobile=width == PHONE)
-    assert browser.complaints() == []
-    assert browser.ask("document.documentElement.scrollWidth") <= width
-    assert browser.ask(NARROW) == []  # only figures and tables may be wider, and those scroll
-    figures = browser.ask(FIGURES)
-    assert len(figures) == 3
-    assert all(natural > 0 and shown > 300 for natural, shown in figures)  # pixels
+    assert faults(browser, page, width, figures=3) == []
     assert browser.ask("document.querySelectorAll('.term').length") > 5
 
 
@@ -143,8 +132,5 @@ def test_the_checks_can_fail(browser: Browser, tmp_path: Path) -> None:
     file = tmp_path / "bad.html"
     wide = "<meta name=viewport content='width=device-width'><p style='width:900px'>x</p>"
     file.write_text(f"{wide}<img src='no.png'><script>console.error('e'); f()</script>")
-    browser.open(file, PHONE, mobile=True)
-    said = " ".join(browser.complaints())
-    assert all(word in said for word in ("console", "exception", "failed"))
-    assert browser.ask(FIGURES)[0][0] == 0
-    assert browser.ask(NARROW)
+    said = " ".join(faults(browser, file, PHONE, figures=2))
+    assert all(word in said for word in ("console", "exception", "failed", "cut off", "1 figures", "px wide of 0"))

@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -18,6 +21,7 @@ from rich.console import Console
 from fem.build import build
 from fem.errors import Interrupted, SceneError
 from fem.run import simulate
+from reduction.engines import ENGINES
 from study import work_plots, wp_full, wp_reduced
 from study.work_precision import WorkStudy, run_study, study_scene
 from study.work_report import rows_of
@@ -27,10 +31,12 @@ from study.wp_forward import forward_settings
 from study.wp_points import Asked, Setting, WorkPoint, least_steps, variant
 from study.wp_probe import Places, find_places, make_probe, run_probed
 from study.wp_reference import extrapolate, fitted, nested_meshes
-from tests.helpers import Array, make_scene
+from tests.browser import look
+from tests.helpers import Array, make_scene, rough_save, write_scene
 
 TOLERANCE, BUDGET = 0.03, 1.0
 SMALL: dict[str, Any] = {
+    "name": "small",
     "tissue": {"cells": [4, 8]},
     "time": {"steps": 64},
     "motion": {"target": [1.0, 0.5], "duration": 3.0},
@@ -38,45 +44,15 @@ SMALL: dict[str, Any] = {
     "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [4, 8]},
     "study": {"repeats": 1},
 }
-TOML = """name = "small"
-[tissue]
-size = [1.0, 2.0]
-cells = [4, 8]
-material = { lambda = 50.0, mu = 50.0, rho = 1.0 }
-[contact]
-sides = ["left", "right"]
-box = [[0.0, 1.5], [1.0, 2.0]]
-[hand]
-mass = 20.0
-inertia = 3.0
-[motion]
-target = [1.0, 0.5]
-duration = 3.0
-[time]
-steps = 64
-[control]
-outputs = [{ kind = "node", point = [0.5, 0.0], name = "tip" }]
-[reduction]
-methods = ["psd_svd_like_fixed", "craig_bampton"]
-N = [4, 8]
-[study]
-repeats = 1
-"""
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_samples() -> Iterator[None]:
     """No test looks at a time, or at more than the existence of a picture."""
-
-    def rough(figure: Any, out_png: Path) -> tuple[Path, Path]:
-        figure.savefig(out_png, dpi=30)
-        plt.close(figure)
-        return out_png, out_png
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wp_full, "BUILD_SECONDS", 0.0)
         patch.setattr(wp_reduced, "CALLS", 5)
-        patch.setattr(work_plots, "save", rough)
+        patch.setattr(work_plots, "save", rough_save)
         yield
 
 
@@ -89,17 +65,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def result(folder: Path) -> dict[str, Any]:
     """The command on a small scene, once for all tests."""
-    comm = MPI.COMM_WORLD
-    if comm.rank == 0:
-        (folder / "small.toml").write_text(TOML)
-    comm.Barrier()
+    file = write_scene(MPI.COMM_WORLD, folder, make_scene(SMALL))
     quiet = Console(quiet=True)
-    return run_study(folder / "small.toml", folder, [], quiet, tolerance=TOLERANCE, budget=BUDGET, quiet=True)
+    return run_study(file, folder, [], quiet, tolerance=TOLERANCE, budget=BUDGET, quiet=True)
 
 
 def again(folder: Path) -> WorkStudy:
     """The same study out of the cache."""
-    scene = make_scene(SMALL, {"name": "small"})
+    scene = make_scene(SMALL)
     return study_scene(scene, MPI.COMM_WORLD, folder / "cache", Asked(TOLERANCE, BUDGET))
 
 
@@ -138,7 +111,7 @@ def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dic
 def test_what_nothing_meets_is_said_with_what_came_closest(
     comm: MPI.Intracomm, result: dict[str, Any], folder: Path
 ) -> None:
-    study = study_scene(make_scene(SMALL, {"name": "small"}), comm, folder / "cache", Asked(1e-9))
+    study = study_scene(make_scene(SMALL), comm, folder / "cache", Asked(1e-9))
     answer = study.answers[0]
     assert not answer.met
     assert "Nothing tried meets 1e-09" in answer.sentences[0]
@@ -156,7 +129,7 @@ def test_budget_takes_the_most_accurate_that_fits(result: dict[str, Any]) -> Non
 
 
 def test_a_budget_that_nothing_fits_is_said(comm: MPI.Intracomm, result: dict[str, Any], folder: Path) -> None:
-    answer = study_scene(make_scene(SMALL, {"name": "small"}), comm, folder / "cache", Asked(None, 1e-9)).answers[0]
+    answer = study_scene(make_scene(SMALL), comm, folder / "cache", Asked(None, 1e-9)).answers[0]
     assert not answer.met
     assert answer.closest is not None
     assert answer.sentences[0].startswith("No full run fits")
@@ -174,16 +147,18 @@ def test_study_out_of_the_cache_is_the_same_table(result: dict[str, Any], folder
 def test_interrupted_study_goes_on_to_the_same_errors(
     comm: MPI.Intracomm, result: dict[str, Any], mpi_tmp_path: Path
 ) -> None:
-    scene = make_scene(SMALL, {"name": "small"})
+    scene = make_scene(SMALL)
     seen: list[str] = []
 
     def stop_later(label: str, share: float) -> None:
         seen.append(label)
-        if len(seen) > 12:
-            raise Interrupted("enough")
+        if len(seen) == 13 and comm.rank == comm.size - 1:
+            signal.raise_signal(signal.SIGINT)  # Ctrl-C that reaches one rank
 
-    with pytest.raises(Interrupted):
+    with pytest.raises(Interrupted, match=r"^stopped before '.*' with \d+ % done; the same command goes on"):
         study_scene(scene, comm, mpi_tmp_path, progress=stop_later)
+    assert len(seen) == 13
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     comm.Barrier()
     kept = {f.name: f.read_text() for f in mpi_tmp_path.glob("*.json")}
     assert len(kept) >= 8  # points before the stop; some settings come twice
@@ -198,6 +173,25 @@ def test_interrupted_study_goes_on_to_the_same_errors(
         assert len(old) == len({p.label for p in study.points[name]})
 
 
+@pytest.mark.serial
+def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: dict[str, Any], tmp_path: Path) -> None:
+    """The real command is killed in the middle, without a chance to clean up."""
+    file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
+    command = [sys.executable, "-m", "study.cli", "study", str(file), "--out", str(tmp_path), "--question", "forward"]
+    with subprocess.Popen(command, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL) as process:
+        while len(list(cache.glob("run-*.json"))) < 8 and process.poll() is None:
+            time.sleep(0.01)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL  # before its end
+    kept = {f.name: f.read_text() for f in cache.glob("*.json")}
+    study = study_scene(make_scene(SMALL), comm, cache, Asked(names=("forward",)))
+    assert study.cached >= len(kept) >= 8
+    assert study.measured > 0
+    assert {name: (cache / name).read_text() for name in kept} == kept
+    table = [(r["label"], r["error"], r["ok"]) for r in rows_of(study.points["forward"])]
+    assert table == [(r["label"], r["error"], r["ok"]) for r in result["points"]["forward"]]
+
+
 def test_another_scene_uses_none_of_the_cached_points(
     comm: MPI.Intracomm, result: dict[str, Any], folder: Path
 ) -> None:
@@ -208,7 +202,7 @@ def test_another_scene_uses_none_of_the_cached_points(
         raise Interrupted("at once")
 
     before = len(list((folder / "cache").glob("run-*.json")))
-    softer = make_scene(SMALL, {"name": "small", "tissue": {"material": {"lambda": 40.0, "mu": 50.0, "rho": 1.0}}})
+    softer = make_scene(SMALL, {"tissue": {"material": {"lambda": 40.0, "mu": 50.0, "rho": 1.0}}})
     with pytest.raises(Interrupted):
         study_scene(softer, comm, folder / "cache", progress=stop)
     assert len(list((folder / "cache").glob("run-*.json"))) == before
@@ -236,11 +230,16 @@ def test_files_hold_every_point(result: dict[str, Any], folder: Path) -> None:
     assert saved["points"] == result["points"]
     with (folder / "points.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == sum(len(v) for v in result["points"].values())
+    assert len(rows) == sum(len(v) for v in result["points"].values()) + len(result["measured_for_the_answers"])
     assert {r["question"] for r in rows} == {"forward", "reduced", "bases"}
     page = (folder / "report.html").read_text()
     assert page.count("data:image/png") == 4
     assert "--tolerance 0.03" in page
+
+
+@pytest.mark.serial
+def test_page_in_a_browser(result: dict[str, Any], folder: Path) -> None:
+    assert look(folder / "report.html", figures=4) == []
 
 
 def test_slopes_show_the_order_of_the_midpoint_rule(result: dict[str, Any]) -> None:
@@ -248,6 +247,14 @@ def test_slopes_show_the_order_of_the_midpoint_rule(result: dict[str, Any]) -> N
     assert len(powers) >= 3
     # e(s) - e(2 steps) of order 2 at s = steps, steps / 2, steps / 4 has about the slope -2.2
     assert -2.4 < np.median(powers) < -1.7
+
+
+def test_every_question_has_slopes(result: dict[str, Any]) -> None:
+    assert {s["question"] for s in result["slopes"]} == set(result["points"])
+    bases = [s for s in result["slopes"] if s["question"] == "bases" and s["against"].startswith("left")]
+    assert {s["series"] for s in bases} == set(ENGINES)
+    # every engine keeps the vectors that the tolerance asks for: what is left falls with them
+    assert all(s["power"] < -1 for s in bases)
 
 
 # --- parts

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -27,9 +27,11 @@ from study.work_precision import WorkStudy, run_study, study_scene
 from study.work_report import rows_of
 from study.wp_loop import step_counts
 from study.wp_points import CONTROL, Asked, Cache, Guard, WorkPoint
-from tests.helpers import make_scene
+from tests.browser import look
+from tests.helpers import make_scene, rough_save, write_scene
 
 SMALL: dict[str, Any] = {
+    "name": "small",
     "tissue": {"cells": [3, 4]},
     "effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}},
     "motion": {"target": [1.0, 0.5], "duration": 3.0},
@@ -37,58 +39,18 @@ SMALL: dict[str, Any] = {
     "control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}], "Q": 10.0, "N": [4, 6, 8]},
     "study": {"repeats": 1},
 }
-TOML = """name = "small"
-[tissue]
-size = [1.0, 2.0]
-cells = [3, 4]
-material = { lambda = 50.0, mu = 50.0, rho = 1.0 }
-[contact]
-sides = ["left", "right"]
-box = [[0.0, 1.5], [1.0, 2.0]]
-[hand]
-mass = 20.0
-inertia = 3.0
-[effects]
-damping = { kind = "kelvin-voigt", beta = 0.01 }
-[motion]
-target = [1.0, 0.5]
-duration = 3.0
-[time]
-steps = 64
-end = 6.0
-[control]
-outputs = [{ kind = "node", point = [0.5, 0.0], name = "tip" }]
-Q = 10.0
-N = [4, 6, 8]
-[study]
-repeats = 1
-"""
 ALL = ",".join(CONTROL)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _rough() -> Iterator[None]:
     """No test looks at a time, or at more than the existence of a picture."""
-
-    def rough(figure: Any, out_png: Path) -> tuple[Path, Path]:
-        figure.set_layout_engine("none")  # seconds a figure
-        figure.savefig(out_png, dpi=30)
-        plt.close(figure)
-        return out_png, out_png
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(work_control_plots, "save", rough)
+        patch.setattr(work_control_plots, "save", rough_save)
         patch.setattr(wp_loop, "SHARES", (8.0, 4.0, 2.0))
         patch.setattr(wp_loop, "BURST_SECONDS", 0.0)
         patch.setattr(wp_riccati, "REPEAT_SECONDS", 0.0)
         yield
-
-
-@pytest.fixture(autouse=True)
-def _two_ranks(request: pytest.FixtureRequest, comm: MPI.Intracomm) -> None:
-    """Thousands of small collective calls: three ranks run the test of rank counts alone."""
-    if comm.size > 2 and "rank_count" not in request.node.name:
-        pytest.skip("runs on one and two ranks")
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +62,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def result(folder: Path) -> dict[str, Any]:
     """The command on a small scene, once for all tests."""
-    comm = MPI.COMM_WORLD
-    if comm.rank == 0:
-        (folder / "small.toml").write_text(TOML)
-    comm.Barrier()
-    return run_study(folder / "small.toml", folder, [], Console(quiet=True), questions=[ALL], quiet=True)
+    file = write_scene(MPI.COMM_WORLD, folder, make_scene(SMALL))
+    return run_study(file, folder, [], Console(quiet=True), questions=[ALL], quiet=True)
 
 
 def the_problem(comm: MPI.Intracomm) -> RiccatiProblem:
@@ -166,12 +125,11 @@ def test_reduced_gains_have_errors_costs_and_times(result: dict[str, Any]) -> No
 
 def test_excess_cost_is_what_the_closed_loop_pays(result: dict[str, Any]) -> None:
     """The cost of the run under a reduced gain against the optimal one, both until almost nothing is to come."""
-    paid = {(r["basis"], r["N"]): r for r in result["points"]["loop"] if not r["held"] and not r["reduced_plant"]}
-    finest = {k: max(r["steps"] for r in result["points"]["loop"]) for k in paid}
+    finest = max(r["steps"] for r in result["points"]["loop"])
     rows = {
         (r["basis"], r["N"]): r
         for r in result["points"]["loop"]
-        if not r["held"] and not r["reduced_plant"] and r["steps"] == finest[(r["basis"], r["N"])]
+        if not r["held"] and not r["reduced_plant"] and r["steps"] == finest
     }
     optimal = result["references"]["loop"]["optimal"]
     to_come = result["references"]["loop"]["to_come"]
@@ -248,16 +206,16 @@ def test_numbers_of_steps_nest() -> None:
 def test_interrupted_study_of_feedback_gives_the_same_table(
     comm: MPI.Intracomm, result: dict[str, Any], mpi_tmp_path: Path
 ) -> None:
-    scene = make_scene(SMALL, {"name": "small"})
+    scene = make_scene(SMALL)
     seen: list[str] = []
 
     def stop_later(label: str, share: float) -> None:
         assert 0 <= share <= 1
         seen.append(label)
         if label.startswith("closed loop, a priori"):
-            raise Interrupted("enough")
+            signal.raise_signal(signal.SIGINT)  # Ctrl-C
 
-    with pytest.raises(Interrupted):
+    with pytest.raises(Interrupted, match="goes on from there"):
         study_scene(scene, comm, mpi_tmp_path, Asked(names=(ALL,)), stop_later)
     comm.Barrier()
     kept = {f.name: f.read_text() for f in mpi_tmp_path.glob("*.json")}
@@ -337,6 +295,11 @@ def test_files_hold_the_questions_of_control(result: dict[str, Any], folder: Pat
     assert page.count("data:image/png") == 3
     assert "--question riccati,reduced_riccati,loop" in page
     assert all((folder / f"work_{name}.png").stat().st_size > 0 for name in CONTROL)
+
+
+@pytest.mark.serial
+def test_page_in_a_browser(result: dict[str, Any], folder: Path) -> None:
+    assert look(folder / "report.html", figures=3) == []
 
 
 def test_the_paper_is_named_for_its_own_scene_only() -> None:

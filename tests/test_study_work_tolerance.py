@@ -122,13 +122,7 @@ def check(comm: MPI.Intracomm, case: Case, folder: Path) -> dict[str, float]:
     return {"asked": case.tolerance, "told": told, "true": error, "reference": own_error, "steps": used.steps}
 
 
-@pytest.fixture
-def _two_ranks(comm: MPI.Intracomm) -> None:
-    if comm.size > 2:
-        pytest.skip("thousands of small collective calls: runs on one and two ranks")
-
-
-@pytest.mark.usefixtures("_two_ranks", "_few_samples")
+@pytest.mark.usefixtures("_few_samples")
 @pytest.mark.parametrize("case", SMALL, ids=lambda c: c.scene)
 def test_tolerance_holds_on_small_scenes(comm: MPI.Intracomm, mpi_tmp_path: Path, case: Case) -> None:
     check(comm, case, mpi_tmp_path)
