@@ -73,7 +73,7 @@ class TissueMidpoint:
         r, h, w, load: vectors on the rows held; ``load_array``, ``w_array`` ... their arrays.
         K2: -2 K, whose product one call adds to h.
         k: K2 z; a step carries it where damping needs the old one.
-        w_own: the rows of w that this rank owns, an array.
+        w_own, load_own: the rows of w and load that this rank owns, arrays.
     """
 
     def __init__(
@@ -97,6 +97,7 @@ class TissueMidpoint:
         self.load_array: Array = self.load.array_w
         self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
         self.w_own: Array = self.w_array[self.rows]
+        self.load_own: Array = self.load_array[self.rows]
         self.x = self.w  # w as the state is distributed
         self._move = self._move_all
         if self.held.whole:
@@ -189,7 +190,7 @@ class TissueMidpoint:
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry k and h on. Collective."""
         z = self._move(old, new)
-        self.work += 2.0 * float(np.dot(self.w_own, self.load_array[self.rows]))
+        self.work += 2.0 * float(np.dot(self.w_own, self.load_own))
         self._propagate(z)
 
     def _move_all(self, old: TissueState, new: TissueState) -> PETSc.Vec:
@@ -258,8 +259,7 @@ class TissueMidpoint:
         left is small against the load, not against the rounding in r.
         """
         # the array, not the vector: it is written through a view, so the norm that PETSc remembers may be an old one
-        load = self.load_array[self.rows]
-        square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
+        square = total(self.system.layout.comm, np.array([np.dot(self.load_own, self.load_own)]))[0]
         with self.held.agree():
             return self.solver.check(self.r, self.w, where, float(np.sqrt(square)))
 

@@ -78,18 +78,19 @@ def schema() -> None:
 @app.command()
 def explain(
     scene: SceneFile,
-    out: Annotated[Path | None, typer.Option(help="also write result.json into this folder")] = None,
+    out: Annotated[Path | None, typer.Option(help="also write result.json and report.html into this folder")] = None,
     set_: Overrides = None,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
     from fem.scene_file import load_scene_collective
-    from study.command import write_json
+    from study.command import list_files
     from study.explain import run_explain
+    from study.explain_report import write_explanation
 
-    found = run_explain(load_scene_collective(MPI.COMM_WORLD, scene, set_ or []), MPI.COMM_WORLD, console())
+    made = load_scene_collective(MPI.COMM_WORLD, scene, set_ or [])
+    found = run_explain(made, MPI.COMM_WORLD, console())
     if out is not None and MPI.COMM_WORLD.rank == 0:
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "result.json", {"command": "explain", **found.to_dict()})
+        list_files(console(), write_explanation(out, found, made, scene, set_ or []))
 
 
 @app.command()

@@ -261,8 +261,8 @@ def render(result: Explanation, console: Console) -> None:
     title("Solver")
     line(f"{result.solver.name}: {result.solver.reason}")
     if result.solver.factor_bytes:
-        line(f"factor about {_size(result.solver.factor_bytes)} (estimate)")
-    line(f"snapshots: {result.snapshot_columns} columns, {_size(result.snapshot_bytes)}")
+        line(f"factor about {size_text(result.solver.factor_bytes)} (estimate)")
+    line(f"snapshots: {result.snapshot_columns} columns, {size_text(result.snapshot_bytes)}")
     title("Time")
     line(f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s")
     if not t.omega:
@@ -272,23 +272,33 @@ def render(result: Explanation, console: Console) -> None:
     title("Effects")
     for name, e in result.effects.items():
         gate = e.gate
-        verdict = "matters" if e.on else "would matter"
-        verdict = verdict if gate.matters else "does not matter" if e.on else "not needed"
-        line(f"{name}: {'on' if e.on else 'off'}, {verdict}")
+        line(f"{name}: {verdict(e)}")
         line(f"{gate.symbol} = {gate.number:.3g} (threshold {gate.threshold:.3g})", 4)
         line(gate.sentence, 4)
         if e.on:
             line(f"adds {e.term}; allocates {', '.join(e.operators) or 'nothing'}.", 4)
             line(e.cost, 4)
-    if result.missing or result.idle or result.warnings:
+    found = remarks(result)
+    if found:
         title("Look at")
+    for text in found:
+        line(text)
+
+
+def verdict(effect: EffectReport) -> str:
+    """On or off, and whether that is right. Not collective."""
+    matters = ("matters" if effect.on else "would matter") if effect.gate.matters else ""
+    return f"{'on' if effect.on else 'off'}, {matters or ('does not matter' if effect.on else 'not needed')}"
+
+
+def remarks(result: Explanation) -> list[str]:
+    """What deserves a look, one sentence each. Not collective."""
+    found = []
     for name in result.missing:
         proviso = result.effects[name].gate.proviso
-        line(f"{name} is off, but the scene seems to call for it{', ' + proviso if proviso else ''}.")
-    for name in result.idle:
-        line(f"{name} is on, but does not matter here.")
-    for text in result.warnings:
-        line(text)
+        found.append(f"{name} is off, but the scene seems to call for it{', ' + proviso if proviso else ''}.")
+    found += [f"{name} is on, but does not matter here." for name in result.idle]
+    return [*found, *result.warnings]
 
 
 def _row(name: str, left: tuple[str, ...], right: tuple[str, ...]) -> str:
@@ -299,7 +309,8 @@ def _sum(terms: tuple[str, ...]) -> str:
     return " + ".join(terms).replace("+ - ", "- ")
 
 
-def _size(size: float) -> str:
+def size_text(size: float) -> str:
+    """Bytes in a unit that suits. Not collective."""
     for unit in ("byte", "KiB", "MiB"):
         if size < 1024:
             return f"{size:.3g} {unit}" if unit != "byte" else f"{size:.0f} byte"

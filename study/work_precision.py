@@ -188,7 +188,7 @@ def forward_questions(scene: Scene, runs: FullRuns, asked: Asked, found: Found) 
     truth = found.reference = make_reference(scene, runs)
     if "forward" in wanted:
         found.points["forward"] = sweep_forward(scene, runs, truth)
-        found.slopes += forward_slopes(found.points["forward"])
+        found.slopes += forward_slopes(found.points["forward"], truth.error)
     if set(wanted) & {"reduced", "bases"}:
         full = found.full = runs.run(own_setting(scene))
         if 2.0 * full["n_e"] * full["steps"] > FULL_SNAPSHOTS:

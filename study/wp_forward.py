@@ -17,6 +17,7 @@ POINT_WORK = {2: 8e6, 3: 6e5}  # unknowns times steps of a point of the diagram
 LARGEST = {2: 150_000, 3: 40_000}  # unknowns of a setting that no run of the diagram tried
 GROWTH = 4.0  # and its work over that of the largest point
 FINEST = 3  # numbers of steps behind a slope in time: coarser ones may not resolve the motion
+CLEAR = 2.0  # times the error of the reference, from which on an error has an order
 SAFETY = 0.9  # of the tolerance that a predicted error may use
 Group = tuple[tuple[int, ...] | None, int]
 
@@ -108,10 +109,10 @@ def setting_of(point: WorkPoint) -> Setting:
     return Setting(cells, d["order"], d["steps"], d["solver"], d["rtol"] or 1e-10)
 
 
-def forward_slopes(points: Sequence[WorkPoint]) -> list[Slope]:
+def forward_slopes(points: Sequence[WorkPoint], reference_error: float) -> list[Slope]:
     """Orders: of the error in the cells (most steps), of the change in the steps, of time in the unknowns.
 
-    Not collective.
+    Errors nearer than :data:`CLEAR` times that of the reference tell no order. Not collective.
     """
     found: list[Slope] = []
     plain = [p for p in points if p.series != "solver"]
@@ -119,7 +120,7 @@ def forward_slopes(points: Sequence[WorkPoint]) -> list[Slope]:
         mine = [
             p for p in plain if p.details["order"] == order and p.details["cells"] and "error_time" not in p.details
         ]
-        mine = sorted(mine, key=lambda p: p.details["n_e"])
+        mine = sorted((p for p in mine if p.error > CLEAR * reference_error), key=lambda p: p.details["n_e"])
         name = f"P{order}"
         for against, x, y in (
             ("cells along an edge", [p.details["cells"][0] for p in mine], [p.error for p in mine]),

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.browser import look
+
 ROOT = Path(__file__).parent.parent
 FORWARD = ROOT / "demos" / "scenes" / "paper_forward.toml"
 pytestmark = pytest.mark.serial
@@ -101,5 +103,11 @@ def test_scenes_schema_explain_and_help(tmp_path: Path) -> None:
     for name in ("paper_forward", "paper_lqr", "paper_lqr_undamped", "franka_muscle", "block_3d", "pillow_3d"):
         assert name in listing.stdout
     assert "tissue" in json.loads(softgrasp("schema").stdout)["properties"]
-    assert "rho g L / E" in softgrasp("explain", str(ROOT / "demos" / "scenes" / "franka_muscle.toml")).stdout
+    muscle = str(ROOT / "demos" / "scenes" / "franka_muscle.toml")
+    assert "rho g L / E" in softgrasp("explain", muscle, "--out", str(tmp_path / "why")).stdout
+    result = json.loads((tmp_path / "why" / "result.json").read_text())
+    page = (tmp_path / "why" / "report.html").read_text()
+    assert all(name in page for name in result["effects"])
+    assert f"2n = {result['sizes']['states']}" in page
+    assert look(tmp_path / "why" / "report.html", figures=0) == []
     assert "simulate" in softgrasp("--help").stdout
