@@ -44,6 +44,10 @@ pictures: demo ## make the README's pictures again
 	cp out/reduce/errors.png docs/reduce_errors.png
 	$(BIN)/softgrasp control demos/scenes/paper_lqr.toml --out out/control
 	cp out/control/errors.png docs/control_errors.png
+	$(BIN)/softgrasp study demos/scenes/paper_forward.toml --tolerance 1e-2 --out out/study
+	cp out/study/work_forward.png docs/study_forward.png
+	$(BIN)/softgrasp effects demos/scenes/franka_muscle.toml --out out/effects
+	cp out/effects/effects.png docs/effects.png
 
 clean: ## remove .venv, out and caches
 	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache
