@@ -20,6 +20,7 @@ from reduction.engines import on_root
 MODES = 30
 MORE_MODES = 60  # when the last of MODES is still lightly damped
 LIGHT = 0.02  # damping ratio below which it is
+FEW_MODES = 8  # whose Riccati equation starts Newton's method for all of them, from twice as many on
 CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost as much as a Schur form
 
 
@@ -137,7 +138,8 @@ def solve_small(plant: Plant, small: SmallPlant, guess: Array | None = None) -> 
 
     def solve() -> SmallSolution:
         E, A, B, C = small.space.E, small.space.A, small.space.B, small.space.C
-        X = None if guess is None else _corrected(small.space, guess)
+        start = _few_modes(small) if guess is None else guess
+        X = None if start is None else _corrected(small.space, start)
         if X is None:
             X = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
         if X is None:
@@ -145,6 +147,24 @@ def solve_small(plant: Plant, small: SmallPlant, guess: Array | None = None) -> 
         return SmallSolution(X, B.T @ X @ E)
 
     return on_root(plant.comm, solve)
+
+
+def _few_modes(small: SmallPlant) -> Array | None:
+    """X of the lowest modes alone, zero for the others; None where all are few. Not collective.
+
+    With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
+    """
+    N, r, k = len(small.space.E), small.order, FEW_MODES
+    if r < 2 * k:
+        return None
+    at = np.r_[: N - 2 * r, N - 2 * r : N - 2 * r + k, N - r : N - r + k]
+    E, A, B, C = (small.space.E[np.ix_(at, at)], small.space.A[np.ix_(at, at)], small.space.B[at], small.space.C[:, at])
+    found = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+    if found is None:
+        return None
+    X = np.zeros((N, N))
+    X[np.ix_(at, at)] = found
+    return X
 
 
 def _corrected(space: StateSpace, X: Array) -> Array | None:

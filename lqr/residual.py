@@ -104,9 +104,14 @@ def _tissue_rows(problem: RiccatiProblem, candidate: Candidate) -> list[Array]:
 
 def _triangular(comm: MPI.Intracomm, parts: list[Array]) -> Array:
     """R of the thin QR factorisation of rows spread over ranks and parts, on every rank. Collective."""
-    r = np.zeros((0, parts[0].shape[1]))
+    waiting = [np.zeros((0, parts[0].shape[1]))]
     for part in parts:
         for first in range(0, len(part), ROWS):
-            r = np.linalg.qr(np.vstack([r, part[first : first + ROWS]]), mode="r")
+            waiting.append(part[first : first + ROWS])
+            if sum(map(len, waiting)) >= ROWS:
+                waiting = [np.linalg.qr(np.vstack(waiting), mode="r")]
+    r = np.linalg.qr(np.vstack(waiting), mode="r")
+    if comm.size == 1:
+        return np.asarray(r)
     gathered = comm.gather(r)
     return np.asarray(comm.bcast(None if gathered is None else np.linalg.qr(np.vstack(gathered), mode="r")))
