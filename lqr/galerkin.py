@@ -212,7 +212,7 @@ class StructuredGalerkin:
         finally:
             tissue.destroy()
         reason = f"galerkin: {level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
-        outcome = Outcome(level.Z, level.gain, reason, 1e-10, history, counts, seconds)
+        outcome = Outcome(level.Z, level.gain, reason, 1e-10, history, counts, seconds, lean=True)
         result = make_solution(plant, outcome, check=False)
         result.seconds["total"] = time.perf_counter() - begin
         return result

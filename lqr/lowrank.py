@@ -28,6 +28,7 @@ class Outcome:
         gain: K' = (B'XE)', z-row as it stands.
         method: name and reason.
         tol: tolerance asked for.
+        lean: Z has no columns to spare.
     """
 
     Z: Block
@@ -37,6 +38,7 @@ class Outcome:
     history: list[dict[str, float]] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    lean: bool = False
 
 
 def make_solution(plant: Plant, outcome: Outcome, check: bool = True) -> RiccatiSolution:
@@ -52,7 +54,7 @@ def make_solution(plant: Plant, outcome: Outcome, check: bool = True) -> Riccati
     """
     begin = time.perf_counter()
     n = plant.n_local
-    Z = compress(plant, outcome.Z, DROP * outcome.tol * plant.scale)
+    Z = outcome.Z if outcome.lean else compress(plant, outcome.Z, DROP * outcome.tol * plant.scale)
     K = -np.linalg.solve(np.linalg.cholesky(plant.problem.R).T, outcome.gain.hand.T)
     tall = -outcome.gain.tall @ np.linalg.inv(np.linalg.cholesky(plant.problem.R))
     result = RiccatiSolution(
