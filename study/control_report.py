@@ -86,6 +86,7 @@ def control_result(model: Model, found: Found, watch: Stopwatch) -> dict[str, An
         "identity_velocity": velocity_defect(problem, solution),
         "closed_loop_abscissa": d.quality.abscissa,
         "closed_loop_certified": d.quality.certified,
+        "closed_loop_exact": d.quality.exact,
         "stable": d.quality.stable,
         "findings": [scene_words(f.sentence) for f in d.diagnosis.findings],
         "damping_enough": d.diagnosis.damping_enough,
@@ -180,6 +181,8 @@ def summary_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     word = "" if result["closed_loop_certified"] else ", not certified for the modes left out"
     word = word if result["stable"] or word else ": not stable"
+    if not word and not result["closed_loop_exact"]:
+        word = ", a lower bound; stable for certain"
     if word and "stay on the imaginary axis" in result["method"]:
         word = ": that of the modes left out, zero to rounding"
     rows.append(("closed-loop spectral abscissa", f"{result['closed_loop_abscissa']:.4g} 1/s{word}"))
