@@ -7,7 +7,9 @@ Requiring
 
 gives E x' = A x + B u + F g with E = J' - L_q' D L_q, J' = P_s' S_q + P_e' L_q - (...)' the symplectic form on the span
 (skew whatever the basis, V' J' V for the coordinates below), and A the Hessian of an energy H. Hence
-dH/dt = -x'' L_q' D L_q x' <= 0 without input: undamped models are Hamiltonian, damped ones dissipative [AH19].
+dH/dt = -x'' L_q' D L_q x' <= 0 without input: undamped models are Hamiltonian, damped ones dissipative [AH19]. One
+exception: one-way with drag in space a coasting hand pulls the tissue through the medium, in the full model as well;
+the hand's motion is an input there, and H falls when the hand rests.
 
     two-way     P_s = M_s S_v + G' L_v, P_e = M L_v + G S_v, M_s = M_hand + M_rigid:       H = the total energy
     one-way     P_s = M_hand S_v, P_e = M L_v; the tissue is pulled by -G M_hand^-1 u:     H = tissue relative to the

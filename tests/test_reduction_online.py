@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+import reduction.online
 from fem.build import build
 from fem.run import simulate
 from reduction.archive import load_model, save_model
@@ -111,7 +112,9 @@ def test_one_step_at_a_time_is_the_run(comm: MPI.Intracomm) -> None:
         assert close(stepper.state, own.x[-1]) < 1e-11, kind
 
 
-def test_a_batch_is_its_runs(comm: MPI.Intracomm) -> None:
+@pytest.mark.parametrize("together", [reduction.online.TOGETHER, 0])
+def test_a_batch_is_its_runs(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch, together: int) -> None:
+    monkeypatch.setattr(reduction.online, "TOGETHER", together)
     model = model_of(comm, DAMPED)
     rom = reduced(model, symplectic_basis(model.system.layout, 4, "relative", True))
     (m,) = model.system.materials
