@@ -15,7 +15,15 @@ from reduction.basis import Coordinates, Frame
 
 
 class BasisError(SoftgraspError):
-    """A basis cannot be built from what is given."""
+    """A basis cannot be built from what is given.
+
+    Attributes:
+        most: largest N there is, where more was asked for.
+    """
+
+    def __init__(self, message: str, most: int | None = None) -> None:
+        super().__init__(message)
+        self.most = most
 
 
 @dataclass(frozen=True)

@@ -118,9 +118,9 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
     want, ranks = free // width, [part.rank for part in parts]
     if want > sum(ranks):
         found = " + ".join([*(str(width * r) for r in ranks), *([f"{hand} of the hand"] if hand else [])])
+        most = hand + width * sum(ranks)
         raise BasisError(
-            f"{name}: N = {N} is more than the snapshots carry above rounding ({found}); "
-            f"ask for N <= {hand + width * sum(ranks)}"
+            f"{name}: N = {N} is more than the snapshots carry above rounding ({found}); ask for N <= {most}", most
         )
     if len(parts) == 1:
         return (want,)

@@ -38,6 +38,7 @@ from study.reduce_tables import (
     box_rows,
     error_rows,
     inner_note,
+    refused_rows,
     speed_dicts,
     speed_notes,
     speed_of,
@@ -250,6 +251,8 @@ def show(console: Console, found: Reduced, result: dict[str, Any]) -> None:
         f"{inner_note(found.swept)}",
         style="dim",
     )
+    for sizes, titles, reason in refused_rows(found.swept):
+        console.print(_narrow(f"N = {sizes} refused for {titles}: {reason}."), markup=False)
     _print(console, TIME_HEADER, time_rows(found.speeds))
     for note in result["speed_notes"]:
         console.print(note)
@@ -266,7 +269,12 @@ def _print(console: Console, header: Sequence[str], rows: Sequence[Sequence[str]
     table = Table(box=None, padding=(0, 1, 0, 0))
     last = len(header) - 1
     for i, name in enumerate(header):
-        table.add_column(escape(name), no_wrap=0 < i < last, min_width={0: 15, last: 8}.get(i))
+        table.add_column(escape(name), no_wrap=0 < i < last, min_width={0: 13, last: 8}.get(i))
     for row in rows:
-        table.add_row(*(escape(cell.replace(", fixed solid modes", ", fixed")) for cell in row))
+        table.add_row(*(escape(_narrow(cell)) for cell in row))
     console.print(table)
+
+
+def _narrow(text: str) -> str:
+    """Titles as a terminal shows them."""
+    return text.replace(", fixed solid modes", ", fixed")

@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from reduction.registry import PAPER_METHODS
 from study.reduce_sweep import Point, Swept, nearest
@@ -17,6 +17,7 @@ from study.style import BLUE, GREEN, HAND, ORANGE, PURPLE, STEPS, WIDTH, paper_s
 
 UNSTABLE = "#D00000"
 TOP = 1.0  # errors above are drawn at the upper edge
+NARROW = 16.0  # largest over least time below which an axis has numbers between the powers of ten
 LOWEST = 1e-17  # of a singular value over the first
 SHOWN_VALUES = 100
 OLIVE, SKY, BROWN = "#8a8a00", "#56B4E9", "#8c510a"
@@ -34,6 +35,7 @@ LOOKS: dict[str, tuple[str, str, str]] = {  # colour by decomposition, dashes fo
     "craig_bampton": (HAND, "-", "P"),
 }
 SPARE = ((BROWN, "-", ">"), (BROWN, "--", "h"), (BROWN, ":", "X"), (BROWN, "-.", "p"))
+CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.1, "color": UNSTABLE}
 FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
 QUANTITIES = (
     ("error", "projection_error", "error of the state"),
@@ -82,7 +84,7 @@ def figure_errors(swept: Sequence[Swept], out_png: Path) -> tuple[Path, Path]:
 
 
 def figure_times(swept: Sequence[Swept], full: float, out_png: Path) -> tuple[Path, Path]:
-    """Errors of the stable models against online time, and against offline plus online time; PNG and PDF.
+    """Errors against online time, and against offline plus online time, with the unstable points; PNG and PDF.
 
     Args:
         swept: methods.
@@ -92,21 +94,26 @@ def figure_times(swept: Sequence[Swept], full: float, out_png: Path) -> tuple[Pa
     look = looks(swept)
     with paper_style():
         figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.4), sharex="col")
+        clipped = False
         for row, (key, _, label) in zip(grid, (QUANTITIES[0], QUANTITIES[2]), strict=True):
             row[0].set_ylabel(label)
             for ax, offline in zip(row, (False, True), strict=True):
                 unit = 1.0 if offline else 1e3
                 for s in swept:
-                    points = [p for p in s.points if p.stable]
-                    seconds = np.array([p.time_online + offline * p.time_offline for p in points])
-                    ax.plot(unit * seconds, _values(points, key), **_marks(look[s.method.key]))
+                    times = [unit * (p.time_online + offline * p.time_offline) for p in s.points]
+                    ax.plot(times, _values(s.points, key), **_marks(look[s.method.key]))
+                    _crosses(ax, s, times, key)
+                    clipped |= _clipped(s, key)
                 ax.axvline(full * unit, **FULL)
                 ax.set_xscale("log")
                 _log_axis(ax)
+        for ax in grid[1]:
+            _time_axis(ax)
         grid[1, 0].set_xlabel("online time of a run [ms]")
         grid[1, 1].set_xlabel("offline + online time [s]")
-        entries = [Line2D([], [], label=_name(s), **_marks(look[s.method.key])) for s in swept]
-        _legend(figure, [*entries, Line2D([], [], label="full run, prefactored", **FULL)])
+        entries = [Line2D([], [], label=_name(s), **_marks(look[s.method.key])) for s in swept if s.points]
+        entries.append(Line2D([], [], label="full run, prefactored", **FULL))
+        _legend(figure, [*entries, *_remarks(swept, clipped)])
         return save(figure, out_png)
 
 
@@ -163,12 +170,19 @@ def _curve(ax: Any, s: Swept, N: list[int], key: str, look: tuple[str, str, str]
     colour, dashes, marker = look
     shown = _values(s.points, key)
     ax.plot(N, shown, color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, zorder=2)
+    _crosses(ax, s, N, key)
+    return _clipped(s, key)
+
+
+def _crosses(ax: Any, s: Swept, at: Sequence[float], key: str) -> None:
+    """Marks of the unstable models among the points at these abscissae."""
     bad = [i for i, p in enumerate(s.points) if not p.stable]
-    ax.plot(
-        [N[i] for i in bad], shown[bad], ls="", marker="x", ms=6.0, mew=1.1, color=UNSTABLE, zorder=4, clip_on=False
-    )
-    values = np.array([getattr(p, key) for p in s.points], dtype=float)
-    return bool((~(values <= TOP)).any())
+    ax.plot([at[i] for i in bad], _values(s.points, key)[bad], **CROSS, zorder=4, clip_on=False)
+
+
+def _clipped(s: Swept, key: str) -> bool:
+    """Whether a value has to be drawn at the edge."""
+    return not all(getattr(p, key) <= TOP for p in s.points)
 
 
 def _log_axis(ax: Any) -> None:
@@ -180,17 +194,32 @@ def _log_axis(ax: Any) -> None:
     ax.set_axisbelow(True)
 
 
+def _time_axis(ax: Any) -> None:
+    """Plain numbers at the powers of ten, and between them where the axis spans hardly more than one."""
+    low, high = ax.get_xlim()
+    shown = "235" if high < NARROW * low else ""
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    ax.xaxis.set_minor_locator(LogLocator(subs=tuple(range(2, 10))))
+    ax.xaxis.set_minor_formatter(FuncFormatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in shown else ""))
+
+
 def _entries(swept: Sequence[Swept], look: dict[str, tuple[str, str, str]], clipped: bool) -> list[Line2D]:
     """Legend of the errors against N."""
     entries = []
     for s in swept:
         colour, dashes, marker = look[s.method.key]
         entries.append(Line2D([], [], color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, label=_name(s)))
-    if any(not p.stable for s in swept for p in s.points):
-        entries.append(Line2D([], [], ls="", marker="x", ms=6.0, mew=1.1, color=UNSTABLE, label="unstable model"))
     entries.append(Line2D([], [], color="#777777", ls=":", lw=0.9, label="projection error, the floor"))
+    return [*entries, *_remarks(swept, clipped)]
+
+
+def _remarks(swept: Sequence[Swept], clipped: bool) -> list[Line2D]:
+    """What a legend says of unstable models and of errors beyond the frame, where there are any."""
+    entries = []
+    if any(not p.stable for s in swept for p in s.points):
+        entries.append(Line2D([], [], **CROSS, label="unstable model"))
     if clipped:
-        entries.append(Line2D([], [], ls="", label="errors above 1 are drawn at 1"))
+        entries.append(Line2D([], [], ls="", label=f"errors above {TOP:g} are drawn at {TOP:g}"))
     return entries
 
 

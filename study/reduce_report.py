@@ -18,6 +18,7 @@ from study.reduce_tables import (
     box_rows,
     error_rows,
     inner_note,
+    refused_rows,
     time_rows,
     write_csv,
 )
@@ -33,8 +34,9 @@ CAPTIONS = {
     "alone, after removing the rigid motion of the hand; then the energy of the tissue. Thin dotted: projection error, "
     "which no model of the basis can fall below. Red crosses: unstable models. Errors above 1 are drawn at 1.",
     "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
-    "times.png": "Errors of all stable models against the time of a run, and against offline plus online time. Open "
-    "marks: global bases. Dashed: the full run with its matrix factored beforehand.",
+    "times.png": "Errors of all models against the time of a run, and against offline plus online time. Open marks: "
+    "global bases. Red crosses: unstable models. Errors above 1 are drawn at 1. Dashed: the full run with its matrix "
+    "factored beforehand.",
     "sigma.png": "Singular values over the first of each decomposition; thin lines are its further parts. Those of "
     "PSD are symplectic or of complex snapshots, each a pair of columns.",
     "modes.png": "First modes of the best method of the paper that keeps the hand apart, and of Craig-Bampton or the "
@@ -99,9 +101,8 @@ def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, s
         Section("", figures=figures),
         Section("Times", text="\n\n".join(result["speed_notes"]), header=TIME_HEADER, rows=time_rows(found.speeds)),
     ]
-    refused = [(s.method.title, N, reason) for s in found.swept for N, reason in s.refused.items()]
-    if refused:
-        parts.append(Section("Refused", header=("method", "N", "reason"), rows=refused))
+    if refused := refused_rows(found.swept):
+        parts.append(Section("Refused", header=("N", "method", "reason"), rows=refused))
     parts += box_sections(found)
     about = [(key, result[key]) for key in ("n_s", "n_e", "states", "steps")]
     about += [*made_with(result), *((f"time {key}", f"{value:.3g} s") for key, value in result["time"].items())]

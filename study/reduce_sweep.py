@@ -39,8 +39,7 @@ class Point:
     """One basis at one N; errors are relative, times in seconds, the abscissa in 1/s. Unstable runs may overflow.
 
     Attributes:
-        N: dimension of the reduced state. A canonical model with fixed solid modes has the hand as its input, so the
-            hand's 2 n_s coordinates do not count; in the paper's (q, v) models they do.
+        N: columns of the basis that count, see :func:`uncounted`.
         columns: basis vectors in all, with those of the hand.
         error: |X - X_r|_F / |X|_F of the snapshot matrix that the basis is built from: [q_s, v_s, q_e, v_e], or
             [q_s, p_s, q_e, p_e] for a canonical basis [SBRH21].
@@ -80,7 +79,7 @@ class Swept:
         points: one for every N.
         models: some of them by the number of their point: those of :func:`noted`. All would fill the memory.
         sigma: singular values of every part of the decomposition.
-        refused: N asked for that the snapshots do not carry, with the reason.
+        refused: N asked for that this basis cannot have, each with its reason.
         kept: N that keeps the wanted share of the energy; None without snapshots.
         inner: inner product of the bases.
     """
@@ -129,16 +128,28 @@ def noted(points: Sequence[Point]) -> set[int]:
 
 
 def uncounted(method: Method, n_s: int) -> int:
-    """Columns of the hand that N leaves out: those of a canonical model, whose hand is an input."""
+    """Columns that N leaves out: the hand's own of canonical bases with fixed solid modes and of Craig-Bampton."""
     return 2 * n_s if method.fixed and method.preserving else 0
 
 
 def sizes_for(method: Method, n_s: int, wanted: Sequence[int]) -> list[int]:
     """Numbers of columns that give the dimensions among ``wanted`` that this method can have."""
-    hand = 2 * n_s if method.fixed else 0
+    none = misfits(method, n_s, wanted)
+    return sorted({N + uncounted(method, n_s) for N in wanted if N not in none})
+
+
+def misfits(method: Method, n_s: int, wanted: Sequence[int]) -> dict[int, str]:
+    """Dimensions among ``wanted`` that this method cannot have whatever the snapshots are, with the reason."""
     step = 2 if method.pairs else 1
-    columns = {N + uncounted(method, n_s) for N in wanted}
-    return sorted(k for k in columns if k - hand >= step and (k - hand) % step == 0)
+    hand = 2 * n_s - uncounted(method, n_s) if method.fixed else 0
+    least = hand + step
+    found = {}
+    for N in wanted:
+        if N % step:
+            found[N] = f"N = {N}: only even N exist for this basis"
+        elif least > N:
+            found[N] = f"N = {N}: the {hand} columns of the hand count; ask for N >= {least}"
+    return found
 
 
 def bases_of(
@@ -146,9 +157,10 @@ def bases_of(
 ) -> tuple[tuple[Basis, ...], int | None]:
     """Bases at all sizes that the snapshots carry, and the columns that keep the wanted share of the energy.
 
-    Sizes beyond the rank are noted with the reason. Collective.
+    What does not fit is noted in ``refused`` by its N, with the reason. Collective.
     """
     method = METHODS[name]
+    hand = uncounted(method, states.layout.n_s)
     inner = None if wanted.inner == "auto" or not method.snapshots else wanted.inner
     rule = [Truncation(energy=wanted.energy)] if method.snapshots else []
     sizes = list(sizes)
@@ -156,9 +168,17 @@ def bases_of(
         try:
             bases = make_bases(name, states, [*sizes, *rule], inner, wanted.engine)
         except BasisError as error:
-            if not sizes:
-                return (), None
-            refused[sizes.pop()] = str(error)
+            most = error.most
+            beyond = [k for k in sizes if most is not None and k > most]
+            if not beyond and rule:
+                rule = []  # it may be the share that fails; what fails in general fails again
+                continue
+            what = "the snapshots carry above rounding" if method.snapshots else "this mesh has modes for"
+            why = str(error).removeprefix(f"{name}: ")
+            if most is not None and beyond:
+                why = f"more than {what}; ask for N <= {most - hand}"
+            refused |= {k - hand: f"N = {k - hand}: {why}" for k in beyond or sizes}
+            sizes = [k for k in sizes if beyond and k not in beyond]
         else:
             return bases[: len(sizes)], bases[-1].N if rule else None
     return (), None
@@ -223,7 +243,7 @@ def sweep(name: str, against: Reference, wanted: Reduction, progress: Progress |
     full, method = against.model, METHODS[name]
     states = States(full.system, ((full.system, against.snapshots),))
     sizes = sizes_for(method, full.system.layout.n_s, wanted.N)
-    refused: dict[int, str] = {}
+    refused = misfits(method, full.system.layout.n_s, wanted.N)
     bases, kept = bases_of(name, states, sizes, wanted, refused)
     outputs, key = make_outputs(full.scene, full.system), scene_hash(full.scene)
     points: list[Point] = []
@@ -242,7 +262,7 @@ def sweep(name: str, against: Reference, wanted: Reduction, progress: Progress |
         points=tuple(points),
         models=models,
         sigma=bases[0].sigma if bases else (),
-        refused={columns - hand: reason for columns, reason in refused.items()},
+        refused=dict(sorted(refused.items())),
         kept=None if kept is None else kept - hand,
         inner=bases[0].inner if bases else "",
     )

@@ -18,8 +18,8 @@ LEVELS = (1e-2, 1e-3, 1e-4)  # of the error, for which the least N is named
 PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
 LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 N_NOTE = (
-    "N is the dimension of the reduced state. A canonical model with fixed solid modes has the hand as its input, so "
-    "the 2 n_s coordinates of the hand do not count; in the (q, v) models, as in the paper, they do."
+    "N counts the columns of the basis, for canonical bases with fixed solid modes and for Craig-Bampton without the "
+    "hand's own 2 n_s; (q, v) bases with fixed solid modes count them, as in the paper."
 )
 
 
@@ -114,18 +114,29 @@ def error_rows(swept: Sequence[Swept]) -> list[tuple[str, ...]]:
     rows = []
     for s in swept:
         i = nearest(s.points, stable=False)
+        kept = "-" if s.kept is None else str(s.kept)
         if i is None:
-            reason = next(iter(s.refused.values()), "no N of the scene fits")
-            rows.append((s.method.title, *[""] * 6, "", f"none: {reason}"))
+            rows.append((s.method.title, kept, *[""] * 6, "refused" if s.refused else "no model"))
             continue
         p = s.points[i]
         mark = "" if p.N == COMPARED else f" at {p.N}"
         mark += "" if p.stable else " !"
         sizes = ["-" if (n := least_size(s.points, level)) is None else str(n) for level in LEVELS]
         errors = [f"{p.error:.1e}" + mark, f"{p.error_deformation:.1e}", f"{p.error_energy:.1e}"]
-        kept = "-" if s.kept is None else str(s.kept)
         rows.append((s.method.title, kept, *errors, *sizes, stability(s.points)))
     return rows
+
+
+def refused_rows(swept: Sequence[Swept]) -> list[tuple[str, str, str]]:
+    """N that were refused, the methods, and the one reason: methods and N that share it stand together."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for s in swept:
+        reasons: dict[str, list[int]] = {}
+        for N, reason in s.refused.items():
+            reasons.setdefault(reason.removeprefix(f"N = {N}: "), []).append(N)
+        for reason, sizes in reasons.items():
+            found.setdefault((", ".join(map(str, sizes)), reason), []).append(s.method.title)
+    return [(sizes, "; ".join(titles), reason) for (sizes, reason), titles in found.items()]
 
 
 def time_rows(speeds: Sequence[Speed]) -> list[tuple[str, ...]]:
@@ -197,7 +208,8 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
         "matrices. Break-even runs = offline / (full run - online run); the full run that gives the snapshots is one "
         "more."
     ]
-    chosen = next((s for s in speeds if s.method == "psd_fixed"), None) or (speeds[0] if speeds else None)
+    stable = [s for s in speeds if s.stable]
+    chosen = next((s for s in stable if s.method == "psd_fixed"), None) or next(iter(stable), None)
     if chosen is None:
         return notes
     mesh, named = break_even_mesh(n_e, full, chosen.time_online), f"{chosen.title}, N = {chosen.N}"

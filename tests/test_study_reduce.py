@@ -28,7 +28,7 @@ from study.reduce import run_reduce
 from study.reduce_box import cases_of, measure_box, summary, training_of, training_states
 from study.reduce_pictures import gather_views, instants
 from study.reduce_reference import Reference, prepare, reference
-from study.reduce_sweep import BEYOND, Point, best, chosen_methods, nearest, noted, sweep
+from study.reduce_sweep import BEYOND, Point, best, chosen_methods, nearest, noted, sweep, uncounted
 from study.reduce_tables import FullTimes, least_size, speed_of, stability
 from tests.browser import find_chromium, look
 from tests.helpers import gather_matrix, gather_rows, gather_states, make_scene
@@ -236,9 +236,9 @@ def test_training_is_as_the_scene_says() -> None:
 # --- the command
 
 
-def reduced(path: Path, *overrides: str, pictures: bool = True) -> tuple[dict[str, Any], str]:
+def reduced(path: Path, *overrides: str, pictures: bool = True, width: int = 200) -> tuple[dict[str, Any], str]:
     text = io.StringIO()
-    console = Console(file=text, width=200, quiet=MPI.COMM_WORLD.rank != 0)
+    console = Console(file=text, width=width, quiet=MPI.COMM_WORLD.rank != 0)
     result = run_reduce(PAPER, path, [*SMALL, *overrides], console, quiet=True, pictures=pictures)
     return result, text.getvalue()
 
@@ -270,7 +270,7 @@ def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: Referenc
         assert (mpi_tmp_path / "compare.gif").stat().st_size > 5000
         if MPI.COMM_WORLD.size == 1 and find_chromium():
             assert look(mpi_tmp_path / "report.html", figures=7) == []
-        for words in ("PSD complex SVD, fixed solid modes", "Break-even mesh", "the hand as its input"):
+        for words in ("PSD complex SVD, fixed solid modes", "Break-even mesh", "without the hand's own 2 n_s"):
             assert words in text
     MPI.COMM_WORLD.Barrier()
     again = load_model(mpi_tmp_path / "models" / "psd_fixed.h5", small.model.system.layout)
@@ -322,13 +322,71 @@ def test_wrong_input_is_one_sentence(
     assert not (mpi_tmp_path / "out").exists()
 
 
-def test_more_vectors_than_the_snapshots_carry(small: Reference) -> None:
-    every = load_scene(PAPER, [*SMALL, "output.every=20"])
-    against = made(every)
+REFUSED = {  # N asked for, with the words of its reason; the snapshots of [5, 10] cells carry less than 300 columns
+    "pod_fixed": {4: "the 4 columns of the hand count; ask for N >= 5", 300: "snapshots", 2000: "snapshots"},
+    "psd_fixed": {13: "only even N", 300: "snapshots", 2000: "snapshots"},
+    "craig_bampton": {13: "only even N", 300: "modes", 2000: "modes"},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_every_refused_size_has_its_own_reason(small: Reference, name: str) -> None:
+    asked = [4, 13, 14, 40, 300, 2000]
+    swept = sweep(name, small, wanted(small, asked))
+    assert [p.N for p in swept.points] == [N for N in asked if N not in REFUSED[name]]
+    assert swept.refused.keys() == REFUSED[name].keys()
+    for N, reason in swept.refused.items():
+        assert reason.startswith(f"N = {N}: ")
+        assert REFUSED[name][N] in reason
+        assert name not in reason
+    most = int(swept.refused[2000].rpartition(" ")[2])
+    again = sweep(name, small, wanted(small, [most, most + 2]))
+    assert [p.N for p in again.points] == [most]  # what the reason offers exists, the next does not
+    assert list(again.refused) == [most + 2]
+
+
+def test_more_vectors_than_few_snapshots_carry() -> None:
+    against = made(load_scene(PAPER, [*SMALL, "output.every=20"]))
     swept = sweep("psd_fixed", against, wanted(against, [4, 40]))
     assert [p.N for p in swept.points] == [4]
     assert list(swept.refused) == [40]
     assert "ask for N <=" in swept.refused[40]
+
+
+def test_a_share_that_cannot_be_kept_refuses_no_size(small: Reference) -> None:
+    gram = {"engine": "gram", "energy": 1 - 1e-16}  # it sees singular values down to 1e-8 of the first only
+    swept = sweep("psd_fixed", small, wanted(small, [4, 14]).model_copy(update=gram))
+    assert [p.N for p in swept.points] == [4, 14]
+    assert swept.refused == {}
+    assert swept.kept is None
+
+
+def test_terminal_says_what_is_refused(mpi_tmp_path: Path) -> None:
+    changes = ["reduction.methods=['pod_fixed', 'psd_fixed', 'craig_bampton']", "reduction.N=[13, 2000]"]
+    result, text = reduced(mpi_tmp_path, *changes, pictures=False, width=80)
+    assert {key: list(about["N_refused"]) for key, about in result["about"].items()} == {
+        "pod_fixed": [2000], "psd_fixed": [13, 2000], "craig_bampton": [13, 2000],
+    }  # fmt: skip
+    if MPI.COMM_WORLD.rank == 0:
+        words = " ".join(text.split())
+        assert "N = 13 refused for PSD complex SVD, fixed; Craig-Bampton: only even N exist for this basis." in words
+        for title in ("POD, fixed", "PSD complex SVD, fixed", "Craig-Bampton"):
+            assert f"N = 2000 refused for {title}: more than " in words
+        (row,) = (line for line in text.splitlines() if line.startswith("Craig-Bampton"))
+        assert row.split() == ["Craig-Bampton", "-", "refused"]
+        assert "stable N" in text  # the last column is whole
+        page = (mpi_tmp_path / "report.html").read_text()
+        assert "PSD complex SVD, fixed solid modes; Craig-Bampton" in page
+        assert "only even N exist for this basis" in page
+
+
+def test_note_on_the_dimension_holds(small: Reference) -> None:
+    hand = 2 * small.model.system.layout.n_s
+    for name, method in METHODS.items():
+        left_out = method.fixed and (method.coordinates == "qp" or name == "craig_bampton")  # N_NOTE
+        assert uncounted(method, hand // 2) == (hand if left_out else 0), name
+    (p,) = sweep("craig_bampton", small, wanted(small, [6])).points
+    assert (p.N, p.columns) == (6, 6 + hand)
 
 
 def test_scene_chooses_methods() -> None:
