@@ -138,8 +138,9 @@ def _velocity(halves: Halves) -> Columns:
 
 
 def joint_parts(request: Request) -> tuple[Part, ...]:
-    """Global POD: V = POD_k(X), X = [q_s; v_s; q_e; v_e]; without the hand, V_e = POD_k(X_e), X_e = [q_e; v_e].
+    """Global POD: V = POD_k(X), X = [q_s; v_s; q_e; v_e].
 
+    With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e = POD_k(X_e), X_e = [q_e; v_e].
     V' W V = I over displacement and velocity rows together. Collective.
     """
     b, layout = request.blocks, request.states.layout
@@ -152,6 +153,7 @@ def joint_parts(request: Request) -> tuple[Part, ...]:
 def componentwise_parts(request: Request) -> tuple[Part, ...]:
     """Componentwise POD: V = blkdiag(POD_k1(X_q), POD_k2(X_v)), displacement and velocity by themselves.
 
+    With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e the same of the tissue's rows.
     V_q' W_q V_q = I and V_v' W_v V_v = I. Collective.
     """
     b, layout = request.blocks, request.states.layout

@@ -108,7 +108,8 @@ def complex_svd_parts(request: Request) -> tuple[Part, ...]:
     """PSD complex SVD [PM16, Algorithm 2]: q + i p = E S C^H, V = [Re E, -Im E; Im E, Re E].
 
     V' V = I and V' J V = J at once (orthosymplectic); span of V is that of the leading left singular vectors of
-    Y = [X, J X] [SBRH21], where every singular value comes twice. Collective.
+    Y = [X, J X] [SBRH21], where every singular value comes twice. With fixed solid modes V = blkdiag(I, V_e), I of
+    order 2 n_s for the hand, V_e the same of the tissue's rows. Collective.
     """
     c = canonical(request)
     comm = request.states.layout.comm
