@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -42,26 +43,22 @@ def total(comm: MPI.Intracomm, local: Array) -> Array:
 def rows_on_all(comm: MPI.Intracomm, local: NDArray[Any]) -> NDArray[Any]:
     """Rows of all ranks, in their order, on every rank. Collective."""
     local = np.ascontiguousarray(local)
-    counts = comm.allgather(local.size)
-    result = _empty_rows(sum(counts), local)
-    comm.Allgatherv(local, [result, counts])
+    rows = comm.allgather(len(local))
+    result = np.empty((sum(rows), *local.shape[1:]), dtype=local.dtype)
+    comm.Allgatherv(local, [result, np.multiply(rows, math.prod(local.shape[1:]))])
     return result
 
 
 def rows_on_root(comm: MPI.Intracomm, local: NDArray[Any]) -> NDArray[Any] | None:
     """Rows of all ranks, in their order, on rank 0; None elsewhere. Collective."""
     local = np.ascontiguousarray(local)
-    counts = comm.gather(local.size)
-    if counts is None:
+    rows = comm.gather(len(local))
+    if rows is None:
         comm.Gatherv(local, None)
         return None
-    result = _empty_rows(sum(counts), local)
-    comm.Gatherv(local, [result, counts])
+    result = np.empty((sum(rows), *local.shape[1:]), dtype=local.dtype)
+    comm.Gatherv(local, [result, np.multiply(rows, math.prod(local.shape[1:]))])
     return result
-
-
-def _empty_rows(size: int, like: NDArray[Any]) -> NDArray[Any]:
-    return np.empty((size // max(1, int(np.prod(like.shape[1:]))), *like.shape[1:]), dtype=like.dtype)
 
 
 def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:

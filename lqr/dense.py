@@ -11,7 +11,7 @@ import scipy.linalg
 from fem.errors import ResourceError, SolverError, agree
 from fem.layout import BlockLayout
 from fem.modes import lowest_modes
-from fem.petsc import Array, PETSc, times_columns
+from fem.petsc import Array, PETSc, rows_on_root, times_columns
 from lqr.care import DenseSolution as DenseSolution
 from lqr.care import care as care
 from lqr.checks import EPS, check_finite, check_weights, square_root
@@ -72,19 +72,13 @@ class ModalPlant:
     space: StateSpace
 
 
-def gather_rows(layout: BlockLayout, local: Array) -> Array | None:
-    """Rows of all ranks on rank 0, None elsewhere. Collective."""
-    parts = layout.comm.gather(np.array(local))
-    return None if parts is None else np.concatenate(parts)
-
-
 def gather_matrix(layout: BlockLayout, A: PETSc.Mat) -> Array | None:
     """A distributed tissue matrix, dense on rank 0, None elsewhere. Collective."""
     indptr, columns, values = A.getValuesCSR()
     local = np.zeros((layout.n_local, layout.n_e))
     rows = np.repeat(np.arange(layout.n_local), np.diff(indptr))
     local[rows, columns] = values
-    return gather_rows(layout, local)
+    return rows_on_root(layout.comm, local)
 
 
 def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
@@ -93,8 +87,8 @@ def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
     matrix = system.damping.matrix
     extra = None if matrix is None else gather_matrix(layout, matrix)
-    T, G, C_z = (gather_rows(layout, a) for a in (system.T, system.G, problem.C_z))
-    B_z = None if problem.B_z is None else gather_rows(layout, problem.B_z)
+    T, G, C_z = (rows_on_root(layout.comm, a) for a in (system.T, system.G, problem.C_z))
+    B_z = None if problem.B_z is None else rows_on_root(layout.comm, problem.B_z)
     if M is None or K is None or T is None or G is None or C_z is None:
         return None
     D = system.damping.alpha * M + (system.damping.beta * K if extra is None else extra)

@@ -157,7 +157,7 @@ def _few_modes(small: SmallPlant) -> Array | None:
     N, r, k = len(small.space.E), small.order, FEW_MODES
     if r < 2 * k:
         return None
-    at = np.r_[: N - 2 * r, N - 2 * r : N - 2 * r + k, N - r : N - r + k]
+    at = np.r_[: N - 2 * r + k, N - r : N - r + k]
     E, A, B, C = (small.space.E[np.ix_(at, at)], small.space.A[np.ix_(at, at)], small.space.B[at], small.space.C[:, at])
     found = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
     if found is None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from fem.scene import Scene
 from fem.scene_file import resolved_toml
 from study.command import origin, write_json
-from study.equation import equation
 from study.explain import Explanation, remarks, size_text, verdict
 from study.report import EQUATION, Section, command_line, equation_text, write_report
 
@@ -31,14 +30,14 @@ def write_explanation(
         out / "report.html",
         title=f"{scene.name}: what it simulates",
         subtitle=scene.description,
-        sections=_sections(found, scene),
+        sections=_sections(found),
         scene=resolved_toml(scene),
         reproduce=command_line("explain", path, overrides, ranks, " --out out"),
     )
     return result, report
 
 
-def _sections(found: Explanation, scene: Scene) -> list[Section]:
+def _sections(found: Explanation) -> list[Section]:
     s, t, solver = found.sizes, found.time, found.solver
     sizes = [
         ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {s.n_e}, 2n = {s.states}"),
@@ -57,7 +56,7 @@ def _sections(found: Explanation, scene: Scene) -> list[Section]:
     costs = [(name, e.term, ", ".join(e.operators) or "nothing", e.cost) for name, e in found.effects.items() if e.on]
     sections = [
         Section("Look at", text="\n\n".join(remarks(found)) or "Nothing stands out."),
-        Section(EQUATION, code=equation_text(equation(scene))),
+        Section(EQUATION, code=equation_text(found.equation)),
         Section("Sizes", rows=sizes),
         Section(
             "Effects", header=("effect", "verdict", "gate", "number", "matters from", "what it says"), rows=effects

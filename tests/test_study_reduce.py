@@ -21,15 +21,14 @@ from fem.scene_file import load_scene
 from reduction.archive import load_model
 from reduction.online import run
 from reduction.project import project
-from reduction.registry import METHODS, PAPER_METHODS, make_bases
+from reduction.registry import METHODS, make_bases
 from reduction.states import BasisError, States
-from study.mesh_study import MeshRow, break_even, exponent, run_mesh_study
 from study.reduce import run_reduce
 from study.reduce_box import cases_of, measure_box, summary, training_of, training_states
 from study.reduce_pictures import gather_views, instants
 from study.reduce_reference import Reference, prepare, reference
-from study.reduce_sweep import BEYOND, Point, best, chosen_methods, nearest, noted, sweep, uncounted
-from study.reduce_tables import FullTimes, least_size, speed_of, stability
+from study.reduce_sweep import sweep, uncounted
+from study.reduce_tables import FullTimes, speed_of
 from tests.browser import find_chromium, look
 from tests.helpers import gather_matrix, gather_rows, gather_states, make_scene
 
@@ -389,30 +388,6 @@ def test_note_on_the_dimension_holds(small: Reference) -> None:
     assert (p.N, p.columns) == (6, 6 + hand)
 
 
-def test_scene_chooses_methods() -> None:
-    assert chosen_methods(make_scene().reduction) == (*PAPER_METHODS, *BEYOND)
-    assert chosen_methods(make_scene(reduction={"methods": ["psd_qv"]}).reduction) == ("psd_qv",)
-
-
-# --- tables
-
-
-def point(N: int, error: float, stable: bool = True, online: float = 1e-3) -> Point:
-    return Point(N, N, error, error, error, error, error, error, 2.0, 1e-3, online, 0.0 if stable else 1.0, stable)
-
-
-def test_choice_of_points() -> None:
-    points = [point(4, 1e-1), point(12, 1e-3), point(14, 1e-9, stable=False), point(30, float("nan")), point(40, 1e-4)]
-    assert nearest(points) == 1
-    assert nearest(points, stable=False) == 2
-    assert best(points) == 4
-    assert noted(points) == {1, 2, 3, 4}  # nearest to 14, all and stable, nearest to 30, best
-    assert least_size(points, 1e-2) == 12
-    assert least_size(points, 1e-6) is None  # an unstable model does not count
-    assert stability(points) == "not 14"
-    assert nearest([]) is None
-
-
 def test_speed_counts_runs_to_break_even(small: Reference) -> None:
     swept = sweep("craig_bampton", small, wanted(small, [6]))
     p = swept.points[0]
@@ -423,27 +398,3 @@ def test_speed_counts_runs_to_break_even(small: Reference) -> None:
     assert slow is not None
     assert slow.break_even_runs is None
     assert slow.speedup == pytest.approx(0.5)
-
-
-# --- mesh study
-
-
-def test_mesh_study_of_small_meshes(mpi_tmp_path: Path, comm: MPI.Intracomm) -> None:
-    console = Console(file=io.StringIO(), quiet=comm.rank != 0)
-    result = run_mesh_study([300, 1200], 60, "psd_fixed", 10, mpi_tmp_path, console, comm)
-    assert [row["N"] for row in result["rows"]] == [10, 10]
-    assert all(row["stable"] and row["error"] < 0.02 for row in result["rows"])  # N = 10 of a coarse run
-    if comm.rank == 0:
-        assert json.loads((mpi_tmp_path / "mesh_study.json").read_text())["rows"] == result["rows"]
-        assert (mpi_tmp_path / "mesh_study.png").stat().st_size > 5000
-
-
-def test_exponent_and_break_even_mesh() -> None:
-    rows = [
-        MeshRow(8, n, 1.0, 1e-6 * n**1.5, 1e-5 * n, 1e-3, 1e-3, 14, 1e-3, 1e-2, True) for n in (10**3, 10**4, 10**5)
-    ]
-    assert exponent(rows, "time_full") == pytest.approx(1.5)
-    assert exponent(rows, "time_offline") == pytest.approx(1.0)
-    assert exponent(rows, "time_online") == pytest.approx(0.0, abs=1e-12)  # rounding
-    assert break_even(rows) == pytest.approx(100.0)  # 1e-6 n^1.5 = 1e-3
-    assert np.isnan(exponent(rows[:1], "time_full"))
