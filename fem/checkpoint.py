@@ -15,7 +15,7 @@ from fem.scene_file import scene_hash
 if TYPE_CHECKING:
     from fem.run import Run
 
-FORMAT = 1
+FORMAT = 2
 
 
 def _rank_file(directory: Path, step: int, rank: int) -> Path:
@@ -71,12 +71,15 @@ def _write_rank(run: Run, path: Path) -> None:
     midpoint, n = run.midpoint, run.reached
     with h5py.File(path, "w") as file:
         file["state"] = run.state.array
-        file["h"] = midpoint.h.array_r
+        file["r"] = midpoint.r.array_r
+        file["pending"] = midpoint.pending
         file["hand_q"] = run.drive.q[: n + 1]
         file["hand_v"] = run.drive.v[: n + 1]
         file["outputs"] = run.local_outputs[: n + 1]
         file["snapshots"] = run.store.kept(n)
-        file["energies"] = [midpoint.work, midpoint.dissipated, run.initial_energy, run.peak_energy]
+        file["loads"] = run.drive.c[:n]
+        file["pulls"] = run.pulls[: n + 1]
+        file["energies"] = [midpoint.dissipated, run.initial_energy, run.peak_energy]
         file["residual_first"] = run.residual_first
 
 
@@ -95,7 +98,7 @@ def read_checkpoint(run: Run, directory: Path) -> None:
                 _restore(run, file, entry["step"])
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
-    for vector in (run.state.z, run.state.v, run.midpoint.h):
+    for vector in (run.state.z, run.state.v, run.midpoint.r):
         vector.stateIncrease()
     run.midpoint.join(run.state)
 
@@ -124,12 +127,14 @@ def _restore(run: Run, file: h5py.File, step: int) -> None:
     run.store.restore(np.asarray(file["snapshots"]), step)
     run.state = run.store.target(step)
     run.state.array[:] = file["state"][:]
-    run.midpoint.h.array_w[:] = file["h"][:]
+    run.midpoint.r.array_w[:] = file["r"][:]
+    run.midpoint.pending = file["pending"][:]
     run.drive.q[:n] = file["hand_q"][:]
     run.drive.v[:n] = file["hand_v"][:]
     run.local_outputs[:n] = file["outputs"][:]
+    run.drive.c[:step] = file["loads"][:]
+    run.pulls[:n] = file["pulls"][:]
     energies = file["energies"][:]
-    run.midpoint.work, run.midpoint.dissipated = float(energies[0]), float(energies[1])
-    run.initial_energy, run.peak_energy = float(energies[2]), float(energies[3])
+    run.midpoint.dissipated, run.initial_energy, run.peak_energy = (float(value) for value in energies)
     run.residual_first = float(file["residual_first"][()])
     run.reached = step

@@ -22,6 +22,8 @@ class Drive(Protocol):
 
     q: Array
     v: Array
+    c: Array
+    """Load l = G c of each step, (steps, n_s)."""
 
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """Leave w and load of step n in ``midpoint``; fill row n + 1 of ``q`` and ``v``. Collective."""
@@ -41,8 +43,7 @@ class TableDrive:
 
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One product with the n_s columns of G and one solve. Collective."""
-        midpoint.set_load(self.c[n])
-        midpoint.solve_midpoint()
+        midpoint.solve_midpoint(self.c[n])
 
 
 class ForceDrive:
@@ -62,7 +63,7 @@ class ForceDrive:
         n_s = system.layout.n_s
         self.system, self.dt = system, midpoint.dt
         self.force: Force = self._checked(force)
-        self.q, self.v = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s))
+        self.q, self.v, self.c = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
         self.q[0], self.v[0] = q0, v0
         self.g = np.zeros(n_s) if system.gravity is None else system.gravity
         self.weight = system.M_hand @ self.g if system.hand_weight else np.zeros(n_s)
@@ -96,8 +97,8 @@ class ForceDrive:
         """One solve. Collective."""
         q, v = self.q[n], self.v[n]
         a = self.inverse @ (self.force(n, (n + 0.5) * self.dt, q, v) + self.weight)
-        midpoint.set_load(-(self.kappa * a + self.alpha * v - self.g))
-        midpoint.solve_midpoint()
+        self.c[n] = -(self.kappa * a + self.alpha * v - self.g)
+        midpoint.solve_midpoint(self.c[n])
         self._move(n, a)
 
     def _two_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
@@ -110,7 +111,9 @@ class ForceDrive:
         relative = self.theta * x - midpoint.s * state.array[layout.n_local :]
         pull = total(layout.comm, G.T @ relative) - self.theta * (self.GY @ c0)
         a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
-        midpoint.accelerate(self.kappa * a + c0)
+        c = self.kappa * a + c0
+        self.c[n] = -c
+        midpoint.accelerate(c)
         self._move(n, a)
 
     def _move(self, n: int, a: Array) -> None:

@@ -6,6 +6,8 @@ import time
 from abc import ABC, abstractmethod
 from typing import Any
 
+import numpy as np
+
 from fem.errors import SoftgraspError, SolverError
 from fem.layout import BlockLayout
 from fem.midpoint import TissueMidpoint, TissueState
@@ -29,6 +31,7 @@ class Stepped(ABC):
         state: at the last step taken.
         reached: number of the last step taken.
         seconds, counted: time and number of the steps taken by :meth:`advance_to`.
+        residual: relative, of the last solve that :meth:`check_step` looked at.
     """
 
     def __init__(
@@ -44,7 +47,8 @@ class Stepped(ABC):
         self.midpoint, self.store, self.solver = midpoint, store, solver
         self.state: TissueState = store.target(0)
         self.reached = 0
-        self.seconds, self.counted = 0.0, 0
+        self.seconds, self.counted, self.residual = 0.0, 0, 0.0
+        self._solve = self.solve_step
 
     @abstractmethod
     def solve_step(self, n: int) -> None:
@@ -57,16 +61,15 @@ class Stepped(ABC):
     def step(self, ts: Any) -> None:
         """One midpoint step, called by TS; the step number, not a summed time, picks the load. Collective."""
         n = self.reached
-        self.solve_step(n)
+        self._solve(n)
         new = self.store.target(n + 1)
         self.midpoint.advance(self.state, new)
         self.state = new
         self.reached = n + 1
         self.record(n + 1)
-        ts.setTime((n + 1) * self.dt)
 
-    def advance_to(self, ts: Any, x: Any, step: int) -> None:
-        """Let TS run up to a step number. Collective.
+    def advance_to(self, ts: Any, step: int) -> None:
+        """Let TS run up to a step number; its own time is set at the end. Collective.
 
         Raises:
             SolverError: a solve failed; the message names solver, step and reason.
@@ -77,7 +80,7 @@ class Stepped(ABC):
         before = self.reached
         begin = time.perf_counter()
         try:
-            ts.solve(x)
+            ts.solve()
         except PETSc.Error as error:
             cause = error.__cause__
             if cause is not None and not isinstance(cause, SoftgraspError):
@@ -92,18 +95,38 @@ class Stepped(ABC):
             )
         self.seconds += time.perf_counter() - begin
         self.counted += step - before
-        if self.state is not self.store.work:
-            self.store.work.array[:] = self.state.array  # the TS solution is current between segments
-            x.stateIncrease()
+        ts.setTime(step * self.dt)
+
+    def check_step(self, ts: Any, step: int) -> float:
+        """Let TS run up to a step number and check the solve of that step; its relative residual. Collective.
+
+        Raises:
+            SolverError: a solve failed or missed its tolerance.
+        """
+        self.advance_to(ts, step - 1)
+        self._solve = self._solve_and_check
+        try:
+            self.advance_to(ts, step)
+        finally:
+            self._solve = self.solve_step
+        return self.residual
+
+    def _solve_and_check(self, n: int) -> None:
+        self.solve_step(n)
+        self.residual = self.midpoint.residual()
 
 
-def make_ts(run: Stepped) -> tuple[Any, Any]:
-    """PETSc TS around a run, and its solution vector [z; v] on the work array. Collective."""
-    layout = run.layout
-    ts = PETSc.TS().createPython(run, comm=layout.comm)
+def make_ts(run: Stepped) -> Any:
+    """PETSc TS around a run. Collective.
+
+    TS copies its solution before every step, for a rollback that nothing here asks for. Of z and v that would be a pass
+    over memory, so the state stays with the run, and TS holds one number a rank.
+    """
+    ts = PETSc.TS().createPython(run, comm=run.layout.comm)
     ts.setTimeStep(run.dt)
     ts.setMaxTime(1e300)  # stepping by time would take one step too many or change the last one
     ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
-    x = PETSc.Vec().createWithArray(run.store.work.array, size=(2 * layout.n_local, 2 * layout.n_e), comm=layout.comm)
-    ts.setSolution(x)
-    return ts, x
+    counter = PETSc.Vec().createWithArray(np.zeros(1), comm=run.layout.comm)
+    ts.setSolution(counter)
+    counter.destroy()
+    return ts

@@ -153,8 +153,7 @@ class HeldDrive:
         u, c_0 = self.held, plant.alpha * self.v[n] - plant.g
         if not system.two_way:
             a = plant.inverse @ (u + plant.weight)
-            midpoint.set_load(-(plant.kappa * a + c_0))
-            midpoint.solve_midpoint()
+            midpoint.solve_midpoint(-(plant.kappa * a + c_0))
             move(self, n, u, a, plant.dt)
             return
         x = midpoint.respond()

@@ -64,7 +64,7 @@ class Stepper:
     def __init__(self, model: Model) -> None:
         self.comm: MPI.Intracomm = model.system.layout.comm
         self.run = Run(model, RunOptions())
-        self.ts, self.x = make_ts(self.run)
+        self.ts = make_ts(self.run)
         self.run.start()
         self.begin = self.run.state.array.copy()
 
@@ -75,7 +75,7 @@ class Stepper:
         run.state.z.stateIncrease()
         run.state.v.stateIncrease()
         run.midpoint.start(run.state)
-        run.midpoint.work = run.midpoint.dissipated = 0.0
+        run.midpoint.dissipated = 0.0
         run.reached = 0
         self.ts.setStepNumber(0)
 
@@ -86,7 +86,7 @@ class Stepper:
             self.rewind()
             n = min(run.steps, count - done)
             self.comm.Barrier()
-            run.advance_to(self.ts, self.x, n)
+            run.advance_to(self.ts, n)
             done += n
         return float(self.comm.allreduce(run.seconds - before, MPI.MAX)) / done
 
@@ -94,20 +94,19 @@ class Stepper:
         """Operations that PETSc counts in one step, over all ranks. Collective."""
         self.rewind()
         few, many = min(1, self.run.steps), min(11, self.run.steps)
-        self.run.advance_to(self.ts, self.x, few)
+        self.run.advance_to(self.ts, few)
         before = PETSc.Log.getFlops()
-        self.run.advance_to(self.ts, self.x, many)
+        self.run.advance_to(self.ts, many)
         local = PETSc.Log.getFlops() - before
         return float(self.comm.allreduce(local)) / max(many - few, 1)
 
     def advance(self, count: int) -> None:
         """Go on by so many steps, or to the end. Collective."""
-        self.run.advance_to(self.ts, self.x, min(self.run.reached + count, self.run.steps))
+        self.run.advance_to(self.ts, min(self.run.reached + count, self.run.steps))
 
     def destroy(self) -> None:
         """Free the PETSc objects. Collective."""
         self.ts.destroy()
-        self.x.destroy()
         self.run.midpoint.destroy()
 
 

@@ -50,7 +50,7 @@ def inject(fault: str) -> None:
                 raise RuntimeError("a bug on rank 1")
             if fault == "killed":
                 os.kill(os.getpid(), signal.SIGKILL)
-            run.midpoint.h.array_w[:] = float("nan")
+            run.midpoint.r.array_w[:] = float("nan")
         step(run, ts)
 
     from mpi4py import MPI

@@ -225,14 +225,13 @@ def run_probed(model: Model, probe: Probe, until: int | None = None) -> Probed:
     comm = model.system.layout.comm
     model.watch.seconds.pop("factor", None)
     run = ProbedRun(model, probe)
-    ts, x = make_ts(run)
+    ts = make_ts(run)
     try:
         run.start()
         last = run.steps if until is None else min(until, run.steps)
         comm.Barrier()
-        run.advance_to(ts, x, last)
+        run.check_step(ts, last)
         run.watch_energy()
-        run.midpoint.residual()
         stamps = np.empty_like(run.stamps[:last])
         comm.Allreduce(run.stamps[:last], stamps, MPI.MAX)
         rigid = run.drive.q[: last + 1] @ probe.C_s.T
@@ -241,5 +240,4 @@ def run_probed(model: Model, probe: Probe, until: int | None = None) -> Probed:
         return Probed(times, y, rigid, stamps, model.watch.seconds["factor"])
     finally:
         ts.destroy()
-        x.destroy()
         run.midpoint.destroy()

@@ -354,14 +354,14 @@ def wave(n: int, t: float, q: Array, v: Array) -> Array:
 def run_from(model: Model, z: Array, v: Array, v_s: Array | None = None, force: Any = None) -> Run:
     """Run the whole scene from a given tissue state (node order) and hand velocity. Collective."""
     run = Run(model, RunOptions(), force)
-    ts, x = make_ts(run)
+    ts = make_ts(run)
     if v_s is not None:
         run.drive.v[0] = v_s
     run.start()
     run.state.z.array_w[:] = local_rows(model.system.layout, z)
     run.state.v.array_w[:] = local_rows(model.system.layout, v)
     run.midpoint.start(run.state)
-    run.advance_to(ts, x, run.steps)
+    run.advance_to(ts, run.steps)
     ts.destroy()
     return run
 

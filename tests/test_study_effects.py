@@ -204,7 +204,7 @@ def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:
     stepper = Stepper(model)
     stepper.seconds_per_step(2 * 60 + 17)
     stepper.rewind()
-    stepper.run.advance_to(stepper.ts, stepper.x, 60)
+    stepper.run.advance_to(stepper.ts, 60)
     layout = model.system.layout
     end, fresh = gather_states(layout, stepper.run.state.array), gather_states(layout, simulate(model).final)
     np.testing.assert_allclose(end, fresh, rtol=0, atol=1e-11 * np.abs(fresh).max())  # sixty steps of rounding
