@@ -107,12 +107,9 @@ class TissueMidpoint:
         self.x = self.w  # w as the state is distributed
         self._move = self._move_all
         if self.held.whole:
-            layout = system.layout
-            self.x = PETSc.Vec().createWithArray(
-                self.w_own, size=(layout.n_local, layout.n_e), bsize=layout.dimension, comm=layout.comm
-            )
+            self.x = self._owned(self.w_own)
             self.z = self.w.duplicate()
-            self.z_own = self.z.array_r[self.rows]
+            self.z_own = self._owned(self.z.array_w[self.rows])
             self._move = self._move_own
         damping = system.damping
         self.alpha, self.beta = damping.alpha, damping.beta
@@ -126,6 +123,13 @@ class TissueMidpoint:
             self.k_old_array = self.k_old.array_r
             self._propagate = self._proportional
         self.dissipated = 0.0
+
+    def _owned(self, array: Array) -> PETSc.Vec:
+        """Rows that this rank owns as its share of a distributed vector, not copied. Collective."""
+        layout = self.system.layout
+        return PETSc.Vec().createWithArray(
+            array, size=(layout.n_local, layout.n_e), bsize=layout.dimension, comm=layout.comm
+        )
 
     def _couple(self) -> None:
         """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w. Not collective.
@@ -232,8 +236,7 @@ class TissueMidpoint:
 
     def _move_own(self, old: TissueState, new: TissueState) -> PETSc.Vec:
         self.z.axpy(2.0, self.w)
-        new.array[: len(self.z_own)] = self.z_own
-        new.z.stateIncrease()
+        self.z_own.copy(new.z)
         self._move_velocity(old, new)
         return self.z
 
@@ -294,6 +297,21 @@ class TissueMidpoint:
         """Free all PETSc objects. Collective."""
         self.solver.destroy()
         self.held.destroy()
-        for name in ("r", "k", "x", "w", "r_here", "w_here", "added", "moved", "coupling", "k_old", "y", "z", "D"):
+        for name in (
+            "r",
+            "k",
+            "x",
+            "w",
+            "r_here",
+            "w_here",
+            "added",
+            "moved",
+            "coupling",
+            "k_old",
+            "y",
+            "z",
+            "z_own",
+            "D",
+        ):
             if hasattr(self, name):
                 getattr(self, name).destroy()

@@ -288,7 +288,7 @@ def collect(console: Console, sizes: list[tuple[str, int]], ranks: list[int], re
 def main(
     sizes: Annotated[str, typer.Option(help="tissue unknowns; 2d:1000 is the paper's scene exactly")] = SIZES,
     ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
-    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 7,
+    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 25,
     out: Annotated[Path, typer.Option(help="folder for bench.json, bench.csv, bench.png and bench.pdf")] = Path("out"),
     large: Annotated[bool, typer.Option("--large", help=f"also 1e6 (2D) and 2e5 (3D), {LARGE_STEPS} steps")] = False,
     worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",

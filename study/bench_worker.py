@@ -28,7 +28,7 @@ from study.workers import leave_result
 
 DT = 0.005  # [s], that of the paper: 600 steps in 3 s
 PAPER_STEPS = 600
-REPEAT_SECONDS = 0.4  # of the TS steps; long against the timer, short enough for many repeats
+REPEAT_SECONDS = 0.1  # of the TS steps: long against the timer, short against the moods of a shared machine
 BUILD_SECONDS = 20.0  # assembly and factor are repeated at most this long
 PYMOR_LIMIT = 12_000  # [n_e]; its LU of size 2 n_e takes minutes beyond
 PEER_SHARE = 3  # SciPy and pyMOR need about so many times longer a step
