@@ -14,13 +14,14 @@ from fem.petsc import PETSc, petsc_options
 SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
-# Where each road ends on two ranks and 24 GiB: PETSc Cholesky (nested dissection) is fastest per solve in 2D but its
-# 3D factorisation is 20 times slower than that of MUMPS; beyond the last limits the factor itself no longer fits.
+# Where each road ends on two ranks and 24 GiB: PETSc Cholesky (nested dissection) is fastest per solve, but its
+# factorisation is the slower one, in 3D by a factor of 10 and growing (study.bench_switches); beyond the last limits the
+# factor itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
-# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. On two ranks its steps take as
-# long as those of a spread factor at n_e = 1e4 in 3D, 1.3 times at 5e4, 1.5 times at 2e5; 1.35 times at 1e6 in 2D. The
-# factorisation takes 1.4 to 2.2 times as long, and each rank needs the memory of the whole factor.
+# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
+# every run: steps and factorisation of a spread factor are faster from some 1e4 unknowns in 3D on (study.bench_switches
+# --large), and each rank needs the memory of the whole factor.
 REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,

@@ -15,8 +15,8 @@ from lqr.plant import Block
 from lqr.problem import RiccatiProblem
 from reduction.engines import on_root
 
-ALL_MODES = 250  # up to here every mode is kept by default: a Schur form of order 500 takes 0.2 s
-DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600 takes half a minute
+ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
+DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
 SOME_MODES = 150
 
 

@@ -16,8 +16,8 @@ from lqr.shifted_distributed import DistributedTissue
 from lqr.shifted_gathered import GatheredTissue
 
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
-# in complex numbers needs less than half the time of MUMPS on the real form of twice the order. Beyond, a whole factor
-# on each rank costs too much memory (3D, n_e = 38 931: 0.9 GB).
+# in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
+# (study.bench_switches). Beyond, a whole factor on each rank costs too much memory.
 GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
 
 

@@ -18,10 +18,11 @@ from lqr.radi import RADI
 
 Method = Literal["auto", "dense", "newton_adi", "radi", "galerkin"]
 METHODS: tuple[Method, ...] = ("auto", "dense", "newton_adi", "radi", "galerkin")
-# Up to here all modes cost less than the low-rank machinery (measured: 0.1 s at 200 states).
+# Exact to rounding, without a start or shifts that could fail, and still as fast as low rank within some tenths of a
+# second; the faster one of the two is the dense one up to about 120 states (study.bench_switches).
 DENSE_STATES = 200
 # A complex factorisation a shift: beyond these sizes 70 to 100 of them take more than a quarter of an hour on two ranks
-# (3D, n_e = 38 931: 13 s each by SuperLU; 52 857: 47 s by MUMPS), while Galerkin needs about 5.
+# (study.bench_switches --large times one), while Galerkin needs about 5.
 LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 40_000}  # 1: systems without a mesh
 
 
@@ -57,7 +58,7 @@ def choose(problem: RiccatiProblem, wanted: Method = "auto") -> Choice:
         return Choice(wanted, "asked for")
     layout, damping = problem.layout, problem.system.damping
     if layout.states <= DENSE_STATES:
-        return Choice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes cost the least")
+        return Choice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes, exact to rounding")
     if not damping.active:
         return Choice("dense", "without damping X has no low rank: only the dense method can tell what is lost")
     limit = LOW_RANK_LIMIT[layout.dimension]

@@ -11,9 +11,9 @@ from fem.petsc import Array
 from reduction.model import ModelError, SmallModel, UnstableModelError
 from reduction.propagator import Propagator, march, propagator
 
-# byte of the matrices of a batch up to which all models step together: 1.3 to 1.8 times faster than one model after the
-# other at 4 MB (100 models with N = 18), 0.8 times at 11 MB (N = 34), when they no longer stay in the cache
-TOGETHER = 8_000_000
+# byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
+# cache, and one model after the other is faster (study.bench_switches)
+TOGETHER = 5_000_000
 
 
 @dataclass(frozen=True)

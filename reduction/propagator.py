@@ -3,7 +3,7 @@
 The implicit midpoint rule of the full model, (E - dt/2 A) x_{n+1} = (E + dt/2 A) x_n + dt (B u_n + f), in coordinates
 in which the energy of the tissue is |w|^2 / 2: rounding in a step then is small against the energy, and P of a damped
 model is a contraction. An undamped structured model, or its tissue beside a hand of its own, is turned into plane
-rotations [HLW06, IX.1] whose c^2 + s^2 = 1 to far below eps, so that the energy neither grows nor decays systematically
+rotations [HLW06] whose c^2 + s^2 = 1 to far below eps, so that the energy neither grows nor decays systematically
 over any number of steps.
 """
 
