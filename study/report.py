@@ -100,7 +100,7 @@ pre{background:none;border:1px solid #bbb;font-size:8pt} .motion{display:none}}
 """
 KINDS = {".png": "image/png", ".gif": "image/gif", ".svg": "image/svg+xml", ".jpg": "image/jpeg"}
 PIXELS_PER_INCH = 135  # width of a figure on the screen against its width in print
-EQUATION = "Equation"  # heading of a section whose code is an equation
+EQUATION = "Equation"  # first word of the heading of a section whose code is an equation
 PACKAGES = {"DOLFINx": ("fenics-dolfinx", "dolfinx-solver-real"), "NumPy": ("numpy",), "SciPy": ("scipy",)}
 HOW = (
     "In a checkout, after `make env`, with OMP_NUM_THREADS=1. All numbers of this page are in {numbers} beside it. "
@@ -283,7 +283,7 @@ def _prepared(section: Section) -> dict[str, Any]:
         "title": section.title,
         "paragraphs": [part.strip() for part in section.text.split("\n\n") if part.strip()],
         "code": section.code,
-        "equation": equation_html(section.code) if section.title == EQUATION and section.code else "",
+        "equation": equation_html(section.code) if section.title.startswith(EQUATION) and section.code else "",
         "header": section.header,
         "rows": [[_shown(cell) for cell in row] for row in section.rows],
         "align": [Markup(f' class="{kind}"') if kind else "" for kind in kinds],

@@ -20,8 +20,9 @@ from fem.scene_file import resolved_toml
 from reduction.registry import METHODS
 from study.command import list_files, origin, plain, write_json, write_scene
 from study.control_reduced import TITLES as BASIS_TITLES
+from study.equation_control import control_text
 from study.reduce_tables import PAPER_FULL, PAPER_REDUCED
-from study.report import Section, command_line, made_with, write_report
+from study.report import EQUATION, Section, command_line, made_with, write_report
 from study.work_control_report import HEADERS, control_sections, draw_control, notes, rows_of_control
 from study.work_plots import figure_budget, figure_forward, figure_reduced, figure_series
 from study.wp_answer import seconds_text
@@ -311,7 +312,12 @@ def _report(
         if rows:
             sections.append(Section(TITLES[name], figures=figures))
             sections.append(Section("", header=header, rows=rows))
-    sections += control_sections(study.points, study.references, study.scene, out, drawn)
+    feedback = control_sections(study.points, study.references, study.scene, out, drawn)
+    if feedback and all(name in CONTROL for name, found in study.points.items() if found):
+        sections.insert(0, Section(EQUATION, code=control_text(study.scene)))  # nothing follows the scene's own motion
+    elif feedback:
+        sections.append(Section(f"{EQUATION} under feedback", code=control_text(study.scene)))
+    sections += feedback
     for reason, names in _left_out(study).items():
         sections.append(Section("Left out", text=f"{', '.join(names)}: {reason}."))
     if "work_budget.png" in drawn:

@@ -294,6 +294,9 @@ def test_files_hold_the_questions_of_control(result: dict[str, Any], folder: Pat
     page = (folder / "report.html").read_text()
     assert page.count("data:image/png") == 3
     assert "--question riccati,reduced_riccati,loop" in page
+    assert page.count("<h2>Equation") == 1  # that of the controlled hand: no question follows the scene's own motion
+    assert "controlled by" in page
+    assert "the motion is prescribed" not in page
     assert all((folder / f"work_{name}.png").stat().st_size > 0 for name in CONTROL)
 
 
