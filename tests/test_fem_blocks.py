@@ -115,7 +115,7 @@ def test_new_materials_equal_a_fresh_build(comm: MPI.Intracomm) -> None:
     for name in ("M_ee", "K_ee"):
         new, old, was = (gather_matrix(layout, getattr(s, name)) for s in (changed, fresh, system))
         assert close(new, old) < EXACT
-        assert close(was, old) > 0.1
+        assert close(was, old) > 0.1  # other materials: 0.7 and 1.4 measured
     assert changed.damping.matrix is not None
     D = gather_matrix(layout, fresh.damping.matrix)
     assert close(gather_matrix(layout, changed.damping.matrix), D) < EXACT

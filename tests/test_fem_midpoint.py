@@ -262,7 +262,7 @@ def test_time_reversal_returns_to_the_start(comm: MPI.Intracomm) -> None:
     back = gather_states(layout, state.array)
     midpoint.destroy()
     assert close(back[: layout.n_e], z) < 1e-10  # 400 solves
-    assert close(back[layout.n_e :], v) < 1e-10
+    assert close(back[layout.n_e :], v) < 1e-10  # as above
 
 
 def true_energy(model: Model, local: Array) -> Array:
@@ -293,7 +293,7 @@ def test_energy_of_free_vibration_does_not_drift(comm: MPI.Intracomm) -> None:
     carried = midpoint.energy(state)
     midpoint.destroy()
     assert abs(after - before) < 1e-12 * before  # the bound the issue asks for
-    assert abs(carried - before) < 1e-12 * before
+    assert abs(carried - before) < 1e-12 * before  # the same bound
 
 
 def test_energy_under_gravity_does_not_drift(comm: MPI.Intracomm) -> None:
@@ -312,7 +312,7 @@ def test_energy_under_gravity_does_not_drift(comm: MPI.Intracomm) -> None:
     z = gather_states(model.system.layout, run.snapshots.Z)[: model.system.layout.n_e]
     energy = true_energy(model, run.snapshots.Z)
     assert np.abs(energy - load @ z).max() < 1e-12 * energy.max()  # the bound the issue asks for
-    assert run.energy_drift < 1e-12
+    assert run.energy_drift < 1e-12  # the same bound
 
 
 def pulse(n: int, t: float, q: Array, v: Array) -> Array:

@@ -76,8 +76,8 @@ def test_blocks_do_not_depend_on_the_ranks(comm: MPI.Intracomm, name: str) -> No
     for key in ("T", "G", "M_es", "K_es"):
         mine, theirs = (gather_rows(s.layout, getattr(s, key)) for s in (together, alone))
         assert close(mine, theirs) < 1e-12  # sums of some twenty products
-    assert close(together.M_rigid, alone.M_rigid) < 1e-12
-    np.testing.assert_allclose(together.layout.reference, alone.layout.reference, rtol=0, atol=1e-14)
+    assert close(together.M_rigid, alone.M_rigid) < 1e-12  # sums over all nodes
+    np.testing.assert_allclose(together.layout.reference, alone.layout.reference, rtol=0, atol=1e-14)  # a mean
 
 
 def test_assembly_has_the_same_bits_every_time(comm: MPI.Intracomm) -> None:
@@ -163,10 +163,10 @@ def test_nearest_node_is_the_same_for_ties(comm: MPI.Intracomm) -> None:
     """The point lies midway between four nodes: every rank count takes the one with the smallest coordinates."""
     layout = build(make_scene(), comm).system.layout
     rank, first, where = layout.nearest_node(np.array([0.375, 0.375]))
-    np.testing.assert_allclose(where, [0.25, 0.25], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(where, [0.25, 0.25], rtol=0, atol=1e-12)  # a node of the mesh, to rounding
     assert same_everywhere(comm, np.array([rank, first]))
     if comm.rank == rank:
-        np.testing.assert_allclose(layout.nodes[first // 2], where, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(layout.nodes[first // 2], where, rtol=0, atol=1e-12)  # rounding
 
 
 def test_outputs_are_displacements_of_the_named_nodes(comm: MPI.Intracomm) -> None:

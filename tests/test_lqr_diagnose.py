@@ -48,7 +48,7 @@ def test_a_good_problem_has_no_findings_and_its_poles_are_known_beforehand() -> 
     for pole in found.rates.poles[:8]:
         nearest = poles[np.argmin(np.abs(poles - pole))]
         assert abs(nearest - pole) < 2e-3 * abs(pole)
-        assert abs(nearest.real / pole.real - 1) < 0.05
+        assert abs(nearest.real / pole.real - 1) < 2e-3  # 3 digits of the rate alone, too
     assert same_everywhere(problem.layout.comm, found.rates.rate)
 
 
@@ -60,7 +60,7 @@ def test_rates_without_damping_are_those_of_the_dense_closed_loop() -> None:
     poles = ModalLoop(problem).poles(gain_of(modal_lqr(problem, 4)))
     first = poles[np.argmin(np.abs(poles - found.rates.poles[0]))]
     assert abs(first.real / found.rates.poles[0].real - 1) < 0.05  # first order in the rate; riccati.md
-    assert first.real < -1e-3
+    assert first.real < -1e-3  # 6e-3 measured: damped, beyond rounding
 
 
 @pytest.mark.parametrize("reaction", [False, True], ids=["one-way", "two-way"])
@@ -167,7 +167,7 @@ def test_modal_lqr_says_what_it_leaves_and_does_not_move_it() -> None:
         poles = ModalLoop(problem).poles(gain_of(solution))
         assert (poles.real > -1e-9).sum() >= 2 * left  # still on the axis
         assert poles.real.max() < 1e-8  # not driven off it: rounding of frequencies up to 3e2
-        assert (poles.real < -1e-9).sum() >= 2 * min(modes, 3) + 4
+        assert (poles.real < -1e-9).sum() >= 2 * min(modes, 3) + 4  # off it
         gains.append(solution.K_s)
     assert close(gains[1], gains[2]) < 1e-4  # riccati.md: hand gains settle with the modes
     assert 0 < close(gains[1], gains[2]) < close(gains[0], gains[2])
@@ -178,7 +178,7 @@ def test_modal_lqr_with_all_modes_is_the_full_solution() -> None:
     full, n_e = DenseRiccati().solve(problem), problem.layout.n_e
     modal = modal_lqr(problem, n_e)
     assert modal.residual < 1e-9  # modes from SLEPc are good to 1e-11 relative, amplified by |A|
-    assert close(modal.K_s, full.K_s) < 1e-9
+    assert close(modal.K_s, full.K_s) < 1e-9  # as above
     comm = problem.layout.comm
     parts = [np.concatenate(comm.allgather(np.array(x))) for x in (modal.K_z, full.K_z)]
     assert close(parts[0], parts[1]) < 1e-7  # K_z is 1e-3 of K_s

@@ -35,7 +35,7 @@ def test_newton_and_radi_equal_the_dense_oracle(name: str) -> None:
         found = method.solve(problem)
         assert found.residual < 2e-10  # 1e-10 of the recursion and what compression may add
         assert gain_error(problem, found, oracle(name)) < 1e-9  # a residual of 1e-10 leaves much less in the gain
-        assert x_error(problem, found, oracle(name)) < 1e-6
+        assert x_error(problem, found, oracle(name)) < 1e-9  # as of the gain; 2e-12 measured
         assert found.rank < problem.layout.states
 
 
@@ -43,7 +43,7 @@ def test_newton_and_radi_equal_the_dense_oracle(name: str) -> None:
 def test_galerkin_gain_is_as_good_as_it_says(name: str) -> None:
     problem = problem_of(name)
     found = StructuredGalerkin().solve(problem)
-    assert found.history[-1]["change"] <= 1e-6
+    assert found.history[-1]["change"] <= 1e-6  # its own tolerance
     assert gain_error(problem, found, oracle(name)) < 1e-6  # the promise of the tolerance
     assert found.counts["solves"] <= 20
 
@@ -53,15 +53,15 @@ def test_paper_scene_over_damping_and_weight(beta: float, weight: float) -> None
     """Residual, agreement of two methods, and the identities that hold for every mesh and material."""
     problem = paper(f"effects.damping.beta={beta}", f"control.Q={weight}")
     newton, radi = NewtonADI().solve(problem), RADI().solve(problem)
-    assert max(newton.residual, radi.residual) < 2e-10
+    assert max(newton.residual, radi.residual) < 2e-10  # as above
     assert gain_error(problem, newton, radi) < 1e-8  # at Q = 1e4 the gain is 100 times the residual's scale
     assert newton.counts["newton_steps"] <= 2  # one, unless Q is large on a coarse mesh
     # whole body displaced: hand-relative state [I; 0; 0; 0], (K x_T)'(K x_T) = Q
     K_q, K_v = newton.K_s[:, :2], newton.K_s[:, 2:]
-    assert np.allclose(K_q.T @ K_q, weight * np.eye(2), rtol=0, atol=1e-9 * weight)
+    assert np.allclose(K_q.T @ K_q, weight * np.eye(2), rtol=0, atol=1e-9 * weight)  # a residual of 2e-10
     # whole body moving: (K x_T)'(K v_T) = x_T'E'XE x_T, E x_T = [I; 0; 0; 0]
     E_x = newton.Z_s[:2]
-    assert np.allclose(K_q.T @ K_v, E_x @ E_x.T, rtol=0, atol=1e-8 * np.abs(K_q.T @ K_v).max())
+    assert np.allclose(K_q.T @ K_v, E_x @ E_x.T, rtol=0, atol=1e-8 * np.abs(K_q.T @ K_v).max())  # as above
 
 
 @pytest.mark.slow
@@ -73,11 +73,11 @@ def test_paper_size_against_the_oracle(beta: float) -> None:
         reference = DenseRiccati(tolerance=1e-6).solve(problem)
         for method in (NewtonADI(), RADI()):
             found = method.solve(problem)
-            assert found.residual < 2e-10
+            assert found.residual < 2e-10  # as above
             assert gain_error(problem, found, reference) < 1e-6  # accuracy of the oracle
-            assert x_error(problem, found, reference) < 1e-6
+            assert x_error(problem, found, reference) < 1e-6  # as above
         galerkin = StructuredGalerkin().solve(problem)
-        assert gain_error(problem, galerkin, reference) < 2e-6
+        assert gain_error(problem, galerkin, reference) < 2e-6  # its own 1e-6 and the oracle's
 
 
 def test_solves_do_not_grow_with_the_mesh() -> None:
@@ -107,7 +107,7 @@ def test_same_result_on_every_rank_count() -> None:
     for method in (NewtonADI(), NewtonADI(tissue="distributed"), RADI(), RADI(tissue="distributed")):
         found = method.solve(problem)
         error = np.linalg.norm(gain(problem, found) - reference) / np.linalg.norm(reference)
-        assert error < 1e-9
+        assert error < 1e-9  # both stop at a residual of 1e-10
         assert len(set(problem.layout.comm.allgather(found.K_s.tobytes()))) == 1
 
 
@@ -118,7 +118,7 @@ def test_rigid_start_needs_more_newton_steps_and_ends_at_the_same_gain() -> None
     problem = paper()
     found = NewtonADI(modes=0).solve(problem)
     assert found.counts["newton_steps"] > 1
-    assert gain_error(problem, found, NewtonADI().solve(problem)) < 1e-9
+    assert gain_error(problem, found, NewtonADI().solve(problem)) < 1e-9  # both stop at a residual of 1e-10
 
 
 @pytest.mark.parametrize(
@@ -208,8 +208,8 @@ def test_resume_goes_on_where_it_stopped(mpi_tmp_path: Path) -> None:
     found = NewtonADI(checkpoint=folder, progress=lambda entry: seen.append(entry["solve"])).solve(problem)
     assert seen[0] == 21
     assert len(found.history) == found.counts["solves"]
-    assert found.residual < 2e-10
-    assert gain_error(problem, found, oracle("one_way")) < 1e-9
+    assert found.residual < 2e-10  # as above
+    assert gain_error(problem, found, oracle("one_way")) < 1e-9  # a residual of 1e-10, as above
 
 
 def test_foreign_restart_file_is_refused(mpi_tmp_path: Path) -> None:

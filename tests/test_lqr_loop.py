@@ -51,12 +51,12 @@ def test_full_order_loop_is_the_dense_recursion(case: Setup) -> None:
     assert run.snapshots is not None
     ours = np.hstack([run.q_s, run.v_s, gather_states(case.problem.layout, run.snapshots.Z).T])
     assert close(ours, X) < 1e-9  # two factorisations with condition about 1e5, 40 steps
-    assert close(run.inputs, U) < 1e-9
-    assert close(run.outputs, X @ case.C.T) < 1e-9
-    assert close(run.outputs_rigid, run.q_s @ case.problem.C_s.T) < 1e-14
+    assert close(run.inputs, U) < 1e-9  # as above
+    assert close(run.outputs, X @ case.C.T) < 1e-9  # as above
+    assert close(run.outputs_rigid, run.q_s @ case.problem.C_s.T) < 1e-14  # the same product
     assert close(case.full(run.final), X[-1]) < 1e-8  # the last state is smaller than the largest
     assert same_everywhere(case.problem.layout.comm, run.inputs)
-    assert max(run.residuals) < 1e-10
+    assert max(run.residuals) < 1e-12  # rounding of direct solves
     assert run.inputs.shape == (STEPS, n_s)
     assert run.saturated == 0.0
     loop.destroy()
@@ -81,7 +81,7 @@ def test_midpoint_recursion_converges_to_the_exponential() -> None:
         errors.append(close(case.full(run.final), exact))
         loop.destroy()
     order = np.polyfit(np.log([40, 80, 160]), np.log(errors[1:]), 1)[0]
-    assert abs(order + 2) < 0.1, f"order {-order:.3f} of {errors}, 2 expected"
+    assert abs(order + 2) < 0.01, f"order {-order:.3f} of {errors}, 2 expected"  # next term at 40 steps
 
 
 ACTUATIONS = [
@@ -105,7 +105,7 @@ def test_actuation_against_a_plain_loop(name: str, law: Actuation) -> None:
     run = loop.run(case.gain, target, STEPS, law)
     X, U = plain_loop(case, 0.05, STEPS, target, law)
     assert close(run.inputs, U) < 1e-9  # two factorisations, 40 steps
-    assert close(run.outputs, X @ case.C.T) < 1e-9
+    assert close(run.outputs, X @ case.C.T) < 1e-9  # as above
     assert close(case.full(run.final), X[-1]) < 1e-8  # the last state is smaller than the largest
     if law.limits is not None:
         assert 0 < run.saturated < 1
@@ -134,7 +134,7 @@ def test_cost_is_the_riccati_prediction(case: Setup) -> None:
         loop = ClosedLoop(case.problem, END / steps)
         run = loop.run(case.gain, target, steps)
         left = predicted_cost(case.problem, case.solution, run.final - target.state)
-        assert 1e-6 * V < left < V
+        assert 1e-6 * V < left < V  # what is to come counts, and is not all
         assert run.cost[-1] + left == pytest.approx(V, rel=1e-7)  # residual of SciPy's X
         assert run.cost[0] == 0
         assert (np.diff(run.cost) >= 0).all()
@@ -199,8 +199,8 @@ def test_output_target_moves_the_hand_past_the_sag() -> None:
     assert np.abs(target.state.q_s - [1.0, 2.0]).max() > 1e-3  # gravity deforms
     loop = ClosedLoop(case.problem, 0.1)
     run = loop.run(case.gain, target, 400)
-    assert close(run.outputs[-1], target.y) < 1e-3  # decays like exp(-t) from 2.2, t = 40
-    assert close(run.inputs[-1], target.u) < 1e-3
+    assert close(run.outputs[-1], target.y) < 1e-3  # slowest pole -0.2: exp(-8) = 3e-4 of the way
+    assert close(run.inputs[-1], target.u) < 1e-3  # as above
     loop.destroy()
 
 
@@ -254,15 +254,15 @@ def test_all_shapes_give_the_full_loop(case: Setup) -> None:
     assert close(u_bar, target.u) < 1e-9 or np.abs(u_bar - target.u).max() < 1e-9  # zero without gravity
     K = shapes.reduce_gain(problem, case.gain)
     back = shapes.expand_gain(problem, K)
-    assert close(gather_rows(problem.layout, back.K_z), gather_rows(problem.layout, case.gain.K_z)) < 1e-9
+    assert close(gather_rows(problem.layout, back.K_z), gather_rows(problem.layout, case.gain.K_z)) < 1e-12  # V'MV = I
     loop = ClosedLoop(problem, dt)
     limit = tuple(1.3 * np.abs(target.u) + 2.0)
     for law in (Actuation(), Actuation(limits=limit), Actuation(rate=10.0, delay=True, limits=limit)):
         run = loop.run(case.gain, target, STEPS, law)
         small = ReducedLoop(plant, dt).run(K, (x_bar, u_bar), STEPS, (problem.Q, problem.R), law)
         assert close(small.outputs, run.outputs) < 1e-8  # two ways to the same numbers, condition of M and K
-        assert close(small.inputs, run.inputs) < 1e-8
-        assert close(small.cost, run.cost) < 1e-8
+        assert close(small.inputs, run.inputs) < 1e-8  # as above
+        assert close(small.cost, run.cost) < 1e-8  # as above
         assert small.saturated == run.saturated
         end = shapes.expand(problem, small.states[-1])
         assert close(gather_rows(problem.layout, end.z), gather_rows(problem.layout, run.final.z)) < 1e-6  # small end
@@ -281,7 +281,7 @@ def test_few_modes_give_nearly_the_full_loop() -> None:
     small = ReducedLoop(plant, 0.05).run(K, plant.rest_at(aim(case)), 200, (problem.Q, problem.R))
     error = close(small.outputs, run.outputs)
     assert error < 2e-3  # static share of the modes left out, about (omega_1 / omega_12)^2 of a deformation of 3 %
-    assert small.cost[-1] == pytest.approx(run.cost[-1], rel=1e-3)
+    assert small.cost[-1] == pytest.approx(run.cost[-1], rel=1e-4)  # sag is little of the cost: 3e-6
     loop.destroy()
 
 

@@ -100,8 +100,8 @@ def test_ritz_values_of_the_open_plant_are_stable_and_true() -> None:
     hand = np.zeros((4, 2))
     hand[2:, 1:] = -np.linalg.solve(plant.M_s, total(layout.comm, plant.G.T @ phi))  # E'V has no row of the hand
     found, _ = ritz_pairs(plant, Block(hand, pair), Block(hand, pair), None)
-    assert np.allclose(found.real, -0.003 * omega**2 / 2, rtol=1e-6)
-    assert np.allclose(np.abs(found), omega, rtol=1e-6)
+    assert np.allclose(found.real, -0.003 * omega**2 / 2, rtol=1e-8, atol=0)  # what fem.modes lets pass
+    assert np.allclose(np.abs(found), omega, rtol=1e-8, atol=0)  # as above
 
 
 @pytest.mark.parametrize("name", ["one_way", "drag_in_space", "two_way_drag_in_space", "layers"])
@@ -155,7 +155,7 @@ def test_line_search_finds_the_minimum_of_the_dense_residual(comm: MPI.Intracomm
         return float(np.linalg.norm(R))
 
     grid = np.linspace(0.01, 1, 2000)
-    assert residual(t) <= min(residual(s) for s in grid) * (1 + 1e-9)
+    assert residual(t) <= min(residual(s) for s in grid) * (1 + 1e-9)  # the grid may hit it: rounding
     assert (before, after) == (pytest.approx(residual(0.0)), pytest.approx(residual(1.0)))
     mixed, weights = mixed_residual((blocks[0], signs), blocks[1], blocks[2], t)
     whole = np.vstack(comm.allgather(mixed.tall))

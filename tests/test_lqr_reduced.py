@@ -137,7 +137,7 @@ def test_reduced_equation_is_the_papers(name: str) -> None:
     error = np.linalg.norm(P - P_hat) / np.linalg.norm(P)
     assert abs(report.error_P - error) < 1e-6 * (1 + error)  # SciPy's accuracy
     K, K_hat = -B.T @ P @ E, -B.T @ P_hat @ E
-    assert abs(report.error_K - np.linalg.norm(K - K_hat) / np.linalg.norm(K)) < 1e-6 * (1 + error)
+    assert abs(report.error_K - np.linalg.norm(K - K_hat) / np.linalg.norm(K)) < 1e-6 * (1 + error)  # as above
     mine = ordered(gain_to_absolute(problem.system, reduced.gain)).T
     assert close(mine, K_hat) < 1e-6  # SciPy's accuracy
     assert mine.shape == (n_s, len(E))
@@ -169,7 +169,7 @@ def test_marks_come_from_the_spectrum_of_the_full_closed_loop() -> None:
                 continue
             K = ordered(gain_to_absolute(problem.system, reduce_riccati(problem, family(name).at(N)).gain)).T
             abscissa = scipy.linalg.eigvals(A + B @ K, E).real.max()
-            assert abs(report.abscissa_full - abscissa) < 1e-6 * (1 + np.linalg.norm(K)), (name, N)
+            assert abs(report.abscissa_full - abscissa) < 1e-9 * (1 + np.linalg.norm(K)), (name, N)  # rounding of B K
             assert report.stable == (abscissa < 0), (name, N)
             assert np.isfinite(report.cost_excess) == report.stable
             seen.add(report.stable)
@@ -183,11 +183,11 @@ def test_a_gain_that_drives_away_is_marked_unstable() -> None:
     good, bad = judge.quality(K), judge.quality(K.times(-np.eye(2)))
     assert good.stable
     assert good.cost_excess == 0
-    assert bad.abscissa > 0.1
+    assert bad.abscissa > 0.1  # 0.43: no rounding
     assert not bad.stable
     assert bad.cost_excess == np.inf
     large = certified_abscissa(problem, K.times(-np.eye(2)))
-    assert abs(large.value - bad.abscissa) < 1e-6
+    assert abs(large.value - bad.abscissa) < 1e-7  # tolerance 1e-9 of eigenvalues of size 10
     assert not large.stable
 
 
@@ -202,8 +202,9 @@ def test_the_road_of_large_scenes_says_the_same() -> None:
     for name, N in (("pod", 12), ("pod", 20), ("structured", 8), ("pod_decomposed", 8)):
         a, b = whole.report(family(name).at(N)), large.report(family(name).at(N))
         assert a.stable == b.stable, name
-        assert abs(a.abscissa_full - b.abscissa_full) < 1e-6 or not a.stable, name
-        assert a.cost_excess == b.cost_excess or abs(a.cost_excess - b.cost_excess) < 1e-3 * a.cost_excess, name
+        assert abs(a.abscissa_full - b.abscissa_full) < 1e-7 or not a.stable, name  # as above
+        # the modes beyond the lowest 20 take no part that shows: 4e-9 measured
+        assert a.cost_excess == b.cost_excess or abs(a.cost_excess - b.cost_excess) < 1e-6 * a.cost_excess, name
 
 
 def test_cost_excess_against_a_dense_lyapunov_equation() -> None:
@@ -218,14 +219,14 @@ def test_cost_excess_against_a_dense_lyapunov_equation() -> None:
     x[2 * n_s : 2 * n_s + problem.layout.n_e] = tissue
     optimal = x @ E.T @ P @ E @ x
     assert abs(judge.optimal / optimal - 1) < 1e-10  # rounding of P
-    assert abs(optimal_cost(problem, solution, TARGET) / optimal - 1) < 1e-10
+    assert abs(optimal_cost(problem, solution, TARGET) / optimal - 1) < 1e-10  # rounding of P, as above
     for name, N in (("pod", 12), ("pod_decomposed", 8), ("structured", 6)):
         gain = reduce_riccati(problem, family(name).at(N)).gain
         K = ordered(gain_to_absolute(problem.system, gain)).T
         F = np.linalg.solve(E, A + B @ K)
         Y = scipy.linalg.solve_continuous_lyapunov(F.T, -(C.T @ C + K.T @ K))
         excess = x @ Y @ x / optimal - 1
-        assert excess > -1e-6
+        assert excess > -1e-6  # cancellation, as below
         assert abs(judge.quality(gain).cost_excess - excess) < 1e-6 * (1 + excess)  # cancellation in SciPy's numbers
 
 
@@ -296,7 +297,7 @@ def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
     inside = values[np.abs(values) <= found.radius]
     assert abs(found.value - inside.real.max()) < 1e-7  # tolerance 1e-9 of eigenvalues of size 10
     assert found.stable
-    assert abs(found.value - values.real.max()) < 1e-7
+    assert abs(found.value - values.real.max()) < 1e-7  # as above
     assert found.bound < 1
     # the true largest gain outside the circle stays below the bound
     space = GainJudge(problem, solution, hand_start(problem, -TARGET)).loop
@@ -311,7 +312,7 @@ def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
         exact, claim = space.poles(loud).real.max(), certified_abscissa(problem, loud)
         assert exact < 0 or not claim.stable, factor
         assert exact > 0 or abs(claim.value - exact) < 1e-6, factor  # an unstable one far out is not searched for
-    assert two_way or exact > 0.1
+    assert two_way or exact > 0.1  # one-way that one is unstable indeed: 13
 
 
 def test_what_cannot_be_certified_is_not_called_stable() -> None:
@@ -334,7 +335,7 @@ def test_retuning_equals_projection_at_the_new_material() -> None:
             moved = replace(problem, system=problem.system.with_materials(new))
             exact, mine = project(moved, retuner.basis), retuner.at(new)
             assert close(mine.A, exact.A) < 1e-11  # rounding of two sums, and K_ee T + K_es = 0
-            assert close(mine.E, exact.E) < 1e-14
+            assert close(mine.E, exact.E) < 1e-14  # no stiffness in E: the same sums
             tuned = retuner.solve(new)
             direct = reduce_riccati(moved, family(name).at(12)) if (lam, mu) == (50.0, 50.0) else None
             if direct is not None:
@@ -350,9 +351,9 @@ def test_retuning_over_a_box() -> None:
     settings = [(replace(material, lam=lam, mu=mu),) for lam, mu in ((50.0, 50.0), (200.0, 100.0))]
     points = over_box(retuner, settings, DenseRiccati().solve, hand_start(problem, -TARGET))
     assert all(p.stable for p in points)
-    assert all(p.error_K < 1e-2 for p in points)  # measured 5e-6 and 1e-3: modes of the reference material
+    assert all(p.error_K < 1e-3 for p in points)  # measured 1e-5 and 3e-5: modes of the reference material
     assert points[0].error_K < points[1].error_K
-    assert all(0 <= p.cost_excess < 1e-4 for p in points)
+    assert all(0 <= p.cost_excess < 1e-6 for p in points)  # second order in the error of K
     with pytest.raises(ControlError, match="rho = 2 differs from 1"):
         retuner.at((replace(material, rho=2.0),))
     with pytest.raises(ControlError, match="the body has 1 layers"):
@@ -372,7 +373,7 @@ def test_bases_of_the_papers_scene_equal_the_dense_definition() -> None:
     P = dense @ dense.T
     U, s, _ = np.linalg.svd(P)
     V = make_family("pod", problem, factor_of(solution))
-    assert close(V.sigma[0][:40], s[:40]) < 1e-12  # of the largest
+    assert close(V.sigma[0][:40], s[:40]) < 1e-12  # rounding, of the largest
     basis = V.at(8)
     T = problem.system.T
     n_s = layout.n_s

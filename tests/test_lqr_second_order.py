@@ -141,7 +141,7 @@ def oracle(example: Example) -> tuple[Array, Array]:
     L_K, L_M = np.linalg.cholesky(example.K.toarray()), np.linalg.cholesky(example.M.toarray())
     S = scipy.linalg.block_diag(np.linalg.inv(L_K.T), np.linalg.inv(L_M.T))  # x = S xi
     L = scipy.linalg.block_diag(L_K.T, np.linalg.inv(L_M))
-    assert np.abs(L @ E @ S - np.eye(2 * n)).max() < 1e-9
+    assert np.abs(L @ E @ S - np.eye(2 * n)).max() < 1e-12  # rounding
     Y = scipy.linalg.solve_continuous_are(L @ A @ S, L @ B, (C @ S).T @ C @ S, np.eye(B.shape[1]))
     X = L.T @ Y @ L
     return X, -B.T @ X @ E
@@ -159,8 +159,8 @@ def test_newton_radi_and_dense_agree(name: str) -> None:
         true = example.residual(Z)
         assert true < 3e-9  # twice the tolerance, and rounding of the dense products
         assert found.residual == pytest.approx(true, rel=0.2, abs=3e-10)  # eps |A| |X| of the dense products
-        assert np.linalg.norm(Z @ Z.T - X) < 1e-6 * np.linalg.norm(X), found.method  # SciPy's own residual is 1e-8
-        assert np.linalg.norm(gain - K) < 1e-6 * np.linalg.norm(K), found.method
+        assert np.linalg.norm(Z @ Z.T - X) < 1e-6 * np.linalg.norm(X), found.method  # a residual of 1e-9 leaves 2e-7
+        assert np.linalg.norm(gain - K) < 1e-6 * np.linalg.norm(K), found.method  # as above
         E, A, B, _ = example.first_order()
         assert np.linalg.eigvals(np.linalg.solve(E, A + B @ gain)).real.max() < 0
         assert found.K_s.shape == (1, 0)
@@ -185,7 +185,7 @@ def test_long_chain_without_a_dense_matrix() -> None:
         r = np.linalg.qr(U, mode="r")
         assert np.linalg.norm(r @ S @ r.T, 2) < 2e-8 * example.n  # twice the tolerance; |C'C| = n
         gains.append(gain)
-    assert np.linalg.norm(gains[0] - gains[1]) < 1e-6 * np.linalg.norm(gains[0])
+    assert np.linalg.norm(gains[0] - gains[1]) < 1e-7 * np.linalg.norm(gains[0])  # two residuals of 1e-8
 
 
 def test_galerkin_of_the_chain() -> None:

@@ -56,7 +56,7 @@ def test_singular_values_are_right_down_to_the_stated_limit(
     f = factor(comm, np.asfortranarray(np.hstack([X.real, X.imag])) if complex_valued else X, engine)
     s = small_svd(comm, f.R[:, :m] + 1j * f.R[:, m:] if complex_valued else f.R)[1] * f.scale
     limit = 1e-6 if engine == "gram" else 1e-9  # the 1e-10 at its 600 columns: see the next test
-    assert reach(s, spectrum_of(m), 1e-8) <= limit
+    assert reach(s, spectrum_of(m), 1e-8) <= limit  # 8 digits
     assert same_everywhere(comm, s)
 
 
@@ -69,7 +69,7 @@ def test_default_is_right_to_1e_8_down_to_1e_10(comm: MPI.Intracomm) -> None:
 def test_gram_keeps_nothing_below_its_floor(comm: MPI.Intracomm) -> None:
     f = factor(comm, rows_of(comm, decaying(300, 60, 14)), "gram")
     s = small_svd(comm, f.R)[1]
-    assert s[-1] > 1e-8 * s[0]
+    assert s[-1] > 5e-8 * s[0]  # 4 sqrt(eps) = 6e-8; below it is noise
     assert f.R.shape[0] < 40  # of 60, evenly over 14 decades: those above 6e-8 are 31
 
 
@@ -356,7 +356,8 @@ def test_benchmark_measures_every_engine(comm: MPI.Intracomm) -> None:
     for name, found in row["engines"].items():
         assert found["off"] < 1e-12, name  # rounding
         assert found["seconds"] > 0
-        assert found["rough"] <= found["right"] < (1e-4 if name != "svd" else 0.01), name
+        # Gram has half the digits; svd stops at 60 of 200 values, the last of them 1.8e-5
+        assert found["rough"] <= found["right"] < (1e-6 if name != "svd" else 2e-5), name
     assert bench_bases.missed([row]) == []
     row["engines"]["tsqr"]["right"] = 2e-10
     assert "goal 1e-10" in bench_bases.missed([row])[0]

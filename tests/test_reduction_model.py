@@ -156,14 +156,14 @@ def test_fixed_canonical_model_is_the_tissues_projection(comm: MPI.Intracomm, fr
     assert close(rates[k:, k : small.N], own) < 1e-10  # mass solves, as above
     if frame == "absolute":
         from_v, from_q = plus(-np.linalg.solve(M_ee, M_es), 0 * M_es), plus(0 * K_es, -K_es)
-        assert close(rates[k:, n_s:k], from_v) < 1e-10
-        assert close(rates[k:, :n_s], from_q) < 1e-10
+        assert close(rates[k:, n_s:k], from_v) < 1e-10  # as above
+        assert close(rates[k:, :n_s], from_q) < 1e-10  # as above
     else:
         pull = M_es + M_ee @ ref.T
         assert np.abs(rates[k:, :k]).max() < 1e-12  # exact zeros but for the factorisation of E
-        assert close(rates[k:, small.N :], plus(0 * pull, -pull @ np.linalg.inv(ref.M_hand))) < 1e-10
+        assert close(rates[k:, small.N :], plus(0 * pull, -pull @ np.linalg.inv(ref.M_hand))) < 1e-10  # as above
     assert close(rates[:k, :k], np.eye(k, k, n_s)) < 1e-14  # exact but for the factorisation of E
-    assert close(rates[n_s:k, small.N :], np.linalg.inv(ref.M_hand)) < 1e-14
+    assert close(rates[n_s:k, small.N :], np.linalg.inv(ref.M_hand)) < 1e-14  # as above
 
 
 # --- new parameters
@@ -274,7 +274,7 @@ def test_spectrum_leaves_out_the_free_hand(comm: MPI.Intracomm) -> None:
     assert small.spectral_abscissa == 0.0
     # a plain eigenvalue solver splits the double zeros
     plain = scipy.linalg.eigvals(small.operators.A, small.operators.E)
-    assert close(np.sort(np.abs(plain))[4:], np.sort(np.abs(small.spectrum.eigenvalues))) < 1e-9
+    assert close(np.sort(np.abs(plain))[4:], np.sort(np.abs(small.spectrum.eigenvalues))) < 1e-9  # as above
 
 
 def test_whole_global_space_has_two_zeros_for_each_way_of_the_hand(comm: MPI.Intracomm) -> None:

@@ -59,7 +59,7 @@ def test_blocks_of_steps_are_the_plain_rule(comm: MPI.Intracomm, steps: int) -> 
         x0 = np.cos(np.arange(small.N))
         own = run(small, dt, wiggle(steps, dt), x0=x0, allow_unstable=True)
         assert own.x.shape == (steps + 1, small.N)
-        assert close(own.times, dt * np.arange(steps + 1)) < 1e-15
+        assert close(own.times, dt * np.arange(steps + 1)) < 1e-15  # the same products
         assert close(own.x, plain_loop(small, dt, wiggle(steps, dt), x0)) < 1e-10, kind  # rounding, as above
 
 
@@ -92,7 +92,7 @@ def test_start_in_equilibrium_stays_there(comm: MPI.Intracomm) -> None:
                 small.equilibrium()
             continue
         x = small.equilibrium()
-        assert np.abs(x).max() > 1e-3
+        assert np.abs(x).max() > 1e-3  # the weight does move it: 0.1
         own = run(small, 0.01, np.zeros((200, 2)), x0=x, allow_unstable=True)
         # rounding against the load; a (q, v) model may amplify it
         assert close(own.x, np.tile(x, (201, 1))) < 1e-9, kind
@@ -106,10 +106,10 @@ def test_one_step_at_a_time_is_the_run(comm: MPI.Intracomm) -> None:
         x0 = np.sin(np.arange(small.N))
         own = run(small, dt, u, x0=x0, allow_unstable=True)
         stepper = Stepper(small, dt, x0, allow_unstable=True)
-        assert close(stepper.outputs, own.outputs[0]) < 1e-12
+        assert close(stepper.outputs, own.outputs[0]) < 1e-12  # one product with C
         outputs = np.array([stepper(force).copy() for force in u])
         assert close(outputs, own.outputs[1:]) < 1e-11, kind  # rounding of powers of one matrix
-        assert close(stepper.state, own.x[-1]) < 1e-11, kind
+        assert close(stepper.state, own.x[-1]) < 1e-11, kind  # as above
 
 
 @pytest.mark.parametrize("together", [reduction.online.TOGETHER, 0])
@@ -124,7 +124,7 @@ def test_a_batch_is_its_runs(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatc
         assert close(run(single, dt, u).x, whole.x) < 1e-12  # the same products in another order
     forces = np.stack([u, 2 * u, -u])
     for force, whole in zip(forces, run_batch(many[:1], dt, forces), strict=True):
-        assert close(run(many[0], dt, force).outputs, whole.outputs) < 1e-12
+        assert close(run(many[0], dt, force).outputs, whole.outputs) < 1e-12  # as above
     with pytest.raises(ModelError, match="do not fit"):
         run_batch(many[:2], dt, forces)
 
@@ -154,7 +154,7 @@ def test_rotations_keep_their_length() -> None:
     # plain rounding leaves 5e-17 in the median, 2e-16 at worst
     assert np.abs(length).max() < 1e-16
     if np.finfo(wide).eps < 1e-18:  # elsewhere a long double is no wider than a double
-        assert np.median(np.abs(length)) < 1e-18
+        assert np.median(np.abs(length)) < 1e-18  # a fiftieth of that
     assert np.abs(np.arctan2(s, c) - angle).max() < 1e-12  # 200 units in the last place at 1e-2
     slow = np.geomspace(1e-9, 1e-2, 30)
     c, s = rotation(slow)
@@ -183,7 +183,7 @@ def assert_constant_energy(small: SmallModel, dt: float) -> None:
     stepper = Stepper(small, dt, x0)
     for _ in range(2000):
         stepper(np.zeros(2))
-    assert abs(energy(stepper.state) / found[0] - 1) < 1e-13
+    assert abs(energy(stepper.state) / found[0] - 1) < 1e-13  # rounding of 2000 products
 
 
 @pytest.mark.parametrize("two_way", [False, True])

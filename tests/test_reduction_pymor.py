@@ -97,7 +97,7 @@ def test_same_trajectory_as_pymor_from_the_same_small_matrices(comm: MPI.Intraco
         own = run(small, dt, wiggle(steps, dt), allow_unstable=True)
         # rounding of 40 steps; E of canonical models has condition 1e4
         assert close(own.x, theirs) < 1e-10, kind
-        assert close(own.outputs, theirs @ C.T) < 1e-10, kind
+        assert close(own.outputs, theirs @ C.T) < 1e-10, kind  # as above
 
 
 @pytest.mark.parametrize("fixed", [True, False])

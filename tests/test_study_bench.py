@@ -101,6 +101,7 @@ def test_exponents_of_made_up_costs_come_back() -> None:
     assert bench_forward.growth(n[:1], [1.0]) is None
     assert bench_forward.growth(n, [0.0, 0.0, 5.0]) is None
     powers = bench_forward.exponents([made_up(m) for m in n])["1"]
+    # rounding of log
     assert powers == pytest.approx({"assembly": 1.0, "factor": 1.5, "step": 1.1, "memory": 1.0}, rel=1e-12)
 
 

@@ -167,7 +167,7 @@ def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
     assert names <= {p.name for p in out.iterdir()}
     table = list(csv.reader((out / "trajectory.csv").open()))
     assert len(table) == 602
-    assert float(table[-1][1]) == pytest.approx(5.0, abs=0.01)
+    assert float(table[-1][1]) == pytest.approx(5.0, abs=1e-5)  # of 5 m after T = 300, 3e-7 is left
     assert len(list(csv.reader((out / "reduced.csv").open()))) == 19
     load_scene(out / "scene.toml", [])
     controller = Controller.load(out / "controller.npz", result["scene_hash"])
@@ -184,8 +184,9 @@ def test_other_methods_find_the_same(result: dict[str, Any], tmp_path: Path) -> 
     other = ran(common(tmp_path), "dense")[0]
     assert other["method"].startswith("dense")
     assert other["optimal_cost"] == pytest.approx(result["optimal_cost"], rel=1e-8)  # two solvers at their residuals
-    assert np.allclose(other["gain_rigid_velocity"], result["gain_rigid_velocity"], atol=1e-7)
-    assert other["closed_loop_abscissa"] == pytest.approx(result["closed_loop_abscissa"], rel=1e-6)
+    # gain and poles of two residuals of 1e-10
+    assert np.allclose(other["gain_rigid_velocity"], result["gain_rigid_velocity"], rtol=0, atol=1e-9)
+    assert other["closed_loop_abscissa"] == pytest.approx(result["closed_loop_abscissa"], rel=1e-9)
 
 
 def refused(name: str, out: Path, *overrides: str) -> str:

@@ -169,7 +169,7 @@ def test_change_is_what_two_runs_differ_by(comm: MPI.Intracomm) -> None:
     change = by["gravity"].change
     assert change is not None
     assert change.outputs == pytest.approx(difference / scale, rel=1e-9)  # parallel sums in another order
-    assert change.absolute == pytest.approx(difference, rel=1e-9)
+    assert change.absolute == pytest.approx(difference, rel=1e-9)  # as above
     assert change.deformation > change.outputs  # the rigid move hides it
 
 
@@ -194,8 +194,8 @@ def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None
     a, b = simulate(plain), simulate(turning)
     assert b.outputs.shape[1] == a.outputs.shape[1] + 1
     node = np.linalg.norm(b.outputs[:, 3:] - a.outputs[:, 2:], axis=1).max()
-    assert node > 0.1
-    assert compare(plain, a, turning, b).absolute == pytest.approx(node, rel=1e-12)
+    assert node > 0.1  # [m]; the turn moves the tip
+    assert compare(plain, a, turning, b).absolute == pytest.approx(node, rel=1e-12)  # the same sums
 
 
 def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:

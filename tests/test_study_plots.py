@@ -193,7 +193,7 @@ def test_instants_differ_when_the_hand_rests_after_its_move() -> None:
     chosen = pick_instants(picture, states, times, table)
     ways = np.linalg.norm(np.diff(table[chosen, 1:], axis=0), axis=1)
     assert len(chosen) == 4
-    assert ways.min() > 0.15 * ways.sum()
+    assert ways.min() > 0.15 * ways.sum()  # a third each if equal; 0 at rest
 
 
 def test_many_frames_still_take_their_time(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_global_pod_is_found_unstable(paper: Reference) -> None:
     assert [p.stable for p in points] == [False] * 3
     assert all(p.spectral_abscissa > 0.1 for p in points)  # growth by e^0.3 and more over the run
     assert points[2].error > 1  # the error explodes where the projection error is 2e-5
-    assert points[2].projection_error < 1e-4
+    assert points[2].projection_error < 1e-4  # as just said
 
 
 def stable_sizes(against: Reference, name: str, sizes: list[int]) -> dict[int, bool]:
@@ -277,7 +277,7 @@ def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: Referenc
     one = again.at()
     step, drive = prepare(again, one, small, small.model.system)
     assert np.abs(run(step, **drive).outputs - small.trajectory.outputs).max() < 1e-3  # m, of a way of 5 m
-    assert result["methods"]["psd_fixed"][-1]["error"] < 1e-3
+    assert result["methods"]["psd_fixed"][-1]["error"] < 2e-4  # N = 20 on this mesh: 5e-5
 
 
 def test_instants_show_large_deformations_apart_from_each_other(small: Reference) -> None:
@@ -289,7 +289,7 @@ def test_instants_show_large_deformations_apart_from_each_other(small: Reference
     size = [np.abs(u - views.picture.rigid(q)).max() for u, q in zip(views.full, hand, strict=True)]
     assert chosen == sorted(chosen)
     assert 2 <= len(chosen) <= 3
-    assert max(size[k] for k in chosen) > 0.8 * max(size)
+    assert max(size[k] for k in chosen) > 0.8 * max(size)  # all but those that would touch: 0.87
     boxes = [(x.min(axis=0), x.max(axis=0)) for x in (views.picture.points + views.full[k] for k in chosen)]
     for i, (low, high) in enumerate(boxes):
         assert all((low > top).any() or (bottom > high).any() for bottom, top in boxes[:i])

@@ -301,7 +301,7 @@ def test_extrapolation_finds_limit_and_order() -> None:
     values = [limit + h**1.5 * np.array([[1.0, 0.3, 1.0, 0.3]]) for h in (0.4, 0.2, 0.1)]
     found, p = extrapolate(values, 2)
     assert p == pytest.approx(1.5, abs=1e-9)  # made with this order: rounding
-    np.testing.assert_allclose(found, limit, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found, limit, rtol=0, atol=1e-12)  # rounding
 
 
 def test_pareto_and_power_law() -> None:

@@ -92,7 +92,7 @@ def test_gain_errors_agree_with_the_dense_solution(comm: MPI.Intracomm, result: 
         # rounding of the dense solution, and of a solution that is made again
         assert row["error"] == pytest.approx(true, rel=1e-3, abs=10 * own + 1e-11)
         if row["series"] != "galerkin":
-            assert row["residual"] <= 10 * row["tolerance"]
+            assert row["residual"] <= 2 * row["tolerance"]  # and what compression may add
 
 
 def test_no_method_is_its_own_judge(result: dict[str, Any]) -> None:
@@ -119,12 +119,15 @@ def test_reduced_gains_have_errors_costs_and_times(result: dict[str, Any]) -> No
     assert [r["N"] for r in best] == [4, 6, 8]
     errors, costs = [r["error"] for r in best], [r["cost_excess"] for r in best]
     assert errors == sorted(errors, reverse=True)
-    assert max(costs) < 1e-2
+    assert max(costs) < 1e-4  # below the square of the largest error, 1e-2
     assert all(0 < r["seconds"] < r["scratch"] for r in rows)
 
 
 def test_excess_cost_is_what_the_closed_loop_pays(result: dict[str, Any]) -> None:
-    """The cost of the run under a reduced gain against the optimal one, both until almost nothing is to come."""
+    """The cost of the run under a reduced gain against the optimal one, but for what is to come after the end.
+
+    That hides an excess as small as this one; `test_lqr_reduced.py` compares the excess itself.
+    """
     finest = max(r["steps"] for r in result["points"]["loop"])
     rows = {
         (r["basis"], r["N"]): r
@@ -135,8 +138,8 @@ def test_excess_cost_is_what_the_closed_loop_pays(result: dict[str, Any]) -> Non
     to_come = result["references"]["loop"]["to_come"]
     told = next(r for r in result["points"]["reduced_riccati"] if r["series"] == "structured" and r["N"] == 4)
     extra = (rows[("structured", 4)]["cost"] - rows[("", 0)]["cost"]) / optimal
-    # what is still to come at the end is not paid
-    assert extra == pytest.approx(told["cost_excess"], rel=0.1, abs=to_come / optimal + 1e-9)
+    # what is still to come at the end is not paid; it is a quadratic form, and differs twice as much as the gains
+    assert extra == pytest.approx(told["cost_excess"], abs=2 * told["error"] * to_come / optimal)
 
 
 def test_unstable_gains_are_marked_and_never_on_the_front() -> None:
@@ -156,11 +159,11 @@ def test_reference_of_the_loop_is_the_limit_of_small_steps(result: dict[str, Any
     assert result["references"]["loop"]["complete"]
     errors = [r["error"] for r in rows]
     # order 2 of the midpoint rule towards the matrix exponential, which knows no step
-    assert np.log2(errors[1] / errors[0]) == pytest.approx(2, abs=0.15)
-    assert errors[0] < 1e-3
+    assert np.log2(errors[1] / errors[0]) == pytest.approx(2, abs=0.05)  # next term: 0.005
+    assert errors[0] < 1e-4  # 3e-5 measured: the reference is that limit
     held = [r["error"] for r in rows_of_series(result, "optimal gain, held")]
     # the law is half a step late on average
-    assert np.log2(held[1] / held[0]) == pytest.approx(1, abs=0.15)
+    assert np.log2(held[1] / held[0]) == pytest.approx(1, abs=0.1)  # next term: 0.03
     powers = {s["series"]: s["power"] for s in result["slopes"] if s["question"] == "loop"}
     assert powers["optimal gain, midpoint"] == pytest.approx(-np.log2(errors[1] / errors[0]), abs=1e-9)  # the same fit
 
@@ -182,7 +185,7 @@ def test_cost_of_the_midpoint_loop_is_the_optimal_cost(result: dict[str, Any]) -
 def test_reduced_plants_are_in_the_diagram(result: dict[str, Any]) -> None:
     small = [r for r in result["points"]["loop"] if r["reduced_plant"] and not r["held"]]
     assert {r["N"] for r in small} == {6, 8}
-    assert min(r["error"] for r in small) < 0.05
+    assert min(r["error"] for r in small) < 2e-3  # 8 shapes: 5e-4
 
 
 def test_a_lost_loop_is_said(comm: MPI.Intracomm) -> None:
