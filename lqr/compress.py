@@ -12,6 +12,7 @@ from lqr.plant import Block, Plant
 from reduction.engines import on_root
 
 COLUMNS = 64  # columns whose products are held at a time
+PROBES = 8  # sums of columns whose products estimate a norm
 CHUNK = 20_000  # rows a QR takes at once; LAPACK copies its argument
 
 
@@ -34,32 +35,58 @@ def gram(comm: MPI.Intracomm, X: Block, Y: Block) -> Array:
     return np.asarray(X.hand.T @ Y.hand + total(comm, X.tall.T @ Y.tall))
 
 
-def residual_weights(plant: Plant, Z: Block) -> tuple[Array, Array]:
-    """Gram matrices (A'Z)'(A'Z) and (E'Z)'(E'Z), a few columns at a time. Collective.
+def residual_weight(plant: Plant, Z: Block) -> Array:
+    """Gram matrix (A'Z)'(A'Z) / r + r (E'Z)'(E'Z), r about |A'Z| / |E'Z|, a few columns at a time. Collective.
 
-    The tissue rows leave out the hand's share of a two-way coupling: these are weights, no exact norms.
+    The tissue rows leave out the hand's share of a two-way coupling: this is a weight, no exact norm.
     """
     n, s, k = plant.n_local, plant.n_s, Z.columns
-    sums = np.zeros((2, k, k))
+    ratio = _ratio(plant, Z)
+    damping = plant.system.damping
+    G = np.zeros((k, k))
     coupling = np.empty((s, k))
     for first in range(0, k, COLUMNS):
         last = min(first + COLUMNS, k)
-        a, b = (np.ascontiguousarray(rows[:, first:last]) for rows in (Z.tall[:n], Z.tall[n:]))
-        K_a, K_b, M_b = plant.stiff(a), plant.stiff(b), plant.mass(b)
-        velocity = K_a - plant.damp(b, M_b=M_b, K_b=K_b)
-        K_v = plant.stiff(velocity)
-        weighted = np.empty((2 * n, 2 * (last - first)))
-        weighted[:n, : last - first], weighted[n:, : last - first] = K_v, plant.stiff(K_b)
-        weighted[n:, : last - first] -= plant.damp(velocity, K_b=K_v)
-        weighted[:n, last - first :], weighted[n:, last - first :] = plant.stiff(K_a), plant.mass(M_b)
+        c = last - first
+        both, K_both, M_b, velocity = _tissue_products(plant, Z[first:last])
+        # A A'Z / r + r E E'Z: tissue rows [K (v / r + r K a); (K K b - D v) / r + r M M b], v = K a - D b
+        both[:, :c] = velocity / ratio + ratio * K_both[:, :c]
+        both[:, c:] = (K_both[:, c:] - damping.beta * velocity) / ratio
+        K_both = plant.stiff(both)
+        weighted = np.empty((2 * n, c))
+        weighted[:n] = K_both[:, :c]
+        weighted[n:] = K_both[:, c:] + plant.mass(ratio * M_b - (damping.alpha / ratio) * velocity)
+        if plant.viscous is not None:
+            weighted[n:] -= plant.viscous(velocity) / ratio
         # the lower triangle is enough
-        part = Z.tall[:, first:].T @ weighted
-        sums[:, first:, first:last] = np.split(part, 2, axis=1)
-        coupling[:, first:last] = plant.G.T @ b
-    sums, coupling = total(plant.comm, sums), total(plant.comm, coupling)
+        G[first:, first:last] = Z.tall[:, first:].T @ weighted
+        coupling[:, first:last] = plant.G.T @ Z.tall[n:, first:last]
+    G, coupling = total(plant.comm, G), total(plant.comm, coupling)
     E_hand = np.vstack([Z.hand[:s], plant.M_s @ Z.hand[s:] + coupling])
-    G_A, G_E = (np.tril(G) + np.tril(G, -1).T for G in sums)
-    return G_A + Z.hand[:s].T @ Z.hand[:s], G_E + E_hand.T @ E_hand
+    G = np.tril(G) + np.tril(G, -1).T
+    return np.asarray(G + Z.hand[:s].T @ Z.hand[:s] / ratio + ratio * E_hand.T @ E_hand)
+
+
+def _tissue_products(plant: Plant, Z: Block) -> tuple[Array, Array, Array, Array]:
+    """[a, b], K_ee [a, b], M_ee b and v = K_ee a - D_ee b for tissue rows a, b of Z. Collective."""
+    n, c = plant.n_local, Z.columns
+    both = np.empty((n, 2 * c))
+    both[:, :c], both[:, c:] = Z.tall[:n], Z.tall[n:]
+    b, K_both = both[:, c:], plant.stiff(both)
+    M_b = plant.mass(b)
+    return both, K_both, M_b, K_both[:, :c] - plant.damp(b, M_b=M_b, K_b=K_both[:, c:])
+
+
+def _ratio(plant: Plant, Z: Block) -> float:
+    """|A'Z| / |E'Z|, estimated from a few sums of columns with random signs. Collective."""
+    signs = np.random.default_rng(0).choice(np.array([-1.0, 1.0]), (Z.columns, PROBES))
+    X = Z.times(signs)
+    _, K_both, M_b, velocity = _tissue_products(plant, X)
+    rates = np.sum(K_both[:, PROBES:] ** 2) + np.sum(velocity**2)
+    square = total(plant.comm, np.array([rates, np.sum(K_both[:, :PROBES] ** 2) + np.sum(M_b**2)]))
+    square += [np.sum(X.hand[: plant.n_s] ** 2), np.sum(plant.mass_adjoint(X).hand ** 2)]
+    sizes = np.sqrt(np.maximum(square, 1e-300))
+    return float(sizes[0] / sizes[1])
 
 
 def compress(plant: Plant, Z: Block, allowed: float) -> Block:
@@ -69,16 +96,16 @@ def compress(plant: Plant, Z: Block, allowed: float) -> Block:
     eigenvalues of the Gram matrix in that norm are dropped from below until their sum is reached. They enter X
     linearly, so rounding of the Gram matrix is rounding of X.
     """
-    G_A, G_E = residual_weights(plant, Z)
-    ratio = np.sqrt(max(np.trace(G_A), 1e-300) / max(np.trace(G_E), 1e-300))
-    return Z.times(on_root(plant.comm, lambda: _leading(G_A / ratio + G_E * ratio, allowed)))
+    G = residual_weight(plant, Z)
+    return Z.times(on_root(plant.comm, lambda: _leading(G, allowed)))
 
 
 def _leading(G: Array, allowed: float) -> Array:
-    """Orthonormal columns, fewest, that leave out at most ``allowed`` of the trace of a semidefinite G.
+    """Columns U, fewest, whose span leaves out at most ``allowed`` of the trace of a semidefinite G; U'U = I.
 
-    A Cholesky factorisation with pivots first takes out the range of G, of about half its order: an eigenvalue problem
-    of that order costs an eighth. Not collective.
+    A Cholesky factorisation with pivots, G = L L', first takes out the range of G, of about half its order; then
+    L'L = V s V' of that order and U = L V s^{-1/2}. U'U = I to rounding of G / sqrt(s_i s_j): what that adds to
+    U' G U is rounding of G. Not collective.
     """
     k = len(G)
     factor, pivots, rank, info = scipy.linalg.lapack.dpstrf(
@@ -88,10 +115,7 @@ def _leading(G: Array, allowed: float) -> Array:
         raise ControlError(f"the Gram matrix of order {k} was refused by LAPACK (info {info})")
     L = np.zeros((k, rank))
     L[pivots - 1] = np.tril(factor)[:, :rank]
-    # G = L L' but for a remainder of rounding
-    basis, small = np.linalg.qr(L)
-    vectors, sizes, _ = np.linalg.svd(small)
-    values = sizes[::-1] ** 2
+    values, vectors = np.linalg.eigh(L.T @ L)
     floor = k * EPS * float(values[-1]) if rank else 0.0
     keep = np.cumsum(values) > max(allowed, floor)
-    return np.ascontiguousarray(basis @ vectors[:, keep[::-1]])
+    return np.ascontiguousarray((L @ (vectors[:, keep] / np.sqrt(values[keep])))[:, ::-1])

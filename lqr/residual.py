@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from mpi4py import MPI
 
-from fem.petsc import Array
+from fem.petsc import Array, PETSc
 from lqr.problem import RiccatiProblem
 
 ROWS = 20_000  # rows of U that are reduced at a time
@@ -51,11 +51,7 @@ def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
     system, comm = problem.system, problem.layout.comm
     n_s, rank, p = problem.layout.n_s, candidate.Z_s.shape[1], problem.C_s.shape[0]
     a_s, b_s = candidate.Z_s[:n_s], candidate.Z_s[n_s:]
-    small = np.zeros((2 * rank + p, 2 * rank + p))
-    small[:rank, rank : 2 * rank] = small[rank : 2 * rank, :rank] = np.eye(rank)
     felt = b_s if problem.B_z is None else comm.allreduce(problem.B_z.T @ candidate.Z_v)  # B'Z
-    small[rank : 2 * rank, rank : 2 * rank] = -felt.T @ np.linalg.solve(problem.R, felt)
-    small[2 * rank :, 2 * rank :] = problem.Q
     U = _tissue_rows(problem, candidate)
     G_b = comm.allreduce(system.G.T @ candidate.Z_v)
     drag = system.damping.alpha if system.damping.in_space else 0.0
@@ -66,8 +62,11 @@ def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
     hand[n_s:, rank : 2 * rank] = problem.M_s @ b_s + G_b
     hand[:n_s, 2 * rank :] = problem.C_s.T
     r = _triangular(comm, [hand, *U] if comm.rank == 0 else U)
-    size = float(np.abs(np.linalg.eigvalsh(r @ small @ r.T)).max())
-    C = _triangular(comm, [part[:, 2 * rank :] for part in ([hand, *U] if comm.rank == 0 else U)])
+    rates, momenta, seen = r[:, :rank], r[:, rank : 2 * rank], r[:, 2 * rank :]
+    product, pushed = rates @ momenta.T, momenta @ felt.T
+    small = product + product.T - pushed @ np.linalg.solve(problem.R, pushed.T) + seen @ problem.Q @ seen.T
+    size = float(np.abs(np.linalg.eigvalsh(small)).max())
+    C = np.linalg.qr(seen, mode="r")
     return size / (float(np.linalg.norm(C @ problem.Q @ C.T, 2)) or 1.0)
 
 
@@ -78,21 +77,13 @@ def _tissue_rows(problem: RiccatiProblem, candidate: Candidate) -> list[Array]:
     n_s, p = problem.layout.n_s, problem.C_s.shape[0]
     b_s = candidate.Z_s[n_s:]
     top, bottom = np.zeros((n, 2 * rank + p)), np.zeros((n, 2 * rank + p))
-    x, y = system.K_ee.createVecs()
-    for j in range(rank):
-        x.array_w[:] = candidate.Z_v[:, j]
-        system.K_ee.mult(x, y)
-        top[:, j] = -y.array_r
-        bottom[:, j] = candidate.Z_z[:, j] - damping.beta * y.array_r
-        system.M_ee.mult(x, y)
-        bottom[:, j] -= damping.alpha * y.array_r
-        bottom[:, rank + j] = y.array_r
-        if damping.matrix is not None:
-            damping.matrix.mult(x, y)
-            bottom[:, j] -= y.array_r
-    x.destroy()
-    y.destroy()
+    stiff, mass = _times(system.K_ee, candidate.Z_v), _times(system.M_ee, candidate.Z_v)
+    np.negative(stiff, out=top[:, :rank])
+    bottom[:, :rank] = candidate.Z_z - damping.beta * stiff - damping.alpha * mass
+    if damping.matrix is not None:
+        bottom[:, :rank] -= _times(damping.matrix, candidate.Z_v)
     top[:, rank : 2 * rank] = candidate.Z_z
+    bottom[:, rank : 2 * rank] = mass
     top[:, 2 * rank :] = problem.C_z
     if system.two_way:
         G_b_s = system.G @ b_s
@@ -100,6 +91,17 @@ def _tissue_rows(problem: RiccatiProblem, candidate: Candidate) -> list[Array]:
         if damping.in_space:
             bottom[:, :rank] -= damping.alpha * G_b_s
     return [top, bottom]
+
+
+def _times(A: PETSc.Mat, X: Array) -> Array:
+    """Local rows of A X by PETSc's product with a dense matrix. Collective."""
+    sizes = (A.getSizes()[1], (None, X.shape[1]))
+    dense = PETSc.Mat().createDense(sizes, array=np.asfortranarray(X), comm=A.comm)
+    product = A.matMult(dense)
+    result = product.getDenseArray().copy(order="K")
+    product.destroy()
+    dense.destroy()
+    return np.asarray(result)
 
 
 def _triangular(comm: MPI.Intracomm, parts: list[Array]) -> Array:
