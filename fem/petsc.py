@@ -35,6 +35,8 @@ def petsc_options(prefix: str, entries: dict[str, object]) -> Iterator[None]:
 def total(comm: MPI.Intracomm, local: Array) -> Array:
     """Sum of a small array over the ranks. Collective."""
     local = np.ascontiguousarray(local, dtype=np.float64)
+    if comm.size == 1:
+        return local.copy()
     result = np.empty_like(local)
     comm.Allreduce(local, result)
     return result

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.linalg
 
 from fem.errors import SolverError
-from fem.petsc import Array
-from lqr.adjoint import Right, Solution, closed_adjoint
+from fem.petsc import Array, Complex
+from lqr.adjoint import Right, closed_adjoint, mass_right
 from lqr.compress import compress, gram
 from lqr.plant import Block, Plant
 from lqr.shifted import ShiftedTissue
@@ -36,7 +37,7 @@ class Columns:
         self.plant, self.allowed, self.limit = plant, allowed, limit
         self.count = self.compressed_to = self.appended = 0
         # rows side by side in memory: what the sparse products want
-        self.hand, self.tall = np.empty((2 * plant.n_s, 64)), np.empty((2 * plant.n_local, 64))
+        self.hand, self.tall = np.empty((2 * plant.n_s, limit)), np.empty((2 * plant.n_local, limit))
         self.widths: list[int] = []
 
     def append(self, block: Block) -> None:
@@ -89,63 +90,86 @@ class Sweep:
     """State of one ADI sweep for A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K.
 
     Attributes:
-        gain: K' of the sweep.
-        W: residual factor, W W' is the Lyapunov residual.
-        new: (B'XE)' of the X found so far.
-        Z: its factor.
+        state: [W, K', dK'] with the residual factor W, W W' the Lyapunov residual, K' of the sweep, and
+            dK = B'XE - K of the X found so far.
+        Z: factor of X.
         steps: solves so far.
         first: ||W_0 W_0'||.
     """
 
-    gain: Right
-    W: Right
-    new: Right
+    state: Right
     Z: Columns
     steps: int = 0
     first: float = 0.0
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
 
+    @property
+    def q(self) -> int:
+        """Columns of W."""
+        return self.state.columns - 2 * self.Z.plant.inputs
+
+    @property
+    def W(self) -> Right:
+        """Residual factor (views)."""
+        return self.state[: self.q]
+
+    @property
+    def gain(self) -> Right:
+        """K' (views)."""
+        return self.state[self.q : self.q + self.Z.plant.inputs]
+
+    @property
+    def change(self) -> Right:
+        """Change of the gain, dK' (views)."""
+        return self.state[self.q + self.Z.plant.inputs :]
+
+    @property
+    def new(self) -> Right:
+        """(B'XE)' of the X found so far."""
+        return self.gain.plus(self.change, np.eye(self.Z.plant.inputs))
+
 
 def zero_like(right: Right) -> Right:
     """A right-hand side of zeros. Not collective."""
-    block = Block(np.zeros_like(right.block.hand), np.zeros_like(right.block.tall))
-    return Right(block, np.zeros_like(right.a))
+    return Right(np.zeros_like(right.hand), np.zeros_like(right.rows))
 
 
 def start_sweep(plant: Plant, outputs: Right, gain: Right, tol: float) -> Sweep:
     """W_0 = [C', K']. Not collective."""
-    return Sweep(gain, Right.join([outputs, gain]), zero_like(gain), Columns(plant, SHARE * tol * plant.scale))
+    state = Right.join([outputs, gain, gain, zero_like(gain).plus(gain, -np.eye(gain.columns))])
+    return Sweep(state, Columns(plant, SHARE * tol * plant.scale))
 
 
-def real_columns(p: complex, V: Solution) -> tuple[Block, Array]:
-    """Real columns of Z for a shift (or its conjugate pair), and W <- W + E'Z small.
+def real_columns(p: complex, q: int) -> tuple[Complex, float]:
+    """Coefficients c of the real columns Z = Re(V c) of a shift or its conjugate pair, and g in W <- W + g E'Z_1.
 
-    p = a + ib, g = 2 sqrt(-a), d = a/b: Z = [g (Re V + d Im V), g sqrt(d^2 + 1) Im V] [BKS13]. Not collective.
+    p = a + ib, g = 2 sqrt(-a), d = a/b: Z = [g (Re V + d Im V), g sqrt(d^2 + 1) Im V] [BKS13], Z_1 its first q columns.
+    Not collective.
     """
-    q = V.hand.shape[1]
-    one, zero = np.eye(q), np.zeros((q, q))
+    one = np.eye(q, dtype=complex)
     if p.imag == 0:
-        g = np.sqrt(-2 * p.real)
-        return V.parts(g * one, zero), g * one
-    g, d = 2 * np.sqrt(-p.real), p.real / p.imag
-    Z = V.parts(np.hstack([g * one, zero]), np.hstack([g * d * one, g * np.sqrt(d * d + 1) * one]))
-    return Z, np.vstack([g * one, zero])
+        g = float(np.sqrt(-2 * p.real))
+        return np.asarray(g * one), g
+    g, d = float(2 * np.sqrt(-p.real)), p.real / p.imag
+    return np.hstack([g * (1 - 1j * d) * one, -1j * g * np.sqrt(d * d + 1) * one]), g
 
 
 def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueue) -> complex:
     """One solve, two real blocks of columns for a pair. Collective. Returns the shift."""
     begin = time.perf_counter()
+    q, m = sweep.q, plant.inputs
     if not queue.pending:
         queue.refill(plant, sweep.Z.recent(), sweep.W.block, sweep.gain)
     p, ahead = queue.next()
     middle = time.perf_counter()
-    V = closed_adjoint(plant, tissue, p, sweep.W, sweep.gain, ahead)
+    V = closed_adjoint(plant, tissue, p, sweep.state[: q + m], q, ahead)
     last = time.perf_counter()
-    Z, small = real_columns(p, V)
-    E_Z = plant.mass_adjoint(Z)
-    a = Z.tall[: plant.n_local]
-    sweep.W = sweep.W.plus(E_Z, a, small)
-    sweep.new = sweep.new.plus(E_Z, a, plant.felt(Z))
+    coefficients, g = real_columns(p, q)
+    Z = V.real(coefficients)
+    small = np.zeros((Z.columns, q + 2 * m))
+    np.fill_diagonal(small[:q, :q], g)
+    small[:, q + m :] = plant.felt(Z)
+    sweep.state = sweep.state.plus(mass_right(plant, Z), small)
     sweep.Z.append(Z)
     sweep.steps += 1
     sweep.seconds["shifts"] += middle - begin
@@ -160,16 +184,19 @@ def sweep_norms(plant: Plant, sweep: Sweep) -> tuple[float, float]:
         SolverError: the residual grows without bound: the closed loop of the gain is unstable.
     """
     begin = time.perf_counter()
-    W = sweep.W.block
-    change = Block(sweep.new.block.hand - sweep.gain.block.hand, sweep.new.block.tall - sweep.gain.block.tall)
-    q, both = W.columns, Block.join([W, change])
-    products = gram(plant.comm, both, both)
+    q, block = sweep.q, sweep.state.block
+    used = np.r_[:q, q + plant.inputs : block.columns]  # [W, dK']
+    products = gram(plant.comm, block, block)[np.ix_(used, used)]
     # the eigenvalues of U S U' that are not zero are those of S U'U
-    signs = np.concatenate([np.ones(q), -np.ones(change.columns)])
+    signs = np.where(used < q, 1.0, -1.0)
 
     def norms() -> tuple[float, float]:
-        riccati = float(np.abs(np.linalg.eigvals(signs[:, None] * products)).max())
-        return float(np.linalg.eigvalsh(products[:q, :q])[-1]), riccati
+        if not np.isfinite(products).all():
+            return np.inf, np.inf
+        # LAPACK itself: the checks of the wrappers cost more than matrices of this order
+        real, imag, *_ = scipy.linalg.lapack.dgeev(signs[:, None] * products, compute_vl=0, compute_vr=0)
+        values, *_ = scipy.linalg.lapack.dsyev(products[:q, :q], compute_v=0)
+        return float(values[-1]), float(np.hypot(real, imag).max())
 
     lyapunov, riccati = on_root(plant.comm, norms)  # the same bits on every rank: they decide when all stop
     sweep.first = max(sweep.first, lyapunov) if sweep.steps <= 1 else sweep.first

@@ -107,8 +107,7 @@ class NewtonADI:
 
     def _advance(self, plant: Plant, sweep: Sweep, state: Iteration) -> None:
         """K_{j+1} = K_j + t (K_new - K_j): the full step unless the residual hardly falls."""
-        new, old, t = sweep.new, sweep.gain, 1.0
-        change = Block(new.block.hand - old.block.hand, new.block.tall - old.block.tall)
+        change, t = sweep.change.block, 1.0
         if state.factor is not None:
             best, before, after = best_step(plant.comm, state.factor, sweep.W.block, change)
             if after > LINE_SEARCH * before:
@@ -116,11 +115,7 @@ class NewtonADI:
                 state.achieved = np.inf  # of the full step, which is not taken
         state.history[-1]["step_length"] = t
         state.factor = mixed_residual(state.factor, sweep.W.block, change, t)
-        if t < 1:
-            new = Right(
-                Block(old.block.hand + t * change.hand, old.block.tall + t * change.tall), old.a + t * (new.a - old.a)
-            )
-        state.gain = new
+        state.gain = sweep.gain.plus(sweep.change, t * np.eye(plant.inputs))
 
     def _sweep(
         self, plant: Plant, tissue: ShiftedTissue, sweep: Sweep, state: Iteration, queue: ShiftQueue, forcing: float

@@ -15,7 +15,7 @@ from lqr.adi import SHARE, Columns, Sweep
 from lqr.adjoint import Right
 from lqr.plant import Block, Plant
 
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass
@@ -60,11 +60,11 @@ def _file(folder: Path, plant: Plant) -> Path:
 
 
 def _pack(name: str, right: Right) -> dict[str, Array]:
-    return {f"{name}_hand": right.block.hand, f"{name}_tall": right.block.tall, f"{name}_a": right.a}
+    return {f"{name}_hand": right.hand, f"{name}_rows": right.rows}
 
 
 def _unpack(name: str, data: np.lib.npyio.NpzFile) -> Right:
-    return Right(Block(data[f"{name}_hand"], data[f"{name}_tall"]), data[f"{name}_a"])
+    return Right(data[f"{name}_hand"], data[f"{name}_rows"])
 
 
 def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> None:
@@ -86,9 +86,7 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> No
         "appended": np.array(sweep.Z.appended),
         "history_keys": np.array(keys, dtype=str),
         "history": np.array([[entry[key] for key in keys] for entry in state.history]),
-        **_pack("gain", sweep.gain),
-        **_pack("W", sweep.W),
-        **_pack("new", sweep.new),
+        **_pack("sweep", sweep.state),
     }
     if state.factor is not None:
         U, signs = state.factor
@@ -139,7 +137,6 @@ def _restore(plant: Plant, state: Iteration, data: np.lib.npyio.NpzFile, tol: fl
     state.achieved, first = (float(value) for value in data["norms"])
     keys = [str(key) for key in data["history_keys"]]
     state.history = [dict(zip(keys, map(float, row), strict=True)) for row in data["history"]]
-    state.gain = _unpack("gain", data)
     if "factor_signs" in data:
         state.factor = (Block(data["factor_hand"], data["factor_tall"]), data["factor_signs"])
     Z = Columns(plant, SHARE * tol * plant.scale)
@@ -147,4 +144,6 @@ def _restore(plant: Plant, state: Iteration, data: np.lib.npyio.NpzFile, tol: fl
     Z.count, Z.compressed_to = Z.hand.shape[1], int(data["compressed_to"])
     Z.appended = int(data["appended"])
     Z.widths = [int(width) for width in data["widths"]]
-    return Sweep(state.gain, _unpack("W", data), _unpack("new", data), Z, steps, first)
+    sweep = Sweep(_unpack("sweep", data), Z, steps, first)
+    state.gain = sweep.gain
+    return sweep

@@ -138,11 +138,16 @@ class Plant:
         hand = np.vstack([self.C_s.T, np.zeros_like(self.C_s.T)])
         return Block(hand, np.vstack([self.C_z, np.zeros_like(self.C_z)]))
 
-    def mass_adjoint(self, V: Block) -> Block:
-        """E'V of a costate block; the z-row of the result is unscaled. Collective."""
+    def mass_adjoint(self, V: Block, out: Array | None = None) -> Block:
+        """E'V of a costate block; the z-row of the result is unscaled. Collective.
+
+        Args:
+            V: the block.
+            out: room for the tissue rows of the result.
+        """
         n, s = self.n_local, self.n_s
         a, b, b_s = V.tall[:n], V.tall[n:], V.hand[s:]
-        tall = np.empty(V.tall.shape, order="F")
+        tall = np.empty(V.tall.shape) if out is None else out
         tall[:n] = self.stiff(a)
         tall[n:] = self.mass(b)
         if self.two_way:

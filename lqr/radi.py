@@ -10,8 +10,8 @@ import numpy as np
 
 from fem.errors import SolverError
 from fem.petsc import Array
-from lqr.adi import GROWTH, SHARE, Columns, Progress, zero_like
-from lqr.adjoint import Right, Solution, closed_adjoint, make_right
+from lqr.adi import GROWTH, SHARE, Columns, Progress
+from lqr.adjoint import Right, Solution, closed_adjoint, make_right, mass_right
 from lqr.compress import gram
 from lqr.lowrank import STOP, Outcome, make_solution
 from lqr.modal_start import modal_start
@@ -27,18 +27,26 @@ class RadiState:
     """W with Res(X_k) = W W', K_k' and Z.
 
     Attributes:
-        W: residual factor, p columns.
-        gain: (B'X_k E)'.
+        both: [W, K'], residual factor with p columns and (B'X_k E)'.
         Z: X_k = Z Z'.
         solves: tissue solves done.
     """
 
-    W: Right
-    gain: Right
+    both: Right
     Z: Columns
     solves: int = 0
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
+
+    @property
+    def W(self) -> Right:
+        """Residual factor (views)."""
+        return self.both[: -self.Z.plant.inputs]
+
+    @property
+    def gain(self) -> Right:
+        """K' (views)."""
+        return self.both[-self.Z.plant.inputs :]
 
 
 def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, Array, float]:
@@ -47,14 +55,14 @@ def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, A
     s real: V_1 = sqrt(-2s) V, Y = I - V_1'B B'V_1 / (2s). s complex: V_1 = sqrt(-2 Re s) [Re V, Im V] and the Y of the
     pair. Collective.
     """
-    q = V.hand.shape[1]
-    one, zero = np.eye(q), np.zeros((q, q))
+    q = V.columns
+    one = np.eye(q)
     c = float(np.sqrt(-2 * s.real))
     if s.imag == 0:
-        columns = V.parts(c * one, zero)
+        columns = V.real(np.asarray(c * one, dtype=complex))
         V_B = plant.felt(columns)
         return columns, one - V_B @ V_B.T / (2 * s.real), V_B, c
-    columns = V.parts(np.hstack([c * one, zero]), np.hstack([zero, c * one]))
+    columns = V.real(np.asarray(c * np.hstack([one, -1j * one]), dtype=complex))
     V_B = plant.felt(columns)
     real, imag = V_B[:q], V_B[q:]
     a, b = s.real / abs(s), s.imag / abs(s)
@@ -75,18 +83,17 @@ def radi_step(plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: Shif
         queue.refill(plant, state.Z.recent(), state.W.block, state.gain)
     s, ahead = queue.next()
     middle = time.perf_counter()
-    V = closed_adjoint(plant, tissue, s, state.W, state.gain, ahead)
+    q = state.W.columns
+    V = closed_adjoint(plant, tissue, s, state.both, q, ahead)
     last = time.perf_counter()
     columns, Y, V_B, c = radi_columns(plant, s, V)
     try:
         root = np.linalg.cholesky((Y + Y.T) / 2)
     except np.linalg.LinAlgError as error:
         raise SolverError(f"radi: the step at the shift {s:.4g} is not definite; use newton_adi") from error
-    E_V, a, q = plant.mass_adjoint(columns), columns.tall[: plant.n_local], state.W.columns
     inverse = np.linalg.inv(root)
     weight = inverse.T @ inverse
-    state.gain = state.gain.plus(E_V, a, weight @ V_B)
-    state.W = state.W.plus(E_V, a, c * weight[:, :q])
+    state.both = state.both.plus(mass_right(plant, columns), np.hstack([c * weight[:, :q], weight @ V_B]))
     state.Z.append(columns.times(inverse.T))
     state.solves += 1
     state.seconds["shifts"] += middle - begin
@@ -129,9 +136,8 @@ class RADI:
         tissue = make_shifted(plant.system, self.tissue)
         try:
             W = make_right(plant, tissue, plant.outputs())
-            nothing = Block(np.zeros_like(start.gain.hand), np.zeros_like(start.gain.tall))
-            gain = zero_like(Right(nothing, nothing.tall[: plant.n_local]))
-            state = RadiState(W, gain, Columns(plant, SHARE * self.tol * plant.scale))
+            gain = Right(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.rows), plant.inputs)))
+            state = RadiState(Right.join([W, gain]), Columns(plant, SHARE * self.tol * plant.scale))
             state.seconds["start"] = after_start - begin
             queue = ShiftQueue.start(shift_range(plant, poles), poles)
             self._iterate(plant, tissue, state, queue)

@@ -13,7 +13,7 @@ from lqr.adjoint import Right
 from lqr.plant import Block, Plant
 from reduction.engines import on_root
 
-WINDOW = 12  # blocks of Z whose Ritz values give the next shifts
+WINDOW = 10  # blocks of Z whose Ritz values give the next shifts
 BATCH = 8  # solves between two projections
 LOWEST = 1e-2  # of the smallest closed-loop frequency: a Ritz value nearer to the hand's zero poles is spurious
 HIGHEST = 10.0  # of the largest frequency
@@ -88,24 +88,23 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
 def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, Array, Array, Array]:
     """V'H^{-1} times A'V, E'V, W and X, from one product each with K_ee, M_ee and the matrix of the damping.
 
-    On the tissue V'H^{-1}E'V = a'K a + b'M b and V'H^{-1}A'V = b'K a - a'K b - b'D b. Collective.
+    On the tissue V'H^{-1}E'V = a'K a + b'M b and V'H^{-1}A'V = b'K a - (b'K a)' - b'D b. Collective.
     """
     n, s, k = plant.n_local, plant.n_s, V.columns
     both = np.empty((n, 2 * k))
     both[:, :k], both[:, k:] = V.tall[:n], V.tall[n:]
     stiff, a, b, b_s = plant.stiff(both), both[:, :k], both[:, k:], V.hand[s:]
     massed = plant.mass(b)
-    viscous = 0.0 if plant.viscous is None else b.T @ plant.viscous(b)
-    damping = plant.system.damping
-    G_M, G_K = b.T @ massed, b.T @ stiff[:, k:]
+    resisted = plant.damp(b, M_b=massed, K_b=stiff[:, k:])
+    power = b.T @ np.hstack([stiff[:, :k], resisted, massed, plant.G])
+    both_tall = V.tall.T @ np.hstack([W.tall, X.tall])
     parts = [
-        b.T @ stiff[:, :k] - a.T @ stiff[:, k:] - damping.alpha * G_M - damping.beta * G_K - viscous,
-        a.T @ stiff[:, :k] + G_M,
-        V.tall.T @ W.tall,
-        V.tall.T @ X.tall,
-        b.T @ plant.G,
+        power[:, :k] - power[:, :k].T - power[:, k : 2 * k],
+        a.T @ stiff[:, :k] + power[:, 2 * k : 3 * k],
+        both_tall,
+        power[:, 3 * k :],
     ]
-    widths = np.cumsum([part.shape[1] for part in parts])[:-1]
+    widths = np.cumsum([k, k, W.columns, X.columns])
     F, G, seen, felt, coupling = np.split(total(plant.comm, np.hstack(parts)), widths, axis=1)
     E_hand = plant.M_s @ b_s + coupling.T
     A_hand = V.hand[:s] - plant.drag_es * coupling.T - plant.drag_hand * (plant.system.M_rigid @ b_s)
@@ -171,7 +170,7 @@ class ShiftQueue:
     def start(cls, limits: ShiftRange, poles: Sequence[complex] | np.ndarray) -> ShiftQueue:
         """The hand's and the lightly damped poles in their order, clipped, doubles removed. Not collective."""
         pending: list[complex] = []
-        for i, p in enumerate(limits.clip(complex(p)) for p in poles):
+        for i, p in enumerate(limits.clip_all(np.asarray(poles, dtype=complex)).tolist()):
             wanted = i < 4 or -p.real < SHARP * abs(p)
             if wanted and all(abs(p - q) > 1e-3 * abs(p.real) for q in pending):
                 pending.append(p)

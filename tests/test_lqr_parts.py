@@ -42,11 +42,12 @@ def test_shifted_adjoint_solve_is_the_dense_one(name: str, tissue: str) -> None:
     right = make_right(plant, solver, local)
     W_full, K_full = full[:, :1], full[:, 1:].T
     for p in (-0.7, -0.3 + 4.0j, -2.0 + 30.0j):
-        V = closed_adjoint(plant, solver, p, right[:1], right[1:])
+        solution = closed_adjoint(plant, solver, p, right, 1)
+        V = solution.real(np.array([[1, -1j]]))  # [Re V, Im V]
         B = space.B @ plant.B
         dense = np.linalg.solve((space.A - B @ K_full + p * space.E).T, W_full)
-        stiff = plant.stiff(np.hstack([V.tall[:n].real, V.tall[:n].imag]))
-        ours = np.vstack([V.hand, stiff[:, :1] + 1j * stiff[:, 1:], V.tall[n:]])
+        columns = np.vstack([V.hand, plant.stiff(V.tall[:n]), V.tall[n:]])
+        ours = columns[:, :1] + 1j * columns[:, 1:]
         theirs = np.vstack([dense[: 2 * s], dense[own], dense[below]])
         scale = np.abs(dense).max()
         assert np.abs(ours - theirs).max() < 1e-9 * scale  # condition of the dense matrix times rounding
