@@ -77,6 +77,7 @@ def _make_eps(system: BlockSystem) -> SLEPc.EPS:
     eps.setType(SLEPc.EPS.Type.KRYLOVSCHUR)
     eps.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
     eps.setTarget(0.0)
+    eps.setPurify(False)  # for singular M_ee; costs one solve a mode
     st = eps.getST()
     st.setType(SLEPc.ST.Type.SINVERT)
     ksp = st.getKSP()

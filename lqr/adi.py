@@ -90,7 +90,7 @@ class Sweep:
     """State of one ADI sweep for A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K.
 
     Attributes:
-        state: [W, K', dK'] with the residual factor W, W W' the Lyapunov residual, K' of the sweep, and
+        state: [K', W, dK'] with K' of the sweep, the residual factor W, W W' the Lyapunov residual, and
             dK = B'XE - K of the X found so far.
         Z: factor of X.
         steps: solves so far.
@@ -111,17 +111,17 @@ class Sweep:
     @property
     def W(self) -> Right:
         """Residual factor (views)."""
-        return self.state[: self.q]
+        return self.state[self.Z.plant.inputs : -self.Z.plant.inputs]
 
     @property
     def gain(self) -> Right:
         """K' (views)."""
-        return self.state[self.q : self.q + self.Z.plant.inputs]
+        return self.state[: self.Z.plant.inputs]
 
     @property
     def change(self) -> Right:
         """Change of the gain, dK' (views)."""
-        return self.state[self.q + self.Z.plant.inputs :]
+        return self.state[-self.Z.plant.inputs :]
 
     @property
     def new(self) -> Right:
@@ -136,7 +136,7 @@ def zero_like(right: Right) -> Right:
 
 def start_sweep(plant: Plant, outputs: Right, gain: Right, tol: float) -> Sweep:
     """W_0 = [C', K']. Not collective."""
-    state = Right.join([outputs, gain, gain, zero_like(gain).plus(gain, -np.eye(gain.columns))])
+    state = Right.join([gain, outputs, gain, zero_like(gain).plus(gain, -np.eye(gain.columns))])
     return Sweep(state, Columns(plant, SHARE * tol * plant.scale))
 
 
@@ -162,13 +162,13 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueu
         queue.refill(plant, sweep.Z.recent(), sweep.W.block, sweep.gain)
     p, ahead = queue.next()
     middle = time.perf_counter()
-    V = closed_adjoint(plant, tissue, p, sweep.state[: q + m], q, ahead)
+    V = closed_adjoint(plant, tissue, p, sweep.state[: m + q], ahead)
     last = time.perf_counter()
     coefficients, g = real_columns(p, q)
     Z = V.real(coefficients)
     small = np.zeros((Z.columns, q + 2 * m))
-    np.fill_diagonal(small[:q, :q], g)
-    small[:, q + m :] = plant.felt(Z)
+    np.fill_diagonal(small[:q, m : m + q], g)
+    small[:, m + q :] = plant.felt(Z)
     sweep.state = sweep.state.plus(mass_right(plant, Z), small)
     sweep.Z.append(Z)
     sweep.steps += 1
@@ -184,17 +184,17 @@ def sweep_norms(plant: Plant, sweep: Sweep) -> tuple[float, float]:
         SolverError: the residual grows without bound: the closed loop of the gain is unstable.
     """
     begin = time.perf_counter()
-    q, block = sweep.q, sweep.state.block
-    used = np.r_[:q, q + plant.inputs : block.columns]  # [W, dK']
-    products = gram(plant.comm, block, block)[np.ix_(used, used)]
+    q, both = sweep.q, sweep.state[plant.inputs :].block  # [W, dK']
+    products = gram(plant.comm, both, both)
     # the eigenvalues of U S U' that are not zero are those of S U'U
-    signs = np.where(used < q, 1.0, -1.0)
+    signed = products.copy()
+    signed[q:] *= -1
 
     def norms() -> tuple[float, float]:
         if not np.isfinite(products).all():
             return np.inf, np.inf
         # LAPACK itself: the checks of the wrappers cost more than matrices of this order
-        real, imag, *_ = scipy.linalg.lapack.dgeev(signs[:, None] * products, compute_vl=0, compute_vr=0)
+        real, imag, *_ = scipy.linalg.lapack.dgeev(signed, compute_vl=0, compute_vr=0)
         values, *_ = scipy.linalg.lapack.dsyev(products[:q, :q], compute_v=0)
         return float(values[-1]), float(np.hypot(real, imag).max())
 

@@ -49,7 +49,7 @@ class Right:
 
 @dataclass(frozen=True)
 class Solution:
-    """V = [a_s; b_s; a; b] = (solutions of the open loop for W and K') mix, a = (a_0 + b) / p.
+    """V = [a_s; b_s; a; b] = (solutions of the open loop for K' and W) mix, a = (a_0 + b) / p.
 
     Attributes:
         p: shift.
@@ -148,22 +148,22 @@ def open_adjoint(
 
 
 def closed_adjoint(
-    plant: Plant, tissue: ShiftedTissue, p: complex, right: Right, q: int, ahead: Sequence[complex] = ()
+    plant: Plant, tissue: ShiftedTissue, p: complex, right: Right, ahead: Sequence[complex] = ()
 ) -> Solution:
     """Solve (A - B K + p E)'V = W by the Sherman-Morrison-Woodbury formula.
 
-    [L, N] = (A + pE)^{-T} [W, K'],  V = L + N (I - B'N)^{-1} B'L. Collective.
+    [N, L] = (A + pE)^{-T} [K', W],  V = L + N (I - B'N)^{-1} B'L. Collective.
 
     Args:
         plant: the plant.
         tissue: solver with S(p).
         p: shift.
-        right: [W, K'].
-        q: columns of W.
+        right: [K', W].
         ahead: shifts that will probably come next.
     """
     hand, b = open_adjoint(plant, tissue, p, right, ahead)
     B_V = plant.B.T @ hand[plant.n_s :] if plant.B_z is None else _total(plant, plant.B_z, b)
-    small = np.linalg.solve(np.eye(plant.inputs) - B_V[:, q:], B_V[:, :q])
-    mix = np.vstack([np.eye(q), small])
+    m = plant.inputs
+    small = np.linalg.solve(np.eye(m) - B_V[:, :m], B_V[:, m:])
+    mix = np.vstack([small, np.eye(right.columns - m)])
     return Solution(complex(p), hand, b, right.rows[2 * plant.n_local :], mix)

@@ -231,17 +231,17 @@ class StructuredGalerkin:
         count = self.per_step * self.max_iterations
         if plant.viscous is not None:
             low = first  # the modes do not decouple, so the responses have to cover their range too
-        wanted = frequencies(low, max(limits.fastest, 2 * low), count)
-        shifts = [0.0, *(_response_shift(plant, float(w)) for w in wanted)]
+        wanted = frequencies(low, max(limits.fastest, 2 * low), count).tolist()
         # two-way the reaction of the hand loads the tissue as well
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
         level, space = solve_level(plant, space)
         change, used = np.inf, 0
         for i in range(self.max_iterations):
-            take = shifts[:1] if i == 0 else shifts[used : used + self.per_step]
+            # the static response first; shift number k + 1 belongs to frequency number k
+            take = [0j] if i == 0 else [_response_shift(plant, w) for w in wanted[used - 1 :][: self.per_step]]
             for j, p in enumerate(take):
                 response = tissue.solve(p, loads, take[j + 1 :])
-                parts = [response.real] if complex(p).imag == 0 else [response.real, response.imag]
+                parts = [response.real] if p.imag == 0 else [response.real, response.imag]
                 space = space.grown(plant, np.hstack(parts))
             used += len(take)
             if space.V.shape[1] < level.small.order + len(take):  # nothing new: no evidence either

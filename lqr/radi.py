@@ -27,7 +27,7 @@ class RadiState:
     """W with Res(X_k) = W W', K_k' and Z.
 
     Attributes:
-        both: [W, K'], residual factor with p columns and (B'X_k E)'.
+        both: [K', W], (B'X_k E)' and the residual factor with p columns.
         Z: X_k = Z Z'.
         solves: tissue solves done.
     """
@@ -41,12 +41,12 @@ class RadiState:
     @property
     def W(self) -> Right:
         """Residual factor (views)."""
-        return self.both[: -self.Z.plant.inputs]
+        return self.both[self.Z.plant.inputs :]
 
     @property
     def gain(self) -> Right:
         """K' (views)."""
-        return self.both[-self.Z.plant.inputs :]
+        return self.both[: self.Z.plant.inputs]
 
 
 def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, Array, float]:
@@ -84,7 +84,7 @@ def radi_step(plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: Shif
     s, ahead = queue.next()
     middle = time.perf_counter()
     q = state.W.columns
-    V = closed_adjoint(plant, tissue, s, state.both, q, ahead)
+    V = closed_adjoint(plant, tissue, s, state.both, ahead)
     last = time.perf_counter()
     columns, Y, V_B, c = radi_columns(plant, s, V)
     try:
@@ -93,7 +93,7 @@ def radi_step(plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: Shif
         raise SolverError(f"radi: the step at the shift {s:.4g} is not definite; use newton_adi") from error
     inverse = np.linalg.inv(root)
     weight = inverse.T @ inverse
-    state.both = state.both.plus(mass_right(plant, columns), np.hstack([c * weight[:, :q], weight @ V_B]))
+    state.both = state.both.plus(mass_right(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
     state.Z.append(columns.times(inverse.T))
     state.solves += 1
     state.seconds["shifts"] += middle - begin
@@ -137,7 +137,7 @@ class RADI:
         try:
             W = make_right(plant, tissue, plant.outputs())
             gain = Right(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.rows), plant.inputs)))
-            state = RadiState(Right.join([W, gain]), Columns(plant, SHARE * self.tol * plant.scale))
+            state = RadiState(Right.join([gain, W]), Columns(plant, SHARE * self.tol * plant.scale))
             state.seconds["start"] = after_start - begin
             queue = ShiftQueue.start(shift_range(plant, poles), poles)
             self._iterate(plant, tissue, state, queue)

@@ -36,13 +36,12 @@ class GatheredTissue:
         layout = system.layout
         self.comm, self.n_local = layout.comm, layout.n_local
         self.counts = np.array(self.comm.allgather(layout.n_local))
-        K = self._gather(system.K_ee)
-        self.order = _dissection(K)
-        self.K, self.M = self._permute(K), self._permute(self._gather(system.M_ee))
         damping = system.damping
         self.alpha, self.beta = damping.alpha, damping.beta
-        self.D = None if damping.matrix is None else self._permute(self._gather(damping.matrix))
-        parts = [self.K, self.M] + ([] if self.D is None else [self.D])
+        wanted = [system.K_ee, system.M_ee] + ([] if damping.matrix is None else [damping.matrix])
+        parts, self.order = self._permuted(wanted)
+        self.K, self.M = parts[:2]
+        self.D = None if damping.matrix is None else parts[2]
         self.same = all(
             np.array_equal(A.indptr, self.K.indptr) and np.array_equal(A.indices, self.K.indices) for A in parts
         )
@@ -56,19 +55,29 @@ class GatheredTissue:
         self.seconds = {"factor": 0.0, "solve": 0.0}
         self.factors = 0
 
-    def _gather(self, A: PETSc.Mat) -> scipy.sparse.csc_matrix:
-        """All rows on every rank; the matrix is symmetric, so its rows serve as columns."""
+    def _permuted(self, wanted: Sequence[PETSc.Mat]) -> tuple[list[scipy.sparse.csc_matrix], NDArray[np.int64]]:
+        """All rows on every rank in the nested dissection order of the first, and that order. Collective."""
+        copies = [self._gather(A) for A in wanted] if self.comm.size > 1 else []
+        whole = copies or wanted
+        rows, columns = whole[0].getOrdering("nd")
+        found = []
+        for A in whole:
+            permuted = A.permute(rows, rows)
+            indptr, indices, values = permuted.getValuesCSR()
+            permuted.destroy()
+            # the matrix is symmetric, so its rows serve as columns
+            found.append(scipy.sparse.csc_matrix((values, indices, indptr), shape=A.getSize()))
+        order = np.array(rows.getIndices(), dtype=np.int64)
+        for item in (rows, columns, *copies):
+            item.destroy()
+        return found, order
+
+    def _gather(self, A: PETSc.Mat) -> PETSc.Mat:
         indptr, columns, values = A.getValuesCSR()
         parts = self.comm.allgather((np.diff(indptr), columns, values))
         lengths, columns, values = (np.concatenate([part[i] for part in parts]) for i in range(3))
-        indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
-        n = len(lengths)
-        return scipy.sparse.csc_matrix((values, columns.astype(np.int32), indptr), shape=(n, n))
-
-    def _permute(self, A: scipy.sparse.csc_matrix) -> scipy.sparse.csc_matrix:
-        result = A[self.order][:, self.order].tocsc()
-        result.sort_indices()
-        return result
+        indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(columns.dtype)
+        return PETSc.Mat().createAIJ(A.getSize(), csr=(indptr, columns, values), comm=PETSc.COMM_SELF)
 
     def _matrix(self, p: complex) -> scipy.sparse.csc_matrix:
         m, k = p * p - p * self.alpha, 1.0 - p * self.beta
@@ -186,16 +195,6 @@ _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
 def _cores() -> int:
     """Cores that this process may use. Not collective."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _dissection(A: scipy.sparse.csc_matrix) -> NDArray[np.int64]:
-    """Nested dissection order of a symmetric pattern. Not collective."""
-    serial = PETSc.Mat().createAIJ(A.shape, csr=(A.indptr, A.indices, A.data), comm=PETSc.COMM_SELF)
-    rows, columns = serial.getOrdering("nd")
-    order = np.array(rows.getIndices(), dtype=np.int64)
-    for item in (rows, columns, serial):
-        item.destroy()
-    return order
 
 
 def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:

@@ -40,9 +40,9 @@ def test_shifted_adjoint_solve_is_the_dense_one(name: str, tissue: str) -> None:
     local = Block(full[: 2 * s], np.vstack([full[own], full[below]]))
     solver = make_shifted(plant.system, tissue)
     right = make_right(plant, solver, local)
-    W_full, K_full = full[:, :1], full[:, 1:].T
+    K_full, W_full = full[:, :2].T, full[:, 2:]
     for p in (-0.7, -0.3 + 4.0j, -2.0 + 30.0j):
-        solution = closed_adjoint(plant, solver, p, right, 1)
+        solution = closed_adjoint(plant, solver, p, right)
         V = solution.real(np.array([[1, -1j]]))  # [Re V, Im V]
         B = space.B @ plant.B
         dense = np.linalg.solve((space.A - B @ K_full + p * space.E).T, W_full)
