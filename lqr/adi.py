@@ -158,7 +158,7 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueu
     """One solve, two real blocks of columns for a pair. Collective. Returns the shift."""
     begin = time.perf_counter()
     q, m = sweep.q, plant.inputs
-    if not queue.pending:
+    if queue.short(sweep.steps):
         queue.refill(plant, sweep.Z.recent(), sweep.W.block, sweep.gain)
     p, ahead = queue.next()
     middle = time.perf_counter()

@@ -79,7 +79,7 @@ def radi_step(plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: Shif
         SolverError: Y is not positive definite: rounding has destroyed the step.
     """
     begin = time.perf_counter()
-    if not queue.pending:
+    if queue.short(state.solves):
         queue.refill(plant, state.Z.recent(), state.W.block, state.gain)
     s, ahead = queue.next()
     middle = time.perf_counter()

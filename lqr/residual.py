@@ -17,7 +17,7 @@ from mpi4py import MPI
 from fem.petsc import Array, PETSc
 from lqr.problem import RiccatiProblem
 
-ROWS = 20_000  # rows of U that are reduced at a time
+ROWS = 4_000  # rows of U that are reduced at a time
 
 
 class Candidate(Protocol):

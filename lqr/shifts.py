@@ -14,6 +14,7 @@ from lqr.plant import Block, Plant
 from reduction.engines import on_root
 
 WINDOW = 10  # blocks of Z whose Ritz values give the next shifts
+EARLY = 1  # shifts still to come when the next are chosen: another core or rank can factor ahead meanwhile
 BATCH = 8  # solves between two projections
 LOWEST = 1e-2  # of the smallest closed-loop frequency: a Ritz value nearer to the hand's zero poles is spurious
 HIGHEST = 10.0  # of the largest frequency
@@ -94,15 +95,17 @@ def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, 
     both = np.empty((n, 2 * k))
     both[:, :k], both[:, k:] = V.tall[:n], V.tall[n:]
     stiff, a, b, b_s = plant.stiff(both), both[:, :k], both[:, k:], V.hand[s:]
-    massed = plant.mass(b)
-    resisted = plant.damp(b, M_b=massed, K_b=stiff[:, k:])
-    power = b.T @ np.hstack([stiff[:, :k], resisted, massed, plant.G])
-    both_tall = V.tall.T @ np.hstack([W.tall, X.tall])
+    kinetic, (power, G_K) = b.T @ plant.mass(b), np.split(b.T @ stiff, 2, axis=1)
+    damping = plant.system.damping
+    resisted = damping.alpha * kinetic + damping.beta * G_K
+    if plant.viscous is not None:
+        resisted += b.T @ plant.viscous(b)
     parts = [
-        power[:, :k] - power[:, :k].T - power[:, k : 2 * k],
-        a.T @ stiff[:, :k] + power[:, 2 * k : 3 * k],
-        both_tall,
-        power[:, 3 * k :],
+        power - power.T - resisted,
+        a.T @ stiff[:, :k] + kinetic,
+        V.tall.T @ W.tall,
+        V.tall.T @ X.tall,
+        b.T @ plant.G,
     ]
     widths = np.cumsum([k, k, W.columns, X.columns])
     F, G, seen, felt, coupling = np.split(total(plant.comm, np.hstack(parts)), widths, axis=1)
@@ -129,7 +132,7 @@ def _pencil_pairs(F: Array, G: Array, W: Array) -> tuple[np.ndarray, Array]:
     return values, np.linalg.norm(np.linalg.solve(ritz, basis.T @ W), axis=1)
 
 
-def choose_shifts(candidates: np.ndarray, weights: Array, count: int) -> list[complex]:
+def choose_shifts(candidates: np.ndarray, weights: Array, count: int, planned: Sequence[complex] = ()) -> list[complex]:
     """Greedy choice: the candidate where most of the residual is left, after the shifts chosen before it.
 
     Like the min-max choice of [P00], with the components of the residual in place of 1: a pole whose residual is
@@ -139,15 +142,22 @@ def choose_shifts(candidates: np.ndarray, weights: Array, count: int) -> list[co
         candidates: admissible values, Re < 0, Im >= 0.
         weights: size of the residual at each.
         count: number of shifts; a complex one stands for its pair.
+        planned: shifts that will be used before them.
     """
     size = np.log(np.maximum(weights, 1e-300))
-    chosen: list[complex] = []
-    while len(chosen) < min(count, len(candidates)):
-        p = complex(candidates[int(np.argmax(size))])
+
+    def left(p: complex) -> Array:
         factor = np.abs((candidates - np.conj(p)) / (candidates + p))
         if p.imag:
             factor = factor * np.abs((candidates - p) / (candidates + np.conj(p)))
-        size = size + np.log(np.maximum(factor, 1e-300))
+        return np.asarray(np.log(np.maximum(factor, 1e-300)))
+
+    for p in planned:
+        size = size + left(p)
+    chosen: list[complex] = []
+    while len(chosen) < min(count, len(candidates)):
+        p = complex(candidates[int(np.argmax(size))])
+        size = size + left(p)
         chosen.append(p)
     return chosen
 
@@ -176,13 +186,17 @@ class ShiftQueue:
                 pending.append(p)
         return cls(limits, pending)
 
+    def short(self, steps: int) -> bool:
+        """Whether more shifts are due after so many steps. Not collective."""
+        return not self.pending or (steps > 0 and len(self.pending) <= EARLY)
+
     def refill(self, plant: Plant, recent: Block, W: Block, gain: Right | None) -> None:
         """Ritz values of the recent blocks, clipped and chosen. Collective."""
         values, sizes = ritz_pairs(plant, recent, W, gain)
         upper = values.imag >= 0
         clipped = self.limits.clip_all(values[upper])
         weights = sizes[upper] * np.abs(clipped)  # from the energy norm to the 2-norm of the residual
-        self.pending = choose_shifts(clipped, weights, BATCH)
+        self.pending += choose_shifts(clipped, weights, BATCH, self.pending)
         self.projections += 1
 
     def next(self) -> tuple[complex, list[complex]]:
