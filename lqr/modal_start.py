@@ -169,16 +169,20 @@ def _few_modes(small: SmallPlant) -> Array | None:
 
 def _corrected(space: StateSpace, X: Array) -> Array | None:
     """Newton's method from a stabilising X near the solution; None when it is not. Not collective."""
-    lu = scipy.linalg.lu_factor(space.E)
-    A, B = scipy.linalg.lu_solve(lu, space.A), scipy.linalg.lu_solve(lu, space.B)
+    n = len(space.E)
+    lu, pivots, info = scipy.linalg.lapack.dgetrf(space.E)
+    if info:
+        return None
+    solved, _ = scipy.linalg.lapack.dgetrs(lu, pivots, np.hstack([space.A, space.B]))
+    A, B = solved[:, :n], solved[:, n:]
     G, H, Y = B @ B.T, space.C.T @ space.C, space.E.T @ X @ space.E
     for _ in range(CORRECTIONS):
         residual = riccati_residual(A, G, H, Y)
         if np.linalg.norm(residual) <= FAST_RESIDUAL * np.linalg.norm(H):
-            half = scipy.linalg.lu_solve(lu, Y, trans=1)
-            X = scipy.linalg.lu_solve(lu, half.T, trans=1)
+            half, _ = scipy.linalg.lapack.dgetrs(lu, pivots, Y, trans=1)
+            X, _ = scipy.linalg.lapack.dgetrs(lu, pivots, half.T, trans=1)
             return np.asarray((X + X.T) / 2)
-        T, U = scipy.linalg.schur(A - G @ Y, output="real")
+        T, U = scipy.linalg.schur(A - G @ Y, output="real", check_finite=False)
         if not np.diag(T).max() < 0:
             return None
         Y = Y + lyapunov(T, U, residual)

@@ -52,16 +52,18 @@ def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
     n_s, rank, p = problem.layout.n_s, candidate.Z_s.shape[1], problem.C_s.shape[0]
     a_s, b_s = candidate.Z_s[:n_s], candidate.Z_s[n_s:]
     felt = b_s if problem.B_z is None else comm.allreduce(problem.B_z.T @ candidate.Z_v)  # B'Z
-    U = _tissue_rows(problem, candidate)
+    n, h = len(candidate.Z_z), 2 * n_s if comm.rank == 0 else 0
+    U = np.zeros((h + 2 * n, 2 * rank + p), order="F")
+    _fill_tissue(problem, candidate, U[h : h + n], U[h + n :])
     G_b = comm.allreduce(system.G.T @ candidate.Z_v)
     drag = system.damping.alpha if system.damping.in_space else 0.0
     own = drag * (system.M_rigid @ b_s) if system.two_way else 0.0
-    hand = np.zeros((2 * n_s, 2 * rank + p))
-    hand[n_s:, :rank] = a_s - drag * G_b - own
-    hand[:n_s, rank : 2 * rank] = a_s
-    hand[n_s:, rank : 2 * rank] = problem.M_s @ b_s + G_b
-    hand[:n_s, 2 * rank :] = problem.C_s.T
-    r = _triangular(comm, [hand, *U] if comm.rank == 0 else U)
+    if comm.rank == 0:
+        U[n_s:h, :rank] = a_s - drag * G_b - own
+        U[:n_s, rank : 2 * rank] = a_s
+        U[n_s:h, rank : 2 * rank] = problem.M_s @ b_s + G_b
+        U[:n_s, 2 * rank :] = problem.C_s.T
+    r = _triangular(comm, U)
     rates, momenta, seen = r[:, :rank], r[:, rank : 2 * rank], r[:, 2 * rank :]
     product, pushed = rates @ momenta.T, momenta @ felt.T
     small = product + product.T - pushed @ np.linalg.solve(problem.R, pushed.T) + seen @ problem.Q @ seen.T
@@ -70,13 +72,10 @@ def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
     return size / (float(np.linalg.norm(C @ problem.Q @ C.T, 2)) or 1.0)
 
 
-def _tissue_rows(problem: RiccatiProblem, candidate: Candidate) -> list[Array]:
-    """Local rows z and v_z of [A'Z, E'Z, C']."""
+def _fill_tissue(problem: RiccatiProblem, candidate: Candidate, top: Array, bottom: Array) -> None:
+    """Local rows z and v_z of [A'Z, E'Z, C']. Collective."""
     system, damping = problem.system, problem.system.damping
-    n, rank = candidate.Z_z.shape
-    n_s, p = problem.layout.n_s, problem.C_s.shape[0]
-    b_s = candidate.Z_s[n_s:]
-    top, bottom = np.zeros((n, 2 * rank + p)), np.zeros((n, 2 * rank + p))
+    rank, b_s = candidate.Z_z.shape[1], candidate.Z_s[problem.layout.n_s :]
     stiff, mass = _times(system.K_ee, candidate.Z_v), _times(system.M_ee, candidate.Z_v)
     np.negative(stiff, out=top[:, :rank])
     bottom[:, :rank] = candidate.Z_z - damping.beta * stiff - damping.alpha * mass
@@ -90,7 +89,6 @@ def _tissue_rows(problem: RiccatiProblem, candidate: Candidate) -> list[Array]:
         bottom[:, rank : 2 * rank] += G_b_s
         if damping.in_space:
             bottom[:, :rank] -= damping.alpha * G_b_s
-    return [top, bottom]
 
 
 def _times(A: PETSc.Mat, X: Array) -> Array:
@@ -104,15 +102,11 @@ def _times(A: PETSc.Mat, X: Array) -> Array:
     return np.asarray(result)
 
 
-def _triangular(comm: MPI.Intracomm, parts: list[Array]) -> Array:
-    """R of the thin QR factorisation of rows spread over ranks and parts, on every rank. Collective."""
-    waiting = [np.zeros((0, parts[0].shape[1]))]
-    for part in parts:
-        for first in range(0, len(part), ROWS):
-            waiting.append(part[first : first + ROWS])
-            if sum(map(len, waiting)) >= ROWS:
-                waiting = [np.linalg.qr(np.vstack(waiting), mode="r")]
-    r = np.linalg.qr(np.vstack(waiting), mode="r")
+def _triangular(comm: MPI.Intracomm, U: Array) -> Array:
+    """R of the thin QR factorisation of rows spread over the ranks, on every rank. Collective."""
+    r = np.linalg.qr(U[:ROWS], mode="r")
+    for first in range(ROWS, len(U), ROWS):
+        r = np.linalg.qr(np.vstack([r, U[first : first + ROWS]]), mode="r")
     if comm.size == 1:
         return np.asarray(r)
     gathered = comm.gather(r)
