@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
+from fem.errors import SolverError
 from fem.petsc import Array, Complex, total
 from lqr.plant import Block, Plant
 from lqr.shifted import ShiftedTissue
@@ -100,6 +102,16 @@ def _total(plant: Plant, X: Array, b: Complex) -> Complex:
     return np.asarray(parts[:, 0::2] + 1j * parts[:, 1::2])
 
 
+def _solve_small(A: Complex, B: Complex) -> Complex:
+    """A^{-1} B for a matrix of a few rows; LAPACK itself, because the checks around it take longer. Not collective."""
+    if A.size == 0:
+        return np.zeros(B.shape, dtype=complex)
+    _, _, X, info = scipy.linalg.lapack.zgesv(A, B)
+    if info:
+        raise SolverError(f"a matrix of order {len(A)} of the feedback or the hand is singular at a shift")
+    return np.asarray(X)
+
+
 def make_right(plant: Plant, tissue: ShiftedTissue, block: Block) -> Right:
     """Add a = K_ee^{-1} W_z: one factorisation and solve. Collective."""
     a = tissue.solve(0.0, block.tall[: plant.n_local])
@@ -140,10 +152,10 @@ def open_adjoint(
     right = hand[s:] - hand[:s] / p - factor * G_b[:, :q]
     if plant.two_way:
         weight = p * (p - plant.drag_hand)
-        b_s = np.linalg.solve(small - factor * weight * G_b[:, q:], right)
+        b_s = _solve_small(np.asarray(small - factor * weight * G_b[:, q:], dtype=complex), right)
         b = np.ascontiguousarray(b[:, :q] - b[:, q:] @ (weight * b_s))
     else:
-        b_s = np.linalg.solve(small, right)
+        b_s = _solve_small(np.asarray(small), right)
     return np.vstack([hand[:s] / p, b_s]), b
 
 
@@ -164,6 +176,6 @@ def closed_adjoint(
     hand, b = open_adjoint(plant, tissue, p, right, ahead)
     B_V = plant.B.T @ hand[plant.n_s :] if plant.B_z is None else _total(plant, plant.B_z, b)
     m = plant.inputs
-    small = np.linalg.solve(np.eye(m) - B_V[:, :m], B_V[:, m:])
+    small = _solve_small(np.eye(m, dtype=complex) - B_V[:, :m], B_V[:, m:])
     mix = np.vstack([small, np.eye(right.columns - m)])
     return Solution(complex(p), hand, b, right.rows[2 * plant.n_local :], mix)
