@@ -129,14 +129,9 @@ class Sweep:
         return self.gain.plus(self.change, np.eye(self.Z.plant.inputs))
 
 
-def zero_like(right: Right) -> Right:
-    """A right-hand side of zeros. Not collective."""
-    return Right(np.zeros_like(right.hand), np.zeros_like(right.rows))
-
-
 def start_sweep(plant: Plant, outputs: Right, gain: Right, tol: float) -> Sweep:
     """W_0 = [C', K']. Not collective."""
-    state = Right.join([gain, outputs, gain, zero_like(gain).plus(gain, -np.eye(gain.columns))])
+    state = Right.join([gain, outputs, gain, Right(-gain.hand, -gain.rows)])
     return Sweep(state, Columns(plant, SHARE * tol * plant.scale))
 
 

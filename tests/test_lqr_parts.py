@@ -12,6 +12,7 @@ from fem.petsc import Array, total
 from fem.scene_file import load_scene
 from fem.system import BlockSystem
 from lqr.adjoint import closed_adjoint, make_right
+from lqr.compress import compress
 from lqr.dense import relative_space
 from lqr.galerkin import frequencies
 from lqr.line_search import best_step, mixed_residual
@@ -71,6 +72,29 @@ def test_modal_start_stabilises_and_leaves_other_modes_alone() -> None:
         distance = np.abs(closed[:, None] - free[None, :]).min(axis=1)
         # 5 pairs and the hand's 4 poles move, the rest stays to rounding of the eigenvalues
         assert (distance < 1e-5 * np.abs(closed)).sum() >= layout.states - 14
+
+
+@pytest.mark.parametrize("name", ["one_way", "two_way_drag_in_space", "layers"])
+def test_compression_changes_the_residual_by_no_more_than_allowed(name: str) -> None:
+    problem = problem_of(name)
+    plant, layout = Plant(problem), problem.layout
+    space = layout.comm.bcast(relative_space(problem))
+    E, A = (ordered(problem, M) for M in (space.E, space.A))
+    n, s, k = layout.n_local, layout.n_s, 24
+    full = np.random.default_rng(4).standard_normal((layout.states, k)) * 10.0 ** (-np.arange(k) / 2)
+    Z = Block(full[: 2 * s], np.vstack([local_rows(layout, part) for part in np.split(full[2 * s :], 2)]))
+
+    def change(X: Block) -> Array:
+        tissue = [gather_rows(layout, part) for part in (plant.stiff(X.tall[:n]), X.tall[n:])]
+        rows = np.vstack([X.hand, *tissue])
+        product = (A.T @ rows) @ (E.T @ rows).T
+        return np.asarray(product + product.T)
+
+    allowed = 1e-6 * float(np.linalg.norm(change(Z), 2))
+    small = compress(plant, Z, allowed)
+    assert 1 < small.columns < k
+    # the bound of the dropped columns; 1e-12: rounding of the dense products
+    assert np.linalg.norm(change(Z) - change(small), 2) <= allowed * (1 + 1e-12 / 1e-6)
 
 
 def ordered(problem: RiccatiProblem, M: Array) -> Array:
@@ -139,6 +163,8 @@ def test_clip_and_choice_of_shifts() -> None:
     assert limits.clip(-0.0 + 5.0j).real < 0
     candidates = np.array([-1.0 + 0j, -1.0 + 10j, -1.0 + 20j])
     chosen = choose_shifts(candidates, np.array([1.0, 5.0, 3.0]), 3)
+    # what is planned already counts as chosen
+    assert choose_shifts(candidates, np.array([1.0, 5.0, 3.0]), 2, chosen[:1]) == chosen[1:]
     assert chosen[0] == candidates[1]
     assert set(chosen) == set(candidates.tolist())
 
