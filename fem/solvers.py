@@ -15,8 +15,8 @@ SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
 # Where each road ends on two ranks and 24 GiB: PETSc Cholesky (nested dissection) is fastest per solve, but its
-# factorisation is the slower one, in 3D by a factor of 10 and growing (study.bench_switches); beyond the last limits the
-# factor itself no longer fits.
+# factorisation is the slower one, in 3D by a factor of 10 and growing (study.bench_switches); beyond the last limits
+# the factor itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
