@@ -112,7 +112,12 @@ def _manifest(run: Run, directory: Path) -> dict[str, int]:
         raise CheckpointError(f"{manifest} does not exist; run once without --resume") from None
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{manifest} cannot be read ({error}); run again without --resume") from error
-    wanted = {"format": FORMAT, "scene_hash": scene_hash(run.model.scene), "ranks": comm.size, "steps": run.steps}
+    if entry.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{manifest} was written by another version of softgrasp (format {entry.get('format')}, this one reads "
+            f"{FORMAT}); run again without --resume"
+        )
+    wanted = {"scene_hash": scene_hash(run.model.scene), "ranks": comm.size, "steps": run.steps}
     for key, value in wanted.items():
         if entry.get(key) != value:
             raise CheckpointError(

@@ -11,7 +11,7 @@ error of the factor then acts as a force that feeds energy in every step. In mom
 change of the mass matrix, whose energy is conserved.
 
 Only r is stored. From r_n to h_{n+1} all terms but one work in place (undamped: r_n - 2 K z_{n+1} + G c_n); the last,
-G c_n, waits for the next load, so that a step reads G once: r_{n+1} = (h_{n+1} - G c_n) + G (c_n + c_{n+1}).
+G c_n, waits for the next load, so that a step adds G to r once: r_{n+1} = (h_{n+1} - G c_n) + G (c_n + c_{n+1}).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class TissueMidpoint:
         held: operators on the rows held.
         r, w, k: vectors on the rows held; ``r_array``, ``w_array``, ``k_array`` their arrays.
         c: coefficients of the load of the step in work, (n_s,).
-        pending: coefficients p of the load that r still lacks, h = r + G p, (n_s,).
+        pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
         K2: -2 K, whose product one call adds to r.
         k: K2 z; a step carries it where damping needs the old one.
         w_own: the rows of w that this rank owns, array.
@@ -134,7 +134,7 @@ class TissueMidpoint:
     def _couple(self) -> None:
         """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w. Not collective.
 
-        PETSc adds a product to r, or takes one with w, in one pass and at a third of the overhead of NumPy.
+        PETSc adds a product to r, or takes one with w, in one pass and with less overhead than NumPy.
         """
         n_s = self.G.shape[1]
         self.coupling = PETSc.Mat().createDense(self.G.shape, array=np.asfortranarray(self.G), comm=PETSc.COMM_SELF)
@@ -178,7 +178,11 @@ class TissueMidpoint:
         return self.z if self.held.whole else state.z
 
     def solve_midpoint(self, c: Array) -> None:
-        """Solve S w = h + G c, c of shape (n_s,), not changed before the step ends. Collective."""
+        """Solve S w = h + G c, once a step. Collective.
+
+        Args:
+            c: load, (n_s,); kept, not copied: leave it as it is until the next solve.
+        """
         np.add(self.pending, c, out=self.added_array)
         self.coupling.multAdd(self.added, self.r_here, self.r_here)
         self.r.stateIncrease()  # else PETSc remembers the norm of the old r
@@ -191,7 +195,9 @@ class TissueMidpoint:
         return self.w_own
 
     def make_responses(self) -> Array:
-        """Set Y = S^{-1} G for :meth:`accelerate`; its owned rows (n_local, n_s). Before :meth:`start`. Collective.
+        """Set Y = S^{-1} G for :meth:`accelerate`; its owned rows (n_local, n_s). Collective.
+
+        Call it before :meth:`start`: r is scratch here, and a run in progress would be lost.
 
         Raises:
             SolverError: a solve missed its tolerance.

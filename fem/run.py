@@ -116,7 +116,7 @@ class Run(Stepped):
         points, regions, at = [], [], 0
         for output in self.outputs:
             share = self.local_outputs[:, at : at + output.size]
-            if len(output.dofs) == 1 and (np.diff(output.dofs[0]) == 1).all():  # a slice costs a quarter of an index
+            if len(output.dofs) == 1 and (np.diff(output.dofs[0]) == 1).all():  # a slice, cheaper than indices
                 points.append((slice(output.dofs[0][0], output.dofs[0][-1] + 1), share))
             elif len(output.dofs):
                 regions.append((output.dofs, share))

@@ -20,8 +20,8 @@ Reproducible = Literal["auto"] | bool
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
-# every run: steps and factorisation of a spread factor are faster from some 1e4 unknowns in 3D on (study.bench_switches
-# --large), and each rank needs the memory of the whole factor.
+# every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
+# (study.bench_switches), and each rank needs the memory of the whole factor.
 REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
@@ -111,6 +111,10 @@ class TissueSolver:
         value = self.residual(r, w, size)
         if value <= self.tolerance:
             return value
+        if not np.isfinite(r.norm()):
+            raise SolverError(
+                f"{self.name}: the right-hand side is not finite at {where}; check material, dt and force"
+            )
         text = f"relative residual {value:.1e} at {where} exceeds {self.tolerance:.0e}"
         if self.name != "cg" and np.isfinite(value):
             error = self.error(r, w)

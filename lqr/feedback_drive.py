@@ -27,7 +27,7 @@ class PlantStep:
 
     Args:
         system: operators.
-        midpoint: factored step; its vectors are used as scratch.
+        midpoint: factored step, before its start: its vectors are used as scratch.
     """
 
     def __init__(self, system: BlockSystem, midpoint: TissueMidpoint) -> None:

@@ -25,7 +25,7 @@ import lqr.shifted
 import lqr.solve
 import reduction.online
 from fem.build import build
-from fem.midpoint import TissueMidpoint
+from fem.midpoint import TissueMidpoint, state_on
 from fem.outputs import make_outputs
 from fem.scene_file import load_scene_collective, shipped_scenes
 from fem.solvers import SolverName
@@ -49,17 +49,18 @@ BATCH = 100  # models of a batch
 STEPS = 600
 SHIFT = -0.5 + 5.0j  # a shift in the middle of the paper's spectrum
 WORKER_LIMIT = 3600.0  # [s]
-HELP = """Measure both methods on each side of the sizes at which softgrasp changes from one to the other.
+HELP = """Measure two methods at sizes near those at which softgrasp changes from one to the other.
 
-Each row compares a first and a second method at one size, medians of runs in turn; 'second / first' above 1 means that
-the first is the faster one. The switches:
+Each row compares a first and a second method at one size, medians of runs in turn (set-ups and the largest sizes are
+timed once); 'second / first' above 1 means that the first is the faster one. The switches:
 
 batch: many reduced models step together (first) or one after the other (second), up to reduction.online.TOGETHER byte.
 start: the modal Riccati equation from few modes (first) or from one Schur form (second), lqr.modal_start.FEW_MODES.
 dense: the dense Riccati solver (first, used up to lqr.solve.DENSE_STATES states) or Newton-ADI (second).
-shift: one shifted factor and solve by SuperLU on whole matrices (first) or by MUMPS (second), lqr.shifted.GATHER_LIMIT.
-factor, step: PETSc Cholesky (first) or MUMPS (second), fem.solvers.CHOLESKY_LIMIT.
-whole: a step with MUMPS' whole factor on every rank (first) or with a spread one (second), fem.solvers.REPEATED_LIMIT.
+shift: a shifted factor and solve for each rank, SuperLU on whole matrices (first) or MUMPS (second), GATHER_LIMIT of
+lqr.shifted.
+set-up, step: of the forward run with PETSc Cholesky (first) or MUMPS (second), fem.solvers.CHOLESKY_LIMIT.
+whole: the same with MUMPS' whole factor on every rank (first) or a spread one (second), fem.solvers.REPEATED_LIMIT.
 
 Keep the machine quiet. A fast look: --switches batch,start --repeats 3."""
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -102,8 +103,6 @@ def compare(
 
 def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """Reduced models of random materials, together and one by one. One rank."""
-    if comm.size > 1:
-        return
     changes = ["effects.damping={kind='kelvin-voigt', beta=0.002}", "motion={drive='force', profile='hold'}"]
     model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm)
     system = model.system
@@ -137,11 +136,9 @@ def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
 
 def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """The Riccati equation of the modal start. One rank."""
-    if comm.size > 1:
-        return
     few = lqr.modal_start.FEW_MODES
     plant = Plant(problem_for(comm, 10, 0.002))
-    for k in (30, 60):
+    for k in (15, 16, 30, 60):
         omega, V = plant_modes(plant, k)
         small = project(plant, V, omega, plant.mass(V))
 
@@ -158,8 +155,6 @@ def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
 
 def dense(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """All modes against low rank. One rank."""
-    if comm.size > 1:
-        return
     for nx in (2, 3, 4, 5, 8):
         problem = problem_for(comm, nx, 0.002)
         calls = (lambda p=problem: DenseRiccati().solve(p), lambda p=problem: NewtonADI().solve(p))
@@ -190,12 +185,12 @@ def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
             solver.destroy()
 
 
-def factor_and_step(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """Set-up and step of the forward run with PETSc's Cholesky and with MUMPS."""
     for d, size in ((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000)):
         model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
         names = f"CHOLESKY_LIMIT = {fem.solvers.CHOLESKY_LIMIT[d]}"
-        yield from _two(comm, model, ("cholesky", "auto"), ("mumps", "auto"), ("factor", "step"), names, repeats)
+        yield from _two(comm, model, ("cholesky", "auto"), ("mumps", "auto"), ("set-up", "step"), names, repeats)
 
 
 def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
@@ -205,7 +200,7 @@ def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     for d, size in ((3, 10_000), (3, 50_000), *(((3, 200_000), (2, 1_000_000)) if large else ())):
         model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
         names = f"REPEATED_LIMIT = {fem.solvers.REPEATED_LIMIT[d]} / ranks"
-        heads = ("whole, factor", "whole, step")
+        heads = ("whole, set-up", "whole, step")
         yield from _two(comm, model, ("mumps", True), ("mumps", False), heads, names, 1 if size > 60_000 else repeats)
 
 
@@ -218,7 +213,7 @@ def _two(
     limit: str,
     repeats: int,
 ) -> Iterator[Row]:
-    """Set-up and solve of S by two solvers."""
+    """Set-up and step with two solvers."""
     system = model.system
     setting = f"{system.layout.dimension}D, n_e = {system.layout.n_e}"
     seconds, made = [], []
@@ -229,8 +224,15 @@ def _two(
         seconds.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
     yield Row(heads[0], limit, setting, comm.size, *seconds)
     c = np.ones(system.layout.n_s)
-    calls = (lambda: made[0].solve_midpoint(c), lambda: made[1].solve_midpoint(c))
-    yield compare(comm, (heads[1], limit), setting, calls, max(repeats, 3))
+    states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in made]
+    for midpoint, state in zip(made, states, strict=True):
+        midpoint.start(state)
+
+    def step(i: int) -> None:
+        made[i].solve_midpoint(c)
+        made[i].advance(states[i], states[i])
+
+    yield compare(comm, (heads[1], limit), setting, (partial(step, 0), partial(step, 1)), max(repeats, 3))
     for midpoint in made:
         midpoint.destroy()
 
@@ -240,9 +242,10 @@ SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
     "start": start,
     "dense": dense,
     "shift": shift,
-    "factor": factor_and_step,
+    "step": step_and_set_up,
     "whole": whole,
 }
+SERIAL = ("batch", "start", "dense")
 
 
 def run_worker(spec: dict[str, Any]) -> None:
@@ -284,13 +287,15 @@ def main(
     for name in wanted:
         if name not in SWITCHES:
             raise typer.BadParameter(f"'{name}' is no switch; choose from {', '.join(SWITCHES)}")
+        if name == "whole" and max(counts) == 1 and len(wanted) == 1:
+            raise typer.BadParameter("whole and spread factors are the same on one rank; add --ranks 2")
     if any(variable in os.environ for variable in IN_MPI_JOB):
         raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
     console = Console(highlight=False, width=max(Console().width, 130), soft_wrap=True)
     rows: list[Row] = []
     failed = False
     for name in wanted:
-        for k in counts:
+        for k in [k for k in counts if k == 1 or name not in SERIAL]:
             with console.status(f"{name}, {k} rank(s)"):
                 spec = {"switch": name, "repeats": repeats, "large": large}
                 found = launch_worker("study.bench_switches", spec, k, WORKER_LIMIT)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import gc
+import json
 import os
 import signal
+import time
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +18,11 @@ from mpi4py import MPI
 
 from fem.build import Model, build
 from fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError
+from fem.midpoint import TissueMidpoint
 from fem.run import Run, RunOptions, simulate
 from fem.scene_file import load_scene
 from fem.solvers import TissueSolver
+from fem.stepping import make_ts
 
 SCENES = Path(__file__).parent.parent / "demos" / "scenes"
 
@@ -117,12 +123,76 @@ def test_a_force_of_the_wrong_shape_is_refused(comm: MPI.Intracomm, force: Any) 
         simulate(small(comm), force=force)
 
 
-def test_a_run_that_is_no_longer_finite_stops(comm: MPI.Intracomm) -> None:
+@pytest.mark.parametrize("step", [0, 25, 39])
+def test_a_run_that_is_no_longer_finite_stops(comm: MPI.Intracomm, step: int) -> None:
     def force(n: int, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return np.full(2, np.nan if n == 25 else 1.0)
+        return np.full(2, np.nan if n == step else 1.0)
 
-    with pytest.raises(SolverError, match="not finite at step 28"):
+    with pytest.raises(
+        SolverError, match="is not finite at step 28" if step == 25 else rf"step {step + 1} .*not finite"
+    ):
         simulate(small(comm), force=force)
+
+
+def residuals_seen(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Every residual that a run asks for from now on."""
+    seen: list[float] = []
+    real = TissueMidpoint.residual
+
+    def watched(self: TissueMidpoint, where: str = "the midpoint") -> float:
+        seen.append(real(self, where))
+        return seen[-1]
+
+    monkeypatch.setattr(TissueMidpoint, "residual", watched)
+    return seen
+
+
+def test_first_and_last_solve_are_checked(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = residuals_seen(monkeypatch)
+    run = simulate(small(comm))
+    assert run.residuals == tuple(seen)
+    assert len(seen) == 2
+    assert seen[0] != seen[1]
+
+
+def test_checks_are_no_part_of_the_time_of_a_step(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = TissueMidpoint.residual
+
+    def slow(self: TissueMidpoint, where: str = "the midpoint") -> float:
+        time.sleep(0.5)
+        return real(self, where)
+
+    monkeypatch.setattr(TissueMidpoint, "residual", slow)
+    assert simulate(small(comm, "time.steps=2")).seconds["steps"] < 0.5  # two steps of 30 us and a busy machine
+
+
+def test_a_run_is_freed_with_its_last_reference(comm: MPI.Intracomm) -> None:
+    """Its snapshots may fill the memory, which the next run needs."""
+    gc.collect()
+    gc.disable()
+    try:
+        run = Run(small(comm), RunOptions())
+        ts = make_ts(run)
+        run.start()
+        run.check_step(ts, 3)
+        ts.destroy()
+        run.midpoint.destroy()
+        gone = weakref.ref(run)
+        del run
+        assert gone() is None
+    finally:
+        gc.enable()
+
+
+def test_restart_file_of_another_format(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    with pytest.raises(Interrupted):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, until=5))
+    manifest = mpi_tmp_path / "checkpoint" / "checkpoint.json"
+    if comm.rank == 0:
+        manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 1}))
+    comm.Barrier()
+    with pytest.raises(CheckpointError, match=r"another version of softgrasp .format 1, this one reads 2.; run"):
+        simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
 
 
 def test_ctrl_c_on_one_rank_leaves_a_restart_file(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:

@@ -56,7 +56,8 @@ def test_full_order_loop_is_the_dense_recursion(case: Setup) -> None:
     assert close(run.outputs_rigid, run.q_s @ case.problem.C_s.T) < 1e-14  # the same product
     assert close(case.full(run.final), X[-1]) < 1e-8  # the last state is smaller than the largest
     assert same_everywhere(case.problem.layout.comm, run.inputs)
-    assert max(run.residuals) < 1e-12  # rounding of direct solves
+    assert 0 < max(run.residuals) < 1e-12  # rounding of direct solves
+    assert run.residuals[0] != run.residuals[1]  # of the first and of the last step
     assert run.inputs.shape == (STEPS, n_s)
     assert run.saturated == 0.0
     loop.destroy()

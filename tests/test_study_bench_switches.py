@@ -19,11 +19,11 @@ from study.bench_switches import Row, app, start, table_of
 def test_rows_compare_two_methods_and_leave_the_constants_alone(comm: MPI.Intracomm) -> None:
     before = lqr.modal_start.FEW_MODES, reduction.online.TOGETHER
     rows = list(start(comm, 1, False))
-    assert [row.setting for row in rows] == ["2D, 30 modes", "2D, 60 modes"]
+    assert [row.setting for row in rows] == [f"2D, {k} modes" for k in (15, 16, 30, 60)]
     assert all(row.first > 0 and row.second > 0 and row.ranks == 1 for row in rows)
     assert rows[0].limit == f"FEW_MODES = {before[0]}"
     assert before == (lqr.modal_start.FEW_MODES, reduction.online.TOGETHER)
-    assert table_of(rows).row_count == 2
+    assert table_of(rows).row_count == 4
 
 
 @pytest.mark.serial
@@ -41,9 +41,10 @@ def test_command_writes_what_the_workers_measured(
     assert "1.50" in good.output
     assert json.loads((tmp_path / "bench_switches.json").read_text())["rows"] == [vars(made)]
     assert (tmp_path / "bench_switches.csv").read_text().splitlines()[1].endswith("3 models,1,2.0,3.0")
-    bad = runner.invoke(app, ["--switches", "batch", "--out", str(tmp_path)])
+    bad = runner.invoke(app, ["--switches", "batch,shift", "--out", str(tmp_path)])
     assert bad.exit_code == 1
-    assert "batch, 2 rank(s): exit status 1: no more" in bad.output
+    assert "shift, 2 rank(s): exit status 1: no more" in bad.output
+    assert "batch, 2 rank(s)" not in bad.output  # on one rank only
     wrong = runner.invoke(app, ["--switches", "btach", "--out", str(tmp_path)])
     assert wrong.exit_code == 2
     assert "'btach' is no switch" in wrong.output
