@@ -221,7 +221,11 @@ class TissueMidpoint:
 
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry k and r on. Collective."""
-        self._propagate(self._move(old, new))
+        z = self._move(old, new)
+        if new is not old:
+            old.v.copy(new.v)
+        new.v.axpby(2 * self.s, -1.0, self.x)
+        self._propagate(z)
         self.pending = self.c
 
     def pull(self) -> Array:
@@ -237,19 +241,12 @@ class TissueMidpoint:
             old.z.axpy(2.0, self.w)
         else:
             new.z.waxpy(2.0, self.w, old.z)
-        self._move_velocity(old, new)
         return new.z
 
     def _move_own(self, old: TissueState, new: TissueState) -> PETSc.Vec:
         self.z.axpy(2.0, self.w)
         self.z_own.copy(new.z)
-        self._move_velocity(old, new)
         return self.z
-
-    def _move_velocity(self, old: TissueState, new: TissueState) -> None:
-        if new is not old:
-            old.v.copy(new.v)
-        new.v.axpby(2 * self.s, -1.0, self.x)
 
     def _undamped(self, z: PETSc.Vec) -> None:
         self.K2.multAdd(z, self.r, self.r)
