@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import numpy as np
 import scipy.sparse
@@ -16,17 +15,19 @@ from numpy.typing import NDArray
 from fem.errors import SolverError, agree
 from fem.petsc import Array, Complex, PETSc
 from fem.system import BlockSystem
+from lqr.factor_ahead import FactorsAhead
 
 # n_e up to which SuperLU works column by column in 2D: a tenth less time; in 3D it needs its panels
 THIN_UP_TO = 20_000
-AHEAD_FROM = 5_000  # n_e from which a second core, if one is idle, makes the next factor
+AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next factors
+THREADS = {1: 2, 2: 2, 3: 1}  # that do: two where this rank would wait for one; a factor in 3D takes too much memory
 
 
 class GatheredTissue:
     """Every rank holds all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
 
     SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
-    program of one rank that may use another core makes the next factor there while it works with the present one.
+    program of one rank that may use another core makes the next factors there while it works with the present one.
 
     Args:
         system: operators.
@@ -49,13 +50,13 @@ class GatheredTissue:
         )
         thin = layout.dimension < 3 and layout.n_e <= THIN_UP_TO
         self.blocking = {"panel_size": 1, "relax": 16} if thin else {}
-        # filled in turn, because making one checks its indices
-        self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(2)]
         self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
-        self.helper: ThreadPoolExecutor | None = None
-        self.next: list[tuple[complex, Future[scipy.sparse.linalg.SuperLU]]] = []
+        self.ahead: FactorsAhead | None = None
+        threads = THREADS[layout.dimension]
         if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and _cores() > 1:
-            self.helper = ThreadPoolExecutor(1)
+            self.ahead = FactorsAhead(self._factor, threads)
+        # one for each thread, filled anew for each shift, because making one checks its indices
+        self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(1 if self.ahead is None else threads)]
         self.seconds = {"factor": 0.0, "solve": 0.0}
         self.factors = 0
 
@@ -83,7 +84,8 @@ class GatheredTissue:
         indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(columns.dtype)
         return PETSc.Mat().createAIJ(A.getSize(), csr=(indptr, columns, values), comm=PETSc.COMM_SELF)
 
-    def _matrix(self, p: complex) -> scipy.sparse.csc_matrix:
+    def _matrix(self, p: complex, shell: int) -> scipy.sparse.csc_matrix:
+        p = p if p.imag else p.real
         m, k = p * p - p * self.alpha, 1.0 - p * self.beta
         if not self.same:
             S = k * self.K + m * self.M
@@ -91,15 +93,11 @@ class GatheredTissue:
         data = k * self.K.data + m * self.M.data
         if self.D is not None:
             data = data - p * self.D.data
-        self.shells.reverse()
-        self.shells[0].data = data
-        return self.shells[0]
+        self.shells[shell].data = data
+        return self.shells[shell]
 
-    def _factor(self, p: complex) -> scipy.sparse.linalg.SuperLU:
-        S = self._matrix(p if p.imag else p.real)
-        return self._decompose(p, S) if self.helper is None else self.helper.submit(self._decompose, p, S).result()
-
-    def _decompose(self, p: complex, S: scipy.sparse.csc_matrix) -> scipy.sparse.linalg.SuperLU:
+    def _factor(self, p: complex, shell: int = 0) -> scipy.sparse.linalg.SuperLU:
+        S = self._matrix(p, shell)
         try:
             return scipy.sparse.linalg.splu(
                 S, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC, **self.blocking
@@ -109,12 +107,11 @@ class GatheredTissue:
 
     def _prepare(self, shifts: Sequence[complex]) -> None:
         """Factor up to one shift a rank. Collective."""
-        wanted = list(dict.fromkeys(shifts))[: self.comm.size]
+        distinct = list(dict.fromkeys(shifts))
+        wanted = distinct[: self.comm.size]
         if self.comm.size == 1:
-            lu = self._taken(wanted[0])
             self._forget()
-            self.cache[wanted[0]] = (0, lu)
-            self._send_ahead(shifts[1:2])
+            self.cache[wanted[0]] = (0, self._factor(wanted[0]) if self.ahead is None else self.ahead.take(distinct))
         else:
             self.cache = {p: (rank, None) for rank, p in enumerate(wanted)}
             with agree(self.comm):
@@ -123,28 +120,14 @@ class GatheredTissue:
                     self.cache[p] = (self.comm.rank, self._factor(p))
         self.factors += len(wanted)
 
-    def _taken(self, p: complex) -> scipy.sparse.linalg.SuperLU:
-        """The factor that the other core has made, or one made here."""
-        stale, self.next = self.next, []
-        if stale and stale[0][0] == p:
-            return stale[0][1].result()
-        if stale and self.helper is not None:
-            wait([stale[0][1]])  # it reads a shell
-            self.helper.submit(stale.clear)
-        return self._factor(p)
-
     def _forget(self) -> None:
-        """Let the factors go, in the thread that made them: SciPy frees the memory of a factor in no other."""
+        """Let the factors go."""
         old, self.cache = self.cache, {}
-        if self.helper is not None:
-            self.helper.submit(old.clear)
-
-    def _send_ahead(self, shifts: Sequence[complex]) -> None:
-        """Start the next factor on the other core."""
-        if self.helper is not None and shifts:
-            p = shifts[0]
-            S = self._matrix(p if p.imag else p.real)
-            self.next = [(p, self.helper.submit(self._decompose, p, S))]
+        if self.ahead is not None and old:
+            (_, factor) = old.popitem()[1]
+            box: list[object] = [factor]
+            del factor
+            self.ahead.free(box)
 
     def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
         """Local rows of S(p)^{-1} F, (n_local, k); complex even where p is real. Collective.
@@ -189,9 +172,8 @@ class GatheredTissue:
     def destroy(self) -> None:
         """Free the factors. Not collective."""
         self._forget()
-        if self.helper is not None:
-            self.helper.submit(self.next.clear)
-            self.helper.shutdown()
+        if self.ahead is not None:
+            self.ahead.close()
 
 
 _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
