@@ -189,13 +189,15 @@ def sweep_norms(plant: Plant, sweep: Sweep) -> tuple[float, float]:
         if not np.isfinite(products).all():
             return np.inf, np.inf
         # LAPACK itself: the checks of the wrappers cost more than matrices of this order
-        real, imag, *_ = scipy.linalg.lapack.dgeev(signed, compute_vl=0, compute_vr=0)
-        values, *_ = scipy.linalg.lapack.dsyev(products[:q, :q], compute_v=0)
+        real, imag, _, _, failed = scipy.linalg.lapack.dgeev(signed, compute_vl=0, compute_vr=0)
+        values, _, failed_too = scipy.linalg.lapack.dsyev(products[:q, :q], compute_v=0)
+        if failed or failed_too:
+            return np.inf, np.inf
         return float(values[-1]), float(np.hypot(real, imag).max())
 
     lyapunov, riccati = on_root(plant.comm, norms)  # the same bits on every rank: they decide when all stop
     sweep.first = max(sweep.first, lyapunov) if sweep.steps <= 1 else sweep.first
-    if not lyapunov <= GROWTH * sweep.first:
+    if not (np.isfinite(lyapunov) and lyapunov <= GROWTH * sweep.first):
         raise SolverError(
             f"ADI diverges after {sweep.steps} solves (residual {lyapunov:.1e}): the start gain does not stabilise "
             "the plant; use the method radi, which needs no start, or add damping"

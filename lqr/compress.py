@@ -38,7 +38,8 @@ def gram(comm: MPI.Intracomm, X: Block, Y: Block) -> Array:
 def residual_weight(plant: Plant, Z: Block) -> Array:
     """Gram matrix (A'Z)'(A'Z) / r + r (E'Z)'(E'Z), r about |A'Z| / |E'Z|, a few columns at a time. Collective.
 
-    The tissue rows leave out the hand's share of a two-way coupling: this is a weight, no exact norm.
+    The tissue rows leave out the hand's share of a two-way coupling, the hand's rows drag in space: this is a weight,
+    no exact norm.
     """
     n, s, k = plant.n_local, plant.n_s, Z.columns
     ratio = _ratio(plant, Z)

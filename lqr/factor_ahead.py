@@ -34,13 +34,16 @@ class FactorsAhead:
             self._drop(p)
         self._begin(shifts)
         self.maker, future = self.coming.pop(shifts[0])
-        factor = future.result()
+        try:
+            factor = future.result()
+        finally:
+            del future  # in a traceback it would keep everything alive that the caller holds
         self._begin(shifts[1:])
         return factor
 
     def _drop(self, p: complex) -> None:
-        self.maker, stale = self.coming.pop(p)
-        self.free([stale])
+        self.maker = self.coming[p][0]
+        self.free([self.coming.pop(p)])  # no name may hold it when the thread lets it go
 
     def _begin(self, shifts: Sequence[complex]) -> None:
         for p in shifts[: 1 + len(self.threads)]:

@@ -73,7 +73,7 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> No
     Raises:
         CheckpointError: the folder cannot be written.
     """
-    keys = sorted(state.history[0]) if state.history else []
+    keys = sorted(set.intersection(*map(set, state.history))) if state.history else []  # the last of a sweep has more
     entries: dict[str, Any] = {
         "format": np.array(FORMAT),
         "fingerprint": np.array(fingerprint(plant)),

@@ -17,10 +17,12 @@ from fem.petsc import Array, Complex, PETSc
 from fem.system import BlockSystem
 from lqr.factor_ahead import FactorsAhead
 
-# n_e up to which SuperLU works column by column in 2D: a tenth less time; in 3D it needs its panels
+# n_e up to which SuperLU works column by column in 2D, where it is the faster way; in 3D it needs its panels
 THIN_UP_TO = 20_000
 AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next factors
-THREADS = {1: 2, 2: 2, 3: 1}  # that do: two where this rank would wait for one; a factor in 3D takes too much memory
+# Threads that do: two in 2D, where this rank would wait for one. Up to four factors are then alive at a time, too much
+# memory in 3D.
+THREADS = {1: 2, 2: 2, 3: 1}
 
 
 class GatheredTissue:
@@ -113,11 +115,14 @@ class GatheredTissue:
             self._forget()
             self.cache[wanted[0]] = (0, self._factor(wanted[0]) if self.ahead is None else self.ahead.take(distinct))
         else:
-            self.cache = {p: (rank, None) for rank, p in enumerate(wanted)}
+            self.cache = {}
+            fresh: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]]
+            fresh = {p: (rank, None) for rank, p in enumerate(wanted)}
             with agree(self.comm):
                 if self.comm.rank < len(wanted):
                     p = wanted[self.comm.rank]
-                    self.cache[p] = (self.comm.rank, self._factor(p))
+                    fresh[p] = (self.comm.rank, self._factor(p))
+            self.cache = fresh
         self.factors += len(wanted)
 
     def _forget(self) -> None:
@@ -135,7 +140,7 @@ class GatheredTissue:
         Args:
             p: shift; 0 gives K_ee^{-1}.
             F: local rows.
-            ahead: shifts that will probably come next, for the other ranks.
+            ahead: shifts that will probably come next, for the other ranks or threads.
 
         Raises:
             SolverError: a pivot vanishes.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import weakref
 from typing import Any
@@ -41,12 +42,18 @@ def test_every_factor_is_the_wanted_one_and_goes_back_to_its_thread(threads: int
 
     ahead = FactorsAhead(make, threads)
     asked = [[1, 2, 3, 4], [2, 3, 4], [3, 4, 5], [9, 3], [4, 5, 6, 7], [8], [6, 7]]
-    for shifts in asked:
-        box = [ahead.take([complex(p) for p in shifts])]
-        assert box[0].p == shifts[0]  # type: ignore[attr-defined]
-        assert len(ahead.coming) <= threads
-        ahead.free(box)
-    ahead.close()
+    often = [[q + 10 * i for q in shifts] for i in range(1, 200) for shifts in asked]  # threads meet in every way
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for shifts in asked + often:
+            box = [ahead.take([complex(p) for p in shifts])]
+            assert box[0].p == shifts[0]  # type: ignore[attr-defined]
+            assert len(ahead.coming) <= threads
+            ahead.free(box)
+        ahead.close()
+    finally:
+        sys.setswitchinterval(interval)
     assert sorted((p.real for p, _, _ in log)) == sorted(p.real for p in made)  # all are freed
     assert all(begin == end for _, begin, end in log)
     assert made.count(2) == 1  # announced and used

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+import lqr.adi
 from fem.build import build
 from fem.errors import CheckpointError, ResourceError, SolverError
 from lqr.checks import ControlError
@@ -133,6 +134,13 @@ def test_unconverged_raises_with_value_tolerance_and_advice(method: NewtonADI | 
 def test_galerkin_that_has_not_settled_raises() -> None:
     with pytest.raises(SolverError, match="still changes by"):
         StructuredGalerkin(modes=3, max_iterations=1).solve(problem_of("one_way"))
+
+
+def test_numbers_that_are_not_finite_stop_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = lqr.adi.gram
+    monkeypatch.setattr(lqr.adi, "gram", lambda *blocks: real(*blocks) * np.nan)
+    with pytest.raises(SolverError, match="diverges after 1 solves"):
+        NewtonADI().solve(problem_of("one_way"))
 
 
 def test_undamped_is_refused_with_the_way_out() -> None:
