@@ -111,6 +111,7 @@ class Stepped(ABC):
         """
         self.check_at = step - 1
         self.advance_to(ts, step)
+        self.check_at = -1  # a run may be taken back to its start
         return self.residual
 
     def _check(self) -> None:

@@ -19,7 +19,7 @@ from lqr.radi import RADI
 Method = Literal["auto", "dense", "newton_adi", "radi", "galerkin"]
 METHODS: tuple[Method, ...] = ("auto", "dense", "newton_adi", "radi", "galerkin")
 # Exact to rounding, without a start or shifts that could fail, and still as fast as low rank within some tenths of a
-# second; the faster one of the two is the dense one up to about 120 states (study.bench_switches).
+# second; the faster one of the two changes between 92 and 160 states (study.bench_switches).
 DENSE_STATES = 200
 # A complex factorisation a shift: beyond these sizes 70 to 100 of them take more than a quarter of an hour on two ranks
 # (study.bench_switches --large times one), while Galerkin needs about 5.
