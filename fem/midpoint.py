@@ -285,7 +285,7 @@ class TissueMidpoint:
         """Sum over the ranks of what each computed on the rows it holds, which may be all of them. Collective."""
         return share if self.held.whole else float(total(self.system.layout.comm, np.array([share]))[0])
 
-    def residual(self, where: str = "the midpoint") -> float:
+    def residual(self) -> float:
         """Check a solve, before :meth:`advance` takes r further; raises SolverError. Collective.
 
         In equilibrium under gravity the load cancels in r, and a two-way step subtracts the hand's part from w: what is
@@ -294,7 +294,7 @@ class TissueMidpoint:
         load = self.G[self.rows] @ self.c
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
         with self.held.agree():
-            return self.solver.check(self.r, self.w, where, float(np.sqrt(square)))
+            return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

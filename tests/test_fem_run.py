@@ -139,8 +139,8 @@ def residuals_seen(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     seen: list[float] = []
     real = TissueMidpoint.residual
 
-    def watched(self: TissueMidpoint, where: str = "the midpoint") -> float:
-        seen.append(real(self, where))
+    def watched(self: TissueMidpoint) -> float:
+        seen.append(real(self))
         return seen[-1]
 
     monkeypatch.setattr(TissueMidpoint, "residual", watched)
@@ -158,9 +158,9 @@ def test_first_and_last_solve_are_checked(comm: MPI.Intracomm, monkeypatch: pyte
 def test_checks_are_no_part_of_the_time_of_a_step(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
     real = TissueMidpoint.residual
 
-    def slow(self: TissueMidpoint, where: str = "the midpoint") -> float:
+    def slow(self: TissueMidpoint) -> float:
         time.sleep(0.5)
-        return real(self, where)
+        return real(self)
 
     monkeypatch.setattr(TissueMidpoint, "residual", slow)
     assert simulate(small(comm, "time.steps=2")).seconds["steps"] < 0.5  # two steps of 30 us and a busy machine
