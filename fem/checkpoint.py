@@ -71,7 +71,7 @@ def _write_rank(run: Run, path: Path) -> None:
     midpoint, n = run.midpoint, run.reached
     with h5py.File(path, "w") as file:
         file["state"] = run.state.array
-        file["r"] = midpoint.r.array_r
+        file["r"] = midpoint.held.leave(midpoint.r.array_r)
         file["pending"] = midpoint.pending
         file["hand_q"] = run.drive.q[: n + 1]
         file["hand_v"] = run.drive.v[: n + 1]
@@ -132,7 +132,7 @@ def _restore(run: Run, file: h5py.File, step: int) -> None:
     run.store.restore(np.asarray(file["snapshots"]), step)
     run.state = run.store.target(step)
     run.state.array[:] = file["state"][:]
-    run.midpoint.r.array_w[:] = file["r"][:]
+    run.midpoint.r.array_w[:] = run.midpoint.held.enter(file["r"][:])
     run.midpoint.pending = file["pending"][:]
     run.drive.q[:n] = file["hand_q"][:]
     run.drive.v[:n] = file["hand_v"][:]

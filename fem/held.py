@@ -1,15 +1,18 @@
-"""The operators of a step on the rows that a rank computes: its own, or all of them."""
+"""The operators of a step on the rows that a rank computes: its own, or all of them in the order of elimination."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fem.errors import agree
 from fem.layout import BlockLayout
-from fem.petsc import Array, PETSc, rows_on_all
+from fem.order import NodeOrder, node_order
+from fem.petsc import Array, PETSc, rows_on_all, whole_copy
 from fem.system import BlockSystem
 
 
@@ -20,7 +23,8 @@ class Held:
     Attributes:
         layout: sizes and ownership.
         whole: all rows are here, on a communicator of this rank alone.
-        rows: the owned rows among those held.
+        order: of the rows held; None: that of the layout.
+        rows: places of the owned rows among those held.
         K: stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries.
         G: coupling to the hand, (rows held, n_s).
         D: damping matrix, or None.
@@ -29,7 +33,8 @@ class Held:
 
     layout: BlockLayout
     whole: bool
-    rows: slice
+    order: NodeOrder | None
+    rows: slice | NDArray[np.intp]
     K: PETSc.Mat
     G: Array
     D: PETSc.Mat | None
@@ -44,13 +49,21 @@ class Held:
 
     def gather(self, local: Array) -> Array:
         """Rows held of a vector given by its owned rows. Collective."""
-        return rows_on_all(self.layout.comm, local) if self.whole else local
+        return self.enter(rows_on_all(self.layout.comm, local)) if self.whole else local
+
+    def enter(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Rows in the order of the layout as they are held. Not collective."""
+        return x if self.order is None else self.order.enter(x)
+
+    def leave(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Rows held in the order of the layout. Not collective."""
+        return x if self.order is None else self.order.leave(x)
 
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
         """The matrix on the rows held; consumes A. Collective."""
         if not self.whole:
             return A
-        copy = whole_copy(A)
+        copy = _whole(A, self.order)
         A.destroy()
         return copy
 
@@ -63,28 +76,33 @@ class Held:
                     A.destroy()
 
 
-def held_operators(system: BlockSystem, whole: bool) -> Held:
-    """Operators of a system on the owned rows, or on all. Collective."""
+def held_operators(system: BlockSystem, whole: bool, ordered: bool) -> Held:
+    """Operators of a system on the owned rows, or on all, these on request in the order of elimination. Collective."""
     layout, D = system.layout, system.damping.matrix
     M = None if D is None else system.M_ee
+    order, n = None, layout.n_local
+    rows: slice | NDArray[np.intp] = slice(0, n)
     if whole:
-        rows = slice(layout.start, layout.start + layout.n_local)
-        G = np.asfortranarray(rows_on_all(layout.comm, system.G))
         K = whole_copy(system.K_ee)
-        D, M = (None if A is None else whole_copy(A) for A in (D, M))
+        rows, G = slice(layout.start, layout.start + n), rows_on_all(layout.comm, system.G)
+        if ordered:
+            every, order = K, node_order(K)
+            K = order.permute(every)
+            every.destroy()
+            rows, G = order.leave(np.arange(layout.n_e))[rows], order.enter(G)
+        D, M = (None if A is None else _whole(A, order) for A in (D, M))
     else:
-        rows, G, K = slice(0, layout.n_local), system.G, system.K_ee.copy()
+        G, K = system.G, system.K_ee.copy()
     if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
         K.convert("baij")
-    return Held(layout, whole, rows, K, G, D, M)
+    return Held(layout, whole, order, rows, K, np.asfortranarray(G), D, M)
 
 
-def whole_copy(A: PETSc.Mat) -> PETSc.Mat:
-    """All rows of a distributed matrix, on every rank. Collective."""
-    every = PETSc.IS().createStride(A.getSize()[0], 0, 1, comm=PETSc.COMM_SELF)
-    every.setBlockSize(A.getBlockSize())
-    (copy,) = A.createSubMatrices([every], [every])
-    copy.setBlockSize(A.getBlockSize())
-    copy.setOption(PETSc.Mat.Option.SPD, bool(A.isSymmetricKnown()[1]))
+def _whole(A: PETSc.Mat, order: NodeOrder | None) -> PETSc.Mat:
+    """All rows on every rank, in the order of elimination if there is one. Collective."""
+    every = whole_copy(A)
+    if order is None:
+        return every
+    result = order.permute(every)
     every.destroy()
-    return copy
+    return result

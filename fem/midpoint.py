@@ -16,7 +16,9 @@ G c_n, waits for the next load, so that a step adds G to r once: r_{n+1} = (h_{n
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -63,7 +65,8 @@ class TissueMidpoint:
     """The tissue half of the step, for a load known at the midpoint.
 
     When every rank holds the whole factor it holds the vectors whole as well, and these calls send no message: all
-    ranks compute the same numbers and each writes its own rows into the state.
+    ranks compute the same numbers, in the order in which the factor has its rows, and each writes its own rows into
+    the state.
 
     Args:
         system: operators.
@@ -79,7 +82,7 @@ class TissueMidpoint:
         pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
         K2: -2 K, whose product one call adds to r.
         k: K2 z; a step carries it where damping needs the old one.
-        w_own: the rows of w that this rank owns, array.
+        x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are held whole.
     """
 
     def __init__(
@@ -91,26 +94,28 @@ class TissueMidpoint:
         reproducible: Reproducible = "auto",
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
-        self.held = held_operators(system, factor_on_every_rank(system.layout, solver, reproducible))
+        ordered = solver == "cholesky"
+        whole = ordered or factor_on_every_rank(system.layout, solver, reproducible)
+        self.held = held_operators(system, whole, ordered)
         self.G, self.rows = self.held.G, self.held.rows
         self.K2 = self.held.K
         self.K2.scale(-2.0)
         S = self.held.matrix(midpoint_matrix(system, dt))
         with self.held.agree():
-            self.solver: TissueSolver = make_solver(S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible)
+            self.solver: TissueSolver = make_solver(
+                S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
+            )
         self._solve = self.solver.solve if self.solver.factor is None else self.solver.factor.solve
         self.r, self.k, self.w = (self.K2.createVecLeft() for _ in range(3))
         # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
         self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
-        self.w_own: Array = self.w_array[self.rows]
         self._couple()
-        self.x = self.w  # w as the state is distributed
-        self._move = self._move_all
+        self.x, self._move = self.w, self._held_z
         if self.held.whole:
-            self.x = self._owned(self.w_own)
-            self.z = self.w.duplicate()
-            self.z_own = self._owned(self.z.array_w[self.rows])
-            self._move = self._move_own
+            self.x, self.z = system.K_ee.createVecRight(), self.w.duplicate()
+            self._move = self._move_whole
+        self.x_array: Array = self.x.array_w
+        self._pick = self._picker()
         damping = system.damping
         self.alpha, self.beta = damping.alpha, damping.beta
         self.a = 2 * self.s / (self.s + self.alpha)
@@ -124,12 +129,17 @@ class TissueMidpoint:
             self._propagate = self._proportional
         self.dissipated = 0.0
 
-    def _owned(self, array: Array) -> PETSc.Vec:
-        """Rows that this rank owns as its share of a distributed vector, not copied. Collective."""
-        layout = self.system.layout
-        return PETSc.Vec().createWithArray(
-            array, size=(layout.n_local, layout.n_e), bsize=layout.dimension, comm=layout.comm
-        )
+    def _picker(self) -> Callable[[], object]:
+        """What copies the owned rows of w to x. Not collective."""
+        held, d = self.held, self.w.getBlockSize()
+        if held.order is not None:
+            first = held.layout.start // d
+            places = held.order.places[first : first + len(self.x_array) // d]
+            w, x = self.w_array.reshape(-1, d), self.x_array.reshape(-1, d)
+            return partial(w.take, places, 0, x, "clip")  # "raise" would copy x
+        if held.whole:
+            return partial(np.copyto, self.x_array, self.w_array[self.rows])
+        return lambda: None  # x is w
 
     def _couple(self) -> None:
         """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w. Not collective.
@@ -192,7 +202,8 @@ class TissueMidpoint:
     def respond(self) -> Array:
         """Solve S w = h, the step without a load; the owned rows of w. Collective."""
         self.solve_midpoint(np.zeros_like(self.c))
-        return self.w_own
+        self._pick()
+        return self.x_array
 
     def make_responses(self) -> Array:
         """Set Y = S^{-1} G for :meth:`accelerate`; its owned rows (n_local, n_s). Collective.
@@ -221,11 +232,14 @@ class TissueMidpoint:
 
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry k and r on. Collective."""
-        z = self._move(old, new)
-        if new is not old:
+        self._pick()
+        if new is old:
+            old.z.axpy(2.0, self.x)
+        else:
+            new.z.waxpy(2.0, self.x, old.z)
             old.v.copy(new.v)
         new.v.axpby(2 * self.s, -1.0, self.x)
-        self._propagate(z)
+        self._propagate(self._move(new))
         self.pending = self.c
 
     def pull(self) -> Array:
@@ -236,16 +250,9 @@ class TissueMidpoint:
         self.coupling.multTranspose(self.w_here, self.moved)
         return self.moved_array
 
-    def _move_all(self, old: TissueState, new: TissueState) -> PETSc.Vec:
-        if new is old:
-            old.z.axpy(2.0, self.w)
-        else:
-            new.z.waxpy(2.0, self.w, old.z)
-        return new.z
-
-    def _move_own(self, old: TissueState, new: TissueState) -> PETSc.Vec:
+    def _move_whole(self, state: TissueState) -> PETSc.Vec:
+        """The rows held of a new z, by the operations that gave the state its rows: the same bits."""
         self.z.axpy(2.0, self.w)
-        self.z_own.copy(new.z)
         return self.z
 
     def _undamped(self, z: PETSc.Vec) -> None:
@@ -274,7 +281,7 @@ class TissueMidpoint:
     def energy(self, state: TissueState) -> float:
         """Energy (z' K z + v' M v) / 2 [J] of the state just reached, from the carried momentum. Collective."""
         self.K2.mult(self._held_z(state), self.k)
-        n, k = len(self.w_own), self.k_array[self.rows] / -2
+        n, k = len(self.x_array), self.k_array[self.rows] / -2
         z, v = state.array[:n], state.array[n:]
         h = self.r_array[self.rows] + self.G[self.rows] @ self.pending
         momentum = (h + k) / self.s
@@ -313,7 +320,6 @@ class TissueMidpoint:
             "k_old",
             "y",
             "z",
-            "z_own",
             "D",
         ):
             if hasattr(self, name):

@@ -8,7 +8,7 @@ from slepc4py import SLEPc
 
 from fem.errors import SolverError
 from fem.petsc import Array, PETSc
-from fem.solvers import CHOLESKY_LIMIT, set_up_repeated
+from fem.solvers import CHOLESKY_LIMIT, SolverName, TissueSolver, make_solver
 from fem.system import BlockSystem
 
 PREFIX = "softgrasp_modes_"
@@ -37,7 +37,8 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     n_e = system.layout.n_e
     if not 1 <= k <= n_e:
         raise SolverError(f"{k} modes are asked for; it must be between 1 and n_e = {n_e}")
-    eps = _make_eps(system)
+    solver = _factor(system)
+    eps = _make_eps(system, solver)
     found: list[PETSc.Vec] = []
     squares: list[float] = []
     try:
@@ -56,6 +57,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
         return _finish(eps, system, [found[i] for i in order])
     finally:
         eps.destroy()
+        solver.destroy()
         for vector in found:
             vector.destroy()
 
@@ -69,7 +71,31 @@ def _generic(system: BlockSystem, number: int) -> Array:
     return np.column_stack([np.cos(phase * (1 + 0.3 * c) + 1 + c) for c in range(d)]).ravel()
 
 
-def _make_eps(system: BlockSystem) -> SLEPc.EPS:
+class _Factored:
+    """The preconditioner of an exact solve, for SLEPc."""
+
+    def __init__(self, solver: TissueSolver) -> None:
+        self.solver = solver
+
+    def apply(self, pc: PETSc.PC, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        """Set w = K_ee^-1 r. Collective."""
+        self.solver.solve(r, w)
+
+
+def _factor(system: BlockSystem) -> TissueSolver:
+    """The stiffness, factored. Collective."""
+    layout = system.layout
+    name: SolverName = "cholesky" if layout.n_e <= CHOLESKY_LIMIT[layout.dimension] else "mumps"
+    try:
+        return make_solver(system.K_ee.copy(), name, layout, PREFIX, reproducible=False)
+    except SolverError as error:
+        raise SolverError(
+            f"modes: the factorisation of the {layout.n_e} x {layout.n_e} stiffness failed ({error}); "
+            "check material, mesh and contact zone"
+        ) from error
+
+
+def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:
     eps = SLEPc.EPS().create(system.layout.comm)
     eps.setOptionsPrefix(PREFIX)
     eps.setOperators(system.K_ee, system.M_ee)
@@ -83,13 +109,8 @@ def _make_eps(system: BlockSystem) -> SLEPc.EPS:
     ksp = st.getKSP()
     ksp.setType("preonly")
     pc = ksp.getPC()
-    pc.setType("cholesky")
-    if system.layout.n_e > CHOLESKY_LIMIT[system.layout.dimension]:
-        pc.setFactorSolverType("mumps")
-    elif system.layout.comm.size == 1:
-        pc.setFactorOrdering("nd")
-    else:
-        set_up_repeated(ksp, "cholesky", ksp.getOptionsPrefix())
+    pc.setType("python")
+    pc.setPythonContext(_Factored(solver))
     return eps
 
 
@@ -113,7 +134,7 @@ def _solve(
         eps.solve()
     except (PETSc.Error, SystemError) as error:
         raise SolverError(
-            f"modes: the factorisation of the {system.layout.n_e} x {system.layout.n_e} stiffness failed ({error}); "
+            f"modes: the iteration with the {system.layout.n_e} x {system.layout.n_e} stiffness failed ({error}); "
             "check material, mesh and contact zone"
         ) from error
     finally:

@@ -63,6 +63,17 @@ def rows_on_root(comm: MPI.Intracomm, local: NDArray[Any]) -> NDArray[Any] | Non
     return result
 
 
+def whole_copy(A: PETSc.Mat) -> PETSc.Mat:
+    """All rows of a distributed matrix, on every rank. Collective."""
+    every = PETSc.IS().createStride(A.getSize()[0], 0, 1, comm=PETSc.COMM_SELF)
+    every.setBlockSize(A.getBlockSize())
+    (copy,) = A.createSubMatrices([every], [every])
+    copy.setBlockSize(A.getBlockSize())
+    copy.setOption(PETSc.Mat.Option.SPD, bool(A.isSymmetricKnown()[1]))
+    every.destroy()
+    return copy
+
+
 def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
     """Return sum_i a_i A_i for matrices of one pattern, as a new matrix. Collective."""
     factor, first = terms[0]

@@ -98,6 +98,7 @@ class Run(Stepped):
         dt, solver = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
         with model.watch.stage("factor"):
             midpoint = TissueMidpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
+        solver = solver[0], solver[1] + midpoint.solver.remark
         store = make_store(
             system, scene.output.snapshots, scene.time.steps, scene.output.every, options.directory, options.resume
         )

@@ -7,17 +7,19 @@ from typing import Literal
 
 import numpy as np
 
-from fem.errors import SolverError
+from fem.cholesky import OrderedFactor, factor_blocks
+from fem.errors import SolverError, agree
 from fem.layout import BlockLayout
-from fem.petsc import PETSc, petsc_options
+from fem.order import node_order
+from fem.petsc import PETSc, petsc_options, whole_copy
 
 SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
-# Where each road ends on two ranks and 24 GiB: PETSc Cholesky (nested dissection) is fastest per solve, but its
-# factorisation is the slower one, in 3D by a factor of 10 and growing (study.bench_switches); beyond the last limits
-# the factor itself no longer fits.
-CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}  # 1: systems without a mesh
+# Where each road ends on two ranks and 24 GiB: PETSc Cholesky in blocks is fastest per solve, but its factorisation is
+# the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (study.bench_switches); beyond
+# the last limits the factor itself no longer fits.
+CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
 # every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
@@ -65,14 +67,23 @@ class TissueSolver:
         ksp: the PETSc solver.
         S: the matrix.
         tolerance: relative residual that :meth:`check` accepts.
-        factor: the factor itself on one rank, whose triangular solves need no detour through ``ksp``; else None.
+        factor: what solves without a detour through ``ksp``: with cholesky on every rank the whole factor, in blocks of
+            d x d and an order of its own (:mod:`fem.cholesky`), as is the matrix of ``ksp``; with mumps its factor on
+            one rank; else None.
     """
 
     name: SolverName
     ksp: PETSc.KSP
     S: PETSc.Mat
     tolerance: float
-    factor: PETSc.Mat | None = None
+    factor: PETSc.Mat | OrderedFactor | None = None
+
+    @property
+    def remark(self) -> str:
+        """What to add to the reason of the choice: single entries cost twice the time of a solve. Not collective."""
+        if self.name != "cholesky" or self.ksp.getPC().getFactorMatrix().getBlockSize() == self.S.getBlockSize():
+            return ""
+        return "; in single entries, since blocks would lose digits here"
 
     def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
         """Solve S w = r.
@@ -140,6 +151,8 @@ class TissueSolver:
 
     def destroy(self) -> None:
         """Free solver and matrix. Collective."""
+        if isinstance(self.factor, OrderedFactor):
+            self.factor.destroy()
         self.ksp.destroy()
         self.S.destroy()
 
@@ -151,6 +164,7 @@ def make_solver(
     prefix: str,
     rtol: float = 1e-10,
     reproducible: Reproducible = "auto",
+    ordered: bool = False,
 ) -> TissueSolver:
     """Factor S (or set up CG with GAMG). Collective.
 
@@ -161,18 +175,22 @@ def make_solver(
         prefix: PETSc options prefix.
         rtol: relative tolerance of cg.
         reproducible: see :func:`factor_on_every_rank`.
+        ordered: cholesky, S on one rank: its rows are in the order of elimination already.
 
     Raises:
         SolverError: the factorisation fails.
     """
+    S.setOption(PETSc.Mat.Option.SPD, True)
+    tolerance = max(DIRECT_RESIDUAL, 10 * rtol)
+    if name == "cholesky":
+        return _cholesky(S, prefix, tolerance, ordered)
     ksp = PETSc.KSP().create(S.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setOperators(S)
-    S.setOption(PETSc.Mat.Option.SPD, True)
     if name == "cg":
         _set_up_cg(ksp, S, layout, prefix, rtol)
     else:
-        _set_up_direct(ksp, name, prefix, ksp.comm.size > 1 and factor_on_every_rank(layout, name, reproducible))
+        _set_up_mumps(ksp, prefix, factor_on_every_rank(layout, name, reproducible))
     try:
         _factor(ksp, S, name)
     except SolverError:
@@ -180,14 +198,39 @@ def make_solver(
         S.destroy()
         raise
     factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
-    return TissueSolver(name, ksp, S, max(DIRECT_RESIDUAL, 10 * rtol), factor)
+    return TissueSolver(name, ksp, S, tolerance, factor)
+
+
+def _cholesky(S: PETSc.Mat, prefix: str, tolerance: float, ordered: bool) -> TissueSolver:
+    """Every rank factors the whole matrix. Collective."""
+    P, order = S, None
+    if not ordered:
+        every = whole_copy(S)
+        order = node_order(every)
+        P = order.permute(every)
+        every.destroy()
+    try:
+        with agree(S.comm.tompi4py()):
+            ksp = factor_blocks(P, prefix)
+    except SolverError:
+        S.destroy()
+        raise
+    finally:
+        if P is not S:
+            P.destroy()  # the ksp holds what it needs
+    factor = ksp.getPC().getFactorMatrix()
+    if order is not None:
+        like = S.createVecLeft()
+        factor = OrderedFactor(factor, order, like)
+        like.destroy()
+    return TissueSolver("cholesky", ksp, S, tolerance, factor)
 
 
 def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
     """The set-up, and what PETSc leaves of it to the first solve. Collective."""
     try:
         ksp.setUp()
-        if ksp.comm.size > 1 and name != "cg":
+        if ksp.comm.size > 1 and name == "mumps":
             _first_solve(ksp, S)
     except PETSc.Error as error:
         raise SolverError(
@@ -207,30 +250,19 @@ def _first_solve(ksp: PETSc.KSP, S: PETSc.Mat) -> None:
     w.destroy()
 
 
-def _set_up_direct(ksp: PETSc.KSP, name: SolverName, prefix: str, repeated: bool) -> None:
+def _set_up_mumps(ksp: PETSc.KSP, prefix: str, repeated: bool) -> None:
+    """One factor spread over the ranks, or the whole of it on every rank and one gather a solve. Collective."""
     ksp.setType("preonly")
-    pc = ksp.getPC()
-    if repeated:
-        set_up_repeated(ksp, name, prefix)
+    if not repeated:
+        ksp.getPC().setType("cholesky")
+        ksp.getPC().setFactorSolverType("mumps")
         return
-    pc.setType("cholesky")
-    if name == "mumps":
-        pc.setFactorSolverType("mumps")
-    else:
-        pc.setFactorOrdering("nd")
-
-
-def set_up_repeated(ksp: PETSc.KSP, name: SolverName, prefix: str) -> None:
-    """Every rank holds the whole Cholesky factor: one gather a solve. Collective."""
     options: dict[str, object] = {
         "pc_type": "redundant",
         "redundant_ksp_type": "preonly",
         "redundant_pc_type": "cholesky",
+        "redundant_pc_factor_mat_solver_type": "mumps",
     }
-    if name == "mumps":
-        options["redundant_pc_factor_mat_solver_type"] = "mumps"
-    else:
-        options["redundant_pc_factor_mat_ordering_type"] = "nd"
     with petsc_options(prefix, options):
         ksp.setFromOptions()
 

@@ -26,15 +26,24 @@ BIG = 9_000
 MEMORY_LIMIT_MB = 24 * 1024
 MEMORY_FLOOR_MB = 8.0  # growth of memory above the libraries is noise below
 WORKER_LIMIT = 3600.0  # [s]
-METHODS = {"ts": "PETSc TS", "solve": "bare solve", "loop": "textbook loop", "scipy": "SciPy", "pymor": "pyMOR"}
+METHODS = {
+    "ts": "PETSc TS",
+    "solve": "bare solve",
+    "own": "bare solve, blocks",
+    "loop": "textbook loop",
+    "scipy": "SciPy",
+    "pymor": "pyMOR",
+}
 HELP = f"""Measure what a forward run costs and print one table.
 
 Every row is a program of its own under mpiexec. In it all methods take turns, several times, and the median
 counts, so that noise of the machine hits all alike. Columns: assembly and factor [s]; microseconds of one time step
-by PETSc TS (what `softgrasp simulate` does) and by the bare triangular solves alone; the median of their quotient,
-with its goal; microseconds by a textbook loop (solve, products with K and M), by SciPy (sparse LU, same loop) and by
-pyMOR's implicit midpoint (up to n_e = 12 000, where installed); energy drift; peak memory of all ranks before SciPy
-and pyMOR start. Below: the paper's scene as a whole run, and growth exponents p of cost ~ n^p over the 2D sizes.
+by PETSc TS (what `softgrasp simulate` does) and by the bare triangular solves alone, as PETSc's solver gives them
+(-pc_type cholesky, or MUMPS); the median of their quotient, with its goal; the same for the solves that the step
+itself does, with a Cholesky factor of d x d blocks; microseconds by a textbook loop (PETSc's solve, products with K
+and M), by SciPy (sparse LU, same loop) and by pyMOR's implicit midpoint (up to n_e = 12 000, where installed);
+energy drift; peak memory of all ranks before SciPy and pyMOR start. Below: the paper's scene as a whole run, and
+growth exponents p of cost ~ n^p over the 2D sizes.
 
 Keep the machine quiet while it runs. A fast look: --sizes 2d:1000 --ranks 1 --repeats 3.
 --large adds 2D with 1e6 and 3D with 2e5 unknowns, {LARGE_STEPS} steps each on {LARGE_RANKS} ranks: minutes, GiB."""
@@ -155,7 +164,7 @@ def _number(value: float | None, digits: int = 3) -> str:
 def table_of(rows: Sequence[Row]) -> Table:
     """The one table. Not collective."""
     heads = ["problem", "n_e", "ranks", "solver", "assembly s", "factor s", "TS us", "solve us", "TS/solve", "goal"]
-    heads += ["loop us", "SciPy us", "pyMOR us", "drift", "MiB"]
+    heads += ["own us", "TS/own", "loop us", "SciPy us", "pyMOR us", "drift", "MiB"]
     table = Table(box=None, pad_edge=False, title="cost of a forward run, medians; us are per time step")
     for head in heads:
         table.add_column(head, justify="left" if head in ("problem", "solver", "goal") else "right", no_wrap=True)
@@ -176,6 +185,8 @@ def table_of(rows: Sequence[Row]) -> Table:
             _number(step.get("solve")),
             _number(row.get("ratio")),
             verdict,
+            _number(step.get("own")),
+            _number(row.get("ratio_own")),
             *(_number(step.get(name)) for name in ("loop", "scipy", "pymor")),
             f"{row['drift']:.0e}",
             _number(row["memory_mb"]),
@@ -209,7 +220,7 @@ def show(console: Console, rows: Sequence[Row]) -> None:
 def write_markdown(path: Path, rows: Sequence[Row]) -> None:
     """The table as the README shows it. Not collective."""
     heads = ["problem", "n_e", "ranks", "solver", "assembly [s]", "factor [s]", "TS step [µs]", "bare solve [µs]"]
-    heads += ["TS / solve", "SciPy step [µs]", "pyMOR step [µs]", "memory [MiB]"]
+    heads += ["TS / solve", "own solve [µs]", "TS / own", "SciPy step [µs]", "pyMOR step [µs]", "memory [MiB]"]
     lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for row in rows:
         if "error" in row:
@@ -217,7 +228,7 @@ def write_markdown(path: Path, rows: Sequence[Row]) -> None:
         step, seconds = row["step_us"], row["seconds"]
         cells = [row["problem"], str(row["n_e"]), str(row["ranks"]), row["solver"]]
         numbers = [seconds["assembly"], seconds["factor"], step["ts"], step.get("solve"), row.get("ratio")]
-        numbers += [step.get("scipy"), step.get("pymor"), row["memory_mb"]]
+        numbers += [step.get("own"), row.get("ratio_own"), step.get("scipy"), step.get("pymor"), row["memory_mb"]]
         lines.append("| " + " | ".join(cells + [_number(value) for value in numbers]) + " |")
     path.write_text("\n".join(lines) + "\n")
 
@@ -226,7 +237,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """One line a row, numbers in full. Not collective."""
     names = ["problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats"]
     stages = ["mesh", "assembly", "factor"]
-    last = ["ratio", "drift", "residual", "memory_mb", "memory_base_mb", "error"]
+    last = ["ratio", "ratio_own", "drift", "residual", "memory_mb", "memory_base_mb", "error"]
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(names + [f"{s}_s" for s in stages] + [f"{m}_us" for m in METHODS] + last)
@@ -240,14 +251,14 @@ def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
     """Per-step time against size for every method, log-log, 2D full and 3D hollow, on one rank (else the fewest)."""
     import matplotlib.pyplot as plt
 
-    from study.style import BLUE, GREEN, HAND, ORANGE, PURPLE, paper_style, save
+    from study.style import BLUE, GREEN, HAND, ORANGE, PURPLE, SKY, paper_style, save
 
     good = [row for row in rows if "error" not in row]
     fewest = min((row["ranks"] for row in good), default=1)
     good = [row for row in good if row["ranks"] == fewest]
     with paper_style():
         figure, axes = plt.subplots(figsize=(4.2, 3.1))
-        colours = dict(zip(METHODS, (BLUE, HAND, GREEN, ORANGE, PURPLE), strict=True))
+        colours = dict(zip(METHODS, (BLUE, HAND, SKY, GREEN, ORANGE, PURPLE), strict=True))
         for name, label in METHODS.items():
             for d, fill in ((2, "full"), (3, "none")):
                 points = sorted(
@@ -257,7 +268,7 @@ def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
                 )
                 if points:
                     n, us = zip(*points, strict=True)
-                    style = "--" if name == "solve" else "-"
+                    style = "--" if name in ("solve", "own") else "-"
                     shown = label if d == 2 else f"{label}, 3D"
                     axes.loglog(n, us, style, marker="o", ms=4, fillstyle=fill, color=colours[name], label=shown)
         axes.set_xlabel("tissue unknowns $n_e$")
@@ -303,7 +314,7 @@ def main(
     if any(variable in os.environ for variable in IN_MPI_JOB):
         raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
     terminal = Console(highlight=False)
-    console = Console(highlight=False, width=max(terminal.width, 160), soft_wrap=True)
+    console = Console(highlight=False, width=max(terminal.width, 175), soft_wrap=True)
     rows = collect(console, wanted, counts, repeats, large)
     show(console, rows)
     out.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ Every method starts from rest, takes the load l_n = G c_n of step n and can be a
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,15 @@ class TextbookLoop:
     Args:
         system: operators.
         dt: step [s].
-        ksp: factored S = K + s^2 M with s = 2/dt.
+        solve: S w = r with S = K + s^2 M and s = 2/dt, as a function of r and w.
         loads: c_n, shape (steps, n_s).
     """
 
-    def __init__(self, system: BlockSystem, dt: float, ksp: PETSc.KSP, loads: Array) -> None:
+    def __init__(
+        self, system: BlockSystem, dt: float, solve: Callable[[PETSc.Vec, PETSc.Vec], None], loads: Array
+    ) -> None:
         self.K, self.M, self.G = system.K_ee, system.M_ee, system.G
-        self.s, self.ksp, self.loads, self.n = 2 / dt, ksp, loads, 0
+        self.s, self.solve, self.loads, self.n = 2 / dt, solve, loads, 0
         self.z, self.v, self.r, self.y, self.w, self.load = (system.K_ee.createVecRight() for _ in range(6))
 
     def advance(self, k: int) -> None:
@@ -42,14 +44,14 @@ class TextbookLoop:
             self.K.mult(self.z, self.y)
             self.r.axpby(-1.0, s, self.y)
             self.r.axpy(1.0, self.load)
-            self.ksp.solve(self.r, self.w)
+            self.solve(self.r, self.w)
             self.z.axpy(2.0, self.w)
             self.v.axpby(2 * s, -1.0, self.w)
         self.n += k
 
 
 class BareSolve:
-    """Nothing but the triangular solves with one right-hand side. Collective."""
+    """Nothing but the triangular solves with one right-hand side: those that a step of the run does. Collective."""
 
     def __init__(self, solver: TissueSolver, r: PETSc.Vec) -> None:
         self.r, self.w = r.copy(), r.duplicate()
@@ -59,6 +61,30 @@ class BareSolve:
         """Solve k times. Collective."""
         for _ in range(k):
             self.solve(self.r, self.w)
+
+
+class PlainCholesky(BareSolve):
+    """The solves of PETSc's Cholesky as ``-pc_type cholesky`` gives it: single entries, its nested dissection.
+
+    Args:
+        S: the matrix, all of it on one rank; consumed.
+
+    Attributes:
+        ksp: the factored solver.
+    """
+
+    def __init__(self, S: PETSc.Mat) -> None:
+        S.setOption(PETSc.Mat.Option.SPD, True)
+        self.ksp = PETSc.KSP().create(S.comm)
+        self.ksp.setOperators(S)
+        self.ksp.setType("preonly")
+        self.ksp.getPC().setType("cholesky")
+        self.ksp.getPC().setFactorOrdering("nd")
+        self.ksp.setUp()
+        self.r, self.w = S.createVecs()
+        self.r.set(1.0)
+        self.solve = self.ksp.getPC().getFactorMatrix().solve
+        S.destroy()  # the ksp holds it
 
 
 def to_scipy(A: PETSc.Mat) -> Any:

@@ -187,7 +187,7 @@ def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
 
 def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """Set-up and step of the forward run with PETSc's Cholesky and with MUMPS."""
-    for d, size in ((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000)):
+    for d, size in ((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000), (3, 20_000)):
         model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
         names = f"CHOLESKY_LIMIT = {fem.solvers.CHOLESKY_LIMIT[d]}"
         yield from _two(comm, model, ("cholesky", "auto"), ("mumps", "auto"), ("set-up", "step"), names, repeats)

@@ -18,12 +18,13 @@ from fem.build import Model, build
 from fem.drive import TableDrive
 from fem.errors import SolverError
 from fem.midpoint import midpoint_matrix
+from fem.petsc import Array, whole_copy
 from fem.run import Run, RunOptions, simulate
 from fem.scene import Scene
 from fem.scene_file import load_scene_collective, shipped_scenes
 from fem.solvers import make_solver
 from fem.stepping import make_ts
-from study.bench_peers import BareSolve, PymorLoop, ScipyLoop, TextbookLoop, has_pymor, to_scipy
+from study.bench_peers import BareSolve, PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, has_pymor, to_scipy
 from study.workers import leave_result
 
 DT = 0.005  # [s], that of the paper: 600 steps in 3 s
@@ -132,14 +133,10 @@ def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dic
 
 def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int, peers: bool) -> dict[str, Any]:
     """Per-step times of all methods [us] and the energy drift of the TS run."""
-    system = model.system
     run = Run(model, RunOptions())
     ts = make_ts(run)
     run.start()
     run.advance_to(ts, 2)
-    if not isinstance(run.drive, TableDrive):
-        raise SolverError("the benchmark needs a hand with a prescribed motion")
-    loads = run.drive.c
 
     def advance() -> None:
         run.advance_to(ts, run.reached + k)
@@ -157,30 +154,27 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int,
 
         return steps
 
-    ksp, own = run.midpoint.solver.ksp, None
-    if run.midpoint.held.whole:  # the textbook loop works on distributed vectors
-        own = make_solver(midpoint_matrix(system, DT), run.solver[0], system.layout, "textbook_")
-        ksp = own.ksp
-    methods = {
-        "ts": of_ts,
-        "solve": of(BareSolve(run.midpoint.solver, run.midpoint.r), k),
-        "loop": of(TextbookLoop(system, DT, ksp, loads), k),
-    }
+    loops, made = _loops(run)
+    methods = {"ts": of_ts} | {name: of(loop, k) for name, loop in loops.items()}
     factor = {}
     if peers and comm.size == 1:
-        K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
         begin = time.perf_counter()
-        scipy_loop = ScipyLoop(K, M, system.G, DT, loads)
+        others = _peers(run)
         factor["scipy"] = time.perf_counter() - begin
-        methods["scipy"] = of(scipy_loop, peer_k)
-        if has_pymor() and system.layout.n_e <= PYMOR_LIMIT:
-            methods["pymor"] = of(PymorLoop(K, M, system.G, DT, loads), peer_k)
+        methods |= {name: of(loop, peer_k) for name, loop in others.items()}
     samples = interleave(methods, repeats)
+
+    def ratio(name: str) -> float | None:
+        if name not in samples:
+            return None
+        return statistics.median(a / b for a, b in zip(samples["ts"], samples[name], strict=True))
+
     residual = run.check_step(ts, run.reached + 1)
     result = {
         "step_us": medians(samples),
         "samples_us": samples,
-        "ratio": statistics.median(a / b for a, b in zip(samples["ts"], samples["solve"], strict=True)),
+        "ratio": ratio("solve"),
+        "ratio_own": ratio("own"),
         "factor_peer_s": factor,
         "drift": run.drift(),
         "drift_steps": run.reached,
@@ -188,10 +182,42 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int,
         "solver": run.solver[0],
     }
     ts.destroy()
-    run.midpoint.destroy()
-    if own is not None:
-        own.destroy()
+    for thing in (run.midpoint, *made):
+        thing.destroy()
     return result
+
+
+def _loads(run: Run) -> Array:
+    if not isinstance(run.drive, TableDrive):
+        raise SolverError("the benchmark needs a hand with a prescribed motion")
+    return run.drive.c
+
+
+def _loops(run: Run) -> tuple[dict[str, Any], list[Any]]:
+    """The bare solves and the textbook loop, and what is to be freed after them. Collective."""
+    system, midpoint, name = run.model.system, run.midpoint, run.solver[0]
+    bare = BareSolve(midpoint.solver, midpoint.r)
+    loops: dict[str, Any] = {"solve": bare}
+    made: list[Any] = []
+    solve = midpoint.solver.solve
+    if name == "cholesky":
+        plain = PlainCholesky(whole_copy(midpoint_matrix(system, DT)))
+        loops, solve, made = {"solve": plain, "own": bare}, plain.solve, [plain.ksp]
+    if midpoint.held.whole and system.layout.comm.size > 1:  # the textbook loop works on distributed vectors
+        made.append(make_solver(midpoint_matrix(system, DT), name, system.layout, "textbook_"))
+        solve = made[-1].solve
+    loops["loop"] = TextbookLoop(system, DT, solve, _loads(run))
+    return loops, made
+
+
+def _peers(run: Run) -> dict[str, Any]:
+    """SciPy's loop, factored, and pyMOR's where it is installed and small enough. Not collective."""
+    system = run.model.system
+    K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
+    found: dict[str, Any] = {"scipy": ScipyLoop(K, M, system.G, DT, _loads(run))}
+    if has_pymor() and system.layout.n_e <= PYMOR_LIMIT:
+        found["pymor"] = PymorLoop(K, M, system.G, DT, _loads(run))
+    return found
 
 
 def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repeats: int) -> dict[str, Any]:

@@ -119,12 +119,13 @@ def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
     """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection. Not collective.
 
     nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
-    (2D) and 5e2 to 2e5 (3D) unknowns; 12 byte an entry.
+    (2D) and 5e2 to 2e5 (3D) unknowns; 8 byte an entry and 4 an index, of which cholesky has one for d^2 entries.
     """
     if name == "cg" or n < 2:
         return 0.0
     row = 7.75 * np.log2(n) - 44 if dimension == 2 else 19.5 * n ** (1 / 3) - 85
-    return float(12 * n * np.clip(row, 1, (n + 1) / 2) * copies)
+    entry = 8 + (4 / dimension**2 if name == "cholesky" else 4)
+    return float(entry * n * np.clip(row, 1, (n + 1) / 2) * copies)
 
 
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:

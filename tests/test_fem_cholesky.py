@@ -1,0 +1,204 @@
+"""The factor in blocks: its order, its solves on any number of ranks, and when single entries take over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from fem.build import build
+from fem.cholesky import BACKWARD_ERROR, backward_error, factor_blocks
+from fem.errors import Interrupted, SolverError
+from fem.midpoint import TissueMidpoint, midpoint_matrix, state_on
+from fem.order import node_order
+from fem.petsc import whole_copy
+from fem.run import RunOptions, simulate
+from fem.solvers import make_solver
+from tests.helpers import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
+
+SCENES: dict[str, dict[str, Any]] = {"2d": {}, "3d": CUBE, "p2": {"tissue": {"order": 2}}}
+# a block 1e6 times as stiff as the one it hangs from, lambda = 0
+HANGING: dict[str, Any] = {
+    "tissue": {
+        "cells": [4, 8],
+        "order": 2,
+        "material": {"lambda": 0.0, "mu": 50.0, "rho": 1.0},
+        "layers": {"low": {"box": [[0.0, 0.0], [1.0, 1.0]], "material": {"lambda": 0.0, "mu": 5e7, "rho": 1.0}}},
+    },
+    "contact": {"sides": ["top"], "box": [[0.0, 0.0], [1.0, 2.0]]},
+}
+
+
+def factor_of(ksp: PETSc.KSP) -> PETSc.Mat:
+    return ksp.getPC().getFactorMatrix()
+
+
+def kept_nonzeros(P: PETSc.Mat, ordering: str) -> float:
+    """Entries of PETSc's own factor of single entries."""
+    ksp = PETSc.KSP().create(P.comm)
+    ksp.setOperators(P)
+    ksp.setType("preonly")
+    ksp.getPC().setType("cholesky")
+    ksp.getPC().setFactorOrdering(ordering)
+    ksp.setUp()
+    kept = float(factor_of(ksp).getInfo()["nz_used"])
+    ksp.destroy()
+    return kept
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_order_moves_nodes_and_comes_back(comm: MPI.Intracomm, name: str) -> None:
+    system = build(make_scene(SCENES[name]), comm).system
+    d, n = system.layout.dimension, system.layout.n_e
+    K = whole_copy(system.K_ee)
+    order = node_order(K)
+    assert sorted(order.nodes.tolist()) == list(range(n // d))
+    x = np.random.default_rng(0).standard_normal((n, 2))
+    moved = order.enter(x)
+    assert np.array_equal(moved.reshape(-1, d, 2), x.reshape(-1, d, 2)[order.nodes])
+    assert np.array_equal(order.leave(moved), x)
+    P = order.permute(K)
+    rows = order.enter(np.arange(n))
+    dense = K.convert("dense", PETSc.Mat()).getDenseArray()
+    assert np.array_equal(P.convert("dense", PETSc.Mat()).getDenseArray(), dense[np.ix_(rows, rows)])
+
+
+@pytest.mark.serial
+def test_order_keeps_the_factor_thin(comm: MPI.Intracomm) -> None:
+    system = build(make_scene(tissue={"cells": [40, 80]}), comm).system
+    order = node_order(system.K_ee)
+    P = order.permute(system.K_ee)
+    ksp = factor_blocks(P, "test_")
+    kept = factor_of(ksp).getInfo()["nz_used"]
+    # nodes instead of their rows in the same dissection: as thin as PETSc's own order, the mesh's own is twice as thick
+    assert kept < 1.1 * kept_nonzeros(system.K_ee, "nd")
+    assert kept < 0.7 * kept_nonzeros(system.K_ee, "natural")
+    ksp.destroy()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_solves_agree_with_a_dense_solve_on_any_ranks(comm: MPI.Intracomm, name: str) -> None:
+    system = build(make_scene(SCENES[name]), comm).system
+    layout = system.layout
+    S = midpoint_matrix(system, 0.01)
+    dense = gather_matrix(layout, S).toarray()
+    solver = make_solver(S, "cholesky", layout, "test_")
+    assert factor_of(solver.ksp).getBlockSize() == layout.dimension
+    r, w = S.createVecs()
+    for seed in (1, 2):  # the second one finds used vectors
+        full = np.random.default_rng(seed).standard_normal(layout.n_e)
+        r.array_w[:] = local_rows(layout, full)
+        solver.solve(r, w)
+        # condition about 1e2
+        assert close(gather_rows(layout, w.array_r), np.linalg.solve(dense, full)) < 1e-12
+        assert solver.residual(r, w) < 1e-13  # as above
+    solver.destroy()
+
+
+def test_single_entries_take_over_where_blocks_lose_digits(comm: MPI.Intracomm) -> None:
+    system = build(make_scene(HANGING), comm).system
+    K = whole_copy(system.K_ee)
+    P = node_order(K).permute(K)
+    blocks = P.convert("sbaij", PETSc.Mat())
+    ksp = PETSc.KSP().create(P.comm)
+    ksp.setOperators(blocks)
+    ksp.setType("preonly")
+    ksp.getPC().setType("cholesky")
+    ksp.getPC().setFactorOrdering("natural")
+    assert backward_error(P, ksp) > BACKWARD_ERROR
+    chosen = factor_blocks(P, "test_")
+    assert factor_of(ksp).getBlockSize() == 2
+    assert factor_of(chosen).getBlockSize() == 1
+    assert backward_error(P, chosen) < BACKWARD_ERROR
+    # the scale of rows and columns is no matter
+    scale = P.createVecLeft()
+    scale.array_w[:] = 10.0 ** np.random.default_rng(0).integers(-5, 6, P.getSize()[0])
+    P.diagonalScale(scale, scale)
+    again = factor_blocks(P, "test_")
+    assert backward_error(P, again) < BACKWARD_ERROR
+    for solver in (ksp, chosen, again):
+        solver.destroy()
+
+
+def test_run_says_when_single_entries_took_over(comm: MPI.Intracomm) -> None:
+    still = {"motion": {"profile": "hold", "target": None}, "time": {"steps": 1, "end": 1.0}}
+    for changes, remark in ((HANGING, True), ({}, False)):
+        run = simulate(build(make_scene(changes, still), comm))
+        assert ("single entries" in run.solver[1]) == remark
+        assert run.energy_drift == 0.0  # nothing moves
+
+
+def test_step_does_not_lose_what_blocks_would(comm: MPI.Intracomm) -> None:
+    """One long step of the hanging scene against a dense solve: the stiff part's stretch is 1e-6 of its motion."""
+    system = build(make_scene(HANGING), comm).system
+    layout = system.layout
+    midpoint = TissueMidpoint(system, 1.0, "cholesky")
+    state = state_on(np.zeros(2 * layout.n_local), system)
+    midpoint.start(state)
+    midpoint.solve_midpoint(np.array([0.0, -1.0]))
+    midpoint.advance(state, state)
+    S = gather_matrix(layout, midpoint_matrix(system, 1.0)).toarray()
+    exact = 2 * np.linalg.solve(S, gather_rows(layout, system.G) @ [0.0, -1.0])
+    # eps times the condition 7e9 of S scaled to a unit diagonal [VDS69]; blocks leave 1e-5
+    assert close(gather_rows(layout, state.z.array_r), exact) < 1.5e-6
+    midpoint.destroy()
+
+
+def test_backward_error_is_that_of_the_matrix_solved_with(comm: MPI.Intracomm) -> None:
+    """The factor of P + 1e-6 D^2, D^2 = diag P, leaves D^-1 (r - P w) = 1e-6 D w."""
+    system = build(make_scene(), comm).system
+    K = whole_copy(system.K_ee)
+    P = node_order(K).permute(K)
+    other, diagonal = P.copy(), P.getDiagonal()
+    diagonal.scale(1 + 1e-6)
+    other.setDiagonal(diagonal)
+    ksp = factor_blocks(other, "test_")
+    # a soft body answers with |D w| well above |D^-1 r|, their sum is what counts
+    assert 0.5e-6 < backward_error(P, ksp) < 1e-6
+    ksp.destroy()
+
+
+def test_vanishing_pivot_is_named_on_every_rank(comm: MPI.Intracomm) -> None:
+    system = build(make_scene(), comm).system
+    S = system.K_ee.copy()
+    S.zeroEntries()
+    with pytest.raises(SolverError, match=r"cholesky: the factorisation of the tissue matrix \(n_e = \d+\) failed"):
+        make_solver(S, "cholesky", system.layout, "test_")
+
+
+def test_state_and_vectors_held_whole_keep_the_same_bits(comm: MPI.Intracomm) -> None:
+    system = build(make_scene(), comm).system
+    layout = system.layout
+    midpoint = TissueMidpoint(system, 0.01, "cholesky")
+    z, v = np.random.default_rng(3).standard_normal((2, layout.n_e))
+    state = state_on(np.concatenate([local_rows(layout, z), local_rows(layout, v)]), system)
+    midpoint.start(state)
+    for _ in range(5):
+        midpoint.solve_midpoint(np.ones(2))
+        midpoint.advance(state, state)
+    own = slice(layout.start, layout.start + layout.n_local)
+    assert np.array_equal(midpoint.held.leave(midpoint.z.array_r)[own], state.z.array_r)
+    midpoint.destroy()
+
+
+def test_restart_file_holds_the_right_hand_side_in_the_order_of_the_layout(
+    comm: MPI.Intracomm, mpi_tmp_path: Path
+) -> None:
+    model = build(make_scene(), comm)
+    with pytest.raises(Interrupted):
+        simulate(model, RunOptions(mpi_tmp_path, until=7))
+    system, layout = model.system, model.system.layout
+    with h5py.File(mpi_tmp_path / "checkpoint" / f"step7-rank{comm.rank}.h5") as file:
+        r, pending, state = file["r"][:], file["pending"][:], state_on(file["state"][:], system)
+    y, k = system.K_ee.createVecs()
+    system.M_ee.mult(state.v, y)
+    system.K_ee.mult(state.z, k)
+    s = 2 * model.scene.time.steps / model.scene.time_end
+    h = s * y.array_r - k.array_r
+    own = slice(layout.start, layout.start + layout.n_local)
+    assert close(r[own] + system.G @ pending, h) < 1e-10  # seven steps of rounding in differences of large terms
