@@ -190,7 +190,7 @@ def make_solver(
     if name == "cg":
         _set_up_cg(ksp, S, layout, prefix, rtol)
     else:
-        _set_up_mumps(ksp, prefix, factor_on_every_rank(layout, name, reproducible))
+        _set_up_mumps(ksp, prefix, S.comm.size > 1 and factor_on_every_rank(layout, name, reproducible))
     try:
         _factor(ksp, S, name)
     except SolverError:
