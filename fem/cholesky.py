@@ -23,7 +23,7 @@ def factor_blocks(P: PETSc.Mat, prefix: str) -> PETSc.KSP:
     """Factor P = P' > 0 in the order of its rows, in blocks where that is stable. Not collective.
 
     Args:
-        P: the matrix in single entries (AIJ), on this rank alone; its block size is d.
+        P: the matrix in blocks of d x d (BAIJ), on this rank alone.
         prefix: PETSc options prefix.
 
     Raises:
@@ -35,7 +35,10 @@ def factor_blocks(P: PETSc.Mat, prefix: str) -> PETSc.KSP:
     if _factored(ksp) and backward_error(P, ksp) <= BACKWARD_ERROR:
         return ksp
     ksp.destroy()
-    ksp = _natural(P, prefix)
+    entries = P.convert("aij", PETSc.Mat())
+    entries.setOption(PETSc.Mat.Option.SPD, True)
+    ksp = _natural(entries, prefix)
+    entries.destroy()
     if not _factored(ksp):
         ksp.destroy()
         raise SolverError(

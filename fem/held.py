@@ -86,14 +86,14 @@ def held_operators(system: BlockSystem, whole: bool, ordered: bool) -> Held:
         K = whole_copy(system.K_ee)
         rows, G = slice(layout.start, layout.start + n), rows_on_all(layout.comm, system.G)
         if ordered:
-            every, order = K, node_order(K)
-            K = order.permute(every)
+            every, order = K, node_order(K, layout.dimension)
+            K = order.matrix(every)
             every.destroy()
             rows, G = order.leave(np.arange(layout.n_e))[rows], order.enter(G)
         D, M = (None if A is None else _whole(A, order) for A in (D, M))
     else:
         G, K = system.G, system.K_ee.copy()
-    if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
+    if K.comm.size == 1 and order is None:  # the conversion of a parallel matrix takes its source apart
         K.convert("baij")
     return Held(layout, whole, order, rows, K, np.asfortranarray(G), D, M)
 
@@ -103,6 +103,6 @@ def _whole(A: PETSc.Mat, order: NodeOrder | None) -> PETSc.Mat:
     every = whole_copy(A)
     if order is None:
         return every
-    result = order.permute(every)
+    result = order.matrix(every)
     every.destroy()
     return result

@@ -81,7 +81,7 @@ class TissueSolver:
     @property
     def remark(self) -> str:
         """What to add to the reason of the choice: single entries cost twice the time of a solve. Not collective."""
-        if self.name != "cholesky" or self.ksp.getPC().getFactorMatrix().getBlockSize() == self.S.getBlockSize():
+        if self.name != "cholesky" or "sbaij" in self.ksp.getOperators()[0].getType():
             return ""
         return "; in single entries, since blocks would lose digits here"
 
@@ -175,7 +175,7 @@ def make_solver(
         prefix: PETSc options prefix.
         rtol: relative tolerance of cg.
         reproducible: see :func:`factor_on_every_rank`.
-        ordered: cholesky, S on one rank: its rows are in the order of elimination already.
+        ordered: cholesky, S on one rank: its rows are in the order of elimination already, in blocks (BAIJ).
 
     Raises:
         SolverError: the factorisation fails.
@@ -183,7 +183,7 @@ def make_solver(
     S.setOption(PETSc.Mat.Option.SPD, True)
     tolerance = max(DIRECT_RESIDUAL, 10 * rtol)
     if name == "cholesky":
-        return _cholesky(S, prefix, tolerance, ordered)
+        return _cholesky(S, layout, prefix, tolerance, ordered)
     ksp = PETSc.KSP().create(S.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setOperators(S)
@@ -201,13 +201,13 @@ def make_solver(
     return TissueSolver(name, ksp, S, tolerance, factor)
 
 
-def _cholesky(S: PETSc.Mat, prefix: str, tolerance: float, ordered: bool) -> TissueSolver:
+def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, ordered: bool) -> TissueSolver:
     """Every rank factors the whole matrix. Collective."""
     P, order = S, None
     if not ordered:
         every = whole_copy(S)
-        order = node_order(every)
-        P = order.permute(every)
+        order = node_order(every, layout.dimension)
+        P = order.matrix(every)
         every.destroy()
     try:
         with agree(S.comm.tompi4py()):
