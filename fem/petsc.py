@@ -17,6 +17,7 @@ from fem import _stack as _stack
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
+MANY_COLUMNS = 8  # below, setting up a product of matrices costs more than it saves
 
 
 @contextmanager
@@ -85,7 +86,9 @@ def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
 
 
 def times_columns(A: PETSc.Mat, X: Array) -> Array:
-    """Return the local rows of A X for a few dense columns, shape (n_local, k). Collective."""
+    """Return the local rows of A X for dense columns, shape (n_local, k), Fortran order. Collective."""
+    if X.shape[1] >= MANY_COLUMNS and A.getType() != PETSc.Mat.Type.PYTHON:
+        return _times_dense(A, X)
     x, y = A.createVecs()
     result = np.empty((y.getLocalSize(), X.shape[1]), order="F")
     for j in range(X.shape[1]):
@@ -95,3 +98,14 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     x.destroy()
     y.destroy()
     return result
+
+
+def _times_dense(A: PETSc.Mat, X: Array) -> Array:
+    """The same by PETSc's product with a dense matrix, which reads A once for several columns. Collective."""
+    sizes = (A.getSizes()[1], (None, X.shape[1]))
+    dense = PETSc.Mat().createDense(sizes, array=np.asfortranarray(X), comm=A.comm)
+    product = A.matMult(dense)
+    result = product.getDenseArray().copy(order="K")
+    product.destroy()
+    dense.destroy()
+    return np.asarray(result)

@@ -1,4 +1,4 @@
-"""The true residual of a low-rank Riccati solution, recomputed from Z by code that shares nothing with the solvers.
+"""The true residual of a low-rank Riccati solution, recomputed from Z; of the solvers' code it shares PETSc's products.
 
     Res = A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = U D U',   X = Z Z',   U = [A'Z, E'Z, C'],
     D = [0 I 0; I -Z'B R^{-1} B'Z 0; 0 0 Q]
@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from mpi4py import MPI
 
-from fem.petsc import Array, PETSc
+from fem.petsc import Array, times_columns
 from lqr.problem import RiccatiProblem
 
 ROWS = 4_000  # rows of U that are reduced at a time
@@ -76,11 +76,11 @@ def _fill_tissue(problem: RiccatiProblem, candidate: Candidate, top: Array, bott
     """Local rows z and v_z of [A'Z, E'Z, C']. Collective."""
     system, damping = problem.system, problem.system.damping
     rank, b_s = candidate.Z_z.shape[1], candidate.Z_s[problem.layout.n_s :]
-    stiff, mass = _times(system.K_ee, candidate.Z_v), _times(system.M_ee, candidate.Z_v)
+    stiff, mass = times_columns(system.K_ee, candidate.Z_v), times_columns(system.M_ee, candidate.Z_v)
     np.negative(stiff, out=top[:, :rank])
     bottom[:, :rank] = candidate.Z_z - damping.beta * stiff - damping.alpha * mass
     if damping.matrix is not None:
-        bottom[:, :rank] -= _times(damping.matrix, candidate.Z_v)
+        bottom[:, :rank] -= times_columns(damping.matrix, candidate.Z_v)
     top[:, rank : 2 * rank] = candidate.Z_z
     bottom[:, rank : 2 * rank] = mass
     top[:, 2 * rank :] = problem.C_z
@@ -89,17 +89,6 @@ def _fill_tissue(problem: RiccatiProblem, candidate: Candidate, top: Array, bott
         bottom[:, rank : 2 * rank] += G_b_s
         if damping.in_space:
             bottom[:, :rank] -= damping.alpha * G_b_s
-
-
-def _times(A: PETSc.Mat, X: Array) -> Array:
-    """Local rows of A X by PETSc's product with a dense matrix. Collective."""
-    sizes = (A.getSizes()[1], (None, X.shape[1]))
-    dense = PETSc.Mat().createDense(sizes, array=np.asfortranarray(X), comm=A.comm)
-    product = A.matMult(dense)
-    result = product.getDenseArray().copy(order="K")
-    product.destroy()
-    dense.destroy()
-    return np.asarray(result)
 
 
 def _triangular(comm: MPI.Intracomm, U: Array) -> Array:
