@@ -132,7 +132,10 @@ def _restore(run: Run, file: h5py.File, step: int) -> None:
     run.store.restore(np.asarray(file["snapshots"]), step)
     run.state = run.store.target(step)
     run.state.array[:] = file["state"][:]
-    run.midpoint.r.array_w[:] = run.midpoint.held.enter(file["r"][:])
+    r = file["r"][:]
+    if r.shape != run.midpoint.r_array.shape:
+        raise ValueError(f"r has {len(r)} rows, the run {len(run.midpoint.r_array)}")
+    run.midpoint.r.array_w[:] = run.midpoint.held.enter(r)
     run.midpoint.pending = file["pending"][:]
     run.drive.q[:n] = file["hand_q"][:]
     run.drive.v[:n] = file["hand_v"][:]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fem.errors import agree
 from fem.layout import BlockLayout
-from fem.order import NodeOrder, node_order
+from fem.order import Dissection, NodeOrder, dissect
 from fem.petsc import Array, PETSc, rows_on_all, whole_copy
 from fem.system import BlockSystem
 
@@ -27,6 +27,7 @@ class Held:
         rows: places of the owned rows among those held.
         K: stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries.
         G: coupling to the hand, (rows held, n_s).
+        S: matrix of the step; whoever factors it owns it.
         D: damping matrix, or None.
         M: mass, only beside D.
     """
@@ -37,6 +38,7 @@ class Held:
     rows: slice | NDArray[np.intp]
     K: PETSc.Mat
     G: Array
+    S: PETSc.Mat
     D: PETSc.Mat | None
     M: PETSc.Mat | None
 
@@ -59,14 +61,6 @@ class Held:
         """Rows held in the order of the layout. Not collective."""
         return x if self.order is None else self.order.leave(x)
 
-    def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
-        """The matrix on the rows held; consumes A. Collective."""
-        if not self.whole:
-            return A
-        copy = _whole(A, self.order)
-        A.destroy()
-        return copy
-
     def destroy(self) -> None:
         """Free what is not the system's own. Collective."""
         self.K.destroy()
@@ -76,33 +70,39 @@ class Held:
                     A.destroy()
 
 
-def held_operators(system: BlockSystem, whole: bool, ordered: bool) -> Held:
-    """Operators of a system on the owned rows, or on all, these on request in the order of elimination. Collective."""
+def held_operators(system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool) -> Held:
+    """Operators of a system on the owned rows, or on all. Collective.
+
+    Args:
+        system: operators.
+        S: matrix of the step, consumed.
+        whole: every rank holds all rows.
+        ordered: in the order of elimination; all rows then.
+    """
     layout, D = system.layout, system.damping.matrix
     M = None if D is None else system.M_ee
-    order, n = None, layout.n_local
-    rows: slice | NDArray[np.intp] = slice(0, n)
-    if whole:
-        K = whole_copy(system.K_ee)
-        rows, G = slice(layout.start, layout.start + n), rows_on_all(layout.comm, system.G)
-        if ordered:
-            every, order = K, node_order(K, layout.dimension)
-            K = order.matrix(every)
-            every.destroy()
-            rows, G = order.leave(np.arange(layout.n_e))[rows], order.enter(G)
-        D, M = (None if A is None else _whole(A, order) for A in (D, M))
-    else:
-        G, K = system.G, system.K_ee.copy()
-    if K.comm.size == 1 and order is None:  # the conversion of a parallel matrix takes its source apart
+    first, last = layout.start, layout.start + layout.n_local
+    if not (whole or ordered):
+        K = system.K_ee.copy()
+        if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
+            K.convert("baij")
+        return Held(layout, False, None, slice(0, layout.n_local), K, np.asfortranarray(system.G), S, D, M)
+    K, step = whole_copy(system.K_ee), whole_copy(S)
+    D, M = (None if A is None else whole_copy(A) for A in (D, M))
+    S.destroy()
+    G = rows_on_all(layout.comm, system.G)
+    if not ordered:
         K.convert("baij")
-    return Held(layout, whole, order, rows, K, np.asfortranarray(G), D, M)
+        return Held(layout, True, None, slice(first, last), K, np.asfortranarray(G), step, D, M)
+    found = dissect(K, layout.dimension)
+    K, step = _moved(found, K), _moved(found, step)
+    D, M = (None if A is None else _moved(found, A) for A in (D, M))
+    order = found.order
+    return Held(layout, True, order, order.rows_of(first, last), K, np.asfortranarray(order.enter(G)), step, D, M)
 
 
-def _whole(A: PETSc.Mat, order: NodeOrder | None) -> PETSc.Mat:
-    """All rows on every rank, in the order of elimination if there is one. Collective."""
-    every = whole_copy(A)
-    if order is None:
-        return every
-    result = order.matrix(every)
-    every.destroy()
+def _moved(found: Dissection, A: PETSc.Mat) -> PETSc.Mat:
+    """A in the order found; consumes A. Not collective."""
+    result = found.matrix(A)
+    A.destroy()
     return result

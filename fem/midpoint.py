@@ -94,16 +94,14 @@ class TissueMidpoint:
         reproducible: Reproducible = "auto",
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
-        ordered = solver == "cholesky"
-        whole = ordered or factor_on_every_rank(system.layout, solver, reproducible)
-        self.held = held_operators(system, whole, ordered)
+        whole, ordered = factor_on_every_rank(system.layout, solver, reproducible), solver == "cholesky"
+        self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered)
         self.G, self.rows = self.held.G, self.held.rows
         self.K2 = self.held.K
         self.K2.scale(-2.0)
-        S = self.held.matrix(midpoint_matrix(system, dt))
         with self.held.agree():
             self.solver: TissueSolver = make_solver(
-                S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
+                self.held.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
             )
         self._solve = self.solver.solve if self.solver.factor is None else self.solver.factor.solve
         self.r, self.k, self.w = (self.K2.createVecLeft() for _ in range(3))
@@ -131,13 +129,12 @@ class TissueMidpoint:
 
     def _picker(self) -> Callable[[], object]:
         """What copies the owned rows of w to x. Not collective."""
-        held, d = self.held, self.w.getBlockSize()
-        if held.order is not None:
-            first = held.layout.start // d
-            places = held.order.places[first : first + len(self.x_array) // d]
-            w, x = self.w_array.reshape(-1, d), self.x_array.reshape(-1, d)
+        layout, order = self.system.layout, self.held.order
+        if order is not None:
+            w, x = (array.reshape(-1, order.d) for array in (self.w_array, self.x_array))
+            places = order.places_of(layout.start, layout.start + layout.n_local)
             return partial(w.take, places, 0, x, "clip")  # "raise" would copy x
-        if held.whole:
+        if self.held.whole:
             return partial(np.copyto, self.x_array, self.w_array[self.rows])
         return lambda: None  # x is w
 

@@ -8,7 +8,7 @@ from slepc4py import SLEPc
 
 from fem.errors import SolverError
 from fem.petsc import Array, PETSc
-from fem.solvers import CHOLESKY_LIMIT, SolverName, TissueSolver, make_solver
+from fem.solvers import FEW_LIMIT, SolverName, TissueSolver, make_solver
 from fem.system import BlockSystem
 
 PREFIX = "softgrasp_modes_"
@@ -85,7 +85,7 @@ class _Factored:
 def _factor(system: BlockSystem) -> TissueSolver:
     """The stiffness, factored. Collective."""
     layout = system.layout
-    name: SolverName = "cholesky" if layout.n_e <= CHOLESKY_LIMIT[layout.dimension] else "mumps"
+    name: SolverName = "cholesky" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps"
     try:
         return make_solver(system.K_ee.copy(), name, layout, PREFIX, reproducible=False)
     except SolverError as error:

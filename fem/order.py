@@ -20,16 +20,11 @@ class NodeOrder:
         nodes: the node at each place, (nodes,).
         places: the place of each node, its inverse.
         d: rows of a node.
-        indptr, indices: pattern of the blocks of d x d in this order.
-        source: where each of them stood before, among the blocks in the order of their rows.
     """
 
     nodes: NDArray[np.intp]
     places: NDArray[np.intp]
     d: int
-    indptr: NDArray[np.int32]
-    indices: NDArray[np.int32]
-    source: NDArray[np.intp]
 
     def enter(self, x: NDArray[Any]) -> NDArray[Any]:
         """Rows (n, ...) in this order, a copy. Not collective."""
@@ -39,38 +34,62 @@ class NodeOrder:
         """Rows (n, ...) of this order as they were before, a copy. Not collective."""
         return x[_rows(self.places, self.d)]
 
+    def places_of(self, first: int, last: int) -> NDArray[np.intp]:
+        """Places of the nodes that had the rows from first to before last. Not collective."""
+        return self.places[first // self.d : last // self.d]
+
+    def rows_of(self, first: int, last: int) -> NDArray[np.intp]:
+        """Where the rows from first to before last are now. Not collective."""
+        return _rows(self.places_of(first, last), self.d)
+
+
+@dataclass(frozen=True)
+class Dissection:
+    """An order and the pattern of blocks of d x d in it, for as long as matrices are put in order.
+
+    Attributes:
+        order: of the nodes.
+        before: row pointers and columns of the blocks before.
+        after: the same in this order.
+        source: where each block of ``after`` stood before.
+    """
+
+    order: NodeOrder
+    before: tuple[NDArray[Any], NDArray[Any]]
+    after: tuple[NDArray[Any], NDArray[Any]]
+    source: NDArray[np.intp]
+
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
         """A of the same pattern with rows and columns in this order, in blocks of d x d (BAIJ). Not collective.
 
         Raises:
             ValueError: A has another pattern.
         """
-        blocks = _blocks(A, self.d)
-        if len(blocks.indices) != len(self.source):
-            raise ValueError(f"{len(blocks.indices)} blocks, but the order is for a pattern of {len(self.source)}")
-        csr = (self.indptr, self.indices, blocks.data[self.source])
-        result = PETSc.Mat().createBAIJ(A.getSize(), self.d, csr=csr, comm=PETSc.COMM_SELF)
+        blocks = _blocks(A, self.order.d)
+        if not all(np.array_equal(a, b) for a, b in zip(self.before, (blocks.indptr, blocks.indices), strict=True)):
+            raise ValueError("the matrix does not have the pattern that was dissected")
+        csr = (*self.after, blocks.data[self.source])
+        result = PETSc.Mat().createBAIJ(A.getSize(), self.order.d, csr=csr, comm=PETSc.COMM_SELF)
         result.setOption(PETSc.Mat.Option.SPD, bool(A.isSymmetricKnown()[1]))
         return result
 
 
-def node_order(A: PETSc.Mat, d: int) -> NodeOrder:
+def dissect(A: PETSc.Mat, d: int) -> Dissection:
     """Nested dissection of the nodes of a matrix on one rank, d rows a node, with symmetric pattern. Not collective."""
     blocks = _blocks(A, d)
+    before = blocks.indptr, blocks.indices
+    count = len(blocks.indices)
     size = (len(blocks.indptr) - 1,) * 2
-    graph = (blocks.indptr, blocks.indices, np.ones(len(blocks.indices)))
-    pattern = PETSc.Mat().createAIJ(size, csr=graph, comm=PETSc.COMM_SELF)
-    found, same = pattern.getOrdering("nd")
+    graph = PETSc.Mat().createAIJ(size, csr=(*before, np.ones(count)), comm=PETSc.COMM_SELF)
+    found, same = graph.getOrdering("nd")
     nodes = found.getIndices().astype(np.intp)
-    for thing in (found, same, pattern):
+    for thing in (found, same, graph):
         thing.destroy()
-    numbered = scipy.sparse.csr_matrix((np.arange(len(blocks.indices)), blocks.indices, blocks.indptr), shape=size)
+    numbered = scipy.sparse.csr_matrix((np.arange(count), blocks.indices, blocks.indptr), shape=size)
     moved = numbered[nodes][:, nodes]
     moved.sort_indices()
-    integer = PETSc.IntType
-    return NodeOrder(
-        nodes, np.argsort(nodes), d, moved.indptr.astype(integer), moved.indices.astype(integer), moved.data
-    )
+    after = tuple(part.astype(PETSc.IntType) for part in (moved.indptr, moved.indices))
+    return Dissection(NodeOrder(nodes, np.argsort(nodes), d), before, after, moved.data)
 
 
 def _blocks(A: PETSc.Mat, d: int) -> Any:

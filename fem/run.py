@@ -157,7 +157,8 @@ class Run(Stepped):
         scene, system = self.model.scene, self.model.system
         if scene.time.start == "equilibrium" and system.gravity is not None:
             with self.model.watch.stage("equilibrium"):
-                self.state.z.array_w[:] = equilibrium(system, self.solver[0], scene.time)
+                name, _ = choose_solver(system.layout, scene.time.solver, few=True)
+                self.state.z.array_w[:] = equilibrium(system, name, scene.time)
         self.midpoint.start(self.state)
         self.record(0)
         self.initial_energy = self.midpoint.energy(self.state)

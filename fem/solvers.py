@@ -10,16 +10,18 @@ import numpy as np
 from fem.cholesky import OrderedFactor, factor_blocks
 from fem.errors import SolverError, agree
 from fem.layout import BlockLayout
-from fem.order import node_order
+from fem.order import dissect
 from fem.petsc import PETSc, petsc_options, whole_copy
 
 SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
 # Where each road ends on two ranks and 24 GiB: PETSc Cholesky in blocks is fastest per solve, but its factorisation is
-# the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (study.bench_switches); beyond
-# the last limits the factor itself no longer fits.
+# the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (study.bench_switches), but
+# not the few solves of an equilibrium or of modes, nor when single entries must do. Beyond the last limits the factor
+# itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
+FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
 # every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
@@ -32,13 +34,14 @@ DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
 
 
-def choose_solver(layout: BlockLayout, wanted: str = "auto") -> tuple[SolverName, str]:
-    """The solver for a size, with the reason in words. Not collective."""
+def choose_solver(layout: BlockLayout, wanted: str = "auto", few: bool = False) -> tuple[SolverName, str]:
+    """The solver for a size, with the reason in words; ``few`` solves with one factor. Not collective."""
     n, d = layout.n_e, layout.dimension
+    limit = (FEW_LIMIT if few else CHOLESKY_LIMIT)[d]
     if wanted != "auto":
         return wanted, "asked for by the scene"  # type: ignore[return-value]
-    if n <= CHOLESKY_LIMIT[d]:
-        return "cholesky", f"n_e = {n} <= {CHOLESKY_LIMIT[d]} in {d}D: fastest per solve"
+    if n <= limit:
+        return "cholesky", f"n_e = {n} <= {limit} in {d}D: fastest per solve"
     if n <= DIRECT_LIMIT[d]:
         return "mumps", f"n_e = {n} <= {DIRECT_LIMIT[d]} in {d}D: the factor fits and factors fast"
     return "cg", f"n_e = {n} > {DIRECT_LIMIT[d]} in {d}D: the factor would not fit"
@@ -51,10 +54,12 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
     differ from run to run.
     """
     ranks = layout.comm.size
+    if solver == "cholesky":
+        return True
     if ranks == 1 or solver == "cg":
         return False
-    if solver == "cholesky" or reproducible != "auto":
-        return solver == "cholesky" or bool(reproducible)
+    if reproducible != "auto":
+        return bool(reproducible)
     return ranks <= REPEATED_RANKS and layout.n_e * ranks <= REPEATED_LIMIT[layout.dimension]
 
 
@@ -64,12 +69,11 @@ class TissueSolver:
 
     Attributes:
         name: cholesky, mumps or cg.
-        ksp: the PETSc solver.
+        ksp: the PETSc solver; its vectors are those of S with mumps and cg only, so solve by :meth:`solve`.
         S: the matrix.
         tolerance: relative residual that :meth:`check` accepts.
-        factor: what solves without a detour through ``ksp``: with cholesky on every rank the whole factor, in blocks of
-            d x d and an order of its own (:mod:`fem.cholesky`), as is the matrix of ``ksp``; with mumps its factor on
-            one rank; else None.
+        factor: what solves without a detour through ``ksp``: with cholesky the factor that every rank has whole, in an
+            order of its own (:mod:`fem.cholesky`); with mumps that of one rank; else None.
     """
 
     name: SolverName
@@ -80,10 +84,11 @@ class TissueSolver:
 
     @property
     def remark(self) -> str:
-        """What to add to the reason of the choice: single entries cost twice the time of a solve. Not collective."""
+        """What to add to the reason of the choice: single entries make a slower step. Not collective."""
         if self.name != "cholesky" or "sbaij" in self.ksp.getOperators()[0].getType():
             return ""
-        return "; in single entries, since blocks would lose digits here"
+        by = self.ksp.getPC().getFactorSolverType().upper().replace("PETSC", "PETSc")
+        return f"; in single entries by {by}, since blocks would lose digits here"
 
     def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
         """Solve S w = r.
@@ -206,12 +211,12 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
     P, order = S, None
     if not ordered:
         every = whole_copy(S)
-        order = node_order(every, layout.dimension)
-        P = order.matrix(every)
+        found = dissect(every, layout.dimension)
+        order, P = found.order, found.matrix(every)
         every.destroy()
     try:
         with agree(S.comm.tompi4py()):
-            ksp = factor_blocks(P, prefix)
+            ksp = factor_blocks(P, prefix, "petsc" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps")
     except SolverError:
         S.destroy()
         raise
@@ -235,7 +240,7 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
     except PETSc.Error as error:
         raise SolverError(
             f"{name}: the factorisation of the tissue matrix (n_e = {S.getSize()[0]}) failed (PETSc error "
-            f"{error.ierr}); check material and mesh, or try time.solver = 'mumps'"
+            f"{error.ierr}); check material and mesh"
         ) from error
     reason = ksp.getPC().getFailedReason()
     if reason:

@@ -117,6 +117,7 @@ class ClosedLoop:
         self.solver = choose_solver(problem.layout, solver)
         begin = time.perf_counter()
         self.midpoint = TissueMidpoint(problem.system, dt, self.solver[0], rtol, reproducible)
+        self.solver = self.solver[0], self.solver[1] + self.midpoint.solver.remark
         try:
             self.plant = PlantStep(problem.system, self.midpoint)
         except Exception:

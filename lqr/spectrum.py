@@ -161,7 +161,7 @@ class Resolvent:
         self.drag = damping.alpha if damping.in_space else 0.0
         terms = [(1 + shift * damping.beta, self.system.K_ee), (shift * (shift + damping.alpha), self.system.M_ee)]
         S = combine(terms + ([] if damping.matrix is None else [(shift, damping.matrix)]))
-        name = choose_solver(self.layout)[0]
+        name = choose_solver(self.layout, few=True)[0]
         self.solver: TissueSolver = make_solver(S, name, self.layout, PREFIX, rtol=1e-12)
         self.r, self.w = self.system.K_ee.createVecs()
         self.extra = 2 * self.n_s if self.comm.rank == 0 else 0

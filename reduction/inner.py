@@ -153,7 +153,7 @@ def solve_columns(
     Raises:
         SolverError: the factorisation fails, or the solution has a large residual.
     """
-    solver = make_solver(A.copy(), choose_solver(layout)[0], layout, "softgrasp_inner_", rtol)
+    solver = make_solver(A.copy(), choose_solver(layout, few=True)[0], layout, "softgrasp_inner_", rtol)
     b, x = A.createVecs()
     result = np.zeros(X.shape, order="F")
     try:

@@ -40,10 +40,11 @@ Every row is a program of its own under mpiexec. In it all methods take turns, s
 counts, so that noise of the machine hits all alike. Columns: assembly and factor [s]; microseconds of one time step
 by PETSc TS (what `softgrasp simulate` does) and by the bare triangular solves alone, as PETSc's solver gives them
 (-pc_type cholesky, or MUMPS); the median of their quotient, with its goal; the same for the solves that the step
-itself does, with a Cholesky factor of d x d blocks; microseconds by a textbook loop (PETSc's solve, products with K
-and M), by SciPy (sparse LU, same loop) and by pyMOR's implicit midpoint (up to n_e = 12 000, where installed);
-energy drift; peak memory of all ranks before SciPy and pyMOR start. Below: the paper's scene as a whole run, and
-growth exponents p of cost ~ n^p over the 2D sizes.
+itself does, with a Cholesky factor of d x d blocks: what a step adds to them is the product with K, vectors and TS;
+microseconds by a textbook loop (PETSc's solve, on several ranks ours; products with K and M), by SciPy (sparse LU,
+same loop) and by pyMOR's implicit midpoint (up to n_e = 12 000, where installed); energy drift; peak memory of all
+ranks before SciPy and pyMOR start. Below: set-up of the factor here, by PETSc and by SciPy; the paper's scene as a
+whole run; growth exponents p of cost ~ n^p over the 2D sizes.
 
 Keep the machine quiet while it runs. A fast look: --sizes 2d:1000 --ranks 1 --repeats 3.
 --large adds 2D with 1e6 and 3D with 2e5 unknowns, {LARGE_STEPS} steps each on {LARGE_RANKS} ranks: minutes, GiB."""
@@ -200,7 +201,13 @@ def show(console: Console, rows: Sequence[Row]) -> None:
     for row in rows:
         if "error" in row:
             console.print(f"{row['problem']}, {row['ranks']} rank(s) failed: {row['error']}", markup=False)
-        elif row["whole"]:
+            continue
+        factors = {"here": row["seconds"]["factor"], **row.get("factor_peer_s", {})}
+        if len(factors) > 1:
+            names = {"here": "here", "petsc": "PETSc's Cholesky", "scipy": "SciPy (SuperLU)"}
+            parts = [f"{names[name]} {_number(value)} s" for name, value in factors.items()]
+            console.print(f"set-up of the factor, {row['problem']}, {row['ranks']} rank(s): {', '.join(parts)}")
+        if row["whole"]:
             seconds = row["whole"]["seconds"]
             names = {"ts_none": "TS", "ts_memory": "TS storing every state", "scipy": "SciPy storing", "pymor": "pyMOR"}
             parts = [f"{names[name]} {1e3 * value:.3g} ms" for name, value in seconds.items()]

@@ -18,7 +18,7 @@ from mpi4py import MPI
 from fem.build import Model, build
 from fem.drive import Force
 from fem.motion import motion_table
-from fem.order import node_order
+from fem.order import dissect
 from fem.petsc import Array, PETSc, whole_copy
 from fem.run import Run, RunOptions, Trajectory, simulate
 from fem.scene import Scene
@@ -159,6 +159,8 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     system, comm = model.system, model.system.layout.comm
     holders: list[tuple[str, Any]] = [("", system), ("", system.damping), ("step.", run.midpoint), ("hand.", run.drive)]
     holders.append(("step.", run.midpoint.held))
+    if run.midpoint.held.order is not None:
+        holders.append(("step.order.", run.midpoint.held.order))
     for layer in system.layers:
         holders += [(f"{key}[{layer.name}].", getattr(layer, key)) for key in ("K_mu", "K_lambda", "M_1")]
     seen: set[int] = set()
@@ -183,6 +185,9 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
                 found[prefix + name] = found.get(prefix + name, 0.0) + float(comm.allreduce(value.nbytes * new))
     solver = run.midpoint.solver
     found["S"] = everywhere(matrix_memory(solver.S), solver.S)
+    factored = solver.ksp.getOperators()[0]
+    if factored.handle != solver.S.handle:
+        found["S, factored"] = everywhere(matrix_memory(factored), factored)
     if solver.name != "cg" and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
         found["factor"] = everywhere(matrix_memory(solver.ksp.getPC().getFactorMatrix()), solver.S)
     return {name: size for name, size in found.items() if size > 0}
@@ -192,7 +197,7 @@ def _as_stepped(S: PETSc.Mat, d: int) -> Iterator[list[Array]]:
     """The entries of a matrix as the steps may hold them: spread, whole, whole in the order of Cholesky. Collective."""
     yield list(S.getValuesCSR())
     whole = whole_copy(S)
-    ordered = node_order(whole, d).matrix(whole)
+    ordered = dissect(whole, d).matrix(whole)
     for copy in (whole, ordered):
         yield list(copy.getValuesCSR())
         copy.destroy()

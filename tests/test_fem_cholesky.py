@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,15 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
+import fem.solvers
 from fem.build import build
-from fem.cholesky import BACKWARD_ERROR, backward_error, factor_blocks
-from fem.errors import Interrupted, SolverError
+from fem.cholesky import BACKWARD_ERROR, backward_error, factor_blocks, make_ksp
+from fem.errors import CheckpointError, Interrupted, SolverError
 from fem.midpoint import TissueMidpoint, midpoint_matrix, state_on
-from fem.order import node_order
+from fem.order import dissect
 from fem.petsc import whole_copy
 from fem.run import RunOptions, simulate
-from fem.solvers import make_solver
+from fem.solvers import FEW_LIMIT, choose_solver, make_solver
 from tests.helpers import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 
 UNEQUAL: dict[str, Any] = {"tissue": {"material": {"lambda": 90.0, "mu": 20.0, "rho": 1.0}}}
@@ -57,13 +59,14 @@ def test_order_moves_nodes_and_comes_back(comm: MPI.Intracomm, name: str) -> Non
     system = build(make_scene(*SCENES[name]), comm).system
     d, n = system.layout.dimension, system.layout.n_e
     K = whole_copy(system.K_ee)
-    order = node_order(K, d)
+    found = dissect(K, d)
+    order = found.order
     assert sorted(order.nodes.tolist()) == list(range(n // d))
     x = np.random.default_rng(0).standard_normal((n, 2))
     moved = order.enter(x)
     assert np.array_equal(moved.reshape(-1, d, 2), x.reshape(-1, d, 2)[order.nodes])
     assert np.array_equal(order.leave(moved), x)
-    P = order.matrix(K)
+    P = found.matrix(K)
     rows = order.enter(np.arange(n))
     dense = K.convert("dense", PETSc.Mat()).getDenseArray()  # lambda is not mu: its blocks are not symmetric
     assert np.array_equal(P.convert("dense", PETSc.Mat()).getDenseArray(), dense[np.ix_(rows, rows)])
@@ -72,10 +75,10 @@ def test_order_moves_nodes_and_comes_back(comm: MPI.Intracomm, name: str) -> Non
 @pytest.mark.serial
 def test_order_keeps_the_factor_thin(comm: MPI.Intracomm) -> None:
     system = build(make_scene(tissue={"cells": [40, 80]}), comm).system
-    P = node_order(system.K_ee, 2).matrix(system.K_ee)
+    P = dissect(system.K_ee, 2).matrix(system.K_ee)
     ksp = factor_blocks(P, "test_")
     kept = factor_of(ksp).getInfo()["nz_used"]
-    # nodes instead of their rows in the same dissection: as thin as PETSc's own order, the mesh's own is twice as thick
+    # nodes instead of their rows in the same dissection: as thin as PETSc's own order, a third less than the mesh's
     assert kept < 1.1 * kept_nonzeros(system.K_ee, "nd")
     assert kept < 0.7 * kept_nonzeros(system.K_ee, "natural")
     ksp.destroy()
@@ -100,36 +103,72 @@ def test_solves_agree_with_a_dense_solve_on_any_ranks(comm: MPI.Intracomm, name:
     solver.destroy()
 
 
-def test_single_entries_take_over_where_blocks_lose_digits(comm: MPI.Intracomm) -> None:
-    system = build(make_scene(HANGING), comm).system
-    K = whole_copy(system.K_ee)
-    P = node_order(K, 2).matrix(K)
-    blocks = P.convert("sbaij", PETSc.Mat())
-    ksp = PETSc.KSP().create(P.comm)
-    ksp.setOperators(blocks)
-    ksp.setType("preonly")
-    ksp.getPC().setType("cholesky")
-    ksp.getPC().setFactorOrdering("natural")
-    assert backward_error(P, ksp) > BACKWARD_ERROR
-    chosen = factor_blocks(P, "test_")
-    assert factor_of(ksp).getBlockSize() == 2
-    assert factor_of(chosen).getBlockSize() == 1
+def permuted(K: PETSc.Mat) -> PETSc.Mat:
+    whole = whole_copy(K)
+    return dissect(whole, 2).matrix(whole)
+
+
+def blocks_of(P: PETSc.Mat) -> PETSc.KSP:
+    """The factor in blocks, whatever it is worth."""
+    ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), "test_")
+    ksp.setUp()
+    return ksp
+
+
+def stiff_part(box: list[list[float]], mu: float) -> dict[str, Any]:
+    """A small part of the soft body much stiffer than the rest, which the softest modes hardly strain."""
+    material = {"lambda": 0.0, "rho": 1.0}
+    layers = {"part": {"box": box, "material": {**material, "mu": mu}}}
+    return {"tissue": {"cells": [8, 16], "order": 2, "material": {**material, "mu": 1.0}, "layers": layers}}
+
+
+UNSTABLE = {
+    "hanging": HANGING,
+    "near the hand": stiff_part([[0.25, 1.25], [0.75, 1.5]], 1e6),
+    "in the middle": stiff_part([[0.25, 0.75], [0.75, 1.25]], 1e6),
+}
+
+
+@pytest.mark.parametrize("name", UNSTABLE)
+@pytest.mark.parametrize("by", ["petsc", "mumps"])
+def test_single_entries_take_over_where_blocks_lose_digits(comm: MPI.Intracomm, name: str, by: Any) -> None:
+    P = permuted(build(make_scene(UNSTABLE[name]), comm).system.K_ee)
+    blocks, chosen = blocks_of(P), factor_blocks(P, "test_", by)
+    assert backward_error(P, blocks) > BACKWARD_ERROR
+    assert "sbaij" not in chosen.getOperators()[0].getType()
+    assert chosen.getPC().getFactorSolverType() == by
     assert backward_error(P, chosen) < BACKWARD_ERROR
-    # the scale of rows and columns is no matter
-    scale = P.createVecLeft()
-    scale.array_w[:] = 10.0 ** np.random.default_rng(0).integers(-5, 6, P.getSize()[0])
-    P.diagonalScale(scale, scale)
-    again = factor_blocks(P, "test_")
-    assert backward_error(P, again) < BACKWARD_ERROR
-    for solver in (ksp, chosen, again):
-        solver.destroy()
+    for ksp in (blocks, chosen):
+        ksp.destroy()
+
+
+def test_choice_is_free_of_the_scale_of_rows(comm: MPI.Intracomm) -> None:
+    for scene, single in (({}, False), (HANGING, True)):
+        P = permuted(build(make_scene(scene), comm).system.K_ee)
+        scale = P.createVecLeft()
+        scale.array_w[:] = 10.0 ** np.random.default_rng(0).integers(-5, 6, P.getSize()[0])
+        P.diagonalScale(scale, scale)
+        ksp = factor_blocks(P, "test_")
+        assert ("sbaij" not in ksp.getOperators()[0].getType()) == single
+        assert backward_error(P, ksp) < BACKWARD_ERROR
+        ksp.destroy()
+
+
+def test_large_systems_in_space_leave_single_entries_to_mumps(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(fem.solvers.FEW_LIMIT, 2, 100)
+    system = build(make_scene(HANGING), comm).system
+    solver = make_solver(system.K_ee.copy(), "cholesky", system.layout, "test_")
+    assert solver.remark == "; in single entries by MUMPS, since blocks would lose digits here"
+    solver.destroy()
 
 
 def test_run_says_when_single_entries_took_over(comm: MPI.Intracomm) -> None:
     still = {"motion": {"profile": "hold", "target": None}, "time": {"steps": 1, "end": 1.0}}
     for changes, remark in ((HANGING, True), ({}, False)):
         run = simulate(build(make_scene(changes, still), comm))
-        assert ("single entries" in run.solver[1]) == remark
+        assert ("single entries by PETSc" in run.solver[1]) == remark
         assert run.energy_drift == 0.0  # nothing moves
 
 
@@ -151,14 +190,12 @@ def test_step_does_not_lose_what_blocks_would(comm: MPI.Intracomm) -> None:
 
 def test_backward_error_is_that_of_the_matrix_solved_with(comm: MPI.Intracomm) -> None:
     """The factor of P + 1e-6 D^2, D^2 = diag P, leaves D^-1 (r - P w) = 1e-6 D w."""
-    system = build(make_scene(), comm).system
-    K = whole_copy(system.K_ee)
-    P = node_order(K, 2).matrix(K)
+    P = permuted(build(make_scene(), comm).system.K_ee)
     other, diagonal = P.copy(), P.getDiagonal()
     diagonal.scale(1 + 1e-6)
     other.setDiagonal(diagonal)
     ksp = factor_blocks(other, "test_")
-    # a soft body answers with |D w| well above |D^-1 r|, their sum is what counts
+    # the sum with |D^-1 r| counts, which for a soft body is well below |D w|
     assert 0.5e-6 < backward_error(P, ksp) < 1e-6
     ksp.destroy()
 
@@ -202,3 +239,25 @@ def test_restart_file_holds_the_right_hand_side_in_the_order_of_the_layout(
     h = s * y.array_r - k.array_r
     own = slice(layout.start, layout.start + layout.n_local)
     assert close(r[own] + system.G @ pending, h) < 1e-10  # seven steps of rounding in differences of large terms
+
+
+def test_restart_file_with_a_right_hand_side_of_another_size_is_damaged(
+    comm: MPI.Intracomm, mpi_tmp_path: Path
+) -> None:
+    model = build(make_scene(), comm)
+    with pytest.raises(Interrupted):
+        simulate(model, RunOptions(mpi_tmp_path, until=7))
+    for rows in (5, 2 * model.system.layout.n_e):
+        with h5py.File(mpi_tmp_path / "checkpoint" / f"step7-rank{comm.rank}.h5", "a") as file:
+            del file["r"]
+            file["r"] = np.zeros(rows)
+        with pytest.raises(CheckpointError, match=rf"is damaged \(r has {rows} rows, the run"):
+            simulate(model, RunOptions(mpi_tmp_path, resume=True))
+
+
+def test_few_solves_in_space_go_to_mumps_earlier(comm: MPI.Intracomm) -> None:
+    layout = build(make_scene(CUBE), comm).system.layout
+    large = replace(layout, n_e=FEW_LIMIT[3] + 3)
+    assert choose_solver(large)[0] == "cholesky"
+    assert choose_solver(large, few=True)[0] == "mumps"
+    assert choose_solver(large, "cholesky", few=True)[0] == "cholesky"
