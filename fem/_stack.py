@@ -2,7 +2,7 @@
 
 Threads are fixed before numpy is imported (two ranks with two BLAS threads each are 10 to 200 times slower on two
 cores), and MPI is initialised before any compiled module. The PyPI wheel does the latter in ``dolfinx_solver``; a
-cluster's own DOLFINx has no such module and needs ``mpi4py.MPI`` only.
+cluster's own DOLFINx has no such module and needs ``mpi4py.MPI`` only. PETSc leaves signals to Python.
 """
 
 from __future__ import annotations
@@ -13,5 +13,11 @@ import os
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
+
+# PETSc's handler aborts the program, and with it the run, when the reader of a pipe has gone; an option keeps it off,
+# which PETSc reads when it is initialised, unless that has happened before (see `study.streams`).
+_options = os.environ.get("PETSC_OPTIONS", "")
+if "-no_signal_handler" not in _options.split():
+    os.environ["PETSC_OPTIONS"] = f"{_options} -no_signal_handler".strip()
 
 importlib.import_module("dolfinx_solver" if importlib.util.find_spec("dolfinx_solver") else "mpi4py.MPI")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -14,8 +14,11 @@ from fem.scene_file import scene_hash
 
 if TYPE_CHECKING:
     from fem.run import Run
+    from fem.scene import Scene
 
-FORMAT = 2
+FORMAT = 3
+FREE_OUTPUT = ("fields", "frames", "checkpoint_every")  # what a run shows and keeps, not what it computes
+FREE = ("name", "description", "reduction", "study")
 
 
 def _rank_file(directory: Path, step: int, rank: int) -> Path:
@@ -51,10 +54,11 @@ def _write_manifest(run: Run, directory: Path, manifest: Path) -> None:
     """Put the new manifest in place of the old one and remove older states. Rank 0 only."""
     entry = {
         "format": FORMAT,
-        "scene_hash": scene_hash(run.model.scene),
+        "scene_hash": _numbers_hash(run.model.scene),
+        "scene": run.model.scene.model_dump(mode="json", by_alias=True),
         "ranks": run.layout.comm.size,
         "step": run.reached,
-        "steps": run.steps,
+        "legs": run.legs,
     }
     try:
         fresh = manifest.with_suffix(".new")
@@ -79,6 +83,8 @@ def _write_rank(run: Run, path: Path) -> None:
         file["snapshots"] = run.store.kept(n)
         file["loads"] = run.drive.c[:n]
         file["pulls"] = run.pulls[: n + 1]
+        if run.drive.u is not None:
+            file["forces"] = run.drive.u[:n]
         file["energies"] = [midpoint.dissipated, run.initial_energy, run.peak_energy]
         file["residual_first"] = run.residual_first
 
@@ -98,16 +104,18 @@ def read_checkpoint(run: Run, directory: Path) -> None:
                 _restore(run, file, entry["step"])
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
+        legs = [leg for leg in entry["legs"] if leg < run.reached]
+        run.begun, run.legs = run.reached, [*legs, run.reached]
     for vector in (run.state.z, run.state.v, run.midpoint.r):
         vector.stateIncrease()
     run.midpoint.join(run.state)
 
 
-def _manifest(run: Run, directory: Path) -> dict[str, int]:
+def _manifest(run: Run, directory: Path) -> dict[str, Any]:
     comm = run.model.system.layout.comm
     manifest = directory / "checkpoint.json"
     try:
-        entry: dict[str, int] = json.loads(manifest.read_text())
+        entry: dict[str, Any] = json.loads(manifest.read_text())
     except FileNotFoundError:
         raise CheckpointError(f"{manifest} does not exist; run once without --resume") from None
     except (OSError, ValueError) as error:
@@ -117,14 +125,48 @@ def _manifest(run: Run, directory: Path) -> dict[str, int]:
             f"{manifest} was written by another version of softgrasp (format {entry.get('format')}, this one reads "
             f"{FORMAT}); run again without --resume"
         )
-    wanted = {"scene_hash": scene_hash(run.model.scene), "ranks": comm.size, "steps": run.steps}
-    for key, value in wanted.items():
-        if entry.get(key) != value:
+    scene = run.model.scene
+    found, why = {"ranks": entry.get("ranks")}, {"ranks": comm.size}
+    if entry.get("scene_hash") != _numbers_hash(scene):
+        found, why = _flat(entry.get("scene", {})), _flat(scene.model_dump(mode="json", by_alias=True))
+    keys = [*why, *(key for key in found if key not in why)]
+    for key in sorted(keys, key=lambda key: key in ("tissue.mesh", "motion.csv")):  # their contents count, not the name
+        if found.get(key) != why.get(key) and not _free(key):
             raise CheckpointError(
-                f"{manifest} was written with {key} = {entry.get(key)}, this run has {value}; "
+                f"{manifest} was written with {key} = {_short(found.get(key))}, this run has {_short(why.get(key))}; "
                 "resume with the same scene and rank count, or run again without --resume"
             )
+    if entry.get("scene_hash") != _numbers_hash(scene):
+        raise CheckpointError(
+            f"a file that the scene names is not what it was when {manifest} was written; put the old one back, or run "
+            "again without --resume"
+        )
     return entry
+
+
+def _numbers_hash(scene: Scene) -> str:
+    """Hash of what may change the numbers of a run."""
+    usual = type(scene.output)()
+    output = scene.output.model_copy(update={key: getattr(usual, key) for key in FREE_OUTPUT})
+    return scene_hash(scene.model_copy(update={"output": output}), FREE)
+
+
+def _free(key: str) -> bool:
+    section, _, rest = key.partition(".")
+    return section in FREE or (section == "output" and rest in FREE_OUTPUT)
+
+
+def _flat(value: dict[str, Any], path: str = "") -> dict[str, Any]:
+    """Leaves of nested tables by their dotted keys."""
+    result: dict[str, Any] = {}
+    for key, item in value.items():
+        result |= _flat(item, f"{path}{key}.") if isinstance(item, dict) and item else {f"{path}{key}": item}
+    return result
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _restore(run: Run, file: h5py.File, step: int) -> None:
@@ -142,6 +184,8 @@ def _restore(run: Run, file: h5py.File, step: int) -> None:
     run.local_outputs[:n] = file["outputs"][:]
     run.drive.c[:step] = file["loads"][:]
     run.pulls[:n] = file["pulls"][:]
+    if run.drive.u is not None:
+        run.drive.u[:step] = file["forces"][:]
     energies = file["energies"][:]
     run.midpoint.dissipated, run.initial_energy, run.peak_energy = (float(value) for value in energies)
     run.residual_first = float(file["residual_first"][()])

@@ -10,15 +10,19 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from fem.errors import MeshError, SceneError
+from fem.errors import MeshError, SceneError, agree
+from fem.meshcheck import counted, place_text
 
 if TYPE_CHECKING:
     from fem.geometry import TissueMesh
+    from fem.meshparts import Parts
     from fem.scene import Contact
 
 Ints = npt.NDArray[np.int32]
 Floats = npt.NDArray[np.float64]
 
+HINGE = 1e-12  # of C^T C: shared nodes nearer than 1e-6 of the part are one node
+MOST_LOOSE = 300  # a dense problem of at most 1800 unknowns
 BOX_TOLERANCE = 1e-8  # of the largest extent: far above round-off of midpoints, far below any cell
 
 
@@ -56,13 +60,13 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     if mesh.comm.allreduce(int(chosen.sum())) == 0:
         raise SceneError(
             f"No boundary facet of the {tissue.source} mesh has its midpoint in the contact zone "
-            f"{' and '.join(keys) or 'of [contact]'}: the boundary spans {_text(low)} to {_text(high)}."
+            f"{' and '.join(keys) or 'of [contact]'}: the boundary spans {place_text(low)} to {place_text(high)}."
         )
     return np.asarray(facets[chosen], dtype=np.int32)
 
 
 def held_check(tissue: TissueMesh, facets: Ints) -> None:
-    """Refuse a mesh with a connected part that no contact facet holds: it could float freely.
+    """Refuse a mesh of which a part could move freely, alone or about the nodes by which it hangs on the rest.
 
     Collective.
 
@@ -71,32 +75,101 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
         facets: owned contact facets, from `contact_facets`.
 
     Raises:
-        MeshError: some part has no contact facet.
+        MeshError: parts that share no node with the rest have no contact facet, or parts are joined to the rest
+            by so few nodes that they can turn.
     """
-    if tissue.parts is None:
+    tags, parts = tissue.part_tags, tissue.parts
+    if tags is None or parts is None:
         return
     mesh, dimension = tissue.mesh, tissue.dimension
     mesh.topology.create_connectivity(dimension - 1, dimension)
     facet_cells = mesh.topology.connectivity(dimension - 1, dimension)
-    labels = np.zeros(len(cell_midpoints(tissue)), dtype=np.int64)
-    owned = tissue.parts.indices < len(labels)
-    labels[tissue.parts.indices[owned]] = tissue.parts.values[owned]
-    count = mesh.comm.allreduce(int(labels.max(initial=-1)), op=MPI.MAX) + 1
+    labels = np.zeros(mesh.topology.index_map(dimension).size_local, dtype=np.int64)
+    owned = tags.indices < len(labels)
+    labels[tags.indices[owned]] = tags.values[owned]
     # An owned exterior facet has one cell, and that cell is owned too.
     cells = np.array([facet_cells.links(f)[0] for f in facets], dtype=np.int64)
-    held = np.zeros(count, dtype=np.int64)
+    held = np.zeros(len(parts.cells), dtype=np.int64)
     held[labels[cells]] = 1
-    total = np.bincount(labels, minlength=count)
-    middle = np.stack([np.bincount(labels, weights=x, minlength=count) for x in cell_midpoints(tissue).T])
-    held, total, middle = (mesh.comm.allreduce(a) for a in (held, total, middle))
-    loose = np.flatnonzero(held == 0)
+    held = mesh.comm.allreduce(held)
+    with agree(mesh.comm):
+        if mesh.comm.rank == 0:
+            check_parts(parts, held > 0, tissue.source)
+
+
+def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
+    """Refuse parts that keep a free motion when those with contact facets are fixed. Not collective.
+
+    A part that hangs together through facets moves without strain as a rigid body only, u = R q, and a contact
+    facet fixes it. The q of the other parts must agree at each shared node, C q = 0; a null vector of C^T C is
+    a free motion.
+
+    Args:
+        parts: the parts of the mesh.
+        held: whether a part has a contact facet, shape (n_parts,).
+        source: name of the mesh, for messages.
+
+    Raises:
+        MeshError: see `held_check`.
+    """
+    groups = int(parts.groups.max()) + 1
+    loose = np.setdiff1d(np.arange(groups), parts.groups[held])
     if loose.size:
-        part = loose[0]
+        chosen = parts.groups == loose[0]
+        cells = parts.cells[chosen]
+        middle = (cells @ parts.middles[chosen]) / cells.sum()
         raise MeshError(
-            f"{loose.size} of {count} separate parts of {tissue.source} touch no contact facet, "
-            f"the first with {total[part]} cells around {_text(middle[:, part] / total[part])}: "
+            f"{loose.size} of {groups} separate parts of {source} touch no contact facet, "
+            f"the first with {counted(cells.sum(), 'cell')} around {place_text(middle)}: "
             "remove such parts, join them to the body or extend [contact]."
         )
+    moving = _moving(parts, held, source)
+    if not moving.any():
+        return
+    point, part = parts.joints.T
+    fixed = np.isin(point, point[~moving[part]]) & moving[part]  # joints of moving parts to parts at rest
+    counts = np.bincount(part[fixed], minlength=len(held))
+    worst = int(np.argmin(np.where(counts > 0, counts, len(point) + 1)))
+    place = parts.points[point[fixed & (part == worst)]].mean(axis=0)
+    raise MeshError(
+        f"{int(moving.sum())} of {len(held)} parts of {source} can turn freely about the nodes they share with the "
+        f"rest, the loosest with {counted(parts.cells[worst], 'cell')} and {counted(counts[worst], 'such node')} "
+        f"around {place_text(place)}: "
+        "join the parts through whole facets, remove them or extend [contact]."
+    )
+
+
+def _moving(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> npt.NDArray[np.bool_]:
+    """The parts that move in some null vector of C^T C."""
+    d = parts.points.shape[1]
+    free = np.flatnonzero(~held)
+    if not free.size:
+        return np.zeros(len(held), dtype=np.bool_)
+    if len(free) > MOST_LOOSE:
+        raise MeshError(
+            f"{len(free)} parts of {source} have no contact facet and hang on the rest by single nodes or edges: "
+            "join the cells through whole facets."
+        )
+    point, part = parts.joints.T
+    arms = (parts.points[point] - parts.middles[part]) / parts.radii[part, None]
+    size = d * (d + 1) // 2
+    R = rigid_modes(arms, d, True, np.zeros(d)).reshape(len(point), d, size)
+    slot = np.full(len(held), -1)
+    slot[free] = np.arange(len(free))
+    gram = np.zeros((len(free), len(free), size, size))
+    every = np.arange(len(point))
+    start = np.maximum.accumulate(np.where(np.diff(point, prepend=-1) > 0, every, 0))  # first joint of the same node
+    for one, sign in ((start, -1.0), (every, 1.0)):  # C: motion of a joint minus that of the first one
+        for other, sign2 in ((start, -1.0), (every, 1.0)):
+            a, b = slot[part[one]], slot[part[other]]
+            both = (a >= 0) & (b >= 0) & (start < every)
+            blocks = np.einsum("kdi,kdj->kij", R[one[both]], R[other[both]])
+            np.add.at(gram, (a[both], b[both]), sign * sign2 * blocks)
+    values, vectors = np.linalg.eigh(gram.transpose(0, 2, 1, 3).reshape(len(free) * size, len(free) * size))
+    null = vectors[:, values <= HINGE * max(values.max(initial=0.0), 1.0)].reshape(len(free), size, -1)
+    moving = np.zeros(len(held), dtype=np.bool_)
+    moving[free] = np.abs(null).max(axis=(1, 2), initial=0.0) > 1e-6  # unit vectors; round-off is far below
+    return moving
 
 
 def contact_blocks(space: dolfinx.fem.FunctionSpace, facets: Ints) -> tuple[Ints, Ints]:
@@ -148,13 +221,18 @@ def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
     Not collective.
 
     Raises:
-        SceneError: the layer has a tag but the mesh has no cell tags, or it has neither tag nor box.
+        SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
     """
     midpoints = cell_midpoints(tissue)
     if layer.tag is not None:
         if tissue.cell_tags is None:
             raise SceneError(f"A layer has tag = {layer.tag}, but the {tissue.source} mesh has no cell tags: use box.")
-        cells = tissue.cell_tags.find(layer.tag)
+        if layer.tag not in tissue.cell_sets:
+            raise SceneError(
+                f"The tag = {layer.tag} of a layer is not in {tissue.source}: "
+                f"its cell tags are {_present(tissue.cell_sets)}."
+            )
+        cells = tissue.cell_tags.indices[np.isin(tissue.cell_tags.values, tissue.cell_sets[layer.tag])]
         return np.asarray(np.sort(cells[cells < len(midpoints)]), dtype=np.int32)
     if layer.box is None:
         raise SceneError("A layer has neither tag nor box: give one of them.")
@@ -181,15 +259,20 @@ def bounding_box(tissue: TissueMesh) -> tuple[Floats, Floats]:
     return low, high
 
 
-def _tagged_facets(tissue: TissueMesh, tag: int) -> Ints:
+def _tagged_facets(tissue: TissueMesh, tag: int | str) -> Ints:
     if tissue.facet_tags is None:
         raise SceneError(
             f"contact.facet_tag = {tag} needs facet tags, but the {tissue.source} mesh has none: use sides."
         )
-    present = sorted(set().union(*tissue.mesh.comm.allgather(set(tissue.facet_tags.values.tolist()))))
-    if tag not in present:
+    if tag not in tissue.facet_sets:
+        present = _present(tissue.facet_sets)
         raise SceneError(f"contact.facet_tag = {tag} is not in {tissue.source}: its facet tags are {present}.")
-    return np.asarray(tissue.facet_tags.find(tag), dtype=np.int32)
+    marks = tissue.facet_tags
+    return np.asarray(marks.indices[np.isin(marks.values, tissue.facet_sets[tag])], dtype=np.int32)
+
+
+def _present(sets: dict[int | str, tuple[int, ...]]) -> list[int | str]:
+    return [*sorted(k for k in sets if isinstance(k, int)), *sorted(k for k in sets if isinstance(k, str))]
 
 
 def _planes(contact: Contact, dimension: int) -> list[tuple[int, int]]:
@@ -208,7 +291,3 @@ def _inside(points: Floats, box: Any, tolerance: float, key: str) -> npt.NDArray
         )
     inside = (points >= corners[0] - tolerance) & (points <= corners[1] + tolerance)
     return np.asarray(inside.all(axis=1), dtype=np.bool_)
-
-
-def _text(point: Floats) -> str:
-    return "(" + ", ".join(f"{x:.6g}" for x in point) + ")"

@@ -7,9 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
-from fem.errors import SceneError
+from fem.errors import SceneError, SolverError
 from fem.midpoint import TissueMidpoint, TissueState
 from fem.motion import HandTable
+from fem.outputs import hand_axes
 from fem.petsc import Array, total
 from fem.system import BlockSystem
 
@@ -25,15 +26,28 @@ class Drive(Protocol):
     c: Array
     """Load l = G c of each step, (steps, n_s)."""
 
+    @property
+    def u(self) -> Array | None:
+        """Force applied in each step without the weight, (steps, n_s) [N, N m]; None when the motion is prescribed."""
+
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """Leave w and load of step n in ``midpoint``; fill row n + 1 of ``q`` and ``v``. Collective."""
 
+    def check(self, begin: int, end: int) -> None:
+        """Look at what moved the hand in these steps; SolverError unless it is finite. Not collective."""
+
 
 class TableDrive:
-    """Hand known beforehand: load l = -G (a - g + alpha v) with alpha only when damping drags in space."""
+    """Hand known beforehand: load l = -G (a - g + alpha v) with alpha only when damping drags in space.
 
-    def __init__(self, system: BlockSystem, table: HandTable) -> None:
-        self.q, self.v = table.q, table.v
+    Args:
+        system: operators.
+        table: the hand's motion.
+        force: that it comes from, (steps, n_s) [N, N m]; None when it is prescribed.
+    """
+
+    def __init__(self, system: BlockSystem, table: HandTable, force: Array | None = None) -> None:
+        self.q, self.v, self.u = table.q, table.v, force
         c = table.a.copy()
         if system.gravity is not None:
             c -= system.gravity
@@ -44,6 +58,9 @@ class TableDrive:
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One product with the n_s columns of G and one solve. Collective."""
         midpoint.solve_midpoint(self.c[n])
+
+    def check(self, begin: int, end: int) -> None:
+        """Nothing to look at: tables are checked when they are read. Not collective."""
 
 
 class ForceDrive:
@@ -64,6 +81,7 @@ class ForceDrive:
         self.system, self.dt = system, midpoint.dt
         self.force: Force = self._checked(force)
         self.q, self.v, self.c = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
+        self.u = np.zeros((steps, n_s))
         self.q[0], self.v[0] = q0, v0
         self.g = np.zeros(n_s) if system.gravity is None else system.gravity
         self.weight = system.M_hand @ self.g if system.hand_weight else np.zeros(n_s)
@@ -93,18 +111,36 @@ class ForceDrive:
 
         return first
 
+    def _applied(self, n: int) -> Array:
+        self.u[n] = self.force(n, (n + 0.5) * self.dt, self.q[n], self.v[n])
+        return np.asarray(self.u[n])
+
+    def check(self, begin: int, end: int) -> None:
+        """Look at the forces taken in these steps, once a segment: a step spends nothing on it. Not collective.
+
+        Raises:
+            SolverError: a force is not finite; the message names the first.
+        """
+        for i, j in np.argwhere(~np.isfinite(self.u[begin:end]))[:1]:
+            layout = self.system.layout
+            n, axis = begin + int(i), hand_axes(layout.n_s, layout.dimension)[j]
+            raise SolverError(
+                f"the force on the hand is {self.u[n, j]} in {axis} in step {n + 1}, at t = {(n + 0.5) * self.dt:.6g} "
+                "s; it must be finite"
+            )
+
     def _one_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One solve. Collective."""
-        q, v = self.q[n], self.v[n]
-        a = self.inverse @ (self.force(n, (n + 0.5) * self.dt, q, v) + self.weight)
+        v = self.v[n]
+        a = self.inverse @ (self._applied(n) + self.weight)
         self.c[n] = -(self.kappa * a + self.alpha * v - self.g)
         midpoint.solve_midpoint(self.c[n])
         self._move(n, a)
 
     def _two_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One solve and one small reduction. Collective."""
-        q, v = self.q[n], self.v[n]
-        u = self.force(n, (n + 0.5) * self.dt, q, v) + self.weight
+        v = self.v[n]
+        u = self._applied(n) + self.weight
         c0 = self.alpha * v - self.g
         G, layout = self.system.G, self.system.layout
         x = midpoint.respond()
@@ -120,3 +156,30 @@ class ForceDrive:
         v = self.v[n]
         self.v[n + 1] = v + self.dt * a
         self.q[n + 1] = self.q[n] + self.dt * (v + self.v[n + 1]) / 2
+
+
+def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float) -> Array:
+    """Force u [N, N m] in each step that leads the hand against inertia and tissue, shape (steps, n_s). Not collective.
+
+        u = M_hand a + M_rigid (a - g + alpha v_mid) + G' (z'' + alpha z'_mid) - weight
+
+    with alpha only when damping drags in space. With w = z_mid - z_n and s = 2/dt the tissue has z'_mid = s w and
+    z'' = s (s w - z'_n), and G' z'_n follows from G' z'_{n+1} = 2 s G' w - G' z'_n, from rest on.
+
+    Args:
+        system: operators, two-way.
+        pulls: G' w of each step, (steps, n_s).
+        v: velocity of the hand, (steps + 1, n_s).
+        c: load of each step, -(a - g + alpha v_mid), (steps, n_s).
+        dt: step [s].
+    """
+    s = 2 / dt
+    turn = np.where(np.arange(len(pulls) + 1) % 2 == 0, 1.0, -1.0)[:, None]
+    rates = np.zeros_like(v)
+    rates[1:] = -turn[1:] * np.cumsum(turn[:-1] * (2 * s * pulls), axis=0)
+    alpha = system.damping.alpha if system.damping.in_space else 0.0
+    tissue = s * (s * pulls - rates[:-1]) + alpha * s * pulls
+    u = np.diff(v, axis=0) / dt @ system.M_hand.T - c @ system.M_rigid.T + tissue
+    if system.hand_weight and system.gravity is not None:
+        u -= system.M_hand @ system.gravity
+    return np.asarray(u)

@@ -79,18 +79,20 @@ class SeriesWriter:
         if format == "vtx" and not dolfinx.has_adios2:
             raise ResourceError("output.fields = 'vtx' needs a DOLFINx with ADIOS2; take 'xdmf' or 'auto'")
         self.format = ("vtx" if dolfinx.has_adios2 else "xdmf") if format == "auto" else format
-        self.comm = model.space.layout.comm
+        self.comm, self.directory = model.space.layout.comm, directory
         with agree(self.comm):
             if self.comm.rank == 0:
                 directory.mkdir(parents=True, exist_ok=True)
-        stem = directory / name
-        self.files = (
-            (stem.with_suffix(".bp"),) if self.format == "vtx" else (stem.with_suffix(".xdmf"), stem.with_suffix(".h5"))
-        )
+        self.rename(name)
         self.full = (FullField(model), FullField(model, "velocity"))
         self.written = tuple(f.u if self.format == "vtx" else _at_vertices(f.u) for f in self.full)
         self.fields = 0  # known at the first write
         self.file: Any = None
+
+    def rename(self, name: str) -> None:
+        """Choose another stem of the files, before the first write. Not collective."""
+        suffixes = (".bp",) if self.format == "vtx" else (".xdmf", ".h5")
+        self.files = tuple(self.directory / f"{name}{suffix}" for suffix in suffixes)
 
     def write(self, t: float, z: Array, v: Array, q_s: Array, v_s: Array | None = None) -> None:
         """Append one instant. Collective.

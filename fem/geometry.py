@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import dolfinx.mesh
@@ -14,6 +14,7 @@ from mpi4py import MPI
 from fem.errors import SceneError
 
 if TYPE_CHECKING:
+    from fem.meshparts import Parts
     from fem.scene import Scene
 
 
@@ -27,7 +28,10 @@ class TissueMesh:
         facet_tags: integer marks of boundary facets, or None.
         cell_tags: integer marks of cells (layers), or None.
         source: "structured" or the name of the mesh file, for messages.
-        parts: number of the connected part of each cell, or None if the mesh is in one piece.
+        part_tags: number of the part of each cell, parts hanging together through facets; None if it is one.
+        parts: what is known of these parts, or None.
+        facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
+        cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -35,7 +39,10 @@ class TissueMesh:
     facet_tags: dolfinx.mesh.MeshTags | None
     cell_tags: dolfinx.mesh.MeshTags | None
     source: str
-    parts: dolfinx.mesh.MeshTags | None = None
+    part_tags: dolfinx.mesh.MeshTags | None = None
+    parts: Parts | None = None
+    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
 
 
 def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:

@@ -55,7 +55,7 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
     bad_points = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad_points.size:
         raise MeshError(
-            f"{name} has {bad_points.size} points with NaN or infinite coordinates, "
+            f"{name} has {counted(bad_points.size, 'point')} with NaN or infinite coordinates, "
             f"the first is {bad_points[0]}: export the mesh again."
         )
     volumes = signed_volumes(points, cells)
@@ -65,7 +65,7 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
     if flat.any():
         worst = int(np.argmin(np.abs(quality)))
         raise MeshError(
-            f"{name} has {int(flat.sum())} cells of zero volume, the worst is cell {worst} around "
+            f"{name} has {counted(int(flat.sum()), 'cell')} of zero volume, the worst is cell {worst} around "
             f"{_middle(points, cells, worst)}: remove or remesh them."
         )
     inverted = quality < 0
@@ -74,13 +74,18 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
     if not repair:
         worst = int(np.argmin(quality))
         raise MeshError(
-            f"{name} has {int(inverted.sum())} inverted cells of {len(cells)}, the worst is cell {worst} "
+            f"{name} has {counted(int(inverted.sum()), 'inverted cell')} of {len(cells)}, the worst is cell {worst} "
             f"around {_middle(points, cells, worst)}: set tissue.repair = true to turn them round, "
             "or export the mesh again."
         )
     turned = cells.copy()
     turned[np.ix_(inverted, [-2, -1])] = cells[np.ix_(inverted, [-1, -2])]
     return turned
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things in words. Not collective."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def components(cells: Integers, n_points: int) -> tuple[int, npt.NDArray[np.int32]]:
@@ -93,5 +98,10 @@ def components(cells: Integers, n_points: int) -> tuple[int, npt.NDArray[np.int3
     return len(used), parts.astype(np.int32)
 
 
+def place_text(point: Floats) -> str:
+    """A point for a message, "(1, 0.5)"."""
+    return "(" + ", ".join(f"{x:.6g}" for x in point) + ")"
+
+
 def _middle(points: Floats, cells: Integers, cell: int) -> str:
-    return "(" + ", ".join(f"{x:.6g}" for x in points[cells[cell]].mean(axis=0)) + ")"
+    return place_text(points[cells[cell]].mean(axis=0))

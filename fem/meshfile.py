@@ -19,16 +19,20 @@ from mpi4py import MPI
 
 from fem.errors import MeshError, agree
 from fem.geometry import TissueMesh
-from fem.meshcheck import check_cells, components
+from fem.meshcells import check_interfaces, check_straight, corners, cut_cells, dimension_of, shape_of, simplices
+from fem.meshcheck import check_cells
+from fem.meshparts import Parts, find_parts
 
+Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Tags = npt.NDArray[np.int32]
 
-_LINEAR = {"vertex": 0, "line": 1, "triangle": 2, "tetra": 3}  # dimension of the cell types we take
 _SHAPES = {2: "triangle", 3: "tetrahedron"}
 _TAG_NAMES = ("gmsh:physical", "medit:ref", "CellEntityIds")  # preferred names of integer cell data
 _NOT_TAGS = ("gmsh:geometrical",)  # numbers of CAD entities, not marks of the user
 _NO_TAGS: Tags = np.zeros(0, dtype=np.int32)
+
+Sets = dict[int | str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -41,19 +45,29 @@ class MeshArrays:
         cell_tags: one integer a cell, or None.
         facets: tagged facets, shape (n_facets, d).
         facet_tags: one integer a tagged facet, or None.
-        parts: number of the connected part of each cell, or None if there is one part only.
+        part_tags: number of the facet-connected part of each cell, or None if there is one part only.
+        parts: what is known of these parts, or None.
+        facet_sets: marks in ``facet_tags`` of each tag number and named set.
+        cell_sets: marks in ``cell_tags`` of each tag number and named set.
     """
 
-    points: npt.NDArray[np.float64]
+    points: Floats
     cells: Integers
     cell_tags: Tags | None
     facets: Integers
     facet_tags: Tags | None
-    parts: Tags | None
+    part_tags: Tags | None
+    parts: Parts | None
+    facet_sets: Sets
+    cell_sets: Sets
 
 
 def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool = False) -> TissueMesh:
-    """Read a mesh of linear triangles or tetrahedra with its facet and cell tags.
+    """Read a mesh and cut its cells into linear triangles or tetrahedra, with its facet and cell tags.
+
+    Quadrilaterals, hexahedra, wedges and pyramids are cut as in `fem.meshcells.simplices`, cells of higher order with
+    straight edges are taken by their corners. Cells of the highest dimension make the body, those one
+    dimension lower carry the facet tags.
 
     Collective. Rank 0 reads and checks.
 
@@ -64,20 +78,20 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
         repair: turn inverted cells round instead of refusing them.
 
     Raises:
-        MeshError: the file is missing or unreadable, holds other cells than linear simplices, a triangle mesh
-            is not in the plane z = 0, or a cell is flat or inverted.
+        MeshError: the file is missing or unreadable, holds polygons, polyhedra or curved cells, a mesh of
+            surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted to cut.
     """
     arrays: MeshArrays | None = None
     with agree(comm):
         if comm.rank == 0:
             arrays = load_arrays(path, scale, repair)
     facts = (arrays.points.shape[1], arrays.cell_tags is not None, arrays.facet_tags is not None,
-             arrays.parts is not None) if arrays else None  # fmt: skip
-    dimension, has_cell_tags, has_facet_tags, has_parts = comm.bcast(facts)
+             arrays.parts, arrays.facet_sets, arrays.cell_sets) if arrays else None  # fmt: skip
+    dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets = comm.bcast(facts)
     if arrays is None:
         none = np.zeros((0, dimension))
         empty = np.zeros((0, dimension + 1), dtype=np.int64)
-        arrays = MeshArrays(none, empty, _NO_TAGS, empty[:, 1:], _NO_TAGS, _NO_TAGS)
+        arrays = MeshArrays(none, empty, _NO_TAGS, empty[:, 1:], _NO_TAGS, _NO_TAGS, parts, facet_sets, cell_sets)
     domain = ufl.Mesh(basix.ufl.element("Lagrange", _SHAPES[dimension], 1, shape=(dimension,)))
     mesh = dolfinx.mesh.create_mesh(comm, arrays.cells, domain, arrays.points)
     return TissueMesh(
@@ -86,7 +100,10 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
         _distribute(mesh, dimension - 1, arrays.facets, arrays.facet_tags) if has_facet_tags else None,
         _distribute(mesh, dimension, arrays.cells, arrays.cell_tags) if has_cell_tags else None,
         path.name,
-        _distribute(mesh, dimension, arrays.cells, arrays.parts) if has_parts else None,
+        _distribute(mesh, dimension, arrays.cells, arrays.part_tags) if parts is not None else None,
+        parts,
+        facet_sets,
+        cell_sets,
     )
 
 
@@ -98,29 +115,41 @@ def load_arrays(path: Path, scale: float, repair: bool) -> MeshArrays:
     """
     raw = _read(path)
     found = sorted({block.type for block in raw.cells})
-    dimension = max((_LINEAR.get(kind, 0) for kind in found), default=0)
-    if any(kind not in _LINEAR for kind in found) or dimension < 2:
+    shapes = [shape_of(block.type) for block in raw.cells]
+    filled = [shape for shape, block in zip(shapes, raw.cells, strict=True) if shape and len(block.data)]
+    dimension = max((dimension_of(shape) for shape in filled), default=0)
+    if None in shapes or dimension < 2:
         raise MeshError(
-            f"{path} holds cells of type {', '.join(found) or 'none'}: "
-            "only linear triangles or tetrahedra are taken, export the mesh with these."
+            f"{path} holds cells of type {', '.join(found) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
+            "hexahedra, wedges and pyramids are taken, export the mesh with these."
         )
-    tag_name = _tag_name(raw)
-    cells, cell_tags = _collect(raw, dimension, tag_name)
-    facets, facet_tags = _collect(raw, dimension - 1, tag_name)
-    for block in (cells, facets):
-        if block.size and not 0 <= block.min() <= block.max() < len(raw.points):
+    for block in raw.cells:
+        if block.data.size and not 0 <= block.data.min() <= block.data.max() < len(raw.points):
             raise MeshError(f"{path} has cells with node numbers outside 0 to {len(raw.points) - 1}: export it again.")
-    used, numbers = np.unique(cells, return_inverse=True)
-    cells = numbers.reshape(cells.shape).astype(np.int64)
-    points = np.asarray(raw.points, dtype=np.float64)[used] * scale
-    points = _in_plane(points, path) if dimension == 2 else points
+    points = np.asarray(raw.points, dtype=np.float64) * scale
+    tag_name = _tag_name(raw)
+    bodies = _blocks(raw, dimension)
+    used = np.unique(np.concatenate([corners(nodes, shape).ravel() for _, shape, nodes in bodies]))
+    if dimension == 2:
+        points = _in_plane(points, used, path)
+    for i, shape, nodes in bodies:
+        check_straight(points, nodes, shape, raw.cells[i].type, str(path))
+    cut = [cut_cells(points, corners(nodes, shape), shape, str(path)) for _, shape, nodes in bodies]
+    check_interfaces(points, [(corners(nodes, shape), shape) for _, shape, nodes in bodies], str(path))
+    cells, cell_tags, cell_sets = _marked(raw, bodies, cut, tag_name, dimension)
+    shells = _blocks(raw, dimension - 1)
+    cut = [simplices(corners(nodes, shape), shape) for _, shape, nodes in shells]
+    facets, facet_tags, facet_sets = _marked(raw, shells, cut, tag_name, dimension - 1)
+    points, cells = points[used], np.searchsorted(used, cells)
     cells = check_cells(points, cells, repair, str(path))
-    if facet_tags is not None:
-        # Facets with a node that no cell uses belong to leftover geometry.
-        kept = np.isin(facets, used).all(axis=1)
-        facets, facet_tags = np.searchsorted(used, facets[kept]).astype(np.int64), facet_tags[kept]
-    count, parts = components(cells, len(points))
-    return MeshArrays(points, cells, cell_tags, facets, facet_tags, parts if count > 1 else None)
+    # Facets with a node that no cell uses belong to leftover geometry.
+    kept = np.isin(facets, used).all(axis=1)
+    facets = np.searchsorted(used, facets[kept])
+    part_tags, parts = find_parts(points, cells, str(path)) or (None, None)
+    return MeshArrays(
+        points, cells, cell_tags, facets, None if facet_tags is None else facet_tags[kept], part_tags, parts,
+        facet_sets, cell_sets,
+    )  # fmt: skip
 
 
 def _read(path: Path) -> meshio.Mesh:
@@ -148,24 +177,86 @@ def _tag_name(raw: meshio.Mesh) -> str | None:
     return next(iter(preferred + names), None)
 
 
-def _collect(raw: meshio.Mesh, dimension: int, tag_name: str | None) -> tuple[Integers, Tags | None]:
-    """All cells of one dimension, and their tags if the file has any."""
-    chosen = [i for i, block in enumerate(raw.cells) if _LINEAR[block.type] == dimension]
-    if not chosen:
-        return np.zeros((0, dimension + 1), dtype=np.int64), None
-    cells = np.concatenate([np.asarray(raw.cells[i].data, dtype=np.int64) for i in chosen])
-    if tag_name is None:
-        return cells, None
-    return cells, np.concatenate([raw.cell_data[tag_name][i] for i in chosen]).astype(np.int32)
+def _blocks(raw: meshio.Mesh, dimension: int) -> list[tuple[int, str, Integers]]:
+    """Place in the file, shape and nodes of the blocks of cells of one dimension."""
+    return [
+        (i, shape, np.asarray(block.data, dtype=np.int64))
+        for i, block in enumerate(raw.cells)
+        if len(block.data) and (shape := shape_of(block.type)) and dimension_of(shape) == dimension
+    ]
 
 
-def _in_plane(points: npt.NDArray[np.float64], path: Path) -> npt.NDArray[np.float64]:
+def _marked(
+    raw: meshio.Mesh,
+    blocks: list[tuple[int, str, Integers]],
+    cut: list[tuple[Integers, Integers]],
+    tag_name: str | None,
+    dimension: int,
+) -> tuple[Integers, Tags | None, Sets]:
+    """The simplices of all blocks, one mark each, and the marks of each tag number and named set.
+
+    The marks are the tag numbers of the file, unless its named sets overlap them.
+    """
+    if not blocks:
+        return np.zeros((0, dimension + 1), dtype=np.int64), None, {}
+    nodes = np.concatenate([part[0] for part in cut])
+    tags = np.zeros(len(nodes), dtype=np.int64)
+    if tag_name is not None:
+        tags = np.concatenate([raw.cell_data[tag_name][i][p] for (i, *_), (_, p) in zip(blocks, cut, strict=True)])
+    named = _named(raw, blocks, cut)
+    if tag_name is None and not named:
+        return nodes, None, {}
+    marks = tags.astype(np.int64)
+    for member in named.values():
+        mixed = np.intersect1d(marks[member], marks[~member])
+        if mixed.size:
+            _, marks = np.unique(2 * marks + (member & np.isin(marks, mixed)), return_inverse=True)
+    sets: Sets = {}
+    if tag_name is not None:
+        for tag, mark in np.unique(np.stack([tags, marks]), axis=1).T.tolist():
+            sets[tag] = (*sets.get(tag, ()), mark)
+    for name, number in _physical_names(raw, dimension).items():
+        if tag_name == "gmsh:physical" and number in sets:
+            sets[name] = sets[number]
+    for name, member in named.items():
+        sets[name] = tuple(np.unique(marks[member]).tolist())
+    return nodes, marks.astype(np.int32), sets
+
+
+def _named(
+    raw: meshio.Mesh, blocks: list[tuple[int, str, Integers]], cut: list[tuple[Integers, Integers]]
+) -> dict[str, npt.NDArray[np.bool_]]:
+    """Which simplices each named set of the file holds, without the sets that hold none."""
+    found = {}
+    for name, lists in raw.cell_sets.items():
+        members = []
+        for (i, _, nodes), (_, parents) in zip(blocks, cut, strict=True):
+            inside = np.zeros(len(nodes), dtype=np.bool_)
+            if i < len(lists) and lists[i] is not None and len(lists[i]):
+                inside[np.asarray(lists[i], dtype=np.int64)] = True
+            members.append(inside[parents])
+        if not name.startswith("gmsh:") and (member := np.concatenate(members)).any():
+            found[name] = member
+    return found
+
+
+def _physical_names(raw: meshio.Mesh, dimension: int) -> dict[str, int]:
+    """Gmsh's names of tag numbers, {name: [number, dimension]} in the field data."""
+    pairs = {name: np.asarray(pair) for name, pair in (raw.field_data or {}).items()}
+    return {
+        name: int(pair[0])
+        for name, pair in pairs.items()
+        if pair.shape == (2,) and np.issubdtype(pair.dtype, np.integer) and pair[1] == dimension
+    }
+
+
+def _in_plane(points: Floats, used: Integers, path: Path) -> Floats:
     if points.shape[1] == 3:
-        height = np.abs(points[:, 2]).max()
-        if not height <= 1e-10 * np.ptp(points[:, :2], axis=0).max():  # also false for NaN
+        height = np.abs(points[used, 2]).max()
+        if not height <= 1e-10 * np.ptp(points[used, :2], axis=0).max():  # also false for NaN
             raise MeshError(
-                f"{path} holds triangles only, and they leave the plane z = 0 (|z| up to {height:.3g}): "
-                "give a flat mesh in x and y, or one of tetrahedra."
+                f"{path} holds surface cells only, and they leave the plane z = 0 (|z| up to {height:.3g}): "
+                "give a flat mesh in x and y, or one of solid cells."
             )
     return np.ascontiguousarray(points[:, :2])
 

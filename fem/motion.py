@@ -72,8 +72,11 @@ def read_csv(path: Path, columns: int, end: float) -> tuple[Array, Array]:
             f"motion.csv: {path} must have at least two rows of {columns + 1} columns "
             "(time, then one per hand degree of freedom)"
         )
-    if not np.isfinite(table).all() or (np.diff(table[:, 0]) <= 0).any():
-        raise SceneError(f"motion.csv: the times in {path} must be finite and increase from row to row")
+    for i, j in np.argwhere(~np.isfinite(table))[:1]:
+        what = "the time" if j == 0 else f"column {j + 1}, at t = {table[i, 0]:g} s,"
+        raise SceneError(f"motion.csv: {path} holds {table[i, j]} as {what} in data row {i + 1}; give finite numbers")
+    if (np.diff(table[:, 0]) <= 0).any():
+        raise SceneError(f"motion.csv: the times in {path} must increase from row to row")
     if table[0, 0] > 0 or table[-1, 0] < end * (1 - 1e-12):
         raise SceneError(
             f"motion.csv: {path} covers {table[0, 0]:g} to {table[-1, 0]:g} s, the run needs 0 to {end:g} s"
@@ -83,6 +86,8 @@ def read_csv(path: Path, columns: int, end: float) -> tuple[Array, Array]:
 
 def motion_table(scene: Scene, n_s: int) -> HandTable:
     """Positions of the prescribed motion (drive = "motion") on the time grid. Not collective.
+
+    A CSV table is joined by a cubic spline, at rest at both ends.
 
     Raises:
         SceneError: a CSV file does not fit.
@@ -111,6 +116,8 @@ def motion_table(scene: Scene, n_s: int) -> HandTable:
 
 def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
     """Force u [N, N m] on the hand at the step midpoints, shape (steps, n_s). Not collective.
+
+    A CSV table is joined by straight lines.
 
     With the quintic profile it is the feed-forward M_hand a(t) that would carry the bare hand to the target.
 

@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 from fem.build import Model
 from fem.outputs import hand_axes, unit
+from fem.petsc import Array
 from fem.run import Trajectory
 from fem.scene_file import resolved_toml, scene_hash
 
@@ -40,6 +41,7 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
     seconds = run.seconds
     mesh = model.space.mesh.mesh
     cells = mesh.topology.index_map(model.space.mesh.dimension).size_global
+    axes = hand_axes(layout.n_s, layout.dimension)
     return {
         "command": "simulate",
         "scene": model.scene.name,
@@ -60,8 +62,10 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
         "output_names": list(run.output_names),
         "output_final": run.outputs[-1].tolist(),
         "energy_drift": run.energy_drift,
+        **({} if run.force is None else {"force_peak": dict(zip(axes, _peaks(run.force), strict=True))}),
         "time": {
             **{key: value for key, value in seconds.items() if key not in ("steps", "per_step")},
+            "steps_timed": run.steps_timed,
             "steps": seconds["steps"],
             "per_step": seconds["per_step"],
         },
@@ -71,8 +75,17 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
     }
 
 
-def trajectory_header(n_s: int, dimension: int, outputs: Sequence[str], velocity: bool) -> list[str]:
-    """Columns of trajectory.csv with their units: time, hand, its velocity on request, outputs. Not collective."""
+def _peaks(force: Array) -> list[float]:
+    return [float(x) for x in np.abs(force).max(axis=0)]
+
+
+def trajectory_header(
+    n_s: int, dimension: int, outputs: Sequence[str], velocity: bool, force: bool = False
+) -> list[str]:
+    """Columns of trajectory.csv with their units: time, hand, velocity on request, outputs, force on request.
+
+    Not collective.
+    """
     hand = [f"hand_{axis}" for axis in hand_axes(n_s, dimension)]
     columns = ["t [s]", *(f"{name} [{unit(name)}]" for name in hand)]
     if velocity:
@@ -81,15 +94,31 @@ def trajectory_header(n_s: int, dimension: int, outputs: Sequence[str], velocity
     for name in outputs:
         column = f"{name} [{unit(name)}]"
         columns.append(column if column not in columns else f"output_{column}")
+    if force:
+        columns += [f"force_{axis} [{force_unit(axis)}]" for axis in hand_axes(n_s, dimension)]
     return columns
 
 
+def force_unit(axis: str) -> str:
+    """Unit of the load on a hand degree of freedom: N, or N m on a rotation. Not collective."""
+    return "N m" if axis.startswith("r") else "N"
+
+
 def write_results(directory: Path, model: Model, run: Trajectory, result: dict[str, Any]) -> list[Path]:
-    """Write result.json, trajectory.csv and scene.toml. Rank 0 only."""
+    """Write result.json, trajectory.csv and scene.toml. Rank 0 only.
+
+    A row of the table has the state at its time, and the force in the step that ends there, nan in the first row.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     table = directory / "trajectory.csv"
-    header = trajectory_header(run.q_s.shape[1], model.system.layout.dimension, run.output_names, velocity=True)
-    rows = np.column_stack([run.times, run.q_s, run.v_s, run.outputs])
+    n_s = run.q_s.shape[1]
+    header = trajectory_header(
+        n_s, model.system.layout.dimension, run.output_names, velocity=True, force=run.force is not None
+    )
+    parts = [run.times, run.q_s, run.v_s, run.outputs]
+    if run.force is not None:
+        parts.append(np.vstack([np.full(n_s, np.nan), run.force]))
+    rows = np.column_stack(parts)
     with table.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)

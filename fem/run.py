@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from mpi4py import MPI
 
 from fem.build import Model
 from fem.checkpoint import read_checkpoint, write_checkpoint
-from fem.drive import Drive, Force, ForceDrive, TableDrive
-from fem.errors import Interrupted, SceneError, SolverError
+from fem.drive import Drive, Force, ForceDrive, TableDrive, force_taken
+from fem.errors import Interrupted, SceneError, SolverError, agree
 from fem.midpoint import TissueMidpoint
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
@@ -41,6 +42,8 @@ class RunOptions:
         until: stop after this step and leave a checkpoint; None runs to the end.
         progress: called about five times a second.
         frame: called at the start, at the end and at ``output.frames`` steps between.
+        begin: called once before the first step, when a checkpoint has been read.
+        keep: called before every checkpoint is written, to keep with it what the run has seen so far.
     """
 
     directory: Path = Path("out")
@@ -48,6 +51,8 @@ class RunOptions:
     until: int | None = None
     progress: Observer | None = None
     frame: Observer | None = None
+    begin: Observer | None = None
+    keep: Observer | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,9 @@ class Trajectory:
         residuals: relative residual of the first and the last solve.
         solver: name and reason.
         seconds: stages of the run.
+        steps_timed: steps taken since the run was started or resumed.
+        force: mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with
+            two-way coupling what a prescribed motion takes; None when one-way coupling leaves it unknown.
     """
 
     times: Array
@@ -80,6 +88,8 @@ class Trajectory:
     residuals: tuple[float, float]
     solver: tuple[str, str]
     seconds: dict[str, float] = field(default_factory=dict)
+    steps_timed: int = 0
+    force: Array | None = None
 
 
 class Run(Stepped):
@@ -89,6 +99,10 @@ class Run(Stepped):
         model: the model.
         options: where files go, and whether to resume.
         force: feedback force on the hand; None takes the scene's motion.
+
+    Attributes:
+        begun: step at which this run was started or resumed.
+        legs: the same of all runs that led here, this one last.
     """
 
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
@@ -111,6 +125,7 @@ class Run(Stepped):
         self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = self.residual_last = 0.0
+        self.begun, self.legs = 0, [0]
 
     def _recorders(self) -> tuple[list[tuple[slice, Array]], list[tuple[np.ndarray, Array]]]:
         """Local dofs and column block of every output that this rank has a share in."""
@@ -135,9 +150,8 @@ class Run(Stepped):
         u = force_values(scene, n_s, system.M_hand)
         if system.two_way:
             return ForceDrive(system, lambda n, t, q, v: u[n], self.midpoint, self.steps, zero, zero)
-        if system.hand_weight and system.gravity is not None:
-            u = u + system.M_hand @ system.gravity
-        return TableDrive(system, driven_table(system.M_hand, u, self.dt, zero, zero))
+        weight = system.M_hand @ system.gravity if system.hand_weight and system.gravity is not None else zero
+        return TableDrive(system, driven_table(system.M_hand, u + weight, self.dt, zero, zero), u)
 
     def solve_step(self, n: int) -> None:
         """Load of the hand's motion, or its force, and one solve. Collective."""
@@ -163,6 +177,35 @@ class Run(Stepped):
         self.record(0)
         self.initial_energy = self.midpoint.energy(self.state)
         self.peak_energy = abs(self.initial_energy)
+
+    def take(self, ts: Any, step: int, check: bool = False) -> None:
+        """Step up to a number, and see that the forces on the way were finite. Collective.
+
+        Raises:
+            SolverError: a solve failed or missed its tolerance, or a force is not finite.
+        """
+        before = self.reached
+        try:
+            if check:
+                self.residual_last = self.check_step(ts, step)
+            else:
+                self.advance_to(ts, step)
+        except SolverError:
+            self._check_force(before)  # which may be why
+            raise
+        self._check_force(before)
+
+    def _check_force(self, begin: int) -> None:
+        with agree(self.layout.comm):  # a callable may differ between the ranks
+            self.drive.check(begin, self.reached + 1)
+
+    def force(self) -> Array | None:
+        """Force on the hand in each step, see :class:`Trajectory`. Collective."""
+        system = self.model.system
+        if self.drive.u is not None or not system.two_way:
+            return self.drive.u
+        pulls = self.pulls[1:] if self.midpoint.held.whole else total(self.layout.comm, self.pulls[1:])
+        return force_taken(system, pulls, self.drive.v, self.drive.c, self.dt)
 
     def watch_energy(self) -> None:
         """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
@@ -211,6 +254,8 @@ class Run(Stepped):
             residuals=(self.residual_first, self.residual_last),
             solver=self.solver,
             seconds=seconds,
+            steps_timed=self.counted,
+            force=self.force(),
         )
 
 
@@ -240,13 +285,16 @@ def frame_steps(scene: Scene) -> list[int]:
 
 
 @contextmanager
-def _interruptible() -> Iterator[list[bool]]:
-    """Turn the first Ctrl-C into a flag; a second one interrupts at once."""
+def _interruptible(speaks: bool) -> Iterator[list[bool]]:
+    """Turn the first Ctrl-C into a flag and say so on the standard error; a second one interrupts at once."""
     flag: list[bool] = []
 
     def note(number: int, frame: Any) -> None:
         flag.append(True)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        if speaks:
+            with suppress(OSError):  # nobody listens; print may not be called while another print is under way
+                os.write(2, b"\nstopping as soon as the restart file is written; Ctrl-C again stops at once\n")
 
     try:
         previous = signal.signal(signal.SIGINT, note)
@@ -297,7 +345,9 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
             ts.setStepNumber(run.reached)
         else:
             run.start()
-        with _interruptible() as stop:
+        if options.begin is not None:
+            options.begin(run)
+        with _interruptible(model.system.layout.comm.rank == 0) as stop:
             _run_segments(run, ts, options, stop)
         return run.trajectory()
     finally:
@@ -313,16 +363,14 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
     if options.frame is not None and run.reached == 0:
         options.frame(run)
     if run.reached == 0:
-        run.residual_first = run.residual_last = run.check_step(ts, 1)
+        run.take(ts, 1, check=True)
+        run.residual_first = run.residual_last
     last, chunk = boundaries[-1], 1
     while run.reached < last:
         limit = next(b for b in boundaries if b > run.reached)
         begin, before = time.perf_counter(), run.reached
         goal = min(limit, run.reached + chunk, run.store.limit(run.reached))
-        if goal == run.steps:
-            run.residual_last = run.check_step(ts, goal)
-        else:
-            run.advance_to(ts, goal)
+        run.take(ts, goal, check=goal == run.steps)
         pace = (time.perf_counter() - begin) / (run.reached - before)
         run.store.flush(run.reached)
         if run.reached in run.milestones:
@@ -336,6 +384,8 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
         stopped = comm.allreduce(bool(stop), MPI.LOR)
         stopped = stopped and run.reached < run.steps  # at the end there is nothing left to stop
         if run.reached in checkpoints or stopped or (run.reached == last < run.steps):
+            if options.keep is not None:
+                options.keep(run)
             manifest = write_checkpoint(run, options.directory / "checkpoint")
             if stopped or run.reached == last:
                 raise Interrupted(

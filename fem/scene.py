@@ -12,20 +12,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from fem.scene_control import Control, ControlOutput, Loop, Reduction, Study
-from fem.scene_tissue import Contact, Layer, Material, Model, NonNegative, Positive, Tissue
+from fem.scene_tissue import Contact, Dropped, Layer, Material, Model, NonNegative, Positive, Tissue
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
     "Motion", "Output", "Reduction", "Scene", "Study", "Time", "Tissue", "check_dimension", "scene_schema",
 ]  # fmt: skip
-
-
-def _off(value: Any) -> Any:
-    """TOML has no null: `--set effects.gravity=false` switches a table off."""
-    return None if value is False else value
 
 
 class Hand(Model):
@@ -66,12 +61,8 @@ class Damping(Model):
 class Effects(Model):
     """Everything is off unless named."""
 
-    gravity: Annotated[Gravity | None, BeforeValidator(_off)] = Field(
-        None, description="gravity {g [m/s2], hand_weight}; off unless given"
-    )
-    damping: Annotated[Damping | None, BeforeValidator(_off)] = Field(
-        None, description="damping {kind, beta [s], alpha [1/s], drag}; off unless given"
-    )
+    gravity: Dropped[Gravity] = Field(None, description="gravity {g [m/s2], hand_weight}; off unless given")
+    damping: Dropped[Damping] = Field(None, description="damping {kind, beta [s], alpha [1/s], drag}; off unless given")
     reaction: bool = Field(False, description="the tissue pushes back on the hand [no unit]")
     rotation: bool = Field(False, description="the hand also turns, by small angles [no unit]")
 
@@ -79,7 +70,7 @@ class Effects(Model):
 class Motion(Model):
     """What the hand does."""
 
-    target: Annotated[list[float] | None, BeforeValidator(_off)] = Field(
+    target: Dropped[list[float]] = Field(
         None, description="final displacement of the hand [m], then its angles [rad] with effects.rotation"
     )
     duration: Positive = Field(1.0, description="duration of the motion [s], > 0")
@@ -89,7 +80,8 @@ class Motion(Model):
     drive: Literal["motion", "force"] = Field("motion", description="motion or force is prescribed [no unit]")
     csv: str | None = Field(
         None,
-        description="table, relative to the scene: t [s], then each hand freedom [m, rad] or load [N, N m]",
+        description="table, relative to the scene: t [s], then each hand freedom [m, rad], joined by a cubic spline at "
+        "rest at both ends, or with drive = 'force' each load [N, N m], joined by straight lines",
     )
 
     @model_validator(mode="after")
@@ -143,9 +135,7 @@ class Scene(Model):
     effects: Effects = Field(default_factory=Effects, description="physics that is on [various]")
     motion: Motion = Field(default_factory=lambda: Motion(profile="hold"), description="what the hand does [m, rad, s]")
     time: Time = Field(description="time grid and solver [s]")
-    control: Annotated[Control | None, BeforeValidator(_off)] = Field(
-        None, description="control problem [various]; off unless given"
-    )
+    control: Dropped[Control] = Field(None, description="control problem [various]; off unless given")
     reduction: Reduction = Field(default_factory=Reduction, description="reduced models to compare [various]")
     study: Study = Field(default_factory=Study, description="how studies judge [various]")
     output: Output = Field(default_factory=Output, description="what is kept [no unit]")

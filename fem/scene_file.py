@@ -9,7 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from mpi4py import MPI
 from pydantic import BaseModel, ValidationError
@@ -253,7 +253,18 @@ def _suggest(path: Sequence[str]) -> str:
 
 def _purpose(path: Sequence[str]) -> str:
     known = _fields(path[:-1])
-    return f"give {known[path[-1]][1]}" if path[-1] in known else "give it"
+    if path[-1] not in known:
+        return "give it"
+    annotation, description = known[path[-1]]
+    choices = _choices(annotation)
+    return f"give {description.removesuffix(' [no unit]')}: {', '.join(choices)}" if choices else f"give {description}"
+
+
+def _choices(annotation: Any) -> list[str]:
+    """The values of a Literal, also inside an annotation such as `Literal["auto"] | bool`."""
+    if get_origin(annotation) is Literal:
+        return [repr(value) for value in get_args(annotation)]
+    return [choice for part in get_args(annotation) for choice in _choices(part)]
 
 
 def _key(key: str) -> str:

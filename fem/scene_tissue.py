@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from fem import materials
 
@@ -19,6 +19,15 @@ class Model(BaseModel):
     """Frozen, strict, without unknown keys or non-finite numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+def off(value: Any) -> Any:
+    """TOML has no null: `--set effects.gravity=false` switches a table off, `--set tissue.size=false` drops a key."""
+    return None if value is False else value
+
+
+T = TypeVar("T")
+Dropped = Annotated[T | None, BeforeValidator(off)]
 
 
 def check_box(box: list[list[float]] | None, key: str) -> None:
@@ -89,7 +98,9 @@ class Material(Model):
 class Layer(Model):
     """A part of the tissue with a material of its own."""
 
-    tag: int | None = Field(None, description="cell tag in the mesh file [no unit]; excludes box")
+    tag: int | str | None = Field(
+        None, description="cell tag, or name of a cell set, in the mesh file [no unit]; excludes box"
+    )
     box: Box | None = Field(None, description="[[lo], [hi]] [m]; cells whose midpoint lies inside; excludes tag")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
     beta: NonNegative | None = Field(None, description="Kelvin-Voigt time of this layer [s]; else the scene's")
@@ -105,16 +116,16 @@ class Layer(Model):
 class Tissue(Model):
     """Geometry, material and element order of the tissue."""
 
-    size: Annotated[list[Positive], Field(min_length=2, max_length=3)] | None = Field(
+    size: Dropped[Annotated[list[Positive], Field(min_length=2, max_length=3)]] = Field(
         None, description="edge lengths of the structured box [m]; with cells"
     )
-    origin: list[float] | None = Field(None, description="lowest corner of the structured box [m]; default 0")
-    cells: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=3)] | None = Field(
+    origin: Dropped[list[float]] = Field(None, description="lowest corner of the structured box [m]; default 0")
+    cells: Dropped[Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=3)]] = Field(
         None, description="cells along each edge [1]; with size"
     )
-    mesh: str | None = Field(None, description="mesh file, relative to the scene [no unit]; excludes size, cells")
+    mesh: Dropped[str] = Field(None, description="mesh file, relative to the scene [no unit]; excludes size, cells")
     scale: Positive = Field(1.0, description="length of one unit of the mesh file [m]")
-    repair: bool = Field(False, description="drop unused nodes and turn inverted cells of a mesh file [no unit]")
+    repair: bool = Field(False, description="turn the inverted cells of a mesh file round [no unit]; else refuse them")
     order: Literal[1, 2] = Field(1, description="polynomial order of the displacement [1]")
     thickness: Positive = Field(1.0, description="thickness out of the plane [m], 2D only")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
@@ -127,7 +138,9 @@ class Tissue(Model):
         if self.mesh is not None:
             for key in ("size", "cells", "origin"):
                 if getattr(self, key) is not None:
-                    raise ValueError(f"{key} cannot go with tissue.mesh; give the mesh file or the structured box")
+                    raise ValueError(
+                        f"{key} cannot go with tissue.mesh; drop one, on the command line by --set tissue.{key}=false"
+                    )
             return self
         if self.size is None or self.cells is None:
             missing = "size" if self.size is None else "cells"
@@ -151,7 +164,9 @@ class Contact(Model):
         description="planes of the bounding box [no unit]: x- to z+, left, right, bottom, top, front, back",
     )
     box: Box | None = Field(None, description="[[lo], [hi]] [m]; facets whose midpoint lies inside")
-    facet_tag: int | None = Field(None, description="facet tag in the mesh file [no unit]")
+    facet_tag: int | str | None = Field(
+        None, description="facet tag, or name of a facet set, in the mesh file [no unit]"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Contact:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from study.plots import Shot, colour_bar, draw_scene, legend, make_axes, make_shot
+from study.plots import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from study.style import TARGET, colour_map, paper_style
 
 if TYPE_CHECKING:
@@ -109,9 +109,10 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
         figure.canvas.draw()
         box = figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
         for i in range(len(frames)):
-            for artist in [*ax.collections, *ax.lines]:
+            for artist in [*ax.collections, *ax.lines, *ax.texts]:
                 artist.remove()
             draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
+            name_layers(ax, shot, frames[i], inside=True)  # beside the body they would change sides
             stamp.set_text(f"$t$ = {times[i]:.{digits}f} s{note}")
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=110, bbox_inches=box)

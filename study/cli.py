@@ -1,9 +1,13 @@
 """The ``softgrasp`` command."""
 
+# ruff: noqa: E402  (the other imports take a second, in which Ctrl-C shall not end in a traceback)
 from __future__ import annotations
 
+from study.streams import outlive_readers, quiet_imports
+
+quiet_imports()
+
 import json
-import signal
 import sys
 import time
 import traceback
@@ -207,6 +211,7 @@ def _end_all(comm: MPI.Intracomm) -> None:
 def main() -> None:
     """Entry point: one sentence and status 1 for a user's error; a bug on one rank ends all ranks."""
     comm = MPI.COMM_WORLD
+    outlive_readers()
     try:
         app()
     except SoftgraspError as error:
@@ -227,5 +232,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     main()

@@ -27,7 +27,8 @@ def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
         SceneError: the file or a key is wrong.
     """
     scene = load_scene_collective(MPI.COMM_WORLD, path, overrides)
-    console.print(f"[bold]{escape(scene.name)}[/bold]: {escape(scene.description)}", soft_wrap=True)
+    described = f": {escape(scene.description)}" if scene.description else ""
+    console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
     return scene
 
 

@@ -241,11 +241,11 @@ def checks() -> list[Check]:
 def show(console: Console) -> bool:
     """Write the diagnosis as a table; True when nothing needs a cure. Not collective: call on one rank."""
     table = Table(box=None, pad_edge=False)
-    for title in ("", "found", "cure"):
+    for title in ("", "check", "found", "cure"):
         table.add_column(title, overflow="fold")
     found = checks()
     for check in found:
-        mark = "[green]ok[/]" if check.ok else "[red]no[/]"
-        table.add_row(f"{mark} {check.name}", check.value.replace("[", r"\["), check.cure.replace("[", r"\["))
+        mark = "[green]ok[/]" if check.ok else "[red]bad[/]"
+        table.add_row(mark, check.name, check.value.replace("[", r"\["), check.cure.replace("[", r"\["))
     console.print(table)
     return all(check.ok for check in found)

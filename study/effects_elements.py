@@ -10,9 +10,9 @@ from fem.materials import young_poisson
 from fem.outputs import make_outputs
 from fem.run import RunOptions, Trajectory, simulate
 from fem.scene import Scene
+from study.cautions import LOCKING
 from study.effects_measure import Change, compare
 from study.effects_switch import changed
-from study.explain import LOCKING
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ def _motion(scene: Scene) -> str:
     motion = scene.motion
     if motion.profile == "quintic":
         return "target s(t), s = 10 x^3 - 15 x^4 + 6 x^5, x = min(t / duration, 1)"
-    return "spline through the csv table" if motion.profile == "csv" else "0"
+    return "cubic spline through the csv table, at rest at both ends" if motion.profile == "csv" else "0"
 
 
 def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
@@ -95,8 +95,13 @@ def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
         if effects.gravity.hand_weight:
             result.append("f_s " + ("also has" if effects.reaction else "=") + " M_hand g")
     if free:
-        drive = {"csv": "csv table", "hold": "0", "quintic": "M_hand q'' of the quintic move to the target"}
+        drive = {
+            "csv": "csv table, straight lines between its rows",
+            "hold": "0",
+            "quintic": "M_hand q'' of the quintic move to the target",
+        }
         result.append(f"u(t): {drive[scene.motion.profile]}")
     else:
-        result.append("the motion is prescribed: the hand's row only tells the force u")
+        kept = ", which simulate writes to trajectory.csv" if effects.reaction else ""
+        result.append(f"the motion is prescribed: the hand's row only tells the force u{kept}")
     return tuple(result)

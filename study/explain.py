@@ -13,10 +13,10 @@ from rich.padding import Padding
 from fem.build import build
 from fem.effects import EFFECTS, Gate
 from fem.effects.measure import measure
-from fem.materials import young_poisson
 from fem.modes import lowest_modes
 from fem.petsc import PETSc
 from fem.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
+from study.cautions import SMALL_STRAIN, coarse, locking, poisson_ratios, turned
 from study.command import plain
 from study.equation import Equation, equation
 
@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from fem.scene import Scene
 
 MODES = 6
-LOCKING = 0.49  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu)
-COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
-SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
-SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
 
 
 @dataclass(frozen=True)
@@ -162,8 +158,7 @@ def explain_model(model: Model) -> Explanation:
     stored = scene.output.snapshots == "memory"
     columns = scene.time.steps // scene.output.every + 1 if stored else 0
     dt = scene.time_end / scene.time.steps
-    names = [blocks.name for blocks in system.layers]
-    poisson = {n: young_poisson(m.lam, m.mu)[1] for n, m in zip(names, system.materials, strict=True)}
+    poisson = poisson_ratios(system)
     return Explanation(
         name=scene.name,
         equation=equation(scene),
@@ -198,28 +193,16 @@ def explain_model(model: Model) -> Explanation:
 def _warnings(
     scene: Scene, poisson: dict[str, float], omega: Any, dt: float, d: int, effects: dict[str, EffectReport]
 ) -> list[str]:
-    found = []
-    for name, nu in poisson.items():
-        if nu > LOCKING + 1e-9 and scene.tissue.order == 1:
-            found.append(
-                f"nu = {nu:.4g} of {name} is above {LOCKING}: P1 locks and is far too stiff, use tissue.order = 2."
-            )
-    if len(omega) and omega[0] * dt / (2 * np.pi) > COARSE_STEP:
-        found.append(
-            f"dt is {omega[0] * dt / (2 * np.pi):.2g} of the first period, so even that mode is coarse in time: "
-            f"use at least {int(np.ceil(scene.time_end * omega[0] / (2 * np.pi * COARSE_STEP)))} steps."
-        )
+    found = locking(poisson, scene.tissue.order)
+    if len(omega):
+        found += coarse(float(omega[0]), dt, scene.time_end, "the first period")
     gravity = effects["gravity"]
     if gravity.on and gravity.gate.number > SMALL_STRAIN:
         found.append(
             f"rho g L / E = {gravity.gate.number:.2g} is above {SMALL_STRAIN}: linear elasticity assumes small strains."
         )
     if scene.effects.rotation:
-        angle = max(map(abs, (scene.motion.target or [])[d:]), default=0.0)
-        if angle > SMALL_ANGLE:
-            found.append(
-                f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."
-            )
+        found += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))
     return found
 
 
@@ -274,7 +257,7 @@ def render(result: Explanation, console: Console) -> None:
     for name, e in result.effects.items():
         gate = e.gate
         line(f"{name}: {verdict(e)}")
-        line(f"{gate.symbol} = {gate.number:.3g} (threshold {gate.threshold:.3g})", 4)
+        line(gate.comparison, 4)
         line(gate.sentence, 4)
         if e.on:
             line(f"adds {e.term}; allocates {', '.join(e.operators) or 'nothing'}.", 4)

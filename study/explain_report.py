@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from fem.effects import Gate
 from fem.scene import Scene
 from fem.scene_file import resolved_toml
 from study.command import origin, write_json
@@ -37,6 +38,10 @@ def write_explanation(
     return result, report
 
 
+def _said(gate: Gate) -> str:
+    return f"{gate.sentence} It {gate.condition}." if gate.condition else gate.sentence
+
+
 def _sections(found: Explanation) -> list[Section]:
     s, t, solver = found.sizes, found.time, found.solver
     sizes = [
@@ -50,7 +55,7 @@ def _sections(found: Explanation) -> list[Section]:
     ]
     periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
     effects = [
-        (name, verdict(e), e.gate.symbol, e.gate.number, e.gate.threshold, e.gate.sentence)
+        (name, verdict(e), e.gate.symbol, e.gate.number, e.gate.threshold, _said(e.gate))
         for name, e in found.effects.items()
     ]
     costs = [(name, e.term, ", ".join(e.operators) or "nothing", e.cost) for name, e in found.effects.items() if e.on]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
 from fem.build import Model
+from fem.errors import CheckpointError, agree
 from fem.fields import SeriesWriter
 from fem.gather import gather_picture, vertex_displacement
 from fem.petsc import Array
@@ -20,18 +22,23 @@ SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run whe
 class Frames:
     """Observer of a run: writes field files and keeps vertex displacements on rank 0.
 
+    A run that is stopped and resumed leaves one field series a leg, named by the step it starts from. What the pictures
+    need lies beside its checkpoint, one small file a frame.
+
     Args:
         model: the model.
-        directory: where the field files go.
+        directory: where the field files go, and of the run.
         pictures: keep what figures and animation need.
-        name: of the field files; a resumed run takes another, so that the frames before the stop stay.
     """
 
-    def __init__(self, model: Model, directory: Path, pictures: bool = True, name: str = "fields") -> None:
-        self.model, self.pictures = model, pictures
+    def __init__(self, model: Model, directory: Path, pictures: bool = True) -> None:
+        self.model, self.directory, self.pictures = model, directory, pictures
         self.writer = None
         if model.scene.output.fields != "none":
-            self.writer = SeriesWriter(model, directory, model.scene.output.fields, name)
+            self.writer = SeriesWriter(model, directory, model.scene.output.fields)
+        self.legs = [0]
+        self.saved = 0  # of the frames below, how many lie beside the checkpoint
+        self.steps: list[int] = []
         self.picture = gather_picture(model) if pictures else None
         vertices = model.space.mesh.mesh.geometry.index_map().size_global
         self.few = vertices > MANY_VERTICES
@@ -39,6 +46,70 @@ class Frames:
         self.times: list[float] = []
         self.hands: list[Array] = []
         self.states: list[np.ndarray] = []
+
+    def begin(self, run: Run) -> None:
+        """Join the legs that led here: field files get their name, pictures what lies beside the checkpoint.
+
+        Collective.
+
+        Raises:
+            CheckpointError: a frame cannot be read.
+        """
+        self.legs = run.legs
+        if self.writer is not None:
+            self.writer.rename(_series(run.begun))
+        with agree(run.layout.comm):
+            if self.picture is not None and run.begun:  # rank 0
+                self._load(run.begun)
+
+    def _load(self, begun: int) -> None:
+        for step, path in _kept(self.directory):
+            if step > begun:
+                break
+            try:
+                with np.load(path) as file:
+                    t, hand, state = float(file["t"]), file["hand"], file["state"]
+            except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+                raise CheckpointError(
+                    f"{path} cannot be read ({error}); resume with --no-pictures, or run again without --resume"
+                ) from error
+            self.steps.append(step)
+            self.times.append(t)
+            self.hands.append(hand)
+            self.states.append(state)
+        self.saved = len(self.steps)
+
+    def keep(self, run: Run) -> None:
+        """Write the new frames beside the checkpoint that is about to be written. Collective.
+
+        Raises:
+            CheckpointError: they cannot be written.
+        """
+        with agree(run.layout.comm):
+            if run.layout.comm.rank == 0:
+                try:
+                    self._save(run.begun)
+                except OSError as error:
+                    raise CheckpointError(
+                        f"{self.directory}: the frames cannot be written ({error}); free the disk"
+                    ) from error
+
+    def _save(self, begun: int) -> None:
+        folder = self.directory / "checkpoint"
+        folder.mkdir(parents=True, exist_ok=True)
+        if begun == 0 and self.saved == 0:  # those of another run
+            for _, path in _kept(self.directory):
+                path.unlink(missing_ok=True)
+        for i in range(self.saved, len(self.states)):
+            path = folder / f"frame{self.steps[i]}.npz"
+            np.savez(path, t=self.times[i], hand=self.hands[i], state=self.states[i])
+        self.saved = len(self.states)
+
+    def lacking(self, begun: int) -> int:
+        """How many frames before a step the pictures must do without; rank 0 only."""
+        if self.picture is None or self.few:
+            return 0
+        return len({step for step in frame_steps(self.model.scene) if step <= begun} - set(self.steps))
 
     def __call__(self, run: Run) -> None:
         """Take one frame. Collective."""
@@ -51,6 +122,7 @@ class Frames:
             self.writer.write(t, z, v, q_s, v_s)
         if self.pictures and (not self.few or run.reached in self.chosen):
             state = vertex_displacement(self.model, z, q_s)
+            self.steps.append(run.reached)
             self.times.append(t)
             self.hands.append(q_s.copy())
             if state is not None:
@@ -64,8 +136,10 @@ class Frames:
         return {grid[int(np.argmin(abs(done - share)))] for share in SHOWN[:-1]} | {grid[-1]}
 
     def close(self) -> list[Path]:
-        """Finish the field files. Collective."""
-        return list(self.writer.close()) if self.writer is not None else []
+        """Finish the field files; those of all legs. Collective."""
+        own = list(self.writer.close()) if self.writer is not None else []
+        names = [f"{_series(leg)}{suffix}" for leg in self.legs[:-1] for suffix in (".bp", ".xdmf", ".h5")]
+        return [path for name in names if (path := self.directory / name).exists()] + own
 
     def draw(self, directory: Path, run: Trajectory) -> list[Path]:
         """Figures and animation; rank 0 only."""
@@ -94,3 +168,14 @@ class Frames:
         if not self.few:
             files.append(gif_move(self.picture, states, times, table, target, directory / "move.gif"))
         return files
+
+
+def _series(begun: int) -> str:
+    """Stem of the field files of the leg that starts from a step."""
+    return f"fields-from{begun}" if begun else "fields"
+
+
+def _kept(directory: Path) -> list[tuple[int, Path]]:
+    """Steps of the frames beside the checkpoint and their files, in order."""
+    files = (directory / "checkpoint").glob("frame*.npz")
+    return sorted((int(path.stem.removeprefix("frame")), path) for path in files)

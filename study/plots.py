@@ -42,6 +42,7 @@ Array = npt.NDArray[np.float64]
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
+ROUNDING = 1e-12  # of the size of the body: what is smaller is no deformation
 CAPTION = 0.72  # width of a caption [inch]
 DOTS: Any = (0, (1, 1.2))
 DASHES: Any = (0, (5, 3))
@@ -55,7 +56,7 @@ class Shot:
         picture: the body.
         hands: hand coordinates at the instants, shape (k, n_s).
         path: where the grip of the hand passes, shape (steps, d) [m].
-        norm: scale of the colours [unit].
+        norm: scale of the colours [unit]; from 0 to 0 when nothing deforms.
         unit: factor and name of the unit of the colours.
         low, high: corners of the scene in the plane of the picture, shape (2,) [m].
         hand: polygons of the hand where it starts, each (corners, d); empty in 3D.
@@ -86,8 +87,11 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
         given = np.asarray(target, dtype=np.float64)
         aim[: len(given)] = given
     relative = [np.linalg.norm(u - picture.rigid(q), axis=1).max() for u, q in zip(states, hands, strict=True)]
-    unit = length_unit(max(relative))
-    norm = mpl.colors.Normalize(0.0, unit[0] * max(relative) or 1.0)
+    largest = float(max(relative))
+    if largest <= ROUNDING * float(np.ptp(picture.points, axis=0).max()):
+        largest = 0.0
+    unit = length_unit(largest)
+    norm = mpl.colors.Normalize(0.0, unit[0] * largest)
     polygons, grip = hand_polygons(picture) if picture.dimension == 2 else ([], contact_centre(picture))
     path = np.vstack([grip + picture.rigid(q, grip[None, :]) for q in table[:, 1:]])
     boxes = [_box(picture.points + u) for u in states] + [_box(path)]
@@ -132,8 +136,7 @@ def figure_move(
             draw_scene(ax, shot, states[group], None if apart else times[group], shot.hands[group])
             if apart:
                 ax.set_title(_time(times[group[0]]), pad=3)
-        if picture.dimension == 2:
-            _name_layers(axes[-1], shot, states[-1])
+        name_layers(axes[-1], shot, states[-1])
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
         return save(figure, out_png)
@@ -209,8 +212,11 @@ def make_axes(
 
 
 def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
-    """Colour bar of the relative displacement beside the axes, at most 2.4 inch high; none for outlines."""
-    if len(shot.picture.cells) > MANY_CELLS:
+    """Colour bar of the relative displacement beside the axes, at most 2.4 inch high.
+
+    None for outlines, nor where nothing deforms: one colour needs no scale.
+    """
+    if len(shot.picture.cells) > MANY_CELLS or not shot.norm.vmax > 0:
         return
     boxes = [ax.get_position() for ax in axes]
     inch = 1 / figure.get_figheight()
@@ -228,15 +234,20 @@ def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
 
 def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
     """One row above the axes, where nothing is hidden."""
-    entries: list[Any] = [Line2D([], [], ls=DASHES, color=OUTLINE, lw=0.9, label="path of the hand")]
-    if shot.hand or len(shot.picture.cells) <= MANY_CELLS:
-        entries.insert(0, Patch(color=HAND, label="hand" if shot.hand else "held by the hand"))
+    entries: list[Any] = []
+    filled = len(shot.picture.cells) <= MANY_CELLS
+    if shot.hand or filled:
+        entries.append(Patch(color=HAND, label="hand" if shot.hand else "held by the hand"))
+    if filled and not shot.norm.vmax > 0:
+        entries.append(Patch(color=colour_map()(0.0), label="tissue, not deformed"))
+    if np.ptp(shot.path, axis=0).max() > 0:
+        entries.append(Line2D([], [], ls=DASHES, color=OUTLINE, lw=0.9, label="path of the hand"))
     if shot.aim:
         entries.append(Line2D([], [], ls=DOTS, color=TARGET, lw=1.3, label="target"))
     title = LINE if axes[0].get_title() else 0.0
     top = max(ax.get_position().y1 for ax in axes) + (0.05 + title) / figure.get_figheight()
     figure.legend(
-        handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=3, borderaxespad=0.0, columnspacing=1.2,
+        handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=4, borderaxespad=0.0, columnspacing=1.2,
         handlelength=1.8,
     )  # fmt: skip
 
@@ -297,17 +308,17 @@ def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> 
     )
 
 
-def _name_layers(ax: Any, shot: Shot, u: Array) -> None:
-    """Names of the layers beside the body on the side with more room; without room in it."""
+def name_layers(ax: Any, shot: Shot, u: Array, *, inside: bool = False) -> None:
+    """Names of the layers in 2D beside the body on the side with more room; without room, or on request, in it."""
     picture, x = shot.picture, shot.picture.points + u
-    if len(picture.names) == 1:
+    if len(picture.names) == 1 or picture.dimension == 3:
         return
     (left, right), (low, high) = ax.get_xlim(), _box(x)
     room = (low[0] - left, right - high[0])
     inch = (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
     place, align = (low[0] - 0.06 * inch, "right") if room[0] > room[1] else (high[0] + 0.06 * inch, "left")
     look: dict[str, Any] = {"color": OUTLINE}
-    if max(room) < CAPTION * inch:
+    if inside or max(room) < CAPTION * inch:
         place, align = (low[0] + high[0]) / 2, "center"
         look = {"color": HAND, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
     heights = x[:, 1][picture.cells].mean(axis=1)

@@ -13,11 +13,13 @@ from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
 from fem.effects import EFFECTS
+from fem.errors import Interrupted
 from fem.outputs import unit
-from fem.results import simulate_result, write_results
+from fem.results import force_unit, simulate_result, write_results
 from fem.run import Run, RunOptions, simulate
 from fem.scene import Scene
 from fem.scene_file import resolved_toml
+from study.cautions import run_warnings, show_warnings
 from study.command import list_files, open_model, open_scene, progress_bar
 from study.equation import equation
 from study.frames import Frames
@@ -45,18 +47,31 @@ def run_simulate(
     comm = MPI.COMM_WORLD
     scene = open_scene(path, overrides, console)
     model = open_model(scene, console)
-    frames = Frames(model, out, pictures, "fields-resumed" if resume else "fields")
-    if resume:
-        console.print("resumed: fields-resumed and the pictures begin where the run was stopped", soft_wrap=True)
+    frames = Frames(model, out, pictures)
+
+    def join(run: Run) -> None:
+        frames.begin(run)
+        if resume:
+            lost = frames.lacking(run.begun)
+            more = f"; {lost} earlier frames are not kept, the pictures do without them" if lost else ""
+            console.print(f"resumed from step {run.begun} of {run.steps}{more}", soft_wrap=True)
+
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
         task = bar.add_task("steps", total=scene.time.steps)
 
         def progress(run: Run) -> None:
             bar.update(task, completed=run.reached)
 
-        run = simulate(model, RunOptions(directory=out, resume=resume, until=until, progress=progress, frame=frames))
+        options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
+        try:
+            run = simulate(model, options)
+        except Interrupted:
+            if files := frames.close():
+                list_files(console, files)
+            raise
     files = frames.close()
     result = simulate_result(model, run)
+    result["warnings"] = run_warnings(model, run)
     if comm.rank == 0:
         begin = time.perf_counter()
         files = write_results(out, model, run, result) + files + frames.draw(out, run)
@@ -64,6 +79,7 @@ def run_simulate(
         files.append(_report(out, scene, result, rows, path, overrides))
         result["time"]["pictures"] = time.perf_counter() - begin
         show(console, rows)
+        show_warnings(console, result["warnings"])
         list_files(console, files)
     comm.Barrier()
     return result
@@ -77,6 +93,11 @@ def result_rows(result: dict[str, Any]) -> Rows:
         (name, f"{value:.6g} {unit(name)}")
         for name, value in zip(result["output_names"], result["output_final"], strict=True)
     ]
+    if "force_peak" in result:
+        peak = ", ".join(f"{axis} {value:.4g} {force_unit(axis)}" for axis, value in result["force_peak"].items())
+        rows.append(("largest force on the hand", peak))
+    timed = seconds["steps_timed"]
+    steps = f"{timed}" if timed == result["steps"] else f"{timed} of {result['steps']}, since the run was resumed,"
     return [
         *rows,
         ("energy drift", f"{result['energy_drift']:.1e}"),
@@ -84,7 +105,7 @@ def result_rows(result: dict[str, Any]) -> Rows:
         ("solver", result["solver"]["name"]),
         ("", result["solver"]["reason"]),
         ("mesh, assembly, factor", f"{seconds['mesh']:.3g} s, {seconds['assembly']:.3g} s, {seconds['factor']:.3g} s"),
-        ("steps", f"{result['steps']} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.4g} us each"),
+        ("steps", f"{steps} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.4g} us each"),
         ("peak memory, all ranks", f"{result['memory_peak_mb']:.0f} MiB"),
     ]
 
@@ -127,6 +148,7 @@ def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: P
         sections=[
             Section("", figures=figures),
             Section("Result", rows=rows),
+            *([Section("Look at", text="\n\n".join(result["warnings"]))] if result["warnings"] else []),
             Section("Equation", code=equation_text(equation(scene))),
             Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
             Section("Size", rows=sizes),

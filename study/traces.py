@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import MaxNLocator
 
+from fem.outputs import hand_axes
 from study.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style, save
 
 Array = npt.NDArray[np.float64]
@@ -27,6 +28,8 @@ def figure_traces(
 ) -> tuple[Path, Path]:
     """Hand and outputs against time, and below what the outputs move relative to the hand; PNG and PDF.
 
+    An output that is the hand again is drawn once, as the hand, and has no share in what moves relative to it.
+
     Args:
         times: shape (m,) [s].
         outputs: absolute displacements, shape (m, c) [m].
@@ -42,15 +45,17 @@ def figure_traces(
     d = dimension or min(q_s.shape[1], 3)
     ends = [name.rsplit("_", 1)[-1] for name in names]
     axes_of = ["xyz".find(end) if len(end) == 1 else -1 for end in ends]  # rotations have a panel of their own
-    shown = [i for i, axis in enumerate(axes_of) if 0 <= axis < d]
-    moving = np.stack([q_s[:, axes_of[i]] for i in shown], axis=1) if rigid is None else rigid[:, shown]
+    shown = _not_the_hand(outputs, names, axes_of, q_s, d)
+    moving = q_s[:, [axes_of[i] for i in shown]] if rigid is None else rigid[:, shown]
     relative = outputs[:, shown] - moving
     bodies = list(dict.fromkeys(names[i].rsplit("_", 1)[0] for i in shown))
     angles = q_s.shape[1] > d
     with paper_style():
+        panels = 1 + bool(shown) + angles
         figure, axes = plt.subplots(
-            2 + angles, 1, figsize=(COLUMN, 3.4 + 1.5 * angles), sharex=True, layout="constrained"
+            panels, 1, figsize=(COLUMN, 0.4 + 1.5 * panels), sharex=True, layout="constrained", squeeze=False
         )
+        axes = axes[:, 0]
         factors = [
             length_unit(float(np.abs(a).max(initial=0.0)))
             for a in (np.hstack([outputs[:, shown], q_s[:, :d]]), relative)
@@ -65,15 +70,13 @@ def figure_traces(
             look = {"color": HAND, "ls": ((0, (4, 3)), (0, (1, 1.5)), (0, (4, 2, 1, 2)))[j], "lw": 0.8}
             axes[0].plot(times, factors[0][0] * q_s[:, j], label=f"hand, ${'xyz'[j]}$", **look)
         axes[0].set_ylabel(f"displacement [{factors[0][1]}]")
-        axes[1].set_ylabel(f"relative to hand [{factors[1][1]}]")
+        if shown:
+            axes[1].set_ylabel(f"relative to hand [{factors[1][1]}]")
         if angles:
-            for j in range(d, q_s.shape[1]):
-                axes[2].plot(times, q_s[:, j], color=CYCLE[(j - d) % len(CYCLE)], label=f"angle {j - d + 1}")
-            axes[2].set_ylabel("hand angle [rad]")
-            axes[2].legend(loc="best", handlelength=2.0)
+            _angles(axes[-1], times, q_s, d)
         entries, labels = axes[0].get_legend_handles_labels()
         figure.legend(
-            entries, labels, loc="outside upper center", ncols=min(4, max(2, (len(labels) + 1) // 2)), handlelength=2.4,
+            entries, labels, loc="outside upper center", ncols=min(4, max(2, -(-len(labels) // d))), handlelength=2.4,
             columnspacing=1.4,
         )  # fmt: skip
         for ax in axes:
@@ -83,3 +86,24 @@ def figure_traces(
         axes[-1].set_xlim(float(times[0]), float(times[-1]))
         figure.align_ylabels(axes)
         return save(figure, out_png)
+
+
+def _not_the_hand(outputs: Array, names: tuple[str, ...], axes_of: list[int], q_s: Array, d: int) -> list[int]:
+    """Displacements to draw: those of outputs that do not repeat a moving hand."""
+    groups: dict[str, list[int]] = {}
+    for i, axis in enumerate(axes_of):
+        if 0 <= axis < d:
+            groups.setdefault(names[i].rsplit("_", 1)[0], []).append(i)
+    moves = bool(np.abs(q_s[:, :d]).max(initial=0.0) > 0)
+    repeated = [moves and np.array_equal(outputs[:, g], q_s[:, [axes_of[i] for i in g]]) for g in groups.values()]
+    return [i for group, same in zip(groups.values(), repeated, strict=True) if not same for i in group]
+
+
+def _angles(ax: Any, times: Array, q_s: Array, d: int) -> None:
+    """The angles that the hand turns by; all if it turns by none."""
+    turned = np.abs(q_s[:, d:]).max(axis=0) > 0
+    for j, axis in enumerate(hand_axes(q_s.shape[1], d)[d:]):
+        if turned[j] or not turned.any():
+            ax.plot(times, q_s[:, d + j], color=CYCLE["xyz".index(axis[-1])], label=f"hand, {axis}")
+    ax.set_ylabel("hand angle [rad]")
+    ax.legend(loc="best", handlelength=2.0)

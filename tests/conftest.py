@@ -71,8 +71,8 @@ CHATTY = {
     "test_lqr_second_order", "test_lqr_spectrum", "test_lqr_tail", "test_reduction_model", "test_reduction_online",
     "test_reduction_pymor", "test_reduction_snapshots", "test_study_bench", "test_study_cli",
     "test_study_control", "test_study_effects", "test_study_explain", "test_study_hardcases", "test_study_loop_plots",
-    "test_study_plots", "test_study_reduce", "test_study_reduce_tables", "test_study_report", "test_study_work",
-    "test_study_work_control", "test_study_work_tolerance",
+    "test_study_plots", "test_study_reduce", "test_study_reduce_tables", "test_study_report", "test_study_simulate",
+    "test_study_work", "test_study_work_control", "test_study_work_tolerance",
 }  # fmt: skip
 
 

@@ -123,6 +123,27 @@ def layered_scene(**parts: Any) -> Scene:
     return scene_of(tissue=tissue, **parts)
 
 
+@pytest.mark.parametrize("drive", ["motion", "force"])
+@pytest.mark.parametrize("control", [None, {"outputs": [{"kind": "hand"}]}])
+@pytest.mark.parametrize("effects", [{}, {"reaction": True}, {"rotation": True}, {"reaction": True, "rotation": True}])
+@pytest.mark.parametrize("inertia", [0.25, 100.0])
+def test_number_and_verdict_do_not_contradict(
+    drive: str, control: Any, effects: dict[str, bool], inertia: float
+) -> None:
+    angle = [0.1] if effects.get("rotation") and inertia > 1 else [0.0] if effects.get("rotation") else []
+    motion = {"target": [1.0, 0.0, *angle], "drive": drive}
+    scene = layered_scene(hand={"inertia": inertia}, effects=effects, motion=motion, control=control)
+    materials = (LayerMaterial(50.0, 50.0, 1.0), LayerMaterial(50.0, 50.0, 3.0))
+    for effect in EFFECTS.values():
+        gate = effect.gate(problem_of(scene, materials=materials))
+        assert ((gate.number > gate.threshold) == gate.matters) == (not gate.condition), gate
+        assert gate.condition in gate.comparison
+        assert f"threshold {gate.threshold:.3g}" in gate.comparison
+    assert (
+        "not computed (counts as it is set)" in EFFECTS["damping"].gate(problem_of(scene, omega=(), zeta=())).comparison
+    )
+
+
 def test_layers() -> None:
     scene = layered_scene()
     stiff, soft = LayerMaterial(50.0, 50.0, 1.0), LayerMaterial(20.0, 20.0, 1.0)

@@ -154,7 +154,7 @@ def test_inverted_cells_are_refused_or_turned(mpi_tmp_path: Path, dimension: int
         bad = cells.copy()
         bad[wrong, :2] = bad[wrong, 1::-1]
         path = write(mpi_tmp_path / f"bad{len(wrong)}.vtu", points, bad)
-        with pytest.raises(MeshError, match=f"{len(wrong)} inverted cells of {len(cells)}.*tissue.repair"):
+        with pytest.raises(MeshError, match=f"{len(wrong)} inverted cells? of {len(cells)}.*tissue.repair"):
             read_mesh(COMM, path)
         assert volume(read_mesh(COMM, path, repair=True)) == pytest.approx(2.0, rel=WIDE)
         repaired = check_cells(points, bad, True, "a")
@@ -166,7 +166,7 @@ def test_flat_cell_is_refused_even_with_repair(mpi_tmp_path: Path) -> None:
     points, cells, _ = grid(3)
     points = np.vstack([points, points[cells[11, :3]].mean(axis=0)])
     cells[11, 3] = len(points) - 1
-    with pytest.raises(MeshError, match="1 cells of zero volume, the worst is cell 11 "):
+    with pytest.raises(MeshError, match="1 cell of zero volume, the worst is cell 11 "):
         read_mesh(COMM, write(mpi_tmp_path / "flat.vtu", points, cells), repair=True)
 
 
@@ -178,7 +178,7 @@ def test_flatness_does_not_depend_on_units() -> None:
 def test_non_finite_point_is_refused() -> None:
     points, cells, _ = grid(2)
     points[3, 1] = np.nan
-    with pytest.raises(MeshError, match=r"1 points with NaN.*first is 3"):
+    with pytest.raises(MeshError, match=r"1 point with NaN.*first is 3"):
         check_cells(points, cells, False, "a")
 
 
@@ -216,7 +216,7 @@ def test_absent_tag_lists_the_present_ones(mpi_tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "nodes", "words"),
     [
-        ("quad", [[0, 1, 2, 3]], "type quad"),
+        ("polygon", [[0, 4, 1, 2, 3]], "type polygon"),
         ("triangle6", [[0, 1, 2, 3, 4, 5]], "type triangle6"),
         ("line", [[0, 1]], "line"),
     ],

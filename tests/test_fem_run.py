@@ -124,14 +124,21 @@ def test_a_force_of_the_wrong_shape_is_refused(comm: MPI.Intracomm, force: Any) 
 
 
 @pytest.mark.parametrize("step", [0, 25, 39])
-def test_a_run_that_is_no_longer_finite_stops(comm: MPI.Intracomm, step: int) -> None:
+@pytest.mark.parametrize("reaction", [False, True])
+def test_a_force_that_is_not_finite_is_named(comm: MPI.Intracomm, step: int, reaction: bool) -> None:
     def force(n: int, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        return np.full(2, np.nan if n == step else 1.0)
+        return np.array([1.0, np.nan if n >= step and comm.rank == comm.size - 1 else 1.0])  # on one rank is enough
 
-    with pytest.raises(
-        SolverError, match="is not finite at step 28" if step == 25 else rf"step {step + 1} .*not finite"
-    ):
-        simulate(small(comm), force=force)
+    said = rf"force on the hand is nan in y in step {step + 1}, at t = {(step + 0.5) * 3 / 40:g} s"
+    with pytest.raises(SolverError, match=said):
+        simulate(small(comm, f"effects.reaction={str(reaction).lower()}"), force=force)
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_a_run_that_is_no_longer_finite_stops(comm: MPI.Intracomm) -> None:
+    """The energy overflows, the force does not."""
+    with pytest.raises(SolverError, match="the energy is not finite at step 4"):
+        simulate(small(comm), force=lambda n, t, q, v: np.full(2, 1.0 if n < 2 else 1e200))
 
 
 def residuals_seen(monkeypatch: pytest.MonkeyPatch) -> list[float]:
@@ -191,11 +198,13 @@ def test_restart_file_of_another_format(comm: MPI.Intracomm, mpi_tmp_path: Path)
     if comm.rank == 0:
         manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 1}))
     comm.Barrier()
-    with pytest.raises(CheckpointError, match=r"another version of softgrasp .format 1, this one reads 2.; run"):
+    with pytest.raises(CheckpointError, match=r"another version of softgrasp .format 1, this one reads 3.; run"):
         simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
 
 
-def test_ctrl_c_on_one_rank_leaves_a_restart_file(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+def test_ctrl_c_on_one_rank_leaves_a_restart_file(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     def interrupt(run: Run) -> None:
         if comm.rank == comm.size - 1:
             os.kill(os.getpid(), signal.SIGINT)
@@ -206,6 +215,7 @@ def test_ctrl_c_on_one_rank_leaves_a_restart_file(comm: MPI.Intracomm, mpi_tmp_p
     with pytest.raises(Interrupted, match="stopped after step"):
         simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path, progress=interrupt))
     assert signal.getsignal(signal.SIGINT) is before
+    assert capfd.readouterr().err.count("stopping as soon as") == (comm.size == 1)  # rank 0 speaks when it was asked
     rest = simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path, resume=True))
     assert np.array_equal(whole.final, rest.final)
 
@@ -249,8 +259,31 @@ def test_resume_without_or_with_foreign_checkpoint(comm: MPI.Intracomm, mpi_tmp_
         simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
     with pytest.raises(Interrupted):
         simulate(small(comm), RunOptions(directory=mpi_tmp_path, until=5))
-    with pytest.raises(CheckpointError, match="scene_hash"):
-        simulate(small(comm, "tissue.material.mu=51.0"), RunOptions(directory=mpi_tmp_path, resume=True))
+    resumed = RunOptions(directory=mpi_tmp_path, resume=True)
+    with pytest.raises(CheckpointError, match=r"with tissue\.material\.mu = 50.0, this run has 51.0; resume"):
+        simulate(small(comm, "tissue.material.mu=51.0", "output.frames=7"), resumed)
+    shown = ("output.frames=7", 'output.fields="xdmf"', "output.checkpoint_every=9")  # the numbers are the same
+    assert np.array_equal(simulate(small(comm, *shown), resumed).final, simulate(small(comm)).final)
+
+
+def test_a_changed_csv_does_not_resume(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    table = mpi_tmp_path / "motion.csv"
+    csv = (f'motion.csv="{table}"', 'motion.profile="csv"', "motion.target=false")
+
+    def write(end: str) -> None:
+        if comm.rank == 0:
+            table.write_text(f"0,0,0\n1,0.5,0.2\n3,{end},1\n")
+        comm.Barrier()
+
+    write("2")
+    with pytest.raises(Interrupted):
+        simulate(small(comm, *csv), RunOptions(directory=mpi_tmp_path, until=5))
+    write("2.5")
+    with pytest.raises(CheckpointError, match="a file that the scene names is not what it was"):
+        simulate(small(comm, *csv), RunOptions(directory=mpi_tmp_path, resume=True))
+    write("nan")
+    with pytest.raises(SceneError, match="holds nan as column 2, at t = 3 s, in data row 3"):
+        simulate(small(comm, *csv))
 
 
 def test_damaged_checkpoint_is_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:

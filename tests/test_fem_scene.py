@@ -38,6 +38,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["control.outputs.0.pont=[0.0, 0.0]"], "control.outputs.0.pont is not a key; did you mean"),
     (SCENES["layers_2d"], ["tissue.layers.fat.bx=1"], "tissue.layers.fat.bx is not a key; did you mean"),
     (PAPER, ["time={}"], "time.steps is missing; give number of equal time steps"),
+    (PAPER, ["effects.damping={beta=1.0}"], "damping.kind is missing; give damping law: 'kelvin-voigt', 'rayleigh'"),
     (
         PAPER,
         ["tissue.material={mu=1.0, rho=1.0}"],
@@ -105,7 +106,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
         "effects.damping.beta is -1.0; it must be >= 0",
     ),
     # geometry
-    (PAPER, ["tissue.mesh=a.msh"], "tissue.size cannot go with tissue.mesh"),
+    (PAPER, ["tissue.mesh=a.msh"], "tissue.size cannot go with tissue.mesh; drop one, on the command line by --set"),
     (PILLOW, ["tissue.cells=[1, 1, 1]"], "tissue.cells cannot go with tissue.mesh"),
     (PAPER, ["tissue.size=[1.0]"], "tissue.size is [1.0]; it must have at least 2 items"),
     (PAPER, ["tissue.cells=[1, 2, 3]"], "tissue.cells is [1, 2, 3]; it must have 2 entries as size does"),
@@ -266,6 +267,8 @@ def test_set_takes_toml_values_bare_words_indices_and_false() -> None:
     assert scene.effects.damping is not None
     assert scene.effects.damping.alpha == 2.0
     assert load_scene(FRANKA, ["effects.damping=false"]).effects.damping is None
+    tissue = load_scene(PAPER, ["tissue.mesh=a.msh", "tissue.size=false", "tissue.cells=false"]).tissue
+    assert (tissue.size, tissue.cells, tissue.mesh) == (None, None, "a.msh")
 
 
 def test_sides_by_dimension() -> None:

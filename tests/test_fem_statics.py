@@ -20,9 +20,10 @@ from skfem.helpers import ddot, div, sym_grad
 from fem.assembly import Inventory, _bilinear, assemble, discretise
 from fem.build import build
 from fem.geometry import TissueMesh, structured_mesh
+from fem.layout import BlockLayout
 from fem.petsc import PETSc
 from fem.scene import Scene
-from fem.system import BlockSystem, LayerMaterial, tissue_matrices
+from fem.system import LayerMaterial, tissue_matrices
 
 Array = NDArray[np.float64]
 SIDES = {2: ["left", "right", "bottom", "top"], 3: ["x-", "x+", "y-", "y+", "z-", "z+"]}
@@ -124,9 +125,9 @@ def test_manufactured_solution_converges(comm: MPI.Intracomm, order: int, cells:
     assert abs(rate - (order + 1)) < 0.1, f"order {rate:.3f}, errors {errors}"  # finest three of four refinements
 
 
-def lowest(system: BlockSystem, count: int) -> Array:
+def lowest(stiffness: PETSc.Mat, mass: PETSc.Mat, layout: BlockLayout, count: int) -> Array:
     """Lowest squared frequencies omega^2 of the clamped tissue."""
-    K, M = (gather_matrix(system.layout, A).tocsc() for A in (system.K_ee, system.M_ee))
+    K, M = (gather_matrix(layout, A).tocsc() for A in (stiffness, mass))
     start = np.sin(np.arange(K.shape[0]) + 1.0)  # a fixed start: the same digits in every run
     return np.sort(scipy.sparse.linalg.eigsh(K, count, M, sigma=0, return_eigenvectors=False, v0=start))
 
@@ -137,13 +138,36 @@ def test_ten_lowest_frequencies_converge(comm: MPI.Intracomm) -> None:
     sizes = [10, 20, 40, 80]
 
     def omega(n: int, order: int) -> Array:
-        return np.sqrt(lowest(build(clamped([1.0, 0.7], [n, 7 * n // 10], order), comm).system, 10))
+        system = build(clamped([1.0, 0.7], [n, 7 * n // 10], order), comm).system
+        return np.sqrt(lowest(system.K_ee, system.M_ee, system.layout, 10))
 
     fine = omega(60, 2)  # its own error is of order h^4: three digits below that of the finest P1 mesh
     errors = np.array([omega(n, 1) - fine for n in sizes])
     assert (errors > 0).all()
     rates = -np.polyfit(np.log(sizes[1:]), np.log(errors[1:]), 1)[0]
     assert np.abs(rates - 2).max() < 0.1, f"orders {rates}"  # finest three of four refinements
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("order", "cells"), [(1, [10, 20, 40, 80]), (2, [5, 10, 20, 40])])
+def test_frequencies_converge_to_exact_ones(comm: MPI.Intracomm, order: int, cells: list[int]) -> None:
+    """With lambda = -mu both components of a clamped body decouple: omega^2 = mu pi^2 (i^2 / a^2 + j^2 / b^2) / rho.
+
+    The difference of the two energies is a divergence. Unlike at other ratios no corner limits the order of P2.
+    """
+    a, b, mu, rho = 1.0, 0.6, 20.0, 2.0
+    i, j = np.meshgrid(np.arange(1, 9), np.arange(1, 9))
+    exact = np.pi * np.sqrt(np.repeat(np.sort((mu / rho * ((i / a) ** 2 + (j / b) ** 2)).ravel()), 2)[:10])
+    errors = []
+    for n in cells:
+        size, counts = [a, b], [n, 3 * n // 5]
+        scene = clamped(size, counts, order)
+        space = discretise(structured_mesh(comm, size, counts), scene)
+        M, K = tissue_matrices(assemble(space, scene, Inventory()), (LayerMaterial(-mu, mu, rho),))
+        errors.append(np.sqrt(lowest(K, M, space.layout, 10)) - exact)
+    assert (np.array(errors) > 0).all()  # Rayleigh quotients in a subspace are never below
+    rates = -np.polyfit(np.log(cells[1:]), np.log(errors[1:]), 1)[0]
+    assert np.abs(rates - 2 * order).max() < 0.1, f"orders {rates}"  # finest three of four refinements
 
 
 def taylor_hood_tip(nu: float, cells: list[int]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,8 @@ from tests.browser import look
 
 ROOT = Path(__file__).parent.parent
 FORWARD = ROOT / "demos" / "scenes" / "paper_forward.toml"
+# A PETSc that was initialised before, with its own handler of signals, as a cluster may have it.
+HANDLING = "from fem import _stack; import os; os.environ['PETSC_OPTIONS'] = ''; import petsc4py.PETSc; "
 pytestmark = pytest.mark.serial
 
 
@@ -41,7 +44,11 @@ def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> Non
     assert result["memory_peak_mb"] > 50  # MiB; Python with PETSc alone needs more
     for name in ("trajectory.csv", "scene.toml", "move.png", "move.pdf", "move.gif", "traces.png", "report.html"):
         assert (out / name).stat().st_size > 500, name
-    assert "data:image/png;base64" in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert "data:image/png;base64" in page
+    assert ["small strains" in text for text in result["warnings"]] == [True]  # of the paper's move
+    assert result["warnings"][0] in page
+    assert run.stdout.count("warning:") == 1
 
 
 def test_set_changes_the_mesh(tmp_path: Path) -> None:
@@ -67,6 +74,7 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, args: tuple[str, ...], word
     run = softgrasp("simulate", str(FORWARD), "--out", str(tmp_path / "out"), *args, ranks=ranks)
     assert run.returncode != 0
     assert "Traceback" not in run.stderr
+    assert "resumed" not in run.stdout
     message = run.stderr[run.stderr.index("error:") :]
     assert message.count("error:") == 1  # one rank speaks
     for word in words:
@@ -74,14 +82,31 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, args: tuple[str, ...], word
     assert not (tmp_path / "out" / "result.json").exists()
 
 
-def test_a_resumed_run_says_where_its_pictures_begin(tmp_path: Path) -> None:
+def test_a_resumed_run_says_from_where_and_what_it_timed(tmp_path: Path) -> None:
     small = ("simulate", str(FORWARD), "--out", str(tmp_path), "--set", "tissue.cells=[4,8]", "--set", "time.steps=40")
     assert softgrasp(*small, "--until", "20", "--no-pictures").returncode != 0  # stopped, as asked
     run = softgrasp(*small, "--resume", "--no-pictures")
     assert run.returncode == 0, run.stderr
-    assert "begin where the run was stopped" in run.stdout
-    assert any(tmp_path.glob("fields-resumed*"))
+    assert "resumed from step 20 of 40" in run.stdout
+    assert "20 of 40, since the run was resumed," in run.stdout
+    assert any(tmp_path.glob("fields-from20*"))
+    assert json.loads((tmp_path / "result.json").read_text())["time"]["steps_timed"] == 20
     assert json.loads((tmp_path / "result.json").read_text())["output_final"][0] > 5  # the tissue came along
+
+
+@pytest.mark.parametrize("first", ["", HANDLING])
+def test_a_reader_that_leaves_ends_no_run(tmp_path: Path, first: str) -> None:
+    out = tmp_path / "out"
+    code = f"{first}from study.cli import main; main()"
+    small = ["--set", "tissue.cells=[4,8]", "--set", "time.steps=40", "--no-pictures"]
+    command = [sys.executable, "-c", code, "simulate", str(FORWARD), "--out", str(out), *small]
+    reader, writer = os.pipe()
+    os.close(reader)
+    run = subprocess.run(command, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60)
+    os.close(writer)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert json.loads((out / "result.json").read_text())["states"] > 0
+    assert (out / "report.html").exists()
 
 
 def test_missing_scene_and_mesh(tmp_path: Path) -> None:

@@ -13,9 +13,12 @@ from rich.console import Console
 
 from fem.build import build
 from fem.midpoint import midpoint_matrix
+from fem.modes import lowest_modes
 from fem.petsc import PETSc
+from fem.run import simulate
 from fem.scene import Scene
 from fem.solvers import choose_solver, make_solver
+from study.cautions import gradients, inexact, run_warnings, slowest
 from study.equation import equation
 from study.explain import Explanation, explain, factor_bytes, render, run_explain
 
@@ -139,6 +142,43 @@ def test_large_strain_and_angle(comm: MPI.Intracomm) -> None:
     result = explain(scene, comm)
     assert any("small strains" in w for w in result.warnings)
     assert any("0.5 rad" in w and "12.5%" in w for w in result.warnings)
+
+
+def test_a_run_warns_of_what_explain_warns_of(comm: MPI.Intracomm) -> None:
+    few = scene_of(1, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, time={"steps": 6})
+    model = build(few, comm)
+    found = run_warnings(model, simulate(model))
+    told = explain(few, comm).warnings
+    assert told[0] in found  # locking, word by word
+    coarse, strained = (next(w for w in found if word in w) for word in ("coarse in time", "small strains"))
+    assert coarse.split(": use")[1] == next(w for w in told if "coarse" in w).split(": use")[1]  # as many steps
+    assert "of the body at t =" in strained
+    gentle = {"motion": {"target": [1e-3, 0.0], "duration": 2.0}, "time": {"steps": 400}}
+    model = build(scene_of(2, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, **gentle), comm)
+    assert run_warnings(model, simulate(model)) == []
+
+
+def test_slowest_period_and_gradient(comm: MPI.Intracomm) -> None:
+    model = build(scene_of(2, contact={"sides": ["top"]}), comm)
+    layout = model.system.layout
+    omega, Phi = lowest_modes(model.system, 3)
+    moving = Phi @ np.array([[1.0, 0.0, 0.0, -1.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]])
+    # three directions are left of four columns without their mean: all three modes; rounding in the eigenvalues
+    assert slowest(model.system, moving) == pytest.approx(omega[0], rel=1e-8)
+    assert slowest(model.system, np.repeat(Phi[:, :1], 4, axis=1)) == 0.0  # a deformation that does not move
+    z = 0.3 * (layout.nodes - [0.0, 2.0]) @ np.array([[0.0, 0.0], [1.0, 0.0]])  # shear, zero at the hand
+    most, share = gradients(model, z.ravel())
+    assert most == pytest.approx(0.3, rel=1e-12)  # linear, so exact but for rounding
+    assert share == 1.0
+    assert gradients(model, z.ravel() / 4)[1] == 0.0
+
+
+def test_digits_that_are_left() -> None:
+    assert inexact(1e-12, 1e-14, "cholesky", 0.3) == []
+    assert inexact(1e-5, 1e-14, "cg", 0.3) == []  # of cg the residual counts
+    assert "about 5 digits, because nu = 0.5 - 2.0e-11" in inexact(5.7e-6, 1e-14, "cholesky", 0.5 - 2e-11)[0]
+    assert "badly conditioned" in inexact(1e-12, 1e-7, "mumps", 0.3)[0]
+    assert "time.rtol" in inexact(1e-5, 1e-7, "cg", 0.3)[0]
 
 
 @pytest.mark.serial

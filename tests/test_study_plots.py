@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageChops
 
 from fem.gather import PictureMesh
 from study.animation import gif_move, speed_up
@@ -108,6 +108,8 @@ def test_figure_without_target_and_without_motion(tmp_path: Path) -> None:
     states, times, table, _ = move(picture, 0.0, 3)
     png, _ = figure_move(picture, 0 * states, times, table, None, tmp_path / "still.png")
     assert len(colours(png)) > 10
+    moved, _ = figure_move(picture, 1e-3 * states, times, table, None, tmp_path / "swayed.png")
+    assert Image.open(png).width < Image.open(moved).width  # no deformation, no colour bar
 
 
 def test_traces_draw_hand_and_output(tmp_path: Path) -> None:
@@ -120,6 +122,11 @@ def test_traces_draw_hand_and_output(tmp_path: Path) -> None:
     assert len(colours(png)) > 30
     assert pdf.stat().st_size > 1000
     assert Image.open(turned).height > Image.open(png).height  # a panel for the angle
+    both = np.hstack([y, q[:, :2]])  # the hand as an output too: drawn once, so the picture is the same
+    again, _ = figure_traces(t, both, (*names, "hand_x", "hand_y"), q[:, :2], tmp_path / "c.png")
+    assert ImageChops.difference(Image.open(again).convert("RGB"), Image.open(png).convert("RGB")).getbbox() is None
+    alone, _ = figure_traces(t, q[:, :2], ("hand_x", "hand_y"), q[:, :2], tmp_path / "d.png")
+    assert Image.open(alone).height < Image.open(png).height  # nothing moves relative to the hand
 
 
 @pytest.mark.parametrize("picture", [rectangle(), cube()])

@@ -67,14 +67,16 @@ class Damping:
             symbol = "zeta_1 = phi_1' D phi_1 / (2 omega_1)"
         if not problem.omega:
             sentence = "The first frequencies were not computed, so the damping ratios are unknown."
-            return Gate(float("nan"), symbol, float("nan"), self.active(scene), sentence)
+            unknown = "counts as it is set"
+            return Gate(float("nan"), symbol, float("nan"), self.active(scene), sentence, condition=unknown)
         end, omega = scene.time_end, problem.omega[0]
         threshold = 0.05 / (omega * end)
         if scene.effects.damping is None:
             sentence = f"Off: undamped ring-down, nothing decays in the {end * omega / (2 * np.pi):.3g} first periods"
             wanted = scene.control is not None
             sentence += "; feedback alone cannot stabilise the high modes." if wanted else " of the run."
-            return Gate(0.0, symbol, threshold, wanted, sentence)
+            condition = "counts whatever the number: the control problem needs it" if wanted else ""
+            return Gate(0.0, symbol, threshold, wanted, sentence, condition=condition)
         zeta = problem.zeta[0]
         left = float(np.exp(-zeta * omega * end))
         sentence = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -21,6 +22,7 @@ class Gate:
         matters: the effect changes what this scene computes; for an effect that is off: it would.
         sentence: the finding in words.
         proviso: on what it hangs that the effect matters; empty when on nothing.
+        condition: what decides beside the number, wherever ``matters`` is not number > threshold; else empty.
     """
 
     number: float
@@ -29,6 +31,15 @@ class Gate:
     matters: bool
     sentence: str
     proviso: str = ""
+    condition: str = ""
+
+    @property
+    def comparison(self) -> str:
+        """Number against threshold, and what else decides, as one line. Not collective."""
+        number = "not computed" if math.isnan(self.number) else f"{self.number:.3g}"
+        beside = [] if math.isnan(self.threshold) else [f"threshold {self.threshold:.3g}"]
+        beside += [self.condition] if self.condition else []
+        return f"{self.symbol} = {number}" + (f" ({'; '.join(beside)})" if beside else "")
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,7 @@ class Layers:
             if differs
         ]
         matters = number > THRESHOLD or bool(others)
+        condition = f"counts by its {' and '.join(others)} too" if others and number <= THRESHOLD else ""
         sentence = f"The stiffest layer is {number:.3g} times as stiff as the softest"
         sentence += f"; they also differ in {' and '.join(others)}." if others else "."
-        return Gate(number, symbol, THRESHOLD, matters, sentence)
+        return Gate(number, symbol, THRESHOLD, matters, sentence, condition=condition)

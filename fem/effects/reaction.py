@@ -43,4 +43,6 @@ class Reaction:
         else:
             sentence = "The motion of the hand is prescribed, so the reaction moves nothing."
         proviso = where.removeprefix(" ") if felt else ""
-        return Gate(number, "tissue mass / hand mass", THRESHOLD, felt and number > THRESHOLD, sentence, proviso)
+        large = number > THRESHOLD
+        condition = "counts only where a force drives the hand" if large and not felt else ""
+        return Gate(number, "tissue mass / hand mass", THRESHOLD, felt and large, sentence, proviso, condition)

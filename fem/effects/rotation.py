@@ -72,7 +72,10 @@ class Rotation:
                 if not scene.effects.reaction
                 else "Off; the tissue hardly turns the hand, or the motion is prescribed."
             )
-            return Gate(number, symbol, THRESHOLD, matters, sentence)
+            condition = ""
+            if number > THRESHOLD and not matters:
+                condition = "counts only where a force drives the hand and effects.reaction is on"
+            return Gate(number, symbol, THRESHOLD, matters, sentence, condition=condition)
         angles = (scene.motion.target or [])[d:]
         turned = scene.motion.profile == "csv" or any(angles)
         torque = force_drives(scene)
@@ -82,4 +85,8 @@ class Rotation:
             sentence = f"A torque can turn the hand; tissue inertia is {number:.2g} of the hand's."
         else:
             sentence = "The prescribed motion does not turn the hand."
-        return Gate(number, symbol, THRESHOLD, turned or torque, sentence)
+        condition = "counts only where the motion or a torque turns the hand"
+        if turned or torque:
+            condition = f"counts whatever the number: {'the motion turns' if turned else 'a torque can turn'} the hand"
+        contrary = (number > THRESHOLD) != (turned or torque)
+        return Gate(number, symbol, THRESHOLD, turned or torque, sentence, condition=condition if contrary else "")

@@ -1,0 +1,67 @@
+"""What a shell does to the command: the reader of its output leaves, and Ctrl-C comes while modules load.
+
+Imports nothing but the standard library, so that it can come first.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import sys
+from types import FrameType
+
+
+class Stream(io.TextIOWrapper):
+    """A standard stream; what is written after its reader has gone goes nowhere."""
+
+    def write(self, text: str, /) -> int:
+        """Write, or drop what nobody reads. Not collective."""
+        try:
+            return super().write(text)
+        except BrokenPipeError:
+            return self._leave(len(text))
+
+    def flush(self) -> None:
+        """Flush, or drop what nobody reads. Not collective."""
+        try:
+            super().flush()
+        except BrokenPipeError:
+            self._leave(0)
+
+    def _leave(self, written: int) -> int:
+        """Turn the descriptor to the null device: what is buffered must go somewhere when Python ends."""
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, self.fileno())
+        os.close(null)
+        return written
+
+
+def outlive_readers() -> None:
+    """Let the program run on when the reader of its output ends. Not collective: call on every rank, in main only."""
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # a PETSc that is initialised already aborts on it
+    for name in ("stdout", "stderr"):
+        given = getattr(sys, name)
+        if isinstance(given, io.TextIOWrapper):
+            lines = given.line_buffering
+            stream = Stream(given.buffer, encoding=given.encoding, errors=given.errors, line_buffering=lines)
+            setattr(sys, name, stream)
+
+
+def quiet_imports() -> None:
+    """Let Ctrl-C end the program at once while modules load, where KeyboardInterrupt would tear compiled ones apart.
+
+    Not collective. Leaves any handler but Python's own alone.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    outer = frame
+    while outer is not None:
+        if outer.f_code.co_filename == "<frozen importlib._bootstrap>":
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        outer = outer.f_back
+    signal.default_int_handler(number, frame)
