@@ -264,7 +264,7 @@ def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
     fewest = min((row["ranks"] for row in good), default=1)
     good = [row for row in good if row["ranks"] == fewest]
     with paper_style():
-        figure, axes = plt.subplots(figsize=(4.2, 3.1))
+        figure, axes = plt.subplots(figsize=(5.4, 3.1))
         colours = dict(zip(METHODS, (BLUE, HAND, SKY, GREEN, ORANGE, PURPLE), strict=True))
         for name, label in METHODS.items():
             for d, fill in ((2, "full"), (3, "none")):
@@ -276,12 +276,12 @@ def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
                 if points:
                     n, us = zip(*points, strict=True)
                     style = "--" if name in ("solve", "own") else "-"
-                    shown = label if d == 2 else f"{label}, 3D"
-                    axes.loglog(n, us, style, marker="o", ms=4, fillstyle=fill, color=colours[name], label=shown)
+                    axes.loglog(n, us, style, marker="o", ms=4, fillstyle=fill, color=colours[name], label=label)
+                    label = f"_{label}"  # named once
         axes.set_xlabel("tissue unknowns $n_e$")
         axes.set_ylabel("time of one step [µs]")
-        axes.set_title(f"{fewest} rank(s), median", loc="left")
-        axes.legend(fontsize=7)
+        axes.set_title(f"median, {'one rank' if fewest == 1 else f'{fewest} ranks'}; hollow: 3D", loc="left")
+        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5))
         return save(figure, path)
 
 
