@@ -89,11 +89,16 @@ def inexact(drift: float, residual: float, solver: str, nu: float) -> list[str]:
     return [f"{name} {worst:.1e}: the numbers carry {left}, because {reason}."]
 
 
-def run_warnings(model: Model, run: Trajectory) -> list[str]:
+def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None = None) -> list[str]:
     """What the result of a run warns of, without an eigenvalue problem. Collective.
 
-    Strain is that of the largest of at most `LOOKED_AT` stored displacements and the last one, the period that of
-    :func:`slowest`; without snapshots in memory there is the last displacement only.
+    Strain is that of the largest of at most `LOOKED_AT` stored displacements, the last one and ``most``; the period is
+    that of :func:`slowest`, which needs snapshots in memory.
+
+    Args:
+        model: the model.
+        run: its run.
+        most: time [s] and local rows (n_local,) [m] of a large displacement that was seen on the way.
     """
     scene, system, d = model.scene, model.system, model.space.mesh.dimension
     poisson = poisson_ratios(system)
@@ -103,13 +108,15 @@ def run_warnings(model: Model, run: Trajectory) -> list[str]:
     if omega > 0:
         period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"
         found += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
+    if most is not None:
+        Z, times = np.column_stack([Z, most[1]]), [*times, most[0]]
     largest = int(np.argmax(total(system.layout.comm, np.einsum("ij,ij->j", Z, Z))))
     z, t = Z[:, largest], times[largest]
-    most, share = gradients(model, z)
+    steepest, share = gradients(model, z)
     if share > SMALL_SHARE:
         found.append(
             f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {share:.0%} of the body at "
-            f"t = {t:.3g} s, at most {most:.2g}: linear elasticity assumes small strains and rotations."
+            f"t = {t:.3g} s, at most {steepest:.2g}: linear elasticity assumes small strains and rotations."
         )
     found += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
     return found + inexact(run.energy_drift, max(run.residuals), run.solver[0], max(poisson.values()))

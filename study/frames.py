@@ -11,7 +11,7 @@ from fem.build import Model
 from fem.errors import CheckpointError, agree
 from fem.fields import SeriesWriter
 from fem.gather import gather_picture, vertex_displacement
-from fem.petsc import Array
+from fem.petsc import Array, total
 from fem.run import Run, Trajectory, frame_steps
 from study.shapes import pick_instants, way_done
 
@@ -29,6 +29,9 @@ class Frames:
         model: the model.
         directory: where the field files go, and of the run.
         pictures: keep what figures and animation need.
+
+    Attributes:
+        most: of the frame with the largest displacement since the start or resume: |z|^2, time [s], z (local rows).
     """
 
     def __init__(self, model: Model, directory: Path, pictures: bool = True) -> None:
@@ -39,6 +42,7 @@ class Frames:
         self.legs = [0]
         self.saved = 0  # of the frames below, how many lie beside the checkpoint
         self.steps: list[int] = []
+        self.most: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(0))
         self.picture = gather_picture(model) if pictures else None
         vertices = model.space.mesh.mesh.geometry.index_map().size_global
         self.few = vertices > MANY_VERTICES
@@ -118,6 +122,9 @@ class Frames:
         t, q_s, v_s = run.reached * run.dt, run.drive.q[run.reached], run.drive.v[run.reached]
         if self.few and not self.chosen:
             self.chosen = self._ahead(run)
+        size = float(total(run.layout.comm, np.array([np.dot(z, z)]))[0])
+        if size > self.most[0]:
+            self.most = size, t, z.copy()
         if self.writer is not None:
             self.writer.write(t, z, v, q_s, v_s)
         if self.pictures and (not self.few or run.reached in self.chosen):

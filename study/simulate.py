@@ -71,7 +71,7 @@ def run_simulate(
             raise
     files = frames.close()
     result = simulate_result(model, run)
-    result["warnings"] = run_warnings(model, run)
+    result["warnings"] = run_warnings(model, run, frames.most[1:])
     if comm.rank == 0:
         begin = time.perf_counter()
         files = write_results(out, model, run, result) + files + frames.draw(out, run)

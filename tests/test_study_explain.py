@@ -144,6 +144,18 @@ def test_large_strain_and_angle(comm: MPI.Intracomm) -> None:
     assert any("0.5 rad" in w and "12.5%" in w for w in result.warnings)
 
 
+def test_a_run_that_stores_nothing_warns_of_a_strain_seen_on_the_way(comm: MPI.Intracomm) -> None:
+    still = scene_of(motion={"target": [1e-3, 0.0]}, output={"snapshots": "none"})
+    model = build(still, comm)
+    run = simulate(model)
+    assert run.snapshots is None
+    assert run_warnings(model, run) == []
+    z = np.zeros(model.system.layout.n_local)
+    z[::2] = model.space.layout.nodes[:, 1] / 2  # sheared by a half
+    (found,) = run_warnings(model, run, (0.25, z))
+    assert "at t = 0.25 s, at most" in found
+
+
 def test_a_run_warns_of_what_explain_warns_of(comm: MPI.Intracomm) -> None:
     few = scene_of(1, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, time={"steps": 6})
     model = build(few, comm)
