@@ -16,7 +16,7 @@ from lqr.abscissa import ModalLoop
 from lqr.coordinates import gain_of
 from study.control_reduced import TITLES, SweptBasis, fast_order
 from study.loop_plots import figure_decay, figure_histories, figure_loop_move
-from study.style import BLUE, COLUMN, GREEN, HAND, ORANGE, PURPLE, WIDTH, paper_style, save
+from study.style import BLUE, COLUMN, GREEN, HAND, ORANGE, PURPLE, SKY, UNSTABLE, WIDTH, paper_style, save
 
 if TYPE_CHECKING:
     from fem.petsc import Array
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from study.frames import Frames
     from study.loop_plots import Poles
 
-SKY, UNSTABLE = "#56B4E9", "#B00020"
 LOOKS = {
     "pod": (BLUE, "-", "o"),
     "weighted_pod": (SKY, "--", "s"),

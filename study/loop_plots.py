@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from study.outputs_named import AXES, TURNS, farthest, turns
 from study.plots import figure_move
 from study.shapes import pick_instants
-from study.style import CYCLE, OUTLINE, TARGET, WIDTH, length_unit, paper_style, save
+from study.style import CYCLE, OUTLINE, SKY, TARGET, WIDTH, length_unit, paper_style, save
 
 if TYPE_CHECKING:
     from fem.gather import PictureMesh
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Poles = npt.NDArray[np.complex128]
 
-COLOURS = (*CYCLE, "#E69F00", "#56B4E9", "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six
+COLOURS = (*CYCLE, "#E69F00", SKY, "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "^", "s", "D", "v", "P")
 FLOOR = 1e-16  # smallest distance to the target that a double of order one can show

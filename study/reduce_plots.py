@@ -13,14 +13,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from reduction.registry import PAPER_METHODS
 from study.reduce_sweep import Point, Swept, nearest
-from study.style import BLUE, GREEN, HAND, ORANGE, PURPLE, STEPS, WIDTH, paper_style, save
+from study.style import BLUE, GREEN, HAND, ORANGE, PURPLE, SKY, STEPS, UNSTABLE, WIDTH, paper_style, save
 
-UNSTABLE = "#D00000"
 TOP = 1.0  # errors above are drawn at the upper edge
 NARROW = 16.0  # largest over least time below which an axis has numbers between the powers of ten
 LOWEST = 1e-17  # of a singular value over the first
 SHOWN_VALUES = 100
-OLIVE, SKY, BROWN = "#8a8a00", "#56B4E9", "#8c510a"
+OLIVE, BROWN = "#8a8a00", "#8c510a"
 LOOKS: dict[str, tuple[str, str, str]] = {  # colour by decomposition, dashes for global bases
     "global_pod": (BLUE, "--", "o"),
     "pod_fixed": (BLUE, "-", "o"),

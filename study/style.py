@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe and Ito
 SKY = "#56B4E9"  # of the same palette
+UNSTABLE = "#B00020"
 HAND = "#2b2b2b"
 OUTLINE = "#555555"
 TARGET = ORANGE

@@ -12,9 +12,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from lqr.reduced_bases import BASES
-from study.control_plots import LOOKS, UNSTABLE
+from study.control_plots import LOOKS
 from study.control_reduced import TITLES as BASIS_TITLES
-from study.style import BLUE, GREEN, HAND, ORANGE, PURPLE, WIDTH, paper_style, save
+from study.style import BLUE, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
 from study.work_plots import FRONT, LINE, axes_log, draw_front
 from study.wp_fit import usable
 from study.wp_points import WorkPoint
