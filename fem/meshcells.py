@@ -29,7 +29,7 @@ _FACES: dict[str, tuple[tuple[int, ...], ...]] = {
 }
 _CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}
 _DIMENSIONS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "tetra": 3, "hexahedron": 3, "wedge": 3, "pyramid": 3}
-_FACE_SHAPES = {1: "vertex", 2: "line", 3: "triangle", 4: "quad"}
+_FACE_SHAPES = {2: "line", 3: "triangle", 4: "quad"}
 _LAGRANGE = {"CURVE": "line", "QUADRILATERAL": "quad", "TETRAHEDRON": "tetra"}  # VTK's names where they differ
 _NODES: dict[str, Callable[[int], int]] = {  # nodes of the Lagrange cell of order p
     "vertex": lambda p: 1,
@@ -173,16 +173,23 @@ def cut_cells(points: Floats, cells: Integers, shape: str, name: str) -> tuple[I
     if cells.shape[1] == cut.shape[1]:
         return cut, parents
     low, high = _signs(points, cut, parents, len(cells))
+    flat = np.flatnonzero((low == 0) & (high == 0))
+    if flat.size:
+        raise MeshError(
+            f"{name} has {counted(flat.size, 'cell')} of type {shape} and zero volume, the first around "
+            f"{place_text(points[cells[flat[0]]].mean(axis=0))}: remove or remesh them."
+        )
     if shape == "quad":
         bad = np.flatnonzero(low * high < 1)
         cut, parents = _replace(cut, parents, bad, simplices(cells[bad], shape, 1))
         low, high = _signs(points, cut, parents, len(cells))
-    tangled = np.flatnonzero(low * high < 0)
+    tangled = np.flatnonzero((low * high < 0) | (low == 0) | (high == 0))
     if tangled.size:
         middle = points[cells[tangled[0]]].mean(axis=0)
         raise MeshError(
             f"{name} has {counted(tangled.size, 'cell')} of type {shape} so distorted that the simplices they are cut "
-            f"into overlap, the first around {place_text(middle)}: remesh there, or export triangles or tetrahedra."
+            f"into overlap or are flat, the first around {place_text(middle)}: remesh there, or export triangles or "
+            "tetrahedra."
         )
     if shape == "wedge":
         turned = (high < 0)[parents]
@@ -207,6 +214,9 @@ def check_interfaces(points: Floats, blocks: list[tuple[Integers, str]], name: s
     if not quads or not triangles:
         return
     ring = np.concatenate(quads)
+    ring = ring[(np.diff(np.sort(ring, axis=1), axis=1) > 0).all(axis=1)]  # a collapsed face is a triangle itself
+    if not len(ring):
+        return
     turn = (ring.argmin(axis=1)[:, None] + np.arange(4)) % 4
     ring = np.take_along_axis(ring, turn, axis=1)
     wrong = np.concatenate([ring[:, [0, 1, 3]], ring[:, [1, 2, 3]]])

@@ -226,18 +226,33 @@ def _marked(
 def _named(
     raw: meshio.Mesh, blocks: list[tuple[int, str, Integers]], cut: list[tuple[Integers, Integers]]
 ) -> dict[str, npt.NDArray[np.bool_]]:
-    """Which simplices each named set of the file holds, without the sets that hold none."""
+    """Which simplices each named set of the file holds, without the sets that hold none.
+
+    A set must have one list of cells a block; others (sets of sets) are left out, and so are unknown names then.
+    """
     found = {}
     for name, lists in raw.cell_sets.items():
+        if name.startswith("gmsh:"):  # numbers of CAD entities, not of cells
+            continue
+        if len(lists) != len(raw.cells) or not all(_is_cell_list(part) for part in lists):
+            continue
         members = []
         for (i, _, nodes), (_, parents) in zip(blocks, cut, strict=True):
             inside = np.zeros(len(nodes), dtype=np.bool_)
             if i < len(lists) and lists[i] is not None and len(lists[i]):
                 inside[np.asarray(lists[i], dtype=np.int64)] = True
             members.append(inside[parents])
-        if not name.startswith("gmsh:") and (member := np.concatenate(members)).any():
+        if (member := np.concatenate(members)).any():
             found[name] = member
     return found
+
+
+def _is_cell_list(part: object) -> bool:
+    """Whether a block's share of a set is an array of cell numbers, or nothing."""
+    if part is None:
+        return True
+    array = part if isinstance(part, np.ndarray) else None
+    return array is not None and array.ndim == 1 and (array.size == 0 or np.issubdtype(array.dtype, np.integer))
 
 
 def _physical_names(raw: meshio.Mesh, dimension: int) -> dict[str, int]:

@@ -25,7 +25,8 @@ SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
 SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain of any fine mesh is large
 SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
 EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
-LOOKED_AT = 25  # stored instants that strain and frequency are taken from
+LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
+LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
 SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to count: far above rounding
 
 
@@ -108,10 +109,10 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     if omega > 0:
         period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"
         found += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
-    if most is not None:
-        Z, times = np.column_stack([Z, most[1]]), [*times, most[0]]
-    largest = int(np.argmax(total(system.layout.comm, np.einsum("ij,ij->j", Z, Z))))
-    z, t = Z[:, largest], times[largest]
+    sizes = total(system.layout.comm, np.einsum("ij,ij->j", Z, Z))
+    z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]
+    if most is not None and total(system.layout.comm, np.array([np.dot(most[1], most[1])]))[0] > sizes.max():
+        t, z = most
     steepest, share = gradients(model, z)
     if share > SMALL_SHARE:
         found.append(
@@ -132,7 +133,8 @@ def _instants(run: Trajectory, system: BlockSystem) -> tuple[Array, list[float]]
     if run.snapshots is None:
         return run.final[:n, None], [float(run.times[-1])]
     last = len(run.snapshots.times) - 1
-    columns = np.unique(np.linspace(0, last, LOOKED_AT).round().astype(int)).tolist()
+    count = int(np.clip(LARGEST // system.layout.n_e, 4, LOOKED_AT))
+    columns = np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
     times = [*run.snapshots.times[columns].tolist(), float(run.times[-1])]
     return np.column_stack([run.snapshots.Z[:n, columns], run.final[:n]]), times
 

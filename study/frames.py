@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -16,6 +17,7 @@ from fem.run import Run, Trajectory, frame_steps
 from study.shapes import pick_instants, way_done
 
 MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
+SUFFIXES = (".bp", ".xdmf", ".h5")
 SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run when few instants are kept
 
 
@@ -41,6 +43,7 @@ class Frames:
             self.writer = SeriesWriter(model, directory, model.scene.output.fields)
         self.legs = [0]
         self.saved = 0  # of the frames below, how many lie beside the checkpoint
+        self.swept = False
         self.steps: list[int] = []
         self.most: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(0))
         self.picture = gather_picture(model) if pictures else None
@@ -63,8 +66,17 @@ class Frames:
         if self.writer is not None:
             self.writer.rename(_series(run.begun))
         with agree(run.layout.comm):
+            if run.layout.comm.rank == 0:
+                self._remove_series(run.begun)
             if self.picture is not None and run.begun:  # rank 0
                 self._load(run.begun)
+
+    def _remove_series(self, begun: int) -> None:
+        """Field files from steps that this run has not reached: those of an earlier run in the same folder."""
+        for path in self.directory.glob("fields-from*"):
+            number = path.stem.removeprefix("fields-from")
+            if number.isdecimal() and (int(number) > begun or begun == 0) and path.suffix in SUFFIXES:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def _load(self, begun: int) -> None:
         for step, path in _kept(self.directory):
@@ -75,7 +87,7 @@ class Frames:
                     t, hand, state = float(file["t"]), file["hand"], file["state"]
             except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
                 raise CheckpointError(
-                    f"{path} cannot be read ({error}); resume with --no-pictures, or run again without --resume"
+                    f"{path} cannot be read; resume with --no-pictures, or run again without --resume"
                 ) from error
             self.steps.append(step)
             self.times.append(t)
@@ -101,19 +113,25 @@ class Frames:
     def _save(self, begun: int) -> None:
         folder = self.directory / "checkpoint"
         folder.mkdir(parents=True, exist_ok=True)
-        if begun == 0 and self.saved == 0:  # those of another run
-            for _, path in _kept(self.directory):
-                path.unlink(missing_ok=True)
+        if not self.swept:  # what a run that was killed, or another one, left behind
+            for step, path in _kept(self.directory):
+                if step > begun or begun == 0:
+                    path.unlink(missing_ok=True)
+            self.swept = True
         for i in range(self.saved, len(self.states)):
             path = folder / f"frame{self.steps[i]}.npz"
-            np.savez(path, t=self.times[i], hand=self.hands[i], state=self.states[i])
+            fresh = path.with_suffix(".new")
+            with fresh.open("wb") as file:
+                np.savez(file, t=self.times[i], hand=self.hands[i], state=self.states[i])
+            fresh.replace(path)
         self.saved = len(self.states)
 
     def lacking(self, begun: int) -> int:
         """How many frames before a step the pictures must do without; rank 0 only."""
         if self.picture is None or self.few:
             return 0
-        return len({step for step in frame_steps(self.model.scene) if step <= begun} - set(self.steps))
+        expected = sum(step <= begun for step in frame_steps(self.model.scene))
+        return max(0, expected - len(self.steps))
 
     def __call__(self, run: Run) -> None:
         """Take one frame. Collective."""
@@ -145,7 +163,7 @@ class Frames:
     def close(self) -> list[Path]:
         """Finish the field files; those of all legs. Collective."""
         own = list(self.writer.close()) if self.writer is not None else []
-        names = [f"{_series(leg)}{suffix}" for leg in self.legs[:-1] for suffix in (".bp", ".xdmf", ".h5")]
+        names = [f"{_series(leg)}{suffix}" for leg in self.legs[:-1] for suffix in SUFFIXES]
         return [path for name in names if (path := self.directory / name).exists()] + own
 
     def draw(self, directory: Path, run: Trajectory) -> list[Path]:
@@ -185,4 +203,5 @@ def _series(begun: int) -> str:
 def _kept(directory: Path) -> list[tuple[int, Path]]:
     """Steps of the frames beside the checkpoint and their files, in order."""
     files = (directory / "checkpoint").glob("frame*.npz")
-    return sorted((int(path.stem.removeprefix("frame")), path) for path in files)
+    numbers = ((path.stem.removeprefix("frame"), path) for path in files)
+    return sorted((int(number), path) for number, path in numbers if number.isdecimal())

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from fem.effects import EFFECTS
 from fem.errors import Interrupted
+from fem.meshcheck import counted
 from fem.outputs import unit
 from fem.results import force_unit, simulate_result, write_results
 from fem.run import Run, RunOptions, simulate
@@ -53,7 +54,10 @@ def run_simulate(
         frames.begin(run)
         if resume:
             lost = frames.lacking(run.begun)
-            more = f"; {lost} earlier frames are not kept, the pictures do without them" if lost else ""
+            missing = (
+                f"; {counted(lost, 'earlier frame')} {'is' if lost == 1 else 'are'} not kept, the pictures do without"
+            )
+            more = missing if lost else ""
             console.print(f"resumed from step {run.begun} of {run.steps}{more}", soft_wrap=True)
 
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:

@@ -5,6 +5,7 @@ Imports nothing but the standard library, so that it can come first.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import signal
@@ -14,6 +15,8 @@ from types import FrameType
 
 class Stream(io.TextIOWrapper):
     """A standard stream; what is written after its reader has gone goes nowhere."""
+
+    given: io.TextIOWrapper  # kept alive: its end would close the buffer that both use
 
     def write(self, text: str, /) -> int:
         """Write, or drop what nobody reads. Not collective."""
@@ -38,13 +41,22 @@ class Stream(io.TextIOWrapper):
 
 
 def outlive_readers() -> None:
-    """Let the program run on when the reader of its output ends. Not collective: call on every rank, in main only."""
+    """Let the program run on when the reader of its output ends. Not collective: call on every rank, in main only.
+
+    Under mpiexec the launcher reads the output, and ends all ranks when its own reader goes.
+    """
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # a PETSc that is initialised already aborts on it
     for name in ("stdout", "stderr"):
         given = getattr(sys, name)
-        if isinstance(given, io.TextIOWrapper):
-            lines = given.line_buffering
-            stream = Stream(given.buffer, encoding=given.encoding, errors=given.errors, line_buffering=lines)
+        if isinstance(given, io.TextIOWrapper) and not isinstance(given, Stream):
+            stream = Stream(
+                given.buffer,
+                encoding=given.encoding,
+                errors=given.errors,
+                line_buffering=given.line_buffering,
+                write_through=given.write_through,
+            )
+            stream.given = given
             setattr(sys, name, stream)
 
 
@@ -54,7 +66,8 @@ def quiet_imports() -> None:
     Not collective. Leaves any handler but Python's own alone.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
+        with contextlib.suppress(ValueError):  # not the main thread
+            signal.signal(signal.SIGINT, _interrupt)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

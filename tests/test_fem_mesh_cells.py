@@ -336,3 +336,97 @@ def test_hinge_is_one_sentence_with_its_place(mpi_tmp_path: Path) -> None:
     held_check(tissue, contact_facets(tissue, zone(["left", "right"])))
     with pytest.raises(MeshError, match="facets with more than two cells"):
         read_mesh(COMM, save(mpi_tmp_path / "twice.vtu", points, [("triangle", np.vstack([cells, cells[[0, 0]]]))]))
+
+
+GMSH_41 = """\
+$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$Entities
+4 4 1 0
+1 0 0 0 0
+2 1 0 0 0
+3 1 1 0 0
+4 0 1 0 0
+11 0 0 0 1 0 0 0 2 1 -2
+12 1 0 0 1 1 0 0 2 2 -3
+13 0 1 0 1 1 0 0 2 3 -4
+14 0 0 0 0 1 0 0 2 4 -1
+1 0 0 0 1 1 0 0 4 11 12 13 14
+$EndEntities
+$Nodes
+1 4 1 4
+2 1 0 4
+1
+2
+3
+4
+0 0 0
+1 0 0
+1 1 0
+0 1 0
+$EndNodes
+$Elements
+2 3 1 3
+1 11 1 1
+1 1 2
+2 1 2 2
+2 1 2 3
+3 1 3 4
+$EndElements
+"""  # curves 11 to 14 bound the surface: meshio lists those numbers in cell_sets
+
+
+@pytest.mark.serial
+def test_numbers_of_cad_entities_are_no_cells(tmp_path: Path) -> None:
+    path = tmp_path / "a.msh"
+    path.write_text(GMSH_41)
+    arrays = load_arrays(path, 1.0, False)
+    assert len(arrays.cells) == 2
+    assert "gmsh:bounding_entities" not in arrays.cell_sets
+
+
+ABAQUS = """\
+*NODE
+1, 0, 0, 0
+2, 1, 0, 0
+3, 0, 1, 0
+4, 1, 1, 0
+*ELEMENT, TYPE=CPS3, ELSET=A
+1, 1, 2, 3
+*ELEMENT, TYPE=CPS3, ELSET=B
+2, 2, 4, 3
+*ELSET, ELSET=ALL
+B,
+"""
+
+
+@pytest.mark.serial
+def test_sets_of_sets_are_left_out(tmp_path: Path) -> None:
+    """Which cells they hold meshio does not say; taking its numbers at their word would mark the wrong ones."""
+    path = tmp_path / "a.inp"
+    path.write_text(ABAQUS)
+    assert "ALL" not in load_arrays(path, 1.0, False).cell_sets
+
+
+@pytest.mark.serial
+def test_collapsed_hexahedron_beside_a_wedge(tmp_path: Path) -> None:
+    """A wedge written as a hexahedron has triangles for two of its faces: its neighbour may have them too."""
+    points = np.array(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 0, 2], [1, 0, 2], [1, 1, 2]]
+    )
+    hexahedron = np.array([[0, 1, 2, 2, 3, 4, 5, 5]])
+    wedge = np.array([[3, 4, 5, 6, 7, 8]])
+    path = save(tmp_path / "a.vtu", points.astype(float), [("hexahedron", hexahedron), ("wedge", wedge)])
+    arrays = load_arrays(path, 1.0, False)
+    assert len(arrays.cells) == 6
+    assert signed_volumes(arrays.points, arrays.cells).sum() == pytest.approx(1.0, rel=WIDE)
+
+
+@pytest.mark.serial
+def test_flat_cells_are_counted_as_the_file_has_them(tmp_path: Path) -> None:
+    points, cubes, _ = bricks(3, 2)
+    points[cubes[0], 2] = 0.0
+    path = save(tmp_path / "a.vtu", points, [("hexahedron", cubes[:1])])
+    with pytest.raises(MeshError, match="has 1 cell of type hexahedron and zero volume, the first around"):
+        load_arrays(path, 1.0, False)
