@@ -136,11 +136,10 @@ class Tissue(Model):
         if "tissue" in self.layers:
             raise ValueError("layers.tissue takes the name of the cells that no layer claims; give it another name")
         if self.mesh is not None:
-            for key in ("size", "cells", "origin"):
-                if getattr(self, key) is not None:
-                    raise ValueError(
-                        f"{key} cannot go with tissue.mesh; drop one, on the command line by --set tissue.{key}=false"
-                    )
+            given = [key for key in ("size", "cells", "origin") if getattr(self, key) is not None]
+            if given:
+                drop = " ".join(f"--set tissue.{key}=false" for key in given)
+                raise ValueError(f"{' and '.join(given)} cannot go with tissue.mesh; drop them, or mesh ({drop})")
             return self
         if self.size is None or self.cells is None:
             missing = "size" if self.size is None else "cells"

@@ -106,7 +106,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
         "effects.damping.beta is -1.0; it must be >= 0",
     ),
     # geometry
-    (PAPER, ["tissue.mesh=a.msh"], "tissue.size cannot go with tissue.mesh; drop one, on the command line by --set"),
+    (PAPER, ["tissue.mesh=a.msh"], "tissue.size and cells cannot go with tissue.mesh; drop them, or mesh (--set"),
     (PILLOW, ["tissue.cells=[1, 1, 1]"], "tissue.cells cannot go with tissue.mesh"),
     (PAPER, ["tissue.size=[1.0]"], "tissue.size is [1.0]; it must have at least 2 items"),
     (PAPER, ["tissue.cells=[1, 2, 3]"], "tissue.cells is [1, 2, 3]; it must have 2 entries as size does"),
