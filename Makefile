@@ -33,10 +33,10 @@ test: lint ## lint, then the tests on 1, 2 and 3 ranks
 	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q
 
 bench: $(STAMP) ## print the table of costs of the forward run
-	$(BIN)/python -m study.bench_forward
+	$(BIN)/python -m softgrasp.study.bench.forward
 
 paper: $(STAMP) ## every figure and table of the paper, and a page that compares
-	$(BIN)/python -m study.paper --out out/paper
+	$(BIN)/python -m softgrasp.study.paper --out out/paper
 
 pictures: demo ## make the README's pictures again
 	cp out/move.png docs/paper_forward.png

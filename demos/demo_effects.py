@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from fem.build import build
-from fem.run import simulate
-from fem.scene_file import load_scene
+from softgrasp.fem.model.build import build
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.file import load_scene
 
 comm = MPI.COMM_WORLD
 file = Path(__file__).parent / "scenes" / "paper_forward.toml"

@@ -13,10 +13,10 @@ import meshio
 import numpy as np
 from mpi4py import MPI
 
-from fem.build import build
-from fem.errors import agree
-from fem.run import simulate
-from fem.scene_file import load_scene
+from softgrasp.fem.model.build import build
+from softgrasp.fem.errors import agree
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.file import load_scene
 
 comm = MPI.COMM_WORLD
 scenes = Path(__file__).parent / "scenes"

@@ -15,7 +15,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
 # PETSc's handler aborts the program, and with it the run, when the reader of a pipe has gone; an option keeps it off,
-# which PETSc reads when it is initialised, unless that has happened before (see `study.streams`).
+# which PETSc reads when it is initialised, unless that has happened before (see `study.shell.streams`).
 _options = os.environ.get("PETSC_OPTIONS", "")
 if "-no_signal_handler" not in _options.split():
     os.environ["PETSC_OPTIONS"] = f"{_options} -no_signal_handler".strip()

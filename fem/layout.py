@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from fem.petsc import Array
+from softgrasp.fem.petsc import Array
 
 
 @dataclass(frozen=True)

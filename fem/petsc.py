@@ -12,7 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc as PETSc
 
-from fem import _stack as _stack
+from softgrasp.fem import _stack as _stack
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fem.layout import BlockLayout
-from fem.petsc import Array, PETSc, combine, times_columns, total
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fem.errors import agree
-from fem.layout import BlockLayout
-from fem.petsc import Array
-from fem.system import LayerMaterial
-from reduction.model import Lift, ModelError, Outputs, ReducedModel
+from softgrasp.fem.errors import agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.system import LayerMaterial
+from softgrasp.reduction.model import Lift, ModelError, Outputs, ReducedModel
 
 FORMAT = "softgrasp reduced model 1"
 ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from fem.layout import BlockLayout
-from fem.petsc import Array
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
 
 Coordinates = Literal["qv", "qp"]
 Frame = Literal["absolute", "relative"]

@@ -28,13 +28,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fem.errors import SoftgraspError
-from fem.petsc import Array, times_columns, total
-from fem.system import BlockSystem
-from reduction.basis import Basis
-from reduction.galerkin import symmetric
-from reduction.inner import solve_columns
-from reduction.small import Operators, Parameters, Parts
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.galerkin import symmetric
+from softgrasp.reduction.inner import solve_columns
+from softgrasp.reduction.small import Operators, Parameters, Parts
 
 MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inherits it
 

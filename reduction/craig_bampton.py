@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fem.modes import lowest_modes
-from reduction.pod import Request
-from reduction.truncation import Columns, Part
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.reduction.pod import Request
+from softgrasp.reduction.truncation import Columns, Part
 
 
 def craig_bampton_parts(request: Request) -> tuple[Part, ...]:

@@ -24,9 +24,9 @@ import scipy.linalg
 from mpi4py import MPI
 from slepc4py import SLEPc
 
-from fem.errors import SolverError
-from fem.petsc import Array, PETSc, total
-from reduction.states import BasisError
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.reduction.states import BasisError
 
 EngineName = Literal["tsqr", "svd", "gram"]
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)

@@ -18,12 +18,12 @@ from typing import Literal, get_args
 import numpy as np
 from mpi4py import MPI
 
-from fem.petsc import Array, times_columns, total
-from fem.snapshots import Snapshots
-from fem.system import BlockSystem
-from reduction.engines import factor
-from reduction.model import ModelError, ReducedModel, SmallModel
-from reduction.online import ReducedTrajectory
+from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.engines import factor
+from softgrasp.reduction.model import ModelError, ReducedModel, SmallModel
+from softgrasp.reduction.online import ReducedTrajectory
 
 BLOCK = 64  # columns at a time: 64 columns of both states are a small part of the snapshots themselves
 RANK_TOLERANCE = 1e-13  # of the largest singular value: directions below are rounding of the basis

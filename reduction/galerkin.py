@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fem.petsc import Array, times_columns, total
-from fem.system import BlockSystem, LayerMaterial, coupling
-from reduction.basis import Basis
-from reduction.small import Operators, Parameters, Parts
+from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.system import BlockSystem, LayerMaterial, coupling
+from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.small import Operators, Parameters, Parts
 
 
 def relative_rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array]:

@@ -30,12 +30,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from fem.layout import BlockLayout
-from fem.petsc import Array, PETSc, times_columns, total
-from fem.solvers import choose_solver, make_solver
-from fem.system import BlockSystem
-from reduction.basis import Basis
-from reduction.states import BasisError
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array, PETSc, times_columns, total
+from softgrasp.fem.solve.solvers import choose_solver, make_solver
+from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.states import BasisError
 
 InnerName = Literal["euclidean", "mass", "energy"]
 INNERS: tuple[InnerName, ...] = get_args(InnerName)

@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from fem.errors import SoftgraspError
-from fem.layout import BlockLayout
-from fem.petsc import Array
-from fem.system import LayerMaterial
-from reduction.basis import Coordinates, Frame, Structure
-from reduction.canonical import canonical_operators
-from reduction.galerkin import galerkin_operators
-from reduction.small import Operators, Parameters, Parts
-from reduction.spectrum import Spectrum, spectrum
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.system import LayerMaterial
+from softgrasp.reduction.basis import Coordinates, Frame, Structure
+from softgrasp.reduction.canonical import canonical_operators
+from softgrasp.reduction.galerkin import galerkin_operators
+from softgrasp.reduction.small import Operators, Parameters, Parts
+from softgrasp.reduction.spectrum import Spectrum, spectrum
 
 
 class ModelError(SoftgraspError):

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fem.petsc import Array
-from reduction.model import ModelError, SmallModel, UnstableModelError
-from reduction.propagator import Propagator, march, propagator
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.model import ModelError, SmallModel, UnstableModelError
+from softgrasp.reduction.propagator import Propagator, march, propagator
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
-# cache, and one model after the other is faster (study.bench_switches)
+# cache, and one model after the other is faster (softgrasp.study.bench.switches)
 TOGETHER = 5_000_000
 
 

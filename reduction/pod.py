@@ -9,12 +9,12 @@ import numpy as np
 import scipy.linalg
 from mpi4py import MPI
 
-from fem.petsc import Array
-from reduction.basis import Coordinates
-from reduction.engines import EngineName, Factor, factor, on_root, small_svd
-from reduction.inner import InnerName, Rows, Weight, weights
-from reduction.states import BasisError, Blocks, States
-from reduction.truncation import Columns, Part
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.basis import Coordinates
+from softgrasp.reduction.engines import EngineName, Factor, factor, on_root, small_svd
+from softgrasp.reduction.inner import InnerName, Rows, Weight, weights
+from softgrasp.reduction.states import BasisError, Blocks, States
+from softgrasp.reduction.truncation import Columns, Part
 
 Halves = list[tuple[Array, Array]]
 

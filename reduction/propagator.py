@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fem.petsc import Array
-from reduction.model import ModelError, SmallModel
-from reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.model import ModelError, SmallModel
+from softgrasp.reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
 
 STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
 BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from fem.petsc import Array, total
-from reduction.engines import Factor, magnitude, on_root, small_svd
-from reduction.inner import Rows, Weight, solve_columns, weights
-from reduction.pod import Request, cholesky_of, weighted_factor
-from reduction.svd_like import svd_like_pairs, symplectic_repair
-from reduction.truncation import Columns, Part
+from softgrasp.fem.petsc import Array, total
+from softgrasp.reduction.engines import Factor, magnitude, on_root, small_svd
+from softgrasp.reduction.inner import Rows, Weight, solve_columns, weights
+from softgrasp.reduction.pod import Request, cholesky_of, weighted_factor
+from softgrasp.reduction.svd_like import svd_like_pairs, symplectic_repair
+from softgrasp.reduction.truncation import Columns, Part
 
 
 @dataclass(frozen=True)

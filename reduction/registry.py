@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fem.petsc import Array
-from reduction.basis import Basis, Coordinates, Frame, Structure
-from reduction.craig_bampton import craig_bampton_parts
-from reduction.engines import EngineName
-from reduction.inner import INNERS, InnerName
-from reduction.pod import Request, componentwise_parts, joint_parts
-from reduction.psd import complex_svd_parts, cotangent_lift_parts, svd_like_parts
-from reduction.states import BasisError, Blocks, States
-from reduction.truncation import PAPER_ENERGY, Columns, Part, Truncation, counts_of
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.basis import Basis, Coordinates, Frame, Structure
+from softgrasp.reduction.craig_bampton import craig_bampton_parts
+from softgrasp.reduction.engines import EngineName
+from softgrasp.reduction.inner import INNERS, InnerName
+from softgrasp.reduction.pod import Request, componentwise_parts, joint_parts
+from softgrasp.reduction.psd import complex_svd_parts, cotangent_lift_parts, svd_like_parts
+from softgrasp.reduction.states import BasisError, Blocks, States
+from softgrasp.reduction.truncation import PAPER_ENERGY, Columns, Part, Truncation, counts_of
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fem.petsc import Array
-from fem.system import LayerMaterial
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.system import LayerMaterial
 
 Parts = dict[str, Array]
 """Named small matrices; those with a leading axis hold one matrix a layer."""

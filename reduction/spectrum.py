@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from fem.petsc import Array
+from softgrasp.fem.petsc import Array
 
 # Of the largest |eigenvalue|: rounding of a non-normal problem of this size stays below; a mode that grows more
 # slowly than this gains less than 1e-5 over 1e4 of the model's fastest radians.

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fem.errors import SoftgraspError, agree
-from fem.layout import BlockLayout
-from fem.petsc import Array, times_columns, total
-from fem.snapshots import Snapshots
-from fem.system import BlockSystem
-from reduction.basis import Coordinates, Frame
+from softgrasp.fem.errors import SoftgraspError, agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.basis import Coordinates, Frame
 
 
 class BasisError(SoftgraspError):

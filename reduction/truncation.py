@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fem.petsc import Array
-from reduction.states import BasisError
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.states import BasisError
 
 PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
 

@@ -3,7 +3,7 @@
 # ruff: noqa: E402  (the other imports take a second, in which Ctrl-C shall not end in a traceback)
 from __future__ import annotations
 
-from study.streams import outlive_readers, quiet_imports
+from softgrasp.study.shell.streams import outlive_readers, quiet_imports
 
 quiet_imports()
 
@@ -19,8 +19,8 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.text import Text
 
-from fem import _stack as _stack  # threads and MPI before anything numerical
-from fem.errors import SceneError, SoftgraspError
+from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
+from softgrasp.fem.errors import SceneError, SoftgraspError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -46,7 +46,7 @@ def console() -> Console:
 @app.command()
 def doctor() -> None:
     """Check Python, DOLFINx, MPI, threads, compiler and caches; one line each."""
-    from study.doctor import show
+    from softgrasp.study.shell.doctor import show
 
     raise typer.Exit(0 if show(console()) else 1)
 
@@ -56,7 +56,7 @@ def scenes() -> None:
     """List the scenes that ship, with what they show."""
     from rich.table import Table
 
-    from fem.scene_file import load_scene, shipped_scenes
+    from softgrasp.fem.scene.file import load_scene, shipped_scenes
 
     found = shipped_scenes()
     if not found:
@@ -73,7 +73,7 @@ def scenes() -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
-    from fem.scene import scene_schema
+    from softgrasp.fem.scene.scene import scene_schema
 
     if MPI.COMM_WORLD.rank == 0:
         typer.echo(json.dumps(scene_schema(), indent=2))
@@ -86,10 +86,10 @@ def explain(
     set_: Overrides = None,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
-    from fem.scene_file import load_scene_collective
-    from study.command import list_files
-    from study.explain import run_explain
-    from study.explain_report import write_explanation
+    from softgrasp.fem.scene.file import load_scene_collective
+    from softgrasp.study.shell.session import list_files
+    from softgrasp.study.forward.explain import run_explain
+    from softgrasp.study.forward.explain_page import write_explanation
 
     made = load_scene_collective(MPI.COMM_WORLD, scene, set_ or [])
     found = run_explain(made, MPI.COMM_WORLD, console())
@@ -108,7 +108,7 @@ def simulate(
     until: Annotated[int | None, typer.Option(help="stop after this step and leave a checkpoint", min=1)] = None,
 ) -> None:
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
-    from study.simulate import run_simulate
+    from softgrasp.study.forward.run import run_simulate
 
     run_simulate(
         scene,
@@ -131,7 +131,7 @@ def reduce(
     no_pictures: NoPictures = False,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
-    from study.reduce import run_reduce
+    from softgrasp.study.reduce.run import run_reduce
 
     run_reduce(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures)
 
@@ -145,7 +145,7 @@ def control(
     no_pictures: NoPictures = False,
 ) -> None:
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
-    from study.control import run_control
+    from softgrasp.study.control.run import run_control
 
     run_control(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures)
 
@@ -170,8 +170,8 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
-    from study.work_precision import run_study
-    from study.wp_answer import parse_budget, parse_tolerance
+    from softgrasp.study.precision.run import run_study
+    from softgrasp.study.precision.answer import parse_budget, parse_tolerance
 
     limit = None if budget is None else parse_budget(budget)
     wanted = None if tolerance is None else parse_tolerance(tolerance)
@@ -181,7 +181,7 @@ def study(
 @app.command()
 def effects(scene: SceneFile, out: Out = Path("out"), set_: Overrides = None, quiet: Quiet = False) -> None:
     """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""
-    from study.effects import run_effects
+    from softgrasp.study.effects.run import run_effects
 
     run_effects(scene, out, set_ or [], console(), quiet=quiet)
 
@@ -194,7 +194,7 @@ def hardcases(
     quiet: Quiet = False,
 ) -> None:
     """Run the suite of hard cases: stay stable, or refuse with a reason."""
-    from study.hardcases import run_hardcases
+    from softgrasp.study.hardcases.run import run_hardcases
 
     result = run_hardcases(out, console(), quick=quick, family=family, quiet=quiet)
     raise typer.Exit(0 if result["ok"] else 1)

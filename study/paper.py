@@ -1,6 +1,6 @@
 """Every figure and table of the paper again, and a page that says what the paper has, what comes out here, and why.
 
-``python -m study.paper --out out/paper``: forward run, all bases, Riccati equation and closed loop [SBRH21].
+``python -m softgrasp.study.paper --out out/paper``: forward run, all bases, Riccati equation and closed loop [SBRH21].
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from fem import _stack as _stack
-from fem.scene_file import shipped_scenes
-from study.control import run_control
-from study.control_reduced import TITLES
-from study.reduce import run_reduce
-from study.report import Section, write_report
-from study.simulate import run_simulate
+from softgrasp.fem import _stack as _stack
+from softgrasp.fem.scene.file import shipped_scenes
+from softgrasp.study.control.run import run_control
+from softgrasp.study.control.sweep import TITLES
+from softgrasp.study.reduce.run import run_reduce
+from softgrasp.study.report.page import Section, write_report
+from softgrasp.study.forward.run import run_simulate
 
 Row = tuple[str, str, str, str]
 HEADER = ("quantity", "paper", "here", "why different")

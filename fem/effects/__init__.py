@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from fem.effects.damping import Damping
-from fem.effects.gate import Effect, Gate, Problem
-from fem.effects.gravity import Gravity
-from fem.effects.layers import Layers
-from fem.effects.reaction import Reaction
-from fem.effects.rotation import Rotation
+from softgrasp.fem.effects.damping import Damping
+from softgrasp.fem.effects.gate import Effect, Gate, Problem
+from softgrasp.fem.effects.gravity import Gravity
+from softgrasp.fem.effects.layers import Layers
+from softgrasp.fem.effects.reaction import Reaction
+from softgrasp.fem.effects.rotation import Rotation
 
 __all__ = ["EFFECTS", "Effect", "Gate", "Problem"]
 

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fem.effects.gate import Gate, Problem
-from fem.petsc import Array
-from fem.system import Damping as DampingOperator
-from fem.system import LayerBlocks, LayerMaterial, layered_viscosity
+from softgrasp.fem.effects.gate import Gate, Problem
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.system import Damping as DampingOperator
+from softgrasp.fem.system import LayerBlocks, LayerMaterial, layered_viscosity
 
 if TYPE_CHECKING:
-    from fem.scene import Scene
+    from softgrasp.fem.scene.scene import Scene
 
 
 def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> DampingOperator:

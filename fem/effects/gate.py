@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from fem.scene import Scene
-    from fem.system import LayerMaterial
+    from softgrasp.fem.scene.scene import Scene
+    from softgrasp.fem.system import LayerMaterial
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Problem:
-    """Scales of one scene; `fem.effects.measure` computes them.
+    """Scales of one scene; `fem.model.scales` computes them.
 
     Attributes:
         scene: the scene.

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fem.effects.gate import Gate, Problem
-from fem.materials import young_poisson
-from fem.petsc import Array
+from softgrasp.fem.effects.gate import Gate, Problem
+from softgrasp.fem.scene.materials import young_poisson
+from softgrasp.fem.petsc import Array
 
 if TYPE_CHECKING:
-    from fem.scene import Scene
+    from softgrasp.fem.scene.scene import Scene
 
 EARTH = 9.81  # [m/s2], assumed when the scene leaves gravity off
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fem.effects.gate import Gate, Problem, force_drives
+from softgrasp.fem.effects.gate import Gate, Problem, force_drives
 
 if TYPE_CHECKING:
-    from fem.scene import Scene
+    from softgrasp.fem.scene.scene import Scene
 
 THRESHOLD = 0.05  # the hand's acceleration under a given force changes by about this much
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fem.effects.gate import Gate, Problem, force_drives
-from fem.petsc import Array
+from softgrasp.fem.effects.gate import Gate, Problem, force_drives
+from softgrasp.fem.petsc import Array
 
 if TYPE_CHECKING:
-    from fem.scene import Scene
+    from softgrasp.fem.scene.scene import Scene
 
 THRESHOLD = 0.05  # the hand's angular acceleration under a given torque changes by about this much
 

@@ -1,0 +1,1 @@
+"""Fields on the mesh: series of files and what pictures show."""

@@ -1,0 +1,144 @@
+"""Small copies of mesh and displacement on rank 0, for pictures: plain arrays, nothing of DOLFINx."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import dolfinx.mesh
+import numpy as np
+import numpy.typing as npt
+
+from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.contact import contact_facets, rigid_modes
+from softgrasp.fem.fields.series import FullField
+from softgrasp.fem.mesh.make import cell_nodes
+from softgrasp.fem.petsc import Array, rows_on_root
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+
+Integers = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PictureMesh:
+    """The whole body in arrays.
+
+    Attributes:
+        points: vertices [m], shape (n, d).
+        cells: vertices of the cells, shape (m, d + 1).
+        facets: vertices of the boundary facets, shape (k, d), the body to their left or below.
+        contact: vertices of those that the hand holds, shape (c, d).
+        layers: number of the layer of each cell, shape (m,).
+        names: names of the layers.
+        reference: point the hand turns about [m], shape (d,).
+        n_s: hand degrees of freedom.
+    """
+
+    points: Array
+    cells: Integers
+    facets: Integers
+    contact: Integers
+    layers: Integers
+    names: tuple[str, ...]
+    reference: Array
+    n_s: int
+
+    @property
+    def dimension(self) -> int:
+        """Space dimension d."""
+        return int(self.points.shape[1])
+
+    def rigid(self, q_s: npt.ArrayLike, points: Array | None = None) -> Array:
+        """Displacement R q_s of points that move with the hand, shape (n, d) [m]; the vertices by default.
+
+        Not collective.
+        """
+        x = self.points if points is None else points
+        modes = rigid_modes(x, self.dimension, self.n_s > self.dimension, self.reference)
+        return np.asarray(modes @ np.asarray(q_s, dtype=np.float64)).reshape(len(x), self.dimension)
+
+
+def gather_picture(model: Model) -> PictureMesh | None:
+    """Copy the mesh to rank 0; None on the other ranks. Collective."""
+    tissue, layout = model.space.mesh, model.space.layout
+    mesh, d, comm = tissue.mesh, tissue.dimension, layout.comm
+    nodes = mesh.geometry.index_map()
+    mesh.topology.create_connectivity(d - 1, d)
+
+    def facet_nodes(facets: npt.NDArray[np.int32]) -> Integers:
+        return _numbered(nodes, _outward(mesh, d, facets))
+
+    cells = np.asarray(cell_nodes(mesh)[: mesh.topology.index_map(d).size_local])
+    layers = np.zeros(len(cells), dtype=np.int64)
+    names: tuple[str, ...] = ("tissue",)
+    if model.scene.tissue.layers:
+        groups = cells_of_layers(tissue, model.scene)
+        names = tuple(groups)
+        for i, members in enumerate(groups.values()):
+            layers[members] = i
+    outer = dolfinx.mesh.exterior_facet_indices(mesh.topology)
+    held = contact_facets(tissue, model.scene.contact)
+    points = np.ascontiguousarray(mesh.geometry.x[: nodes.size_local, :d])
+    parts = [points, _numbered(nodes, cells), facet_nodes(outer), facet_nodes(held), layers]
+    whole = [rows for rows in (rows_on_root(comm, part) for part in parts) if rows is not None]
+    if not whole:
+        return None
+    return PictureMesh(whole[0], whole[1], whole[2], whole[3], whole[4], names, layout.reference, layout.n_s)
+
+
+def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
+    """Absolute displacement of the vertices on rank 0, ordered as ``PictureMesh.points``; None elsewhere.
+
+    Collective.
+
+    Args:
+        model: the model.
+        z: relative displacement on the owned free dofs [m], shape (n_local,), or (n_local, k) for k instants.
+        q_s: hand [m, rad], shape (n_s,) or (n_s, k).
+
+    Returns:
+        Shape (n, d), or (k, n, d) for k instants.
+    """
+    d, space = model.space.layout.dimension, model.space
+    geometry, dofmap = space.mesh.mesh.geometry, space.V.dofmap
+    owned = geometry.index_map().size_local
+    # The first d + 1 dofs of a Lagrange cell sit on its vertices, in the order of the geometry; a vertex may belong
+    # to another rank as dof than as mesh node, so ghosts count too.
+    node_dof = np.zeros(len(geometry.x), dtype=np.int64)
+    node_dof[cell_nodes(space.mesh.mesh)] = dofmap.list[:, : d + 1]
+    dofs = node_dof[:owned]
+    full = FullField(model)
+    columns = z.reshape(len(z), -1)
+    hands = np.asarray(q_s, dtype=np.float64).reshape(len(q_s), -1)
+    local = np.empty((owned, columns.shape[1] * d))
+    for j in range(columns.shape[1]):
+        values = full.fill(columns[:, j], hands[:, j]).x.array.reshape(-1, d)
+        local[:, j * d : (j + 1) * d] = values[dofs]
+    gathered = rows_on_root(space.layout.comm, local)
+    if gathered is None or z.ndim == 1:
+        return gathered
+    return np.ascontiguousarray(gathered.reshape(len(gathered), -1, d).transpose(1, 0, 2))
+
+
+def _outward(mesh: Any, d: int, facets: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Local mesh nodes of exterior facets, ordered so that (b - a) turned right, or (b - a) x (c - a), points out."""
+    if len(facets) == 0:
+        return np.zeros((0, d), dtype=np.int32)
+    nodes = dolfinx.mesh.entities_to_geometry(mesh, d - 1, facets).reshape(len(facets), d)
+    cells = mesh.topology.connectivity(d - 1, d)
+    inside = cell_nodes(mesh)[cells.array[cells.offsets[facets]]]
+    opposite = inside.sum(axis=1) - nodes.sum(axis=1)
+    x = mesh.geometry.x[:, :d]
+    edges = x[nodes[:, 1:]] - x[opposite][:, None, :]
+    volume = np.linalg.det(np.concatenate([(x[nodes[:, 0]] - x[opposite])[:, None, :], edges], axis=1))
+    flipped = volume < 0
+    nodes[flipped] = nodes[flipped][:, ::-1]
+    return np.asarray(nodes)
+
+
+def _numbered(index_map: Any, local: npt.NDArray[np.int32]) -> Integers:
+    """Global node numbers of local ones, same shape."""
+    flat = np.ascontiguousarray(local, dtype=np.int32).ravel()
+    return np.asarray(index_map.local_to_global(flat), dtype=np.int64).reshape(local.shape)

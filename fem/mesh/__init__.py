@@ -1,0 +1,1 @@
+"""Meshes: structured or from a file, their cells, parts and checks."""

@@ -1,0 +1,291 @@
+"""Mesh files of any format meshio reads: taken apart and checked on rank 0, then distributed."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import basix.ufl
+import dolfinx.io
+import dolfinx.mesh
+import meshio
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx.graph import adjacencylist
+from mpi4py import MPI
+
+from softgrasp.fem.errors import MeshError, agree
+from softgrasp.fem.mesh.make import TissueMesh
+from softgrasp.fem.mesh.cells import check_interfaces, check_straight, corners, cut_cells, dimension_of, shape_of, simplices
+from softgrasp.fem.mesh.check import check_cells
+from softgrasp.fem.mesh.parts import Parts, find_parts
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Tags = npt.NDArray[np.int32]
+
+_SHAPES = {2: "triangle", 3: "tetrahedron"}
+_TAG_NAMES = ("gmsh:physical", "medit:ref", "CellEntityIds")  # preferred names of integer cell data
+_NOT_TAGS = ("gmsh:geometrical",)  # numbers of CAD entities, not marks of the user
+_NO_TAGS: Tags = np.zeros(0, dtype=np.int32)
+
+Sets = dict[int | str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """A simplex mesh in arrays, before distribution.
+
+    Attributes:
+        points: shape (n_points, d) [m].
+        cells: shape (n_cells, d + 1).
+        cell_tags: one integer a cell, or None.
+        facets: tagged facets, shape (n_facets, d).
+        facet_tags: one integer a tagged facet, or None.
+        part_tags: number of the facet-connected part of each cell, or None if there is one part only.
+        parts: what is known of these parts, or None.
+        facet_sets: marks in ``facet_tags`` of each tag number and named set.
+        cell_sets: marks in ``cell_tags`` of each tag number and named set.
+    """
+
+    points: Floats
+    cells: Integers
+    cell_tags: Tags | None
+    facets: Integers
+    facet_tags: Tags | None
+    part_tags: Tags | None
+    parts: Parts | None
+    facet_sets: Sets
+    cell_sets: Sets
+
+
+def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool = False) -> TissueMesh:
+    """Read a mesh and cut its cells into linear triangles or tetrahedra, with its facet and cell tags.
+
+    Quadrilaterals, hexahedra, wedges and pyramids are cut as in `fem.mesh.cells.simplices`, cells of higher order with
+    straight edges are taken by their corners. Cells of the highest dimension make the body, those one
+    dimension lower carry the facet tags.
+
+    Collective. Rank 0 reads and checks.
+
+    Args:
+        comm: communicator of the mesh.
+        path: mesh file in any format of meshio.
+        scale: factor of all coordinates, e.g. 1e-3 for a file in millimetres.
+        repair: turn inverted cells round instead of refusing them.
+
+    Raises:
+        MeshError: the file is missing or unreadable, holds polygons, polyhedra or curved cells, a mesh of
+            surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted to cut.
+    """
+    arrays: MeshArrays | None = None
+    with agree(comm):
+        if comm.rank == 0:
+            arrays = load_arrays(path, scale, repair)
+    facts = (arrays.points.shape[1], arrays.cell_tags is not None, arrays.facet_tags is not None,
+             arrays.parts, arrays.facet_sets, arrays.cell_sets) if arrays else None  # fmt: skip
+    dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets = comm.bcast(facts)
+    if arrays is None:
+        none = np.zeros((0, dimension))
+        empty = np.zeros((0, dimension + 1), dtype=np.int64)
+        arrays = MeshArrays(none, empty, _NO_TAGS, empty[:, 1:], _NO_TAGS, _NO_TAGS, parts, facet_sets, cell_sets)
+    domain = ufl.Mesh(basix.ufl.element("Lagrange", _SHAPES[dimension], 1, shape=(dimension,)))
+    mesh = dolfinx.mesh.create_mesh(comm, arrays.cells, domain, arrays.points)
+    return TissueMesh(
+        mesh,
+        dimension,
+        _distribute(mesh, dimension - 1, arrays.facets, arrays.facet_tags) if has_facet_tags else None,
+        _distribute(mesh, dimension, arrays.cells, arrays.cell_tags) if has_cell_tags else None,
+        path.name,
+        _distribute(mesh, dimension, arrays.cells, arrays.part_tags) if parts is not None else None,
+        parts,
+        facet_sets,
+        cell_sets,
+    )
+
+
+def load_arrays(path: Path, scale: float, repair: bool) -> MeshArrays:
+    """Read and check a mesh file. Not collective.
+
+    Raises:
+        MeshError: see `read_mesh`.
+    """
+    raw = _read(path)
+    found = sorted({block.type for block in raw.cells})
+    shapes = [shape_of(block.type) for block in raw.cells]
+    filled = [shape for shape, block in zip(shapes, raw.cells, strict=True) if shape and len(block.data)]
+    dimension = max((dimension_of(shape) for shape in filled), default=0)
+    if None in shapes or dimension < 2:
+        raise MeshError(
+            f"{path} holds cells of type {', '.join(found) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
+            "hexahedra, wedges and pyramids are taken, export the mesh with these."
+        )
+    for block in raw.cells:
+        if block.data.size and not 0 <= block.data.min() <= block.data.max() < len(raw.points):
+            raise MeshError(f"{path} has cells with node numbers outside 0 to {len(raw.points) - 1}: export it again.")
+    points = np.asarray(raw.points, dtype=np.float64) * scale
+    tag_name = _tag_name(raw)
+    bodies = _blocks(raw, dimension)
+    used = np.unique(np.concatenate([corners(nodes, shape).ravel() for _, shape, nodes in bodies]))
+    if dimension == 2:
+        points = _in_plane(points, used, path)
+    for i, shape, nodes in bodies:
+        check_straight(points, nodes, shape, raw.cells[i].type, str(path))
+    cut = [cut_cells(points, corners(nodes, shape), shape, str(path)) for _, shape, nodes in bodies]
+    check_interfaces(points, [(corners(nodes, shape), shape) for _, shape, nodes in bodies], str(path))
+    cells, cell_tags, cell_sets = _marked(raw, bodies, cut, tag_name, dimension)
+    shells = _blocks(raw, dimension - 1)
+    cut = [simplices(corners(nodes, shape), shape) for _, shape, nodes in shells]
+    facets, facet_tags, facet_sets = _marked(raw, shells, cut, tag_name, dimension - 1)
+    points, cells = points[used], np.searchsorted(used, cells)
+    cells = check_cells(points, cells, repair, str(path))
+    # Facets with a node that no cell uses belong to leftover geometry.
+    kept = np.isin(facets, used).all(axis=1)
+    facets = np.searchsorted(used, facets[kept])
+    part_tags, parts = find_parts(points, cells, str(path)) or (None, None)
+    return MeshArrays(
+        points, cells, cell_tags, facets, None if facet_tags is None else facet_tags[kept], part_tags, parts,
+        facet_sets, cell_sets,
+    )  # fmt: skip
+
+
+def _read(path: Path) -> meshio.Mesh:
+    if not path.is_file():
+        raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is taken relative to the scene file.")
+    said = io.StringIO()
+    try:
+        # meshio prints its complaints and may end the process; one sentence is enough.
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            return meshio.read(path)
+    except (Exception, SystemExit) as error:
+        reason = " ".join(f"{error if not isinstance(error, SystemExit) else ''} {said.getvalue()}".split())
+        raise MeshError(
+            f"meshio cannot read {path} ({reason or type(error).__name__}): check format and suffix."
+        ) from error
+
+
+def _tag_name(raw: meshio.Mesh) -> str | None:
+    names: list[str] = [
+        name
+        for name, blocks in raw.cell_data.items()
+        if name not in _NOT_TAGS and all(np.issubdtype(b.dtype, np.integer) and b.ndim == 1 for b in blocks)
+    ]
+    preferred = [name for name in _TAG_NAMES if name in names]
+    return next(iter(preferred + names), None)
+
+
+def _blocks(raw: meshio.Mesh, dimension: int) -> list[tuple[int, str, Integers]]:
+    """Place in the file, shape and nodes of the blocks of cells of one dimension."""
+    return [
+        (i, shape, np.asarray(block.data, dtype=np.int64))
+        for i, block in enumerate(raw.cells)
+        if len(block.data) and (shape := shape_of(block.type)) and dimension_of(shape) == dimension
+    ]
+
+
+def _marked(
+    raw: meshio.Mesh,
+    blocks: list[tuple[int, str, Integers]],
+    cut: list[tuple[Integers, Integers]],
+    tag_name: str | None,
+    dimension: int,
+) -> tuple[Integers, Tags | None, Sets]:
+    """The simplices of all blocks, one mark each, and the marks of each tag number and named set.
+
+    The marks are the tag numbers of the file, unless its named sets overlap them.
+    """
+    if not blocks:
+        return np.zeros((0, dimension + 1), dtype=np.int64), None, {}
+    nodes = np.concatenate([part[0] for part in cut])
+    tags = np.zeros(len(nodes), dtype=np.int64)
+    if tag_name is not None:
+        tags = np.concatenate([raw.cell_data[tag_name][i][p] for (i, *_), (_, p) in zip(blocks, cut, strict=True)])
+    named = _named(raw, blocks, cut)
+    if tag_name is None and not named:
+        return nodes, None, {}
+    marks = tags.astype(np.int64)
+    for member in named.values():
+        mixed = np.intersect1d(marks[member], marks[~member])
+        if mixed.size:
+            _, marks = np.unique(2 * marks + (member & np.isin(marks, mixed)), return_inverse=True)
+    sets: Sets = {}
+    if tag_name is not None:
+        for tag, mark in np.unique(np.stack([tags, marks]), axis=1).T.tolist():
+            sets[tag] = (*sets.get(tag, ()), mark)
+    for name, number in _physical_names(raw, dimension).items():
+        if tag_name == "gmsh:physical" and number in sets:
+            sets[name] = sets[number]
+    for name, member in named.items():
+        sets[name] = tuple(np.unique(marks[member]).tolist())
+    return nodes, marks.astype(np.int32), sets
+
+
+def _named(
+    raw: meshio.Mesh, blocks: list[tuple[int, str, Integers]], cut: list[tuple[Integers, Integers]]
+) -> dict[str, npt.NDArray[np.bool_]]:
+    """Which simplices each named set of the file holds, without the sets that hold none.
+
+    A set must have one list of cells a block; others (sets of sets) are left out, and so are unknown names then.
+    """
+    found = {}
+    for name, lists in raw.cell_sets.items():
+        if name.startswith("gmsh:"):  # numbers of CAD entities, not of cells
+            continue
+        if len(lists) != len(raw.cells) or not all(_is_cell_list(part) for part in lists):
+            continue
+        members = []
+        for (i, _, nodes), (_, parents) in zip(blocks, cut, strict=True):
+            inside = np.zeros(len(nodes), dtype=np.bool_)
+            if i < len(lists) and lists[i] is not None and len(lists[i]):
+                inside[np.asarray(lists[i], dtype=np.int64)] = True
+            members.append(inside[parents])
+        if (member := np.concatenate(members)).any():
+            found[name] = member
+    return found
+
+
+def _is_cell_list(part: object) -> bool:
+    """Whether a block's share of a set is an array of cell numbers, or nothing."""
+    if part is None:
+        return True
+    array = part if isinstance(part, np.ndarray) else None
+    return array is not None and array.ndim == 1 and (array.size == 0 or np.issubdtype(array.dtype, np.integer))
+
+
+def _physical_names(raw: meshio.Mesh, dimension: int) -> dict[str, int]:
+    """Gmsh's names of tag numbers, {name: [number, dimension]} in the field data."""
+    pairs = {name: np.asarray(pair) for name, pair in (raw.field_data or {}).items()}
+    return {
+        name: int(pair[0])
+        for name, pair in pairs.items()
+        if pair.shape == (2,) and np.issubdtype(pair.dtype, np.integer) and pair[1] == dimension
+    }
+
+
+def _in_plane(points: Floats, used: Integers, path: Path) -> Floats:
+    if points.shape[1] == 3:
+        height = np.abs(points[used, 2]).max()
+        if not height <= 1e-10 * np.ptp(points[used, :2], axis=0).max():  # also false for NaN
+            raise MeshError(
+                f"{path} holds surface cells only, and they leave the plane z = 0 (|z| up to {height:.3g}): "
+                "give a flat mesh in x and y, or one of solid cells."
+            )
+    return np.ascontiguousarray(points[:, :2])
+
+
+def _distribute(
+    mesh: dolfinx.mesh.Mesh, dimension: int, entities: Integers, values: Tags | None
+) -> dolfinx.mesh.MeshTags:
+    """Mesh tags from entities in file numbering, given on rank 0. Collective."""
+    mesh.topology.create_entities(dimension)
+    mesh.topology.create_connectivity(dimension, 0)
+    mesh.topology.create_connectivity(dimension, mesh.topology.dim)
+    given = values if values is not None else _NO_TAGS
+    local, local_values = dolfinx.io.distribute_entity_data(
+        mesh, dimension, np.ascontiguousarray(entities), np.ascontiguousarray(given, dtype=np.int32)
+    )
+    vertices = adjacencylist(np.ascontiguousarray(local, dtype=np.int32))
+    return dolfinx.mesh.meshtags_from_entities(mesh, dimension, vertices, local_values.astype(np.int32))

@@ -1,0 +1,1 @@
+"""From a scene to the matrices of hand and tissue."""

@@ -1,0 +1,208 @@
+"""From a mesh and a scene to the blocks of hand and tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import dolfinx.fem
+import numpy as np
+import scipy.sparse
+import ufl
+from mpi4py import MPI
+
+from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
+from softgrasp.fem.errors import MeshError, SceneError
+from softgrasp.fem.mesh.make import TissueMesh
+from softgrasp.fem.layout import BlockLayout, bounding_box
+from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.system import Component, LayerBlocks
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+
+
+@dataclass
+class Inventory:
+    """What an assembly made: names of compiled forms and of allocated tissue operators."""
+
+    forms: list[str] = field(default_factory=list)
+    operators: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """Function space and the split of its nodes into contact and free ones.
+
+    Attributes:
+        mesh: the tissue mesh.
+        V: displacement space (Lagrange P1 or P2, blocked).
+        contact: owned local node indices that follow the hand.
+        free: owned local node indices of the tissue unknowns.
+        is_e: PETSc index set of the free dofs (blocked).
+        R: rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s).
+        layout: sizes and ownership.
+    """
+
+    mesh: TissueMesh
+    V: Any
+    contact: np.ndarray
+    free: np.ndarray
+    is_e: PETSc.IS
+    R: Array
+    layout: BlockLayout
+
+
+def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
+    """Build the space and the block dof maps. Collective.
+
+    Raises:
+        SceneError: the contact zone is empty.
+        MeshError: part of the body is not held, or every node is in the contact zone.
+    """
+    d, comm = mesh.dimension, mesh.mesh.comm
+    V = dolfinx.fem.functionspace(mesh.mesh, ("Lagrange", scene.tissue.order, (d,)))
+    facets = contact_facets(mesh, scene.contact)
+    contact, free = contact_blocks(V, facets)
+    held_check(mesh, facets)
+    index_map = V.dofmap.index_map
+    n_e = comm.allreduce(len(free)) * d
+    if n_e == 0:
+        raise MeshError(
+            f"{mesh.source}: every node lies in the contact zone; make [contact] smaller or refine the mesh"
+        )
+    X = V.tabulate_dof_coordinates()[: index_map.size_local]
+    if scene.hand.reference is not None:
+        reference = np.asarray(scene.hand.reference, dtype=float)
+    else:
+        sums = total(comm, np.append(X[contact, :d].sum(axis=0), float(len(contact))))
+        reference = sums[:d] / sums[d]
+    modes = rigid_modes(X, d, scene.effects.rotation, reference)
+    R = np.zeros(modes.shape, order="F")
+    rows = (contact[:, None] * d + np.arange(d)).ravel()
+    R[rows] = modes[rows]
+    is_e = PETSc.IS().createBlock(d, (free + index_map.local_range[0]).astype(PETSc.IntType), comm=comm)
+    n_local = len(free) * d
+    nodes = np.ascontiguousarray(X[free, :d])
+    low, high = bounding_box(comm, nodes)
+    layout = BlockLayout(
+        comm=comm,
+        dimension=d,
+        n_s=R.shape[1],
+        n_e=n_e,
+        n_local=n_local,
+        start=int(comm.exscan(n_local) or 0),
+        nodes=nodes,
+        reference=reference,
+        extent=float((high - low).max()) or 1.0,
+    )
+    return Discretisation(mesh, V, contact, free, is_e, R, layout)
+
+
+def _bilinear(V: Any) -> dict[str, Callable[[Any], Any]]:
+    """The three affine bilinear forms as functions of the measure."""
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+
+    def eps(w: Any) -> Any:
+        return ufl.sym(ufl.grad(w))
+
+    return {
+        "K_mu": lambda dx: 2 * ufl.inner(eps(u), eps(v)) * dx,
+        "K_lambda": lambda dx: ufl.inner(ufl.div(u), ufl.div(v)) * dx,
+        "M_1": lambda dx: ufl.inner(u, v) * dx,
+    }
+
+
+def _component(space: Discretisation, A: PETSc.Mat, thickness: float) -> Component:
+    """Cut a full matrix into blocks and free it. Collective."""
+    if thickness != 1.0:
+        A.scale(thickness)
+    n_s = space.layout.n_s
+    es = np.zeros((space.layout.n_local, n_s), order="F")
+    ss = np.zeros((n_s, n_s))
+    r, y = A.createVecs()
+    for j in range(n_s):
+        r.array_w[:] = space.R[:, j]
+        A.mult(r, y)
+        ss[:, j] = space.R.T @ y.array_r
+        part = y.getSubVector(space.is_e)
+        es[:, j] = part.array_r
+        y.restoreSubVector(space.is_e, part)
+    ee = A.createSubMatrix(space.is_e, space.is_e)
+    for used in (r, y, A):
+        used.destroy()
+    return Component(ee, es, total(space.layout.comm, ss))
+
+
+def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple[LayerBlocks, ...]:
+    """Assemble K_mu, K_lambda and M_1, once per layer; a uniform body is one layer. Collective.
+
+    One form is compiled for each component: layers share it and differ in their cells only.
+
+    Raises:
+        SceneError: a layer has no cells, or some cells belong to no layer.
+    """
+    domain = space.mesh.mesh
+    layers = cells_of_layers(space.mesh, scene) if scene.tissue.layers else {"tissue": None}
+    forms = _bilinear(space.V)
+    inventory.forms += list(forms)
+    pattern = None
+    if len(layers) > 1:
+        # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
+        owned = np.arange(domain.topology.index_map(space.mesh.dimension).size_local, dtype=np.int32)
+        whole = ufl.Measure("dx", domain=domain, subdomain_data=[(1, owned)])(1)
+        pattern = dolfinx.fem.create_matrix(dolfinx.fem.form(forms["M_1"](whole)))
+    result = []
+    for name, cells in layers.items():
+        dx = ufl.dx(domain) if cells is None else ufl.Measure("dx", domain=domain, subdomain_data=[(1, cells)])(1)
+        parts = {}
+        for key, form in forms.items():
+            compiled = dolfinx.fem.form(form(dx))
+            csr = dolfinx.fem.create_matrix(compiled) if pattern is None else pattern
+            parts[key] = _component(space, _assembled(domain.comm, csr, compiled), scene.tissue.thickness)
+            inventory.operators.append(f"{key}[{name}]")
+        result.append(LayerBlocks(name, **parts))
+    return tuple(result)
+
+
+def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
+    """The form's matrix as PETSc AIJ, with the same bits in every run on the same number of ranks. Collective.
+
+    PETSc adds what other ranks give to a row in the order their messages arrive; DOLFINx's own matrix adds it in the
+    order of the ranks.
+    """
+    csr.set_value(0.0)
+    dolfinx.fem.assemble_matrix(csr, form)
+    csr.scatter_reverse()
+    rows, columns, d = csr.index_map(0), csr.index_map(1), csr.block_size[0]
+    n = rows.size_local
+    used = csr.indptr[n]
+    numbers = columns.local_to_global(csr.indices[:used].astype(np.int32))
+    blocks = csr.data[: used * d * d].reshape(-1, d, d)
+    A = scipy.sparse.bsr_matrix((blocks, numbers, csr.indptr[: n + 1]), shape=(n * d, columns.size_global * d)).tocsr()
+    A.sort_indices()
+    size = ((n * d, rows.size_global * d), (columns.size_local * d, columns.size_global * d))
+    entries = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
+    return PETSc.Mat().createAIJ(size, bsize=d, csr=entries, comm=comm)
+
+
+def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
+    """Owned cells of each layer; later layers win where boxes overlap, the rest is ``tissue``. Collective.
+
+    Raises:
+        SceneError: a layer holds no cell.
+    """
+    owned = mesh.mesh.topology.index_map(mesh.dimension).size_local
+    label = np.full(owned, -1)
+    names = list(scene.tissue.layers)
+    for i, name in enumerate(names):
+        label[cells_in(mesh, scene.tissue.layers[name])] = i
+    counts = total(mesh.mesh.comm, np.array([float((label == i).sum()) for i in range(-1, len(names))]))
+    empty = [n for n, c in zip(names, counts[1:], strict=True) if c == 0]
+    if empty:
+        raise SceneError(f"tissue.layers.{empty[0]} holds no cell of {mesh.source}; check its tag or box")
+    cells = {name: np.flatnonzero(label == i).astype(np.int32) for i, name in enumerate(names)}
+    if counts[0]:
+        cells["tissue"] = np.flatnonzero(label == -1).astype(np.int32)
+    return cells

@@ -1,0 +1,293 @@
+"""The contact zone: which facets the hand holds, their nodes, and the rigid motions it gives them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import dolfinx.fem
+import dolfinx.mesh
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from softgrasp.fem.errors import MeshError, SceneError, agree
+from softgrasp.fem.mesh.check import counted, place_text
+
+if TYPE_CHECKING:
+    from softgrasp.fem.mesh.make import TissueMesh
+    from softgrasp.fem.mesh.parts import Parts
+    from softgrasp.fem.scene.scene import Contact
+
+Ints = npt.NDArray[np.int32]
+Floats = npt.NDArray[np.float64]
+
+HINGE = 1e-12  # of C^T C: shared nodes nearer than 1e-6 of the part are one node
+MOST_LOOSE = 300  # a dense problem of at most 1800 unknowns
+BOX_TOLERANCE = 1e-8  # of the largest extent: far above round-off of midpoints, far below any cell
+
+
+def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
+    """Owned exterior facets in the contact zone, sorted.
+
+    A facet belongs to the zone if its midpoint lies on one of ``contact.sides`` (planes of the bounding box)
+    and inside ``contact.box``; or if it carries ``contact.facet_tag``. What is not given does not restrict.
+
+    Collective.
+
+    Raises:
+        SceneError: a side is unknown, the tag is absent, or no facet is in the zone.
+    """
+    mesh, fdim = tissue.mesh, tissue.dimension - 1
+    mesh.topology.create_connectivity(fdim, fdim + 1)
+    facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology))
+    midpoints = dolfinx.mesh.compute_midpoints(mesh, fdim, facets)[:, : tissue.dimension]
+    low, high = bounding_box(tissue)
+    tolerance = BOX_TOLERANCE * float(np.max(high - low))
+    chosen = np.ones(len(facets), dtype=np.bool_)
+    keys = []
+    if contact.facet_tag is not None:
+        keys.append(f"contact.facet_tag = {contact.facet_tag}")
+        chosen &= np.isin(facets, _tagged_facets(tissue, contact.facet_tag))
+    if contact.sides:
+        keys.append(f"contact.sides = {list(contact.sides)}")
+        on_side = np.zeros(len(facets), dtype=np.bool_)
+        for axis, end in _planes(contact, tissue.dimension):
+            on_side |= np.abs(midpoints[:, axis] - (high if end > 0 else low)[axis]) <= tolerance
+        chosen &= on_side
+    if contact.box is not None:
+        keys.append(f"contact.box = {[list(corner) for corner in contact.box]}")
+        chosen &= _inside(midpoints, contact.box, tolerance, "contact.box")
+    if mesh.comm.allreduce(int(chosen.sum())) == 0:
+        raise SceneError(
+            f"No boundary facet of the {tissue.source} mesh has its midpoint in the contact zone "
+            f"{' and '.join(keys) or 'of [contact]'}: the boundary spans {place_text(low)} to {place_text(high)}."
+        )
+    return np.asarray(facets[chosen], dtype=np.int32)
+
+
+def held_check(tissue: TissueMesh, facets: Ints) -> None:
+    """Refuse a mesh of which a part could move freely, alone or about the nodes by which it hangs on the rest.
+
+    Collective.
+
+    Args:
+        tissue: the mesh.
+        facets: owned contact facets, from `contact_facets`.
+
+    Raises:
+        MeshError: parts that share no node with the rest have no contact facet, or parts are joined to the rest
+            by so few nodes that they can turn.
+    """
+    tags, parts = tissue.part_tags, tissue.parts
+    if tags is None or parts is None:
+        return
+    mesh, dimension = tissue.mesh, tissue.dimension
+    mesh.topology.create_connectivity(dimension - 1, dimension)
+    facet_cells = mesh.topology.connectivity(dimension - 1, dimension)
+    labels = np.zeros(mesh.topology.index_map(dimension).size_local, dtype=np.int64)
+    owned = tags.indices < len(labels)
+    labels[tags.indices[owned]] = tags.values[owned]
+    # An owned exterior facet has one cell, and that cell is owned too.
+    cells = np.array([facet_cells.links(f)[0] for f in facets], dtype=np.int64)
+    held = np.zeros(len(parts.cells), dtype=np.int64)
+    held[labels[cells]] = 1
+    held = mesh.comm.allreduce(held)
+    with agree(mesh.comm):
+        if mesh.comm.rank == 0:
+            check_parts(parts, held > 0, tissue.source)
+
+
+def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
+    """Refuse parts that keep a free motion when those with contact facets are fixed. Not collective.
+
+    A part that hangs together through facets moves without strain as a rigid body only, u = R q, and a contact
+    facet fixes it. The q of the other parts must agree at each shared node, C q = 0; a null vector of C^T C is
+    a free motion.
+
+    Args:
+        parts: the parts of the mesh.
+        held: whether a part has a contact facet, shape (n_parts,).
+        source: name of the mesh, for messages.
+
+    Raises:
+        MeshError: see `held_check`.
+    """
+    groups = int(parts.groups.max()) + 1
+    loose = np.setdiff1d(np.arange(groups), parts.groups[held])
+    if loose.size:
+        chosen = parts.groups == loose[0]
+        cells = parts.cells[chosen]
+        middle = (cells @ parts.middles[chosen]) / cells.sum()
+        raise MeshError(
+            f"{loose.size} of {groups} separate parts of {source} touch no contact facet, "
+            f"the first with {counted(cells.sum(), 'cell')} around {place_text(middle)}: "
+            "remove such parts, join them to the body or extend [contact]."
+        )
+    moving = _moving(parts, held, source)
+    if not moving.any():
+        return
+    point, part = parts.joints.T
+    fixed = np.isin(point, point[~moving[part]]) & moving[part]  # joints of moving parts to parts at rest
+    counts = np.bincount(part[fixed], minlength=len(held))
+    worst = int(np.argmin(np.where(counts > 0, counts, len(point) + 1)))
+    place = parts.points[point[fixed & (part == worst)]].mean(axis=0)
+    raise MeshError(
+        f"{int(moving.sum())} of {len(held)} parts of {source} can turn freely about the nodes they share with the "
+        f"rest, the loosest with {counted(parts.cells[worst], 'cell')} and {counted(counts[worst], 'such node')} "
+        f"around {place_text(place)}: "
+        "join the parts through whole facets, remove them or extend [contact]."
+    )
+
+
+def _moving(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> npt.NDArray[np.bool_]:
+    """The parts that move in some null vector of C^T C."""
+    d = parts.points.shape[1]
+    free = np.flatnonzero(~held)
+    if not free.size:
+        return np.zeros(len(held), dtype=np.bool_)
+    if len(free) > MOST_LOOSE:
+        raise MeshError(
+            f"{len(free)} parts of {source} have no contact facet and hang on the rest by single nodes or edges: "
+            "join the cells through whole facets."
+        )
+    point, part = parts.joints.T
+    arms = (parts.points[point] - parts.middles[part]) / parts.radii[part, None]
+    size = d * (d + 1) // 2
+    R = rigid_modes(arms, d, True, np.zeros(d)).reshape(len(point), d, size)
+    slot = np.full(len(held), -1)
+    slot[free] = np.arange(len(free))
+    gram = np.zeros((len(free), len(free), size, size))
+    every = np.arange(len(point))
+    start = np.maximum.accumulate(np.where(np.diff(point, prepend=-1) > 0, every, 0))  # first joint of the same node
+    for one, sign in ((start, -1.0), (every, 1.0)):  # C: motion of a joint minus that of the first one
+        for other, sign2 in ((start, -1.0), (every, 1.0)):
+            a, b = slot[part[one]], slot[part[other]]
+            both = (a >= 0) & (b >= 0) & (start < every)
+            blocks = np.einsum("kdi,kdj->kij", R[one[both]], R[other[both]])
+            np.add.at(gram, (a[both], b[both]), sign * sign2 * blocks)
+    values, vectors = np.linalg.eigh(gram.transpose(0, 2, 1, 3).reshape(len(free) * size, len(free) * size))
+    null = vectors[:, values <= HINGE * max(values.max(initial=0.0), 1.0)].reshape(len(free), size, -1)
+    moving = np.zeros(len(held), dtype=np.bool_)
+    moving[free] = np.abs(null).max(axis=(1, 2), initial=0.0) > 1e-6  # unit vectors; round-off is far below
+    return moving
+
+
+def contact_blocks(space: dolfinx.fem.FunctionSpace, facets: Ints) -> tuple[Ints, Ints]:
+    """Owned nodes of a blocked space on and off the contact zone, local numbering, sorted.
+
+    Collective. A node counts as contact node on its owner even if only another rank sees the facet.
+    """
+    mesh = space.mesh
+    found = dolfinx.fem.locate_dofs_topological(space, mesh.topology.dim - 1, facets, remote=True)
+    owned = space.dofmap.index_map.size_local
+    on = np.zeros(owned, dtype=np.bool_)
+    on[found[found < owned]] = True
+    return np.flatnonzero(on).astype(np.int32), np.flatnonzero(~on).astype(np.int32)
+
+
+def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.ArrayLike) -> Floats:
+    """Rigid motions R of nodes, u = R q_s: translations, then linearised rotations about ``reference``.
+
+    With (x, y, z) measured from the reference, the rotations are (-y, x) in 2D and (0, -z, y), (z, 0, -x),
+    (-y, x, 0) in 3D.
+
+    Not collective.
+
+    Args:
+        points: coordinates, shape (n_nodes, 2 or 3) [m].
+        dimension: 2 or 3.
+        rotation: append the rotations.
+        reference: point the hand turns about, ``dimension`` entries [m].
+
+    Returns:
+        R, shape (n_nodes * dimension, n_s), rows blocked by node.
+    """
+    n = len(points)
+    modes = [np.tile(unit, (n, 1)) for unit in np.eye(dimension)]
+    if rotation:
+        r = points[:, :dimension] - np.asarray(reference, dtype=np.float64)[:dimension]
+        zero = np.zeros(n)
+        if dimension == 2:
+            modes.append(np.stack([-r[:, 1], r[:, 0]], axis=1))
+        else:
+            x, y, z = r.T
+            modes += [np.stack(c, axis=1) for c in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return np.stack([mode.ravel() for mode in modes], axis=1)
+
+
+def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
+    """Owned cells with the layer's ``tag``, or with their midpoint in its ``box``; sorted, maybe empty here.
+
+    Not collective.
+
+    Raises:
+        SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
+    """
+    midpoints = cell_midpoints(tissue)
+    if layer.tag is not None:
+        if tissue.cell_tags is None:
+            raise SceneError(f"A layer has tag = {layer.tag}, but the {tissue.source} mesh has no cell tags: use box.")
+        if layer.tag not in tissue.cell_sets:
+            raise SceneError(
+                f"The tag = {layer.tag} of a layer is not in {tissue.source}: "
+                f"its cell tags are {_present(tissue.cell_sets)}."
+            )
+        cells = tissue.cell_tags.indices[np.isin(tissue.cell_tags.values, tissue.cell_sets[layer.tag])]
+        return np.asarray(np.sort(cells[cells < len(midpoints)]), dtype=np.int32)
+    if layer.box is None:
+        raise SceneError("A layer has neither tag nor box: give one of them.")
+    # The tolerance must not depend on the rank: lengths of the layer's own box, not of the local mesh.
+    tolerance = BOX_TOLERANCE * float(np.max(np.ptp(np.asarray(layer.box, dtype=np.float64), axis=0)))
+    return np.flatnonzero(_inside(midpoints, layer.box, tolerance, "box of a layer")).astype(np.int32)
+
+
+def cell_midpoints(tissue: TissueMesh) -> Floats:
+    """Midpoints of the owned cells, shape (n_owned, dimension) [m]. Not collective."""
+    owned = tissue.mesh.topology.index_map(tissue.dimension).size_local
+    cells = np.arange(owned, dtype=np.int32)
+    midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, cells)
+    return np.asarray(midpoints[:, : tissue.dimension], dtype=np.float64)
+
+
+def bounding_box(tissue: TissueMesh) -> tuple[Floats, Floats]:
+    """Lower and upper corner of the mesh over all ranks [m]. Collective."""
+    x = tissue.mesh.geometry.x[:, : tissue.dimension]
+    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+    comm = tissue.mesh.comm
+    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    return low, high
+
+
+def _tagged_facets(tissue: TissueMesh, tag: int | str) -> Ints:
+    if tissue.facet_tags is None:
+        raise SceneError(
+            f"contact.facet_tag = {tag} needs facet tags, but the {tissue.source} mesh has none: use sides."
+        )
+    if tag not in tissue.facet_sets:
+        present = _present(tissue.facet_sets)
+        raise SceneError(f"contact.facet_tag = {tag} is not in {tissue.source}: its facet tags are {present}.")
+    marks = tissue.facet_tags
+    return np.asarray(marks.indices[np.isin(marks.values, tissue.facet_sets[tag])], dtype=np.int32)
+
+
+def _present(sets: dict[int | str, tuple[int, ...]]) -> list[int | str]:
+    return [*sorted(k for k in sets if isinstance(k, int)), *sorted(k for k in sets if isinstance(k, str))]
+
+
+def _planes(contact: Contact, dimension: int) -> list[tuple[int, int]]:
+    try:
+        return contact.axes(dimension)
+    except ValueError as error:
+        raise SceneError(f"{error}") from error
+
+
+def _inside(points: Floats, box: Any, tolerance: float, key: str) -> npt.NDArray[np.bool_]:
+    corners = np.asarray(box, dtype=np.float64)
+    if corners.shape != (2, points.shape[1]):
+        raise SceneError(
+            f"{key} = {corners.tolist()} must have two corners with {points.shape[1]} coordinates each, "
+            "as in [[x_min, ...], [x_max, ...]]."
+        )
+    inside = (points >= corners[0] - tolerance) & (points <= corners[1] + tolerance)
+    return np.asarray(inside.all(axis=1), dtype=np.bool_)

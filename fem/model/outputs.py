@@ -1,0 +1,133 @@
+"""Outputs y of a scene: displacement of a node, mean over a region, or the hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.system import BlockSystem
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Output:
+    """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m; angles rad].
+
+    Attributes:
+        name: label in tables and files.
+        size: number of components.
+        dofs: local tissue dofs that enter, shape (k, size); empty on ranks that own none.
+        weight: every listed dof enters with this factor.
+        C_s: rigid part, (size, n_s), on every rank.
+        point: coordinates [m] of the node, or of the centre of the region.
+        axes: of the components, see :func:`hand_axes`.
+    """
+
+    name: str
+    size: int
+    dofs: np.ndarray
+    weight: float
+    C_s: Array
+    point: tuple[float, ...] = ()
+    axes: tuple[str, ...] = ("x", "y", "z")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One per component: the label and its axis."""
+        return tuple(f"{self.name}_{axis}" for axis in self.axes[: self.size])
+
+
+def hand_axes(n_s: int, dimension: int) -> tuple[str, ...]:
+    """Axes of the hand's degrees of freedom: x, y (z), then the rotations rz in the plane, rx, ry, rz in space.
+
+    Not collective.
+    """
+    turns = ("rz",) if dimension == 2 else ("rx", "ry", "rz")
+    return (*("x", "y", "z")[:dimension], *turns)[:n_s]
+
+
+def unit(name: str, rate: bool = False) -> str:
+    """Unit of a component by the axis that ends its name; of its rate of change on request. Not collective."""
+    return ("rad" if name.replace(".", "_").rsplit("_", 1)[-1].startswith("r") else "m") + ("/s" if rate else "")
+
+
+def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
+    """Outputs of the scene; without any, the free node farthest from the hand. Collective.
+
+    Raises:
+        SceneError: a node lies outside the body or a region holds no node.
+    """
+    wanted = scene.control.outputs if scene.control is not None else []
+    if not wanted:
+        return (_node(system, "tip", _farthest(system)),)
+    result = []
+    for i, output in enumerate(wanted):
+        name = output.name or f"y{i + 1}"
+        if output.kind == "hand":
+            result.append(_hand(system, name))
+        elif output.kind == "region":
+            result.append(_region(system, name, np.asarray(output.box, dtype=float), i))
+        else:
+            _inside(system, output.point or [], i)
+            result.append(_node(system, name, np.asarray(output.point, dtype=float)))
+    return tuple(result)
+
+
+def _hand(system: BlockSystem, name: str) -> Output:
+    n_s = system.layout.n_s
+    none = np.zeros((0, n_s), int)
+    return Output(name, n_s, none, 0.0, np.eye(n_s), axes=hand_axes(n_s, system.layout.dimension))
+
+
+def _node(system: BlockSystem, name: str, point: Array) -> Output:
+    layout = system.layout
+    d = layout.dimension
+    rank, first, where = layout.nearest_node(point)
+    mine = layout.comm.rank == rank
+    dofs = np.arange(first, first + d)[None, :] if mine else np.zeros((0, d), int)
+    C_s = layout.comm.bcast(system.T[first : first + d].copy() if mine else None, root=rank)
+    return Output(name, d, dofs, 1.0, C_s, tuple(where.tolist()))
+
+
+def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
+    layout = system.layout
+    d = layout.dimension
+    slack = 1e-9 * max(
+        layout.extent, float(np.abs(box).max())
+    )  # a node on the edge of the box is inside, rounded or not
+    inside = np.flatnonzero(((layout.nodes >= box[0] - slack) & (layout.nodes <= box[1] + slack)).all(axis=1))
+    dofs = inside[:, None] * d + np.arange(d)
+    count = int(total(layout.comm, np.array([float(len(inside))]))[0])
+    if count == 0:
+        raise SceneError(
+            f"control.outputs[{i}].box = {box.tolist()} holds no free node of the body; move or enlarge it"
+        )
+    C_s = total(layout.comm, system.T[dofs].sum(axis=0) if len(dofs) else np.zeros((d, layout.n_s))) / count
+    return Output(name, d, dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()))
+
+
+def _inside(system: BlockSystem, point: list[float], i: int) -> None:
+    low, high = system.layout.bounds()
+    p = np.asarray(point, dtype=float)
+    slack = 0.05 * float((high - low).max())  # free nodes end one cell short of the contact zone
+    if (p < low - slack).any() or (p > high + slack).any():
+        raise SceneError(
+            f"control.outputs[{i}].point = {list(point)} lies outside the body, which spans "
+            f"{(np.round(low, 6) + 0.0).tolist()} to {(np.round(high, 6) + 0.0).tolist()} m"  # + 0: no -0.0
+        )
+
+
+def _farthest(system: BlockSystem) -> Array:
+    layout = system.layout
+    best: tuple[float, tuple[float, ...]] = (1.0, ())
+    if len(layout.nodes):
+        distance = layout.rounded(np.linalg.norm(layout.nodes - layout.reference, axis=1))
+        far = np.flatnonzero(distance == distance.max())
+        best = (-float(distance.max()), min(tuple(layout.rounded(layout.nodes[j]).tolist()) for j in far))
+    return np.asarray(min(layout.comm.allgather(best))[1], dtype=float)

@@ -1,0 +1,1 @@
+"""The midpoint run: step, motion of the hand, snapshots, restart."""

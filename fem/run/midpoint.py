@@ -1,0 +1,323 @@
+"""Implicit midpoint rule in momentum form: one solve and one product with K a step (layered damping: K, M and D).
+
+With s = 2/dt, w = z_mid - z_n, momentum pi = M_ee v and the load l = G c at the midpoint,
+
+    S w = r,   r = h_n + G c_n,   h_n = s pi_n - K z_n,   S = K + s D + s^2 M,
+    z_{n+1} = z_n + 2 w,   v_{n+1} = 2 s w - v_n,
+    s pi_{n+1} = a S w - a (1 + s beta) (K z_{n+1} - K z_n) / 2 - s pi_n,   a = 2 s / (s + alpha)
+
+for D = alpha M + beta K. The textbook form computes pi_{n+1} as M v_{n+1} instead: a second product, and the rounding
+error of the factor then acts as a force that feeds energy in every step. In momentum form the same error is a fixed
+change of the mass matrix, whose energy is conserved.
+
+Only r is stored. From r_n to h_{n+1} all terms but one work in place (undamped: r_n - 2 K z_{n+1} + G c_n); the last,
+G c_n, waits for the next load, so that a step adds G to r once: r_{n+1} = (h_{n+1} - G c_n) + G (c_n + c_{n+1}).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.solve.held import held_operators
+from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
+from softgrasp.fem.system import BlockSystem
+
+
+def midpoint_matrix(system: BlockSystem, dt: float) -> PETSc.Mat:
+    """S = K + s D + s^2 M with s = 2/dt. Collective."""
+    s, damping = 2 / dt, system.damping
+    S = system.K_ee.copy()
+    if damping.beta:
+        S.scale(1 + s * damping.beta)
+    S.axpy(s * s + s * damping.alpha, system.M_ee, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    if damping.matrix is not None:
+        S.axpy(s, damping.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    return S
+
+
+@dataclass
+class TissueState:
+    """Relative displacement and velocity of the tissue as PETSc vectors that share one local array [z; v]."""
+
+    array: Array
+    z: PETSc.Vec
+    v: PETSc.Vec
+
+
+def state_on(array: Array, system: BlockSystem) -> TissueState:
+    """Wrap a local array [z; v] without copying. Collective."""
+    layout = system.layout
+    n, sizes = layout.n_local, (layout.n_local, layout.n_e)
+    return TissueState(
+        array,
+        PETSc.Vec().createWithArray(array[:n], size=sizes, bsize=layout.dimension, comm=layout.comm),
+        PETSc.Vec().createWithArray(array[n:], size=sizes, bsize=layout.dimension, comm=layout.comm),
+    )
+
+
+class TissueMidpoint:
+    """The tissue half of the step, for a load known at the midpoint.
+
+    When every rank holds the whole factor it holds the vectors whole as well, and these calls send no message: all
+    ranks compute the same numbers, in the order in which the factor has its rows, and each writes its own rows into
+    the state.
+
+    Args:
+        system: operators.
+        dt: step [s].
+        solver: name of the linear solver.
+        rtol: tolerance of an iterative solver.
+        reproducible: see :func:`fem.solve.solvers.factor_on_every_rank`.
+
+    Attributes:
+        held: operators on the rows held.
+        r, w, k: vectors on the rows held; ``r_array``, ``w_array``, ``k_array`` their arrays.
+        c: coefficients of the load of the step in work, (n_s,).
+        pending: coefficients p of the load that r still lacks between steps, h = r + G p, (n_s,).
+        K2: -2 K, whose product one call adds to r.
+        k: K2 z; a step carries it where damping needs the old one.
+        x: the rows of w that this rank owns, in the order of the state; w itself unless the vectors are held whole.
+    """
+
+    def __init__(
+        self,
+        system: BlockSystem,
+        dt: float,
+        solver: SolverName,
+        rtol: float = 1e-10,
+        reproducible: Reproducible = "auto",
+    ) -> None:
+        self.system, self.dt, self.s = system, dt, 2 / dt
+        whole, ordered = factor_on_every_rank(system.layout, solver, reproducible), solver == "cholesky"
+        self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered)
+        self.G, self.rows = self.held.G, self.held.rows
+        self.K2 = self.held.K
+        self.K2.scale(-2.0)
+        with self.held.agree():
+            self.solver: TissueSolver = make_solver(
+                self.held.S, solver, system.layout, "softgrasp_midpoint_", rtol, reproducible, ordered
+            )
+        self._solve = self.solver.solve if self.solver.factor is None else self.solver.factor.solve
+        self.r, self.k, self.w = (self.K2.createVecLeft() for _ in range(3))
+        # views stay valid for the life of a vector; asking PETSc for them costs as much as a short dot product
+        self.w_array, self.r_array, self.k_array = self.w.array_w, self.r.array_r, self.k.array_r
+        self._couple()
+        self.x, self._move = self.w, self._held_z
+        if self.held.whole:
+            self.x, self.z = system.K_ee.createVecRight(), self.w.duplicate()
+            self._move = self._move_whole
+        self.x_array: Array = self.x.array_w
+        self._pick = self._picker()
+        damping = system.damping
+        self.alpha, self.beta = damping.alpha, damping.beta
+        self.a = 2 * self.s / (self.s + self.alpha)
+        self.b = self.a * (1 + self.s * self.beta) / 2
+        self._propagate = self._undamped
+        if damping.matrix is not None:
+            self._prepare_general()
+        elif damping.active:
+            self.k_old = self.k.duplicate()
+            self.k_old_array = self.k_old.array_r
+            self._propagate = self._proportional
+        self.dissipated = 0.0
+
+    def _picker(self) -> Callable[[], object]:
+        """What copies the owned rows of w to x. Not collective."""
+        layout, order = self.system.layout, self.held.order
+        if order is not None:
+            w, x = (array.reshape(-1, order.d) for array in (self.w_array, self.x_array))
+            places = order.places_of(layout.start, layout.start + layout.n_local)
+            return partial(w.take, places, 0, x, "clip")  # "raise" would copy x
+        if self.held.whole:
+            return partial(np.copyto, self.x_array, self.w_array[self.rows])
+        return lambda: None  # x is w
+
+    def _couple(self) -> None:
+        """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w. Not collective.
+
+        PETSc adds a product to r, or takes one with w, in one pass and with less overhead than NumPy.
+        """
+        n_s = self.G.shape[1]
+        self.coupling = PETSc.Mat().createDense(self.G.shape, array=np.asfortranarray(self.G), comm=PETSc.COMM_SELF)
+        self.coupling.assemble()
+        self.r_here, self.w_here = (
+            PETSc.Vec().createWithArray(array, comm=PETSc.COMM_SELF) for array in (self.r.array_w, self.w_array)
+        )
+        self.added, self.moved = (PETSc.Vec().createSeq(n_s, comm=PETSc.COMM_SELF) for _ in range(2))
+        self.added_array: Array = self.added.array_w
+        self.moved_array: Array = self.moved.array_r
+        self.c, self.pending = np.zeros(n_s), np.zeros(n_s)
+
+    def _prepare_general(self) -> None:
+        """The damping matrix with its mass-proportional part, so that a step needs one product with it. Collective."""
+        self.y = self.k.duplicate()
+        self.y_array = self.y.array_r
+        if self.held.D is None or self.held.M is None:
+            raise SolverError("a damping matrix is missing")
+        self.M, self.D = self.held.M, self.held.D.copy()
+        self.D.axpy(self.alpha, self.M, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self._propagate = self._general
+
+    def start(self, state: TissueState) -> None:
+        """Set the carried vectors k = -2 K z and r = h = s M v - K z. Collective."""
+        self.join(state)
+        y = state.z.duplicate()
+        self.system.M_ee.mult(state.v, y)
+        self.r.array_w[:] = self.held.gather(y.array_r)
+        y.destroy()
+        self.r.scale(self.s)
+        self.r.axpy(0.5, self.k)
+        self.c = self.pending = np.zeros_like(self.c)
+
+    def join(self, state: TissueState) -> None:
+        """Take a state over whose r is set. Collective."""
+        if self.held.whole:
+            self.z.array_w[:] = self.held.gather(state.z.array_r)
+        self.K2.mult(self._held_z(state), self.k)
+
+    def _held_z(self, state: TissueState) -> PETSc.Vec:
+        return self.z if self.held.whole else state.z
+
+    def solve_midpoint(self, c: Array) -> None:
+        """Solve S w = h + G c, once a step. Collective.
+
+        Args:
+            c: load, (n_s,); kept, not copied: leave it as it is until the next solve.
+        """
+        np.add(self.pending, c, out=self.added_array)
+        self.coupling.multAdd(self.added, self.r_here, self.r_here)
+        self.r.stateIncrease()  # else PETSc remembers the norm of the old r
+        self.c = c
+        self._solve(self.r, self.w)
+
+    def respond(self) -> Array:
+        """Solve S w = h, the step without a load; the owned rows of w. Collective."""
+        self.solve_midpoint(np.zeros_like(self.c))
+        self._pick()
+        return self.x_array
+
+    def make_responses(self) -> Array:
+        """Set Y = S^{-1} G for :meth:`accelerate`; its owned rows (n_local, n_s). Collective.
+
+        Call it before :meth:`start`: r is scratch here, and a run in progress would be lost.
+
+        Raises:
+            SolverError: a solve missed its tolerance.
+        """
+        self.Y = np.empty(self.G.shape, order="F")
+        with self.held.agree():
+            for j in range(self.Y.shape[1]):
+                self.r.array_w[:] = self.G[:, j]
+                self.solver.solve(self.r, self.w)
+                self.solver.check(self.r, self.w, "the response to the hand")
+                self.Y[:, j] = self.w.array_r
+        return np.asarray(self.Y[self.rows])
+
+    def accelerate(self, c: Array) -> None:
+        """Turn S^{-1} h in w into S^{-1} (h - G c), and the right-hand side and the load to match. Not collective."""
+        w = self.w.array_w  # not the view: PETSc must see that w changed
+        w -= self.Y @ c
+        self.c = self.added_array[:] = -c
+        self.coupling.multAdd(self.added, self.r_here, self.r_here)
+        self.r.stateIncrease()
+
+    def advance(self, old: TissueState, new: TissueState) -> None:
+        """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry k and r on. Collective."""
+        self._pick()
+        if new is old:
+            old.z.axpy(2.0, self.x)
+        else:
+            new.z.waxpy(2.0, self.x, old.z)
+            old.v.copy(new.v)
+        new.v.axpby(2 * self.s, -1.0, self.x)
+        self._propagate(self._move(new))
+        self.pending = self.c
+
+    def pull(self) -> Array:
+        """G'w over the rows held, (n_s,), until the next call: the load l = G c of the step did the work 2 c'G'w.
+
+        Not collective.
+        """
+        self.coupling.multTranspose(self.w_here, self.moved)
+        return self.moved_array
+
+    def _move_whole(self, state: TissueState) -> PETSc.Vec:
+        """The rows held of a new z, by the operations that gave the state its rows: the same bits."""
+        self.z.axpy(2.0, self.w)
+        return self.z
+
+    def _undamped(self, z: PETSc.Vec) -> None:
+        self.K2.multAdd(z, self.r, self.r)
+
+    def _proportional(self, z: PETSc.Vec) -> None:
+        self.k, self.k_old = self.k_old, self.k
+        self.k_array, self.k_old_array = self.k_old_array, self.k_array
+        self.K2.mult(z, self.k)
+        w = self.w_array
+        wKw = (np.dot(w, self.k_old_array) - np.dot(w, self.k_array)) / 4
+        wMw = (np.dot(w, self.r_array) - (1 + self.s * self.beta) * wKw) / (self.s * (self.s + self.alpha))
+        self.dissipated += 2 * self.s * float(self.alpha * wMw + self.beta * wKw)
+        self.r.axpby((1 + self.b) / 2, self.a - 1, self.k)
+        self.r.axpy((1 - self.b) / 2, self.k_old)
+
+    def _general(self, z: PETSc.Vec) -> None:
+        self.M.mult(self.w, self.y)
+        self.r.axpby(2 * self.s**2, -1.0, self.y)
+        self.r.axpy(0.5, self.k)
+        self.K2.mult(z, self.k)
+        self.r.axpy(0.5, self.k)
+        self.D.mult(self.w, self.y)
+        self.dissipated += 2 * self.s * float(np.dot(self.w_array, self.y_array))
+
+    def energy(self, state: TissueState) -> float:
+        """Energy (z' K z + v' M v) / 2 [J] of the state just reached, from the carried momentum. Collective."""
+        self.K2.mult(self._held_z(state), self.k)
+        n, k = len(self.x_array), self.k_array[self.rows] / -2
+        z, v = state.array[:n], state.array[n:]
+        h = self.r_array[self.rows] + self.G[self.rows] @ self.pending
+        momentum = (h + k) / self.s
+        local = np.array([np.dot(z, k), np.dot(v, momentum)])
+        return float(total(self.system.layout.comm, local).sum()) / 2
+
+    def over_ranks(self, share: float) -> float:
+        """Sum over the ranks of what each computed on the rows it holds, which may be all of them. Collective."""
+        return share if self.held.whole else float(total(self.system.layout.comm, np.array([share]))[0])
+
+    def residual(self) -> float:
+        """Check a solve, before :meth:`advance` takes r further; raises SolverError. Collective.
+
+        In equilibrium under gravity the load cancels in r, and a two-way step subtracts the hand's part from w: what is
+        left is small against the load, not against the rounding in r.
+        """
+        load = self.G[self.rows] @ self.c
+        square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
+        with self.held.agree():
+            return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))
+
+    def destroy(self) -> None:
+        """Free all PETSc objects. Collective."""
+        self.solver.destroy()
+        self.held.destroy()
+        for name in (
+            "r",
+            "k",
+            "x",
+            "w",
+            "r_here",
+            "w_here",
+            "added",
+            "moved",
+            "coupling",
+            "k_old",
+            "y",
+            "z",
+            "D",
+        ):
+            if hasattr(self, name):
+                getattr(self, name).destroy()

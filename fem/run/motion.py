@@ -1,0 +1,146 @@
+"""How the hand moves: tables of position, velocity and mean acceleration at the time steps.
+
+A one-way coupled hand does not feel the tissue, so its whole trajectory is known before the first step, whether it is
+prescribed or driven by a force.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.petsc import Array
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class HandTable:
+    """Hand trajectory on the time grid.
+
+    Attributes:
+        q: positions [m, rad], shape (steps + 1, n_s).
+        v: velocities, shape (steps + 1, n_s).
+        a: mean acceleration of each step, (v_{n+1} - v_n) / dt, shape (steps, n_s).
+    """
+
+    q: Array
+    v: Array
+    a: Array
+
+
+def quintic(t: Array, duration: float) -> tuple[Array, Array, Array]:
+    """Rest-to-rest profile s = 10 x^3 - 15 x^4 + 6 x^5 of x = t / duration, with first and second derivative.
+
+    Source: minimum-jerk motion [FlashHogan1985].
+    """
+    x = np.clip(t / duration, 0.0, 1.0)
+    s = x**3 * (10 + x * (-15 + 6 * x))
+    ds = 30 * x**2 * (1 - x) ** 2 / duration
+    dds = 60 * x * (1 - x) * (1 - 2 * x) / duration**2
+    return s, ds, dds
+
+
+def read_csv(path: Path, columns: int, end: float) -> tuple[Array, Array]:
+    """Read times (steps,) and values (steps, columns) of a trajectory.
+
+    Raises:
+        SceneError: the file is missing, not numeric, not increasing in time or does not cover [0, end].
+    """
+    try:
+        with path.open(newline="") as file:
+            rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
+    except OSError as error:
+        raise SceneError(f"motion.csv: {path} cannot be read ({error.strerror}); name an existing CSV file") from error
+    try:
+        float(rows[0][0])
+    except (ValueError, IndexError):
+        rows = rows[1:]
+    try:
+        table = np.array([[float(x) for x in row] for row in rows])
+    except ValueError as error:
+        raise SceneError(f"motion.csv: {path} holds a value that is not a number ({error})") from error
+    if table.ndim != 2 or len(table) < 2 or table.shape[1] != columns + 1:
+        raise SceneError(
+            f"motion.csv: {path} must have at least two rows of {columns + 1} columns "
+            "(time, then one per hand degree of freedom)"
+        )
+    for i, j in np.argwhere(~np.isfinite(table))[:1]:
+        what = "the time" if j == 0 else f"column {j + 1}, at t = {table[i, 0]:g} s,"
+        raise SceneError(f"motion.csv: {path} holds {table[i, j]} as {what} in data row {i + 1}; give finite numbers")
+    if (np.diff(table[:, 0]) <= 0).any():
+        raise SceneError(f"motion.csv: the times in {path} must increase from row to row")
+    if table[0, 0] > 0 or table[-1, 0] < end * (1 - 1e-12):
+        raise SceneError(
+            f"motion.csv: {path} covers {table[0, 0]:g} to {table[-1, 0]:g} s, the run needs 0 to {end:g} s"
+        )
+    return table[:, 0], table[:, 1:]
+
+
+def motion_table(scene: Scene, n_s: int) -> HandTable:
+    """Positions of the prescribed motion (drive = "motion") on the time grid. Not collective.
+
+    A CSV table is joined by a cubic spline, at rest at both ends.
+
+    Raises:
+        SceneError: a CSV file does not fit.
+    """
+    steps, end = scene.time.steps, scene.time_end
+    t = end * np.arange(steps + 1) / steps
+    motion = scene.motion
+    if motion.profile == "quintic":
+        if end / steps > motion.duration / 2:
+            raise SceneError(
+                f"time.steps = {steps} gives steps of {end / steps:g} s, too long for a move of {motion.duration:g} s; "
+                f"take at least {int(np.ceil(2 * end / motion.duration))}"
+            )
+        target = np.zeros(n_s)
+        target[: len(motion.target or [])] = motion.target or []
+        s, ds, _ = quintic(t, motion.duration)
+        q, v = np.outer(s, target), np.outer(ds, target)
+    elif motion.profile == "csv":
+        times, values = read_csv(scene.directory / (motion.csv or ""), n_s, end)
+        spline = CubicSpline(times, values, bc_type="clamped")
+        q, v = spline(t), spline(t, 1)
+    else:
+        q, v = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s))
+    return HandTable(q, v, np.diff(v, axis=0) * (steps / end))
+
+
+def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
+    """Force u [N, N m] on the hand at the step midpoints, shape (steps, n_s). Not collective.
+
+    A CSV table is joined by straight lines.
+
+    With the quintic profile it is the feed-forward M_hand a(t) that would carry the bare hand to the target.
+
+    Raises:
+        SceneError: a CSV file does not fit.
+    """
+    steps, end = scene.time.steps, scene.time_end
+    t = end * (np.arange(steps) + 0.5) / steps
+    motion = scene.motion
+    if motion.profile == "quintic":
+        target = np.zeros(n_s)
+        target[: len(motion.target or [])] = motion.target or []
+        acceleration = np.outer(np.where(t < motion.duration, quintic(t, motion.duration)[2], 0.0), target)
+        return acceleration @ M_hand.T
+    if motion.profile == "csv":
+        times, values = read_csv(scene.directory / (motion.csv or ""), n_s, end)
+        return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
+    return np.zeros((steps, n_s))
+
+
+def driven_table(M_hand: Array, force: Array, dt: float, q0: Array, v0: Array) -> HandTable:
+    """Midpoint rule for the free hand M_hand a = u: exact for the given mean forces. Not collective."""
+    a = np.linalg.solve(M_hand, force.T).T
+    v = np.vstack([v0, v0 + dt * np.cumsum(a, axis=0)])
+    q = np.vstack([q0, q0 + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
+    return HandTable(q, v, a)

@@ -1,0 +1,393 @@
+"""PETSc TS runs the midpoint step, in segments; between them come progress, frames, checkpoints and interrupts."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.run.checkpoint import read_checkpoint, write_checkpoint
+from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
+from softgrasp.fem.errors import Interrupted, SceneError, SolverError, agree
+from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.run.motion import driven_table, force_values, motion_table
+from softgrasp.fem.model.outputs import Output, make_outputs
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.scene.scene import Scene, Time
+from softgrasp.fem.run.snapshots import Snapshots, make_store
+from softgrasp.fem.solve.solvers import SolverName, choose_solver, make_solver
+from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.fem.system import BlockSystem
+
+Observer = Callable[["Run"], None]
+"""Called between segments and at every frame; collective, may raise to end the run."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How to run, apart from what the scene says.
+
+    Attributes:
+        directory: where checkpoints and streamed snapshots go.
+        resume: continue from the checkpoint in ``directory``.
+        until: stop after this step and leave a checkpoint; None runs to the end.
+        progress: called about five times a second.
+        frame: called at the start, at the end and at ``output.frames`` steps between.
+        begin: called once before the first step, when a checkpoint has been read.
+        keep: called before every checkpoint is written, to keep with it what the run has seen so far.
+    """
+
+    directory: Path = Path("out")
+    resume: bool = False
+    until: int | None = None
+    progress: Observer | None = None
+    frame: Observer | None = None
+    begin: Observer | None = None
+    keep: Observer | None = None
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What a run returns.
+
+    Attributes:
+        times: time grid [s], shape (steps + 1,).
+        q_s, v_s: hand, shape (steps + 1, n_s), on every rank.
+        outputs: named outputs [m], shape (steps + 1, components), on every rank.
+        outputs_rigid: what the outputs would be if the tissue moved rigidly with the hand, same shape.
+        output_names: one per component.
+        snapshots: stored states, or None.
+        final: local [z; v_z] at the end.
+        energy_drift: |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless.
+        residuals: relative residual of the first and the last solve.
+        solver: name and reason.
+        seconds: stages of the run.
+        steps_timed: steps taken since the run was started or resumed.
+        force: mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with
+            two-way coupling what a prescribed motion takes; None when one-way coupling leaves it unknown.
+    """
+
+    times: Array
+    q_s: Array
+    v_s: Array
+    outputs: Array
+    outputs_rigid: Array
+    output_names: tuple[str, ...]
+    snapshots: Snapshots | None
+    final: Array
+    energy_drift: float
+    residuals: tuple[float, float]
+    solver: tuple[str, str]
+    seconds: dict[str, float] = field(default_factory=dict)
+    steps_timed: int = 0
+    force: Array | None = None
+
+
+class Run(Stepped):
+    """One run in progress: the TS context and what it carries.
+
+    Args:
+        model: the model.
+        options: where files go, and whether to resume.
+        force: feedback force on the hand; None takes the scene's motion.
+
+    Attributes:
+        begun: step at which this run was started or resumed.
+        legs: the same of all runs that led here, this one last.
+    """
+
+    def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
+        scene, system = model.scene, model.system
+        self.model = model
+        self.end = scene.time_end
+        dt, solver = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
+        with model.watch.stage("factor"):
+            midpoint = TissueMidpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
+        solver = solver[0], solver[1] + midpoint.solver.remark
+        store = make_store(
+            system, scene.output.snapshots, scene.time.steps, scene.output.every, options.directory, options.resume
+        )
+        super().__init__(system.layout, dt, scene.time.steps, midpoint, store, solver)
+        self.outputs: tuple[Output, ...] = make_outputs(scene, system)
+        self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
+        self.points, self.regions = self._recorders()
+        self.drive: Drive = self._make_drive(force)
+        self.pulls = np.zeros((self.steps + 1, system.layout.n_s))
+        self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
+        self.initial_energy = self.peak_energy = 0.0
+        self.residual_first = self.residual_last = 0.0
+        self.begun, self.legs = 0, [0]
+
+    def _recorders(self) -> tuple[list[tuple[slice, Array]], list[tuple[np.ndarray, Array]]]:
+        """Local dofs and column block of every output that this rank has a share in."""
+        points, regions, at = [], [], 0
+        for output in self.outputs:
+            share = self.local_outputs[:, at : at + output.size]
+            if len(output.dofs) == 1 and (np.diff(output.dofs[0]) == 1).all():  # a slice, cheaper than indices
+                points.append((slice(output.dofs[0][0], output.dofs[0][-1] + 1), share))
+            elif len(output.dofs):
+                regions.append((output.dofs, share))
+            at += output.size
+        return points, regions
+
+    def _make_drive(self, force: Force | None) -> Drive:
+        scene, system = self.model.scene, self.model.system
+        n_s = system.layout.n_s
+        zero = np.zeros(n_s)
+        if force is not None:
+            return ForceDrive(system, force, self.midpoint, self.steps, zero, zero)
+        if scene.motion.drive == "motion":
+            return TableDrive(system, motion_table(scene, n_s))
+        u = force_values(scene, n_s, system.M_hand)
+        if system.two_way:
+            return ForceDrive(system, lambda n, t, q, v: u[n], self.midpoint, self.steps, zero, zero)
+        weight = system.M_hand @ system.gravity if system.hand_weight and system.gravity is not None else zero
+        return TableDrive(system, driven_table(system.M_hand, u + weight, self.dt, zero, zero), u)
+
+    def solve_step(self, n: int) -> None:
+        """Load of the hand's motion, or its force, and one solve. Collective."""
+        self.drive.solve(n, self.midpoint, self.state)
+
+    def record(self, n: int) -> None:
+        """Store this rank's share of the outputs at step n, and what the work of the load needs. Not collective."""
+        self.pulls[n] = self.midpoint.pull()
+        z = self.state.array
+        for rows, share in self.points:
+            share[n] = z[rows]
+        for dofs, share in self.regions:
+            share[n] = z[dofs].sum(axis=0)
+
+    def start(self) -> None:
+        """Initial state: at rest, or in equilibrium under gravity. Collective."""
+        scene, system = self.model.scene, self.model.system
+        if scene.time.start == "equilibrium" and system.gravity is not None:
+            with self.model.watch.stage("equilibrium"):
+                name, _ = choose_solver(system.layout, scene.time.solver, few=True)
+                self.state.z.array_w[:] = equilibrium(system, name, scene.time)
+        self.midpoint.start(self.state)
+        self.record(0)
+        self.initial_energy = self.midpoint.energy(self.state)
+        self.peak_energy = abs(self.initial_energy)
+
+    def take(self, ts: Any, step: int, check: bool = False) -> None:
+        """Step up to a number, and see that the forces on the way were finite. Collective.
+
+        Raises:
+            SolverError: a solve failed or missed its tolerance, or a force is not finite.
+        """
+        before = self.reached
+        try:
+            if check:
+                self.residual_last = self.check_step(ts, step)
+            else:
+                self.advance_to(ts, step)
+        except SolverError:
+            self._check_force(before)  # which may be why
+            raise
+        self._check_force(before)
+
+    def _check_force(self, begin: int) -> None:
+        with agree(self.layout.comm):  # a callable may differ between the ranks
+            self.drive.check(begin, self.reached + 1)
+
+    def force(self) -> Array | None:
+        """Force on the hand in each step, see :class:`Trajectory`. Collective."""
+        system = self.model.system
+        if self.drive.u is not None or not system.two_way:
+            return self.drive.u
+        pulls = self.pulls[1:] if self.midpoint.held.whole else total(self.layout.comm, self.pulls[1:])
+        return force_taken(system, pulls, self.drive.v, self.drive.c, self.dt)
+
+    def watch_energy(self) -> None:
+        """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
+        energy = self.midpoint.energy(self.state)
+        if not np.isfinite(energy):
+            raise SolverError(
+                f"{self.solver[0]}: the energy is not finite at step {self.reached}; check material, dt and force"
+            )
+        self.peak_energy = max(self.peak_energy, abs(energy))
+
+    def balance(self) -> tuple[float, float]:
+        """Work sum_n 2 c_n'G'w_n of the loads and energy dissipated since the start [J]. Collective."""
+        n = self.reached
+        work = 2 * float(np.einsum("ij,ij", self.drive.c[:n], self.pulls[1 : n + 1]))
+        return self.midpoint.over_ranks(work), self.midpoint.over_ranks(self.midpoint.dissipated)
+
+    def drift(self) -> float:
+        """Energy that neither load nor damping explains, over the largest energy seen. Collective."""
+        work, lost = self.balance()
+        defect = self.midpoint.energy(self.state) - self.initial_energy - work + lost
+        scale = max(self.peak_energy, abs(work), abs(lost))
+        return abs(defect) / scale if scale > 0 else 0.0
+
+    def trajectory(self) -> Trajectory:
+        """Gather the small results; the tissue stays distributed. Collective."""
+        system, outputs = self.model.system, self.outputs
+        comm = system.layout.comm
+        y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
+        rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
+        y += rigid
+        names = tuple(name for o in outputs for name in o.names)
+        times = self.end * np.arange(self.steps + 1) / self.steps
+        snapshots = self.store.finish(times, self.drive.q, self.drive.v)
+        spent = comm.allreduce(self.seconds, MPI.MAX)
+        seconds = {**self.model.watch.seconds, "steps": spent, "per_step": spent / max(self.counted, 1)}
+        return Trajectory(
+            times=times,
+            q_s=self.drive.q,
+            v_s=self.drive.v,
+            outputs=y,
+            outputs_rigid=rigid,
+            output_names=names,
+            snapshots=snapshots,
+            final=self.state.array.copy(),
+            energy_drift=self.drift(),
+            residuals=(self.residual_first, self.residual_last),
+            solver=self.solver,
+            seconds=seconds,
+            steps_timed=self.counted,
+            force=self.force(),
+        )
+
+
+def equilibrium(system: BlockSystem, solver: SolverName, time: Time) -> Array:
+    """Static displacement relative to the hand, K_ee z = G g; local rows. Collective.
+
+    Raises:
+        SolverError: the stiffness is singular or the residual too large.
+    """
+    load = system.K_ee.createVecLeft()
+    z = system.K_ee.createVecRight()
+    load.array_w[:] = 0.0 if system.gravity is None else system.G @ system.gravity
+    static = make_solver(system.K_ee.copy(), solver, system.layout, "softgrasp_static_", time.rtol, time.reproducible)
+    static.solve(load, z)
+    static.check(load, z, "the static equilibrium")
+    result = z.array_r.copy()
+    static.destroy()
+    load.destroy()
+    z.destroy()
+    return np.asarray(result)
+
+
+def frame_steps(scene: Scene) -> list[int]:
+    """Steps at which ``RunOptions.frame`` is called: ``output.frames`` intervals from start to end."""
+    steps = scene.time.steps
+    return np.linspace(0, steps, min(scene.output.frames, steps) + 1).round().astype(int).tolist()
+
+
+@contextmanager
+def _interruptible(speaks: bool) -> Iterator[list[bool]]:
+    """Turn the first Ctrl-C into a flag and say so on the standard error; a second one interrupts at once."""
+    flag: list[bool] = []
+
+    def note(number: int, frame: Any) -> None:
+        flag.append(True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if speaks:
+            with suppress(OSError):  # nobody listens; print may not be called while another print is under way
+                os.write(2, b"\nstopping as soon as the restart file is written; Ctrl-C again stops at once\n")
+
+    try:
+        previous = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not the main thread: leave signals alone
+        yield flag
+        return
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:
+    """Steps at which a segment must end, and those of them with a frame or a checkpoint.
+
+    Ten of them do not depend on the options: there the energy is sampled, the same in every run of a scene.
+    """
+    scene = run.model.scene
+    frames: set[int] = set()
+    if options.frame is not None:
+        frames = set(frame_steps(scene))
+    every = scene.output.checkpoint_every
+    checkpoints = set(range(every, run.steps, every)) if every else set()
+    last = run.steps if options.until is None else min(options.until, run.steps)
+    return sorted({s for s in frames | checkpoints | run.milestones if s < last} | {last}), frames, checkpoints
+
+
+def simulate(model: Model, options: RunOptions | None = None, force: Force | None = None) -> Trajectory:
+    """Run a scene from its start to its end. Collective.
+
+    Args:
+        model: from :func:`fem.model.build.build`.
+        options: files, resume and observers.
+        force: feedback force on the hand instead of the scene's motion.
+
+    Raises:
+        SolverError: a solve failed or missed its tolerance.
+        ResourceError: the snapshots do not fit.
+        CheckpointError: resume was asked for and no fitting restart file is there.
+        Interrupted: Ctrl-C or ``until``; the message names the restart file.
+    """
+    options = options or RunOptions()
+    run = Run(model, options, force)
+    ts = make_ts(run)
+    try:
+        if options.resume:
+            read_checkpoint(run, options.directory / "checkpoint")
+            ts.setStepNumber(run.reached)
+        else:
+            run.start()
+        if options.begin is not None:
+            options.begin(run)
+        with _interruptible(model.system.layout.comm.rank == 0) as stop:
+            _run_segments(run, ts, options, stop)
+        return run.trajectory()
+    finally:
+        ts.destroy()
+        run.midpoint.destroy()
+
+
+def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> None:
+    comm: MPI.Intracomm = run.model.system.layout.comm
+    if options.until is not None and options.until <= run.reached and run.reached < run.steps:
+        raise SceneError(f"the run is at step {run.reached} already; --until must be larger, not {options.until}")
+    boundaries, frames, checkpoints = _boundaries(run, options)
+    if options.frame is not None and run.reached == 0:
+        options.frame(run)
+    if run.reached == 0:
+        run.take(ts, 1, check=True)
+        run.residual_first = run.residual_last
+    last, chunk = boundaries[-1], 1
+    while run.reached < last:
+        limit = next(b for b in boundaries if b > run.reached)
+        begin, before = time.perf_counter(), run.reached
+        goal = min(limit, run.reached + chunk, run.store.limit(run.reached))
+        run.take(ts, goal, check=goal == run.steps)
+        pace = (time.perf_counter() - begin) / (run.reached - before)
+        run.store.flush(run.reached)
+        if run.reached in run.milestones:
+            run.watch_energy()
+        # rank 0 sets the pace, all agree whether somebody asked to stop
+        chunk = comm.bcast(int(np.clip(0.2 / max(pace, 1e-7), 1, 10_000)))
+        if options.frame is not None and run.reached in frames:
+            options.frame(run)
+        if options.progress is not None:
+            options.progress(run)
+        stopped = comm.allreduce(bool(stop), MPI.LOR)
+        stopped = stopped and run.reached < run.steps  # at the end there is nothing left to stop
+        if run.reached in checkpoints or stopped or (run.reached == last < run.steps):
+            if options.keep is not None:
+                options.keep(run)
+            manifest = write_checkpoint(run, options.directory / "checkpoint")
+            if stopped or run.reached == last:
+                raise Interrupted(
+                    f"stopped after step {run.reached} of {run.steps}; {manifest} lets --resume go on from there"
+                )

@@ -1,0 +1,249 @@
+"""Snapshot columns [z; v] that the time loop writes into without a copy, kept in memory or streamed to HDF5."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import psutil
+
+from softgrasp.fem.errors import CheckpointError, ResourceError, agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.run.midpoint import TissueState, state_on
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.system import BlockSystem
+
+BUFFER_BYTES = 64 * 2**20  # per rank; large enough that HDF5 writes whole chunks
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """Hand and relative tissue states at some steps.
+
+    Attributes:
+        layout: sizes and ownership.
+        steps: step numbers of the columns, shape (m,).
+        times: their times [s], shape (m,).
+        q_s, v_s: hand, shape (n_s, m), on every rank.
+        Z: local rows of [z; v_z] relative to the hand, shape (2 n_local, m), Fortran order.
+    """
+
+    layout: BlockLayout
+    steps: np.ndarray
+    times: Array
+    q_s: Array
+    v_s: Array
+    Z: Array
+
+    def displacement(self, T: Array) -> Array:
+        """Absolute displacement q_e = z + T q_s, local rows (n_local, m). Not collective."""
+        return np.asarray(self.Z[: self.layout.n_local] + T @ self.q_s)
+
+    def velocity(self, T: Array) -> Array:
+        """Absolute velocity v_e = v_z + T v_s, local rows (n_local, m). Not collective."""
+        return np.asarray(self.Z[self.layout.n_local :] + T @ self.v_s)
+
+
+class NoStore:
+    """Nothing is stored: one working state for the whole run."""
+
+    def __init__(self, system: BlockSystem) -> None:
+        self.system = system
+        self.work = state_on(np.zeros(2 * system.layout.n_local), system)
+        self.steps = np.zeros(0, dtype=int)
+
+    def target(self, step: int) -> TissueState:
+        """State that the step writes into."""
+        return self.work
+
+    def limit(self, step: int) -> int:
+        """Last step that may be reached before :meth:`flush`."""
+        return 2**62
+
+    def flush(self, step: int) -> None:
+        """Write out what is buffered, up to a step."""
+
+    def kept(self, step: int) -> Array:
+        """Columns in memory that a restart needs."""
+        return np.zeros((0, 0))
+
+    def restore(self, columns: Array, step: int) -> None:
+        """Take back what :meth:`kept` gave."""
+
+    def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
+        """The stored snapshots, or None when they are not in memory. Collective."""
+        return None
+
+
+class MemoryStore(NoStore):
+    """Every k-th state is a column of one local array; the step writes straight into it.
+
+    Raises:
+        ResourceError: the columns of all ranks would not fit in the memory that is free now.
+    """
+
+    def __init__(self, system: BlockSystem, steps: int, every: int) -> None:
+        super().__init__(system)
+        layout = system.layout
+        count = steps // every + 1
+        needed = 16 * layout.n_e * count
+        free = layout.comm.bcast(psutil.virtual_memory().available)
+        if needed > 0.8 * free:
+            raise ResourceError(
+                f"output.snapshots: {count} columns of {2 * layout.n_e} doubles need {needed} bytes "
+                f"and {free} are free; set output.every = {every * int(np.ceil(needed / (0.5 * free)))} "
+                "or output.snapshots = 'hdf5'"
+            )
+        self.steps = np.arange(0, steps + 1, every)
+        self.Z = np.empty((2 * layout.n_local, len(self.steps)), order="F")
+        self.Z.fill(0.0)  # touches every page here, not in the time loop
+        self.columns = {int(s): state_on(self.Z[:, j], system) for j, s in enumerate(self.steps)}
+
+    def target(self, step: int) -> TissueState:
+        """The column of the step if it is stored, else the working state."""
+        return self.columns.get(step, self.work)
+
+    def kept(self, step: int) -> Array:
+        """Columns filled so far."""
+        return self.Z[:, : int(np.searchsorted(self.steps, step, side="right"))]
+
+    def restore(self, columns: Array, step: int) -> None:
+        """Fill the first columns again."""
+        self.Z[:, : columns.shape[1]] = columns
+
+    def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
+        """Snapshots with the hand's rows. Not collective."""
+        s = self.steps
+        return Snapshots(self.system.layout, s, times[s], q[s].T.copy(), v[s].T.copy(), self.Z)
+
+
+class Hdf5Store(NoStore):
+    """Columns go through a buffer to one HDF5 file a rank; ``snapshots.h5`` shows them as one.
+
+    Datasets of ``snapshots.h5``: z, v (m, n_e), nodes (n_e / d, d), times, steps (m,), q_s, v_s (m, n_s).
+
+    Raises:
+        ResourceError: the files of all ranks would not fit on the disk.
+    """
+
+    def __init__(self, system: BlockSystem, steps: int, every: int, directory: Path, resume: bool) -> None:
+        super().__init__(system)
+        layout = system.layout
+        self.directory = directory
+        count = steps // every + 1
+        self.needed = 16 * layout.n_e * count
+        with agree(layout.comm):
+            if layout.comm.rank == 0:
+                directory.mkdir(parents=True, exist_ok=True)
+                free = shutil.disk_usage(directory).free
+                if self.needed > 0.9 * free:
+                    raise ResourceError(
+                        f"output.snapshots: {count} columns of {2 * layout.n_e} doubles need "
+                        f"{self.needed} bytes and {free} are free in {directory}; set output.every to a larger number"
+                    )
+        self.steps = np.arange(0, steps + 1, every)
+        self.resume = resume
+        rows = 2 * layout.n_local
+        fit = max(1, BUFFER_BYTES // max(8 * rows, 1))
+        self.width = min(layout.comm.allreduce(fit, min), len(self.steps))
+        self.buffer = np.zeros((rows, self.width), order="F")
+        self.slots = [state_on(self.buffer[:, j], system) for j in range(self.width)]
+        self.index = {int(s): j for j, s in enumerate(self.steps)}
+        self.written = 0
+        with agree(layout.comm):
+            self._open(rows)
+
+    def _open(self, rows: int) -> None:
+        path, shape = self._file(self.system.layout.comm.rank), (len(self.steps), rows)
+        if not self.resume:
+            try:
+                with h5py.File(path, "w") as file:
+                    file.create_dataset("Z", shape, dtype="f8", chunks=(1, max(rows, 1)))
+                    file.attrs["written"] = 0
+            except OSError as error:
+                raise ResourceError(f"{path} cannot be written ({error}); choose another --out") from error
+            return
+        try:
+            with h5py.File(path, "r+") as file:
+                found, self.on_file = file["Z"].shape, int(file.attrs["written"])
+        except (OSError, KeyError) as error:
+            raise CheckpointError(f"{path} cannot be read ({error}); run again without --resume") from error
+        if found != shape:
+            raise CheckpointError(
+                f"{path} holds {found} numbers, this run needs {shape}; resume with the same scene and rank count, or "
+                "run again without --resume"
+            )
+
+    def _file(self, rank: int) -> Path:
+        return self.directory / f"snapshots-rank{rank}.h5"
+
+    def target(self, step: int) -> TissueState:
+        """The buffer slot of the step if it is stored, else the working state."""
+        j = self.index.get(step)
+        return self.work if j is None else self.slots[j % self.width]
+
+    def limit(self, step: int) -> int:
+        """Last step before the buffer would overflow."""
+        j = self.written + self.width - 1
+        return int(self.steps[j]) if j < len(self.steps) else 2**62
+
+    def flush(self, step: int) -> None:
+        """Append the filled slots to this rank's file. Collective."""
+        end = int(np.searchsorted(self.steps, step, side="right"))
+        path = self._file(self.system.layout.comm.rank)
+        if end > self.written:
+            with agree(self.system.layout.comm):
+                try:
+                    with h5py.File(path, "r+") as file:
+                        for j in range(self.written, end):
+                            file["Z"][j] = self.buffer[:, j % self.width]
+                        file.attrs["written"] = end
+                except OSError as error:
+                    raise ResourceError(f"{path} cannot be written ({error}); free the disk") from error
+            self.written = end
+
+    def restore(self, columns: Array, step: int) -> None:
+        """Go on behind what is already in the file.
+
+        Raises:
+            CheckpointError: the file holds less.
+        """
+        self.written = int(np.searchsorted(self.steps, step, side="right"))
+        if self.on_file < self.written:
+            path = self._file(self.system.layout.comm.rank)
+            raise CheckpointError(
+                f"{path} holds {self.on_file} snapshots, step {step} needs {self.written}; run again without --resume"
+            )
+
+    def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
+        """Write ``snapshots.h5`` over the rank files. Collective."""
+        layout, s = self.system.layout, self.steps
+        sizes = layout.comm.gather(layout.n_local)
+        nodes = layout.comm.gather(layout.nodes)
+        if sizes is not None and nodes is not None:  # rank 0
+            with h5py.File(self.directory / "snapshots.h5", "w") as file:
+                for key, part in (("z", 0), ("v", 1)):
+                    joined = h5py.VirtualLayout((len(s), layout.n_e), dtype="f8")
+                    at = 0
+                    for rank, n in enumerate(sizes):
+                        source = h5py.VirtualSource(self._file(rank).name, "Z", (len(s), 2 * n))
+                        joined[:, at : at + n] = source[:, part * n : (part + 1) * n]
+                        at += n
+                    file.create_virtual_dataset(key, joined)
+                file["nodes"] = np.vstack(nodes)
+                file["times"], file["steps"] = times[s], s
+                file["q_s"], file["v_s"] = q[s], v[s]
+        layout.comm.Barrier()
+        return None
+
+
+def make_store(system: BlockSystem, kind: str, steps: int, every: int, directory: Path, resume: bool) -> NoStore:
+    """Store of a run: memory, hdf5 or none. Collective."""
+    if kind == "memory":
+        return MemoryStore(system, steps, every)
+    if kind == "hdf5":
+        return Hdf5Store(system, steps, every, directory, resume)
+    return NoStore(system)

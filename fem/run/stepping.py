@@ -1,0 +1,136 @@
+"""PETSc TS takes the midpoint steps of a run, in segments; the forward run and the closed loop share it."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.errors import SoftgraspError, SolverError
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.run.snapshots import NoStore
+from softgrasp.fem.solve.solvers import SolverName
+
+
+class Stepped(ABC):
+    """A run whose steps TS counts.
+
+    Args:
+        layout: sizes and ownership.
+        dt: step [s].
+        steps: number of steps.
+        midpoint: factored step.
+        store: where the states go.
+        solver: name and reason.
+
+    Attributes:
+        state: at the last step taken.
+        reached: number of the last step taken.
+        seconds, counted: time and number of the steps taken by :meth:`advance_to`, without the checks.
+        checking: time of the checks [s].
+        residual: relative, of the last solve that :meth:`check_step` looked at.
+    """
+
+    def __init__(
+        self,
+        layout: BlockLayout,
+        dt: float,
+        steps: int,
+        midpoint: TissueMidpoint,
+        store: NoStore,
+        solver: tuple[SolverName, str],
+    ) -> None:
+        self.layout, self.dt, self.steps = layout, dt, steps
+        self.midpoint, self.store, self.solver = midpoint, store, solver
+        self.state: TissueState = store.target(0)
+        self.reached = 0
+        self.seconds, self.checking, self.counted = 0.0, 0.0, 0
+        self.check_at, self.residual = -1, 0.0
+
+    @abstractmethod
+    def solve_step(self, n: int) -> None:
+        """Leave w and load of step n in the midpoint, and the hand's new state in its table. Collective."""
+
+    @abstractmethod
+    def record(self, n: int) -> None:
+        """Store this rank's share of the outputs at step n. Not collective."""
+
+    def step(self, ts: Any) -> None:
+        """One midpoint step, called by TS; the step number, not a summed time, picks the load. Collective."""
+        n = self.reached
+        self.solve_step(n)
+        if n == self.check_at:
+            self._check()
+        new = self.store.target(n + 1)
+        self.midpoint.advance(self.state, new)
+        self.state = new
+        self.reached = n + 1
+        self.record(n + 1)
+
+    def advance_to(self, ts: Any, step: int) -> None:
+        """Let TS run up to a step number; its own time is set at the end. Collective.
+
+        Raises:
+            SolverError: a solve failed; the message names solver, step and reason.
+        """
+        if step <= self.reached:
+            return
+        ts.setMaxSteps(step)
+        before, checked = self.reached, self.checking
+        begin = time.perf_counter()
+        try:
+            ts.solve()
+        except PETSc.Error as error:
+            cause = error.__cause__
+            if cause is not None and not isinstance(cause, SoftgraspError):
+                raise cause from error  # a bug, perhaps on this rank alone: the command must end all ranks
+            if cause is None and self.midpoint.held.whole and self.layout.comm.size > 1:
+                raise  # of this rank alone, while the others step on: the command must end all ranks
+            text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
+            raise SolverError(f"step {self.reached + 1} of {self.steps}: {text}") from error
+        if self.reached != step:
+            raise SolverError(
+                f"{self.solver[0]}: TS stopped at step {self.reached} of {step} (reason {ts.getConvergedReason()})"
+            )
+        self.seconds += time.perf_counter() - begin - (self.checking - checked)
+        self.counted += step - before
+        ts.setTime(step * self.dt)
+
+    def check_step(self, ts: Any, step: int) -> float:
+        """Let TS run up to a step number and check the solve of that step; its relative residual. Collective.
+
+        The residual needs the right-hand side, which the end of the step overwrites; so the check is part of the step,
+        but not of its time. A step that is behind already is not checked again: the residual is that of the last check.
+
+        Raises:
+            SolverError: a solve failed or missed its tolerance.
+        """
+        self.check_at = step - 1
+        self.advance_to(ts, step)
+        self.check_at = -1  # a run may be taken back to its start
+        return self.residual
+
+    def _check(self) -> None:
+        begin = time.perf_counter()
+        self.residual = self.midpoint.residual()
+        self.checking += time.perf_counter() - begin
+
+
+def make_ts(run: Stepped) -> Any:
+    """PETSc TS around a run. Collective.
+
+    TS copies its solution before every step, for a rollback that nothing here asks for. Of z and v that would be a pass
+    over memory, so the state stays with the run, and TS holds one number a rank.
+    """
+    ts = PETSc.TS().createPython(run, comm=run.layout.comm)
+    ts.setTimeStep(run.dt)
+    ts.setMaxTime(1e300)  # stepping by time would take one step too many or change the last one
+    ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
+    counter = PETSc.Vec().createWithArray(np.zeros(1), comm=run.layout.comm)
+    ts.setSolution(counter)
+    counter.destroy()
+    return ts

@@ -1,0 +1,142 @@
+"""Sections of a scene beyond the forward run: reduction, control, study."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from softgrasp.fem.scene.tissue import Box, Model, Positive, check_box
+
+Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+
+
+class Reduction(Model):
+    """Which reduced models `softgrasp reduce` builds and compares."""
+
+    methods: list[str] = Field(
+        default_factory=list, description="bases by name [no unit]; empty: the paper's six and the best beyond them"
+    )
+    N: list[Annotated[int, Field(ge=1)]] = Field(
+        default_factory=lambda: [4, 6, 8, 10, 12, 14, 18, 22, 26, 30, 40, 60],
+        description="reduced dimensions to try [1]",
+    )
+    energy: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.999, description="share of the snapshot energy that picks N [1], the paper's 99.9 %"
+    )
+    inner: Literal["auto", "euclidean", "mass", "energy"] = Field(
+        "auto",
+        description="inner product of the bases [no unit]; auto: energy for canonical bases beyond the paper's six, "
+        "which makes them ten times better, else Euclidean",
+    )
+    engine: Literal["tsqr", "svd", "gram"] = Field(
+        "tsqr", description="factorisation of the snapshots [no unit]; gram is fast and loses small singular values"
+    )
+    lambda_range: Range = Field(
+        default_factory=lambda: [30.0, 500.0], description="range of lambda for tests at other parameters [Pa]"
+    )
+    mu_range: Range = Field(
+        default_factory=lambda: [20.0, 500.0], description="range of mu for tests at other parameters [Pa]"
+    )
+
+    train: Literal["corners"] | list[Range] = Field(
+        "corners",
+        description="[lambda, mu] of full runs that train bases beside the scene's own, for the tests at other "
+        "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Reduction:
+        for key in ("lambda_range", "mu_range"):
+            low, high = getattr(self, key)
+            if low > high:
+                raise ValueError(f"{key} is [{low}, {high}]; the first must not exceed the second")
+        return self
+
+
+class Study(Model):
+    """How `softgrasp study`, `effects` and `hardcases` judge."""
+
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
+        1e-3, description="relative change of the outputs that counts [1]"
+    )
+    repeats: Annotated[int, Field(ge=1)] = Field(5, description="repeats behind each median time [1]")
+
+
+class Loop(Model):
+    """How the feedback runs in the closed loop."""
+
+    sampling: Literal["midpoint", "held"] = Field(
+        "midpoint", description="feedback inside the midpoint rule, or sampled and held as on a robot [no unit]"
+    )
+    rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
+    limit: Positive | None = Field(None, description="largest absolute load of an actuator [N]; none by default")
+    delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
+
+
+class ControlOutput(Model):
+    """One vector-valued output of the control problem."""
+
+    kind: Literal["node", "region", "hand"] = Field(description="a node, the mean of a region, or the hand [no unit]")
+    point: list[float] | None = Field(None, description="the node nearest to it is taken [m]; kind node")
+    box: Box | None = Field(None, description="[[lo], [hi]] [m]; mean over the nodes inside; kind region")
+    name: str = Field("", description="label [no unit]")
+
+    @model_validator(mode="after")
+    def _check(self) -> ControlOutput:
+        for key, kind in (("point", "node"), ("box", "region")):
+            if (getattr(self, key) is not None) != (self.kind == kind):
+                raise ValueError(f"{key} and kind = '{kind}' go together; give both or neither")
+        check_box(self.box, "box")
+        return self
+
+
+Weight = float | list[list[float]]
+
+
+def _check_weight(key: str, weight: Weight, definite: bool) -> None:
+    word = "> 0" if definite else ">= 0"
+    if isinstance(weight, list):
+        if any(len(row) != len(weight) for row in weight) or not weight:
+            raise ValueError(f"{key} is not square; give a number or a square symmetric matrix")
+        matrix = np.array(weight)
+        if not np.array_equal(matrix, matrix.T):
+            raise ValueError(f"{key} is not symmetric; give a number or a square symmetric matrix")
+        eigenvalues = np.linalg.eigvalsh(matrix)
+        least = float(eigenvalues[0])
+        # rounding of eigvalsh is of the order n eps |matrix|
+        noise = 10 * len(weight) * float(np.finfo(float).eps) * float(np.abs(eigenvalues).max())
+        good = least > noise if definite else least >= -noise
+        if not good:
+            raise ValueError(f"{key} has the eigenvalue {least:.3g}; all must be {word}")
+    elif weight < 0 or (definite and weight == 0):
+        raise ValueError(f"{key} is {weight}; it must be {word}")
+
+
+class Control(Model):
+    """Quadratic cost: integral of y' Q y + u' R u."""
+
+    outputs: Annotated[list[ControlOutput], Field(min_length=1)] = Field(
+        description="outputs y {kind, point or box [m], name}"
+    )
+    Q: Weight = Field(1.0, description="weight of the outputs [1/(m2 s)]: number or matrix, positive semidefinite")
+    R: Weight = Field(1.0, description="weight of the hand load [1/(N2 s)]: number or matrix, positive definite")
+
+    method: Literal["auto", "newton-adi", "radi", "galerkin", "dense", "modal"] = Field(
+        "auto", description="solver of the Riccati equation [no unit]; auto chooses by size"
+    )
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
+        1e-10, description="relative residual of the Riccati equation [1]"
+    )
+    N: list[Annotated[int, Field(ge=1)]] = Field(
+        default_factory=lambda: [4, 6, 8, 10, 12, 16, 20, 30, 40],
+        description="dimensions of the reduced Riccati equations [1]",
+    )
+    loop: Loop = Field(default_factory=Loop, description="how the feedback runs [various]")
+
+    @model_validator(mode="after")
+    def _check(self) -> Control:
+        _check_weight("Q", self.Q, definite=False)
+        _check_weight("R", self.R, definite=True)
+        return self

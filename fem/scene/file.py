@@ -1,0 +1,284 @@
+"""Scene files: read TOML, apply `--set`, explain what is wrong in one sentence, write the resolved scene."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import re
+import tomllib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from mpi4py import MPI
+from pydantic import BaseModel, ValidationError
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.scene import Scene
+
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_FILES = (("tissue", "mesh"), ("motion", "csv"))
+_EXPECTED = {
+    "model_type": "a table",
+    "dict_type": "a table",
+    "list_type": "a list",
+    "string_type": "a string",
+    "float_type": "a number",
+    "int_type": "an integer",
+    "int_from_float": "an integer",
+    "bool_type": "true or false",
+    "finite_number": "a finite number",
+}
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """Name and path of the scenes that ship with the project. Not collective."""
+    folder = Path(__file__).resolve().parent.parent / "demos" / "scenes"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
+    """Read and validate a scene file.
+
+    `overrides` are the arguments of `--set`, each `a.b.c=value` with a TOML value; a bare word is a string,
+    and `false` switches off an optional table.
+
+    Not collective: call it on one rank, or use `load_scene_collective`.
+
+    Raises:
+        SceneError: the file is missing, no TOML, or a key is unknown, missing, ill-typed or meaningless.
+    """
+    file = Path(path)
+    data = _read(file)
+    for override in overrides:
+        _apply(data, override)
+    try:
+        scene = Scene.model_validate(data)
+    except ValidationError as error:
+        raise SceneError(f"{path}: {_explain(error, data)}") from None
+    scene._directory = file.resolve().parent
+    return scene
+
+
+def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequence[str] = ()) -> Scene:
+    """`load_scene` on rank 0, broadcast to all. Collective.
+
+    Raises:
+        SceneError: on every rank, as rank 0 met it.
+    """
+    result: Scene | Exception | None = None
+    if comm.rank == 0:
+        try:
+            result = load_scene(path, overrides)
+        except Exception as error:
+            result = error
+    result = comm.bcast(result, root=0)
+    if isinstance(result, Scene):
+        return result
+    raise result if isinstance(result, Exception) else SceneError(f"{path}: rank 0 sent no scene")
+
+
+def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
+    """SHA-256 of the resolved scene and of the contents of its mesh and csv files, 64 hex digits.
+
+    Top-level keys in `without` do not count; nor do folder and name of the files. Not collective.
+
+    Raises:
+        SceneError: a file that the scene names cannot be read.
+    """
+    data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
+    for section, key in _FILES:
+        name = data.get(section, {}).get(key)
+        if name is not None:
+            data[section][key] = hashlib.sha256(_bytes(scene, name, f"{section}.{key}")).hexdigest()
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def resolved_toml(scene: Scene) -> str:
+    """TOML text with every default and absolute file names; it loads to the same scene. Not collective."""
+    data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
+    for section, key in _FILES:
+        if key in data[section]:
+            data[section][key] = str(scene.path(data[section][key]))
+    lines = [f"{key} = {_value(value)}" for key, value in data.items() if not isinstance(value, dict)]
+    for section, table in data.items():
+        if isinstance(table, dict):
+            lines += ["", f"[{section}]"] + [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _bytes(scene: Scene, name: str, key: str) -> bytes:
+    try:
+        return scene.path(name).read_bytes()
+    except OSError as error:
+        raise SceneError(f"scene '{scene.name}': {key} = '{name}' cannot be read ({error.strerror})") from None
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_bytes().decode())
+    except FileNotFoundError:
+        near = difflib.get_close_matches(file.stem, shipped_scenes(), n=1)
+        hint = f"; did you mean demos/scenes/{near[0]}.toml?" if near else "; give the path of a TOML scene file"
+        raise SceneError(f"{file}: there is no such scene file{hint}") from None
+    except OSError as error:
+        raise SceneError(f"{file}: the scene file cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise SceneError(f"{file}: the scene file is not UTF-8 text") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{file}: the scene file is not valid TOML: {error}") from None
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    key, equals, text = (part.strip() for part in override.partition("="))
+    parts = key.split(".")
+    if not equals or not text or not all(parts):
+        raise SceneError(f"--set {override}: it must read section.key=value")
+    node: Any = data
+    for done, part in enumerate(parts[:-1], start=1):
+        node = _child(node, part, override, ".".join(parts[:done]))
+    last = parts[-1]
+    if isinstance(node, list):
+        node[_index(node, last, override)] = _parse(text, override)
+    else:
+        node[last] = _parse(text, override)
+
+
+def _child(node: Any, part: str, override: str, path: str) -> Any:
+    child = node[_index(node, part, override)] if isinstance(node, list) else node.setdefault(part, {})
+    if not isinstance(child, dict | list):
+        raise SceneError(f"--set {override}: {path} is {child!r}, no table; set {path} itself")
+    return child
+
+
+def _index(node: list[Any], part: str, override: str) -> int:
+    if not part.isdecimal() or int(part) >= len(node):
+        raise SceneError(f"--set {override}: '{part}' must be an index below {len(node)}")
+    return int(part)
+
+
+def _parse(text: str, override: str) -> Any:
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        if re.fullmatch(r"[A-Za-z_./~][A-Za-z0-9_./~+-]*", text):  # the shell ate the quotes
+            return text
+        raise SceneError(f"--set {override}: '{text}' is not a TOML value; a text is '\"...\"'") from None
+    if table.keys() != {"value"}:
+        raise SceneError(f"--set {override}: it must hold one value")
+    return table["value"]
+
+
+def _explain(error: ValidationError, data: dict[str, Any]) -> str:
+    """The first problem as a sentence, and how many more there are; misspelled keys come first."""
+    problems: dict[str, tuple[bool, list[str]]] = {}
+    for item in error.errors(include_url=False):
+        path, value = _locate(item["loc"], data)
+        dotted = ".".join(path)
+        kind, message = item["type"], item["msg"]
+        if kind == "extra_forbidden":
+            text = f"{dotted} is not a key; {_suggest(path)}"
+        elif kind == "missing":
+            text = f"{dotted} is missing; {_purpose(path)}"
+        elif kind == "value_error":
+            reason = message.removeprefix("Value error, ")
+            text = f"{dotted} {reason}" if reason.startswith("'") else ".".join(filter(None, [dotted, reason]))
+        else:
+            text = _EXPECTED.get(kind) or re.sub(r"^(Input|List|String) should (be |have )?", "", message)
+            verb = "have" if kind.startswith(("too_", "string_too_")) else "be"
+            text = text.replace("greater than", ">").replace("> or equal to", ">=").replace("less than", "<")
+            text = text.replace(" after validation", "")
+            earlier = problems.get(dotted, (False, []))[1]
+            text = f"{earlier[0]} or {text}" if earlier else f"{dotted} is {_show(value)}; it must {verb} {text}"
+        problems[dotted] = (kind == "extra_forbidden", [text])
+    ordered = sorted(problems.values(), key=lambda problem: not problem[0])
+    more = f"; and {len(ordered) - 1} more" if len(ordered) > 1 else ""
+    return ordered[0][1][0] + more
+
+
+def _show(value: Any) -> str:
+    text = _value(value) if isinstance(value, dict | list | str | bool | int | float) else str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _locate(loc: tuple[int | str, ...], data: Any) -> tuple[list[str], Any]:
+    """Path and value of an error; names of union branches, which are no keys, drop out."""
+    path: list[str] = []
+    for part in loc:
+        if isinstance(data, dict):
+            path.append(str(part))
+            data = data.get(part)
+        elif isinstance(data, list) and isinstance(part, int):
+            path.append(str(part))
+            data = data[part]
+    return path, data
+
+
+def _model(annotation: Any) -> type[BaseModel] | None:
+    """The model inside an annotation such as `list[Model]` or `Model | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((found for part in get_args(annotation) if (found := _model(part))), None)
+
+
+def _fields(path: Sequence[str]) -> dict[str, tuple[Any, str]]:
+    """TOML keys below a path, with annotation and description."""
+    model: type[BaseModel] | None = Scene
+    skip = False
+    for part in path:
+        if skip or part.isdecimal():  # a layer's own name, or an index
+            skip = False
+            continue
+        if model is None or part not in (known := _keys(model)):
+            return {}
+        skip = "dict[" in str(known[part][0])
+        model = _model(known[part][0])
+    return {} if model is None else _keys(model)
+
+
+def _keys(model: type[BaseModel]) -> dict[str, tuple[Any, str]]:
+    return {f.alias or name: (f.annotation, f.description or "") for name, f in model.model_fields.items()}
+
+
+def _suggest(path: Sequence[str]) -> str:
+    known = _fields(path[:-1])
+    if path[-2:-1] == ["material"]:
+        known = known | {"young": (float, ""), "poisson": (float, "")}
+    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {'.'.join([*path[:-1], near[0]])}?"
+    return f"keys of {'.'.join(path[:-1]) or 'a scene'} are {', '.join(known)}"
+
+
+def _purpose(path: Sequence[str]) -> str:
+    known = _fields(path[:-1])
+    if path[-1] not in known:
+        return "give it"
+    annotation, description = known[path[-1]]
+    choices = _choices(annotation)
+    return f"give {description.removesuffix(' [no unit]')}: {', '.join(choices)}" if choices else f"give {description}"
+
+
+def _choices(annotation: Any) -> list[str]:
+    """The values of a Literal, also inside an annotation such as `Literal["auto"] | bool`."""
+    if get_origin(annotation) is Literal:
+        return [repr(value) for value in get_args(annotation)]
+    return [choice for part in get_args(annotation) for choice in _choices(part)]
+
+
+def _key(key: str) -> str:
+    return key if _BARE.fullmatch(key) else _value(key)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        inner = ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items())
+        return f"{{ {inner} }}" if inner else "{}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)

@@ -1,0 +1,225 @@
+"""The scene: what a user writes in TOML, as frozen and validated models.
+
+Nothing here touches a mesh. Checks that need the space dimension run at once for a structured box, and
+through `check_dimension` when the mesh comes from a file.
+
+Reasons given by validators start with the key they are about, relative to the model: the loader puts the file
+and the path in front of them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, PrivateAttr, model_validator
+
+from softgrasp.fem.scene.control import Control, ControlOutput, Loop, Reduction, Study
+from softgrasp.fem.scene.tissue import Contact, Dropped, Layer, Material, Model, NonNegative, Positive, Tissue
+
+__all__ = [
+    "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
+    "Motion", "Output", "Reduction", "Scene", "Study", "Time", "Tissue", "check_dimension", "scene_schema",
+]  # fmt: skip
+
+
+class Hand(Model):
+    """The rigid hand."""
+
+    mass: Positive = Field(20.0, description="mass [kg], > 0")
+    inertia: Positive | Annotated[list[Positive], Field(min_length=3, max_length=3)] | None = Field(
+        None,
+        description="moment of inertia about the reference point [kg m2]: a number, in 3D also three (x, y, z)",
+    )
+    reference: list[float] | None = Field(None, description="reference point of the hand [m]; default: contact centre")
+
+
+class Gravity(Model):
+    """Body force rho g on the tissue."""
+
+    g: list[float] = Field(description="acceleration of gravity, one entry per axis [m/s2]")
+    hand_weight: bool = Field(False, description="whether the hand weighs too [no unit]")
+
+
+class Damping(Model):
+    """C = beta K (Kelvin-Voigt) or C = alpha M + beta K (Rayleigh)."""
+
+    kind: Literal["kelvin-voigt", "rayleigh"] = Field(description="damping law [no unit]")
+    beta: NonNegative = Field(description="stiffness-proportional time [s], >= 0")
+    alpha: NonNegative = Field(0.0, description="mass-proportional rate [1/s], >= 0, rayleigh only")
+    drag: Literal["hand", "space"] = Field(
+        "hand", description="alpha acts on the velocity against the hand or against space [no unit]"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Damping:
+        if self.alpha and self.kind == "kelvin-voigt":
+            raise ValueError(f"alpha is {self.alpha}; Kelvin-Voigt has none, set kind = 'rayleigh' or alpha = 0")
+        return self
+
+
+class Effects(Model):
+    """Everything is off unless named."""
+
+    gravity: Dropped[Gravity] = Field(None, description="gravity {g [m/s2], hand_weight}; off unless given")
+    damping: Dropped[Damping] = Field(None, description="damping {kind, beta [s], alpha [1/s], drag}; off unless given")
+    reaction: bool = Field(False, description="the tissue pushes back on the hand [no unit]")
+    rotation: bool = Field(False, description="the hand also turns, by small angles [no unit]")
+
+
+class Motion(Model):
+    """What the hand does."""
+
+    target: Dropped[list[float]] = Field(
+        None, description="final displacement of the hand [m], then its angles [rad] with effects.rotation"
+    )
+    duration: Positive = Field(1.0, description="duration of the motion [s], > 0")
+    profile: Literal["quintic", "csv", "hold"] = Field(
+        "quintic", description="time law [no unit]: rest-to-rest quintic, a csv table, or no motion"
+    )
+    drive: Literal["motion", "force"] = Field("motion", description="motion or force is prescribed [no unit]")
+    csv: str | None = Field(
+        None,
+        description="table, relative to the scene: t [s], then each hand freedom [m, rad], joined by a cubic spline at "
+        "rest at both ends, or with drive = 'force' each load [N, N m], joined by straight lines",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Motion:
+        if self.profile == "quintic" and self.target is None:
+            raise ValueError("target is missing; the quintic profile needs it (profile = 'hold' for none)")
+        if self.profile != "quintic" and self.target is not None:
+            raise ValueError(f"target cannot go with profile = '{self.profile}'; only 'quintic' takes it")
+        if (self.profile == "csv") != (self.csv is not None):
+            raise ValueError("csv and profile = 'csv' go together; give both or neither")
+        return self
+
+
+class Time(Model):
+    """Time grid and linear solver."""
+
+    steps: Annotated[int, Field(ge=1)] = Field(description="number of equal time steps [1], >= 1")
+    end: Positive | None = Field(None, description="end time [s]; default motion.duration")
+    start: Literal["rest", "equilibrium"] = Field(
+        "rest", description="start undeformed, or in equilibrium under gravity [no unit]"
+    )
+    solver: Literal["auto", "cholesky", "mumps", "cg"] = Field("auto", description="linear solver [no unit]")
+    rtol: Annotated[float, Field(gt=0, lt=1)] = Field(1e-10, description="relative tolerance [1], cg only")
+    reproducible: Literal["auto"] | bool = Field(
+        "auto",
+        description="equal bits in every run on the same number of ranks: each holds the whole factor [no unit]; "
+        "auto: on up to 4 ranks, while the factors fit",
+    )
+
+
+class Output(Model):
+    """What is kept of a run."""
+
+    snapshots: Literal["memory", "hdf5", "none"] = Field("memory", description="where snapshots go [no unit]")
+    every: Annotated[int, Field(ge=1)] = Field(1, description="a snapshot every so many steps [1]")
+    fields: Literal["auto", "vtx", "xdmf", "none"] = Field("auto", description="field file format [no unit]")
+    frames: Annotated[int, Field(ge=1)] = Field(60, description="frames in field files and animations [1]")
+    checkpoint_every: Annotated[int, Field(ge=0)] = Field(
+        0, description="steps between restart files [1]; 0: only on interrupt"
+    )
+
+
+class Scene(Model):
+    """A whole scene; relative file names count from `directory`."""
+
+    name: str = Field(min_length=1, description="short name [no unit]")
+    description: str = Field("", description="what the scene shows [no unit]")
+    tissue: Tissue = Field(description="the soft body [m, Pa, kg/m3]")
+    contact: Contact = Field(description="where the hand holds it [m]")
+    hand: Hand = Field(default_factory=Hand, description="the rigid hand [kg, kg m2, m]")
+    effects: Effects = Field(default_factory=Effects, description="physics that is on [various]")
+    motion: Motion = Field(default_factory=lambda: Motion(profile="hold"), description="what the hand does [m, rad, s]")
+    time: Time = Field(description="time grid and solver [s]")
+    control: Dropped[Control] = Field(None, description="control problem [various]; off unless given")
+    reduction: Reduction = Field(default_factory=Reduction, description="reduced models to compare [various]")
+    study: Study = Field(default_factory=Study, description="how studies judge [various]")
+    output: Output = Field(default_factory=Output, description="what is kept [no unit]")
+    _directory: Path = PrivateAttr(default_factory=Path.cwd)
+
+    @property
+    def directory(self) -> Path:
+        """Where the scene file lies."""
+        return self._directory
+
+    @property
+    def dimension(self) -> int | None:
+        """2 or 3 for a structured box; None while the mesh file is unread."""
+        return None if self.tissue.size is None else len(self.tissue.size)
+
+    @property
+    def time_end(self) -> float:
+        """End time [s]."""
+        return self.motion.duration if self.time.end is None else self.time.end
+
+    def path(self, name: str) -> Path:
+        """A file named in the scene, absolute. Not collective."""
+        return (self._directory / name).resolve()
+
+    @model_validator(mode="after")
+    def _check(self) -> Scene:
+        effects = self.effects
+        if effects.rotation and self.hand.inertia is None:
+            raise ValueError("hand.inertia is missing; effects.rotation needs it")
+        if self.time.start == "equilibrium" and effects.gravity is None:
+            raise ValueError("time.start is 'equilibrium' but effects.gravity is off; use 'rest' or give gravity")
+        if self.contact.facet_tag is not None and self.tissue.mesh is None:
+            raise ValueError("contact.facet_tag needs tissue.mesh; on a structured box give sides or box")
+        for name, layer in self.tissue.layers.items():
+            if layer.beta is not None and effects.damping is None:
+                raise ValueError(f"tissue.layers.{name}.beta needs effects.damping; give it or drop beta")
+        if self.dimension is not None:
+            _check_vectors(self, self.dimension)
+        return self
+
+
+def _check_vectors(scene: Scene, d: int) -> None:
+    """ValueError for the first vector of the scene that does not fit d dimensions."""
+    freedoms = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
+    gravity, control = scene.effects.gravity, scene.control
+    vectors: list[tuple[str, list[float] | None, int]] = [
+        ("tissue.origin", scene.tissue.origin, d),
+        ("hand.reference", scene.hand.reference, d),
+        ("effects.gravity.g", None if gravity is None else gravity.g, d),
+        ("motion.target", scene.motion.target, freedoms),
+    ]
+    boxes = [("contact.box", scene.contact.box)]
+    boxes += [(f"tissue.layers.{name}.box", layer.box) for name, layer in scene.tissue.layers.items()]
+    for i, output in enumerate([] if control is None else control.outputs):
+        vectors.append((f"control.outputs.{i}.point", output.point, d))
+        boxes.append((f"control.outputs.{i}.box", output.box))
+    for key, box in boxes:
+        vectors += [(key, corner, d) for corner in box or []]
+    for key, vector, length in vectors:
+        if vector is not None and len(vector) != length:
+            raise ValueError(f"{key} has a vector of {len(vector)} entries; it must have {length} in this {d}D scene")
+    scene.contact.axes(d)
+    if d == 2 and isinstance(scene.hand.inertia, list):
+        raise ValueError("hand.inertia is a list; in 2D it must be one number")
+    if d == 3 and scene.tissue.thickness != 1.0:
+        raise ValueError(f"tissue.thickness is {scene.tissue.thickness}; in 3D it has no meaning, drop it")
+    if control is not None and isinstance(control.R, list) and len(control.R) != freedoms:
+        raise ValueError(f"control.R has {len(control.R)} rows; it must have {freedoms}, one per hand freedom")
+
+
+def check_dimension(scene: Scene, d: int) -> None:
+    """Check every vector of the scene against the dimension d of its mesh. Not collective.
+
+    Raises:
+        SceneError: the first vector, side or value that does not fit.
+    """
+    from softgrasp.fem.errors import SceneError  # imports MPI, which the models do without
+
+    try:
+        _check_vectors(scene, d)
+    except ValueError as error:
+        raise SceneError(f"scene '{scene.name}': {error}") from error
+
+
+def scene_schema() -> dict[str, Any]:
+    """JSON schema of a scene file. Not collective."""
+    return Scene.model_json_schema(by_alias=True)

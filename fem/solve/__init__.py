@@ -1,0 +1,1 @@
+"""Factors and solves of the tissue's matrices."""

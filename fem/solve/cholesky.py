@@ -1,0 +1,150 @@
+"""Cholesky of a matrix that one rank holds, in blocks of d x d, and its solves for distributed vectors.
+
+PETSc's solves with blocks take less time than those with single entries (``python -m softgrasp.study.bench.forward`` prints
+both): one index serves d^2 numbers, and d unknowns at a time. But PETSc takes such a matrix in the order in which it
+comes, so the rows are put in order first (:mod:`fem.solve.order`); and it multiplies by inverses of the blocks on the
+diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured, and a factor of
+single entries is made where blocks would lose digits.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.solve.order import NodeOrder
+from softgrasp.fem.petsc import PETSc
+
+# Stable factors leave below 1e-15, in whatever units and however ill-conditioned; blocks may leave 1e-14 and more, as
+# in the hard cases with layers or nu near 0.5. Ten rounding units tell them apart.
+BACKWARD_ERROR = 10 * float(np.finfo(float).eps)
+VANISHING_PIVOT = (71, 81)  # PETSC_ERR_MAT_LU_ZRPVT, PETSC_ERR_MAT_CH_ZRPVT
+
+
+def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] = "petsc") -> PETSc.KSP:
+    """Factor P = P' > 0 in the order of its rows, in blocks where that is stable. Not collective.
+
+    Args:
+        P: the matrix in blocks of d x d (BAIJ), on this rank alone.
+        prefix: PETSc options prefix.
+        entries: who factors single entries where blocks are not stable.
+
+    Raises:
+        SolverError: a pivot vanishes, or PETSc gives up.
+    """
+    ksp = make_ksp(P.convert("sbaij", PETSc.Mat()), prefix)
+    if _factored(ksp) and (P.getBlockSize() == 1 or backward_error(P, ksp) <= BACKWARD_ERROR):
+        return ksp
+    ksp.destroy()
+    single = P.convert("aij", PETSc.Mat())
+    single.setOption(PETSc.Mat.Option.SPD, True)
+    ksp = make_ksp(single, prefix, entries)
+    if not _factored(ksp):
+        ksp.destroy()
+        raise SolverError(
+            f"cholesky: the factorisation of the tissue matrix (n_e = {P.getSize()[0]}) failed; the matrix is singular "
+            "or not definite: check material and mesh"
+        )
+    return ksp
+
+
+def backward_error(S: PETSc.Mat, ksp: PETSc.KSP) -> float:
+    """Return |D^-1 (r - S w)| / (|D w| + |D^-1 r|) with D^2 = diag S, for the w that the solver finds [1].
+
+    What it solved exactly is S with errors of this size, counted in units in which the diagonal is one, and so free of
+    the scaling of rows [VDS69]. The larger value of two r: D g lets soft parts answer most, S D^-1 g all parts alike,
+    with g generic. Collective.
+    """
+    w, r = S.createVecs()
+    y, D = r.duplicate(), S.getDiagonal()
+    D.sqrtabs()
+    first, last = r.owner_range
+    g = np.cos(1.3 * np.arange(first, last)) + 0.5
+    values = []
+    for soft in (True, False):
+        r.array_w[:] = g
+        if soft:
+            r.pointwiseMult(r, D)
+        else:
+            r.pointwiseDivide(r, D)
+            S.mult(r, y)
+            y.copy(r)
+        ksp.solve(r, w)
+        S.mult(w, y)
+        y.aypx(-1.0, r)
+        y.pointwiseDivide(y, D)
+        r.pointwiseDivide(r, D)
+        w.pointwiseMult(w, D)
+        values.append(y.norm() / (w.norm() + r.norm()))
+    for x in (w, r, y, D):
+        x.destroy()
+    return float(np.max(values))  # not a number if one is none
+
+
+def make_ksp(P: PETSc.Mat, prefix: str, by: Literal["petsc", "mumps"] = "petsc") -> PETSc.KSP:
+    """A solver by Cholesky, PETSc's in the order of the rows, not factored yet; consumes P. Collective."""
+    ksp = PETSc.KSP().create(P.comm)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setOperators(P)
+    P.destroy()  # the ksp holds it
+    ksp.setType("preonly")
+    pc = ksp.getPC()
+    pc.setType("cholesky")
+    if by == "mumps":
+        pc.setFactorSolverType("mumps")
+    else:
+        pc.setFactorOrdering("natural")
+    return ksp
+
+
+def _factored(ksp: PETSc.KSP) -> bool:
+    """Make the factor; whether no pivot vanished."""
+    try:
+        ksp.setUp()
+    except PETSc.Error as error:
+        if error.ierr in VANISHING_PIVOT:
+            return False
+        raise SolverError(
+            f"cholesky: PETSc gave up the factorisation of the tissue matrix with error {error.ierr} (55 is out of "
+            "memory); try time.solver = 'mumps' or fewer ranks"
+        ) from error
+    return not ksp.getPC().getFailedReason()
+
+
+class OrderedFactor:
+    """Triangular solves for distributed vectors, every rank with the whole factor of a matrix in another order.
+
+    One gather a solve; every rank solves for all rows and keeps its own.
+
+    Args:
+        factor: of the permuted matrix; stays with its solver.
+        order: of its rows.
+        like: a vector with the distribution of those to come.
+    """
+
+    def __init__(self, factor: PETSc.Mat, order: NodeOrder, like: PETSc.Vec) -> None:
+        self.factor, self.order = factor, order
+        self.comm = like.comm.tompi4py()
+        first, last = like.owner_range
+        self.counts = self.comm.allgather(last - first)
+        self.places = order.places_of(first, last)
+        self.all = np.empty(like.getSize())
+        self.r, self.w = factor.createVecs()
+        self.r_nodes, self.w_nodes = (x.array_w.reshape(-1, order.d) for x in (self.r, self.w))
+
+    def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        """Solve S w = r. Collective."""
+        d, rows = self.order.d, r.array_r
+        if self.comm.size > 1:
+            self.comm.Allgatherv(rows, [self.all, self.counts])
+            rows = self.all
+        rows.reshape(-1, d).take(self.order.nodes, 0, self.r_nodes, "clip")  # "raise" would copy
+        self.factor.solve(self.r, self.w)
+        self.w_nodes.take(self.places, 0, w.array_w.reshape(-1, d), "clip")
+
+    def destroy(self) -> None:
+        """Free the vectors. Not collective."""
+        self.r.destroy()
+        self.w.destroy()

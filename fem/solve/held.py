@@ -1,0 +1,108 @@
+"""The operators of a step on the rows that a rank computes: its own, or all of them in the order of elimination."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softgrasp.fem.errors import agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.solve.order import Dissection, NodeOrder, dissect
+from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
+from softgrasp.fem.system import BlockSystem
+
+
+@dataclass(frozen=True)
+class Held:
+    """Stiffness, damping matrix and coupling as one rank steps them.
+
+    Attributes:
+        layout: sizes and ownership.
+        whole: all rows are here, on a communicator of this rank alone.
+        order: of the rows held; None: that of the layout.
+        rows: places of the owned rows among those held.
+        K: stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries.
+        G: coupling to the hand, (rows held, n_s).
+        S: matrix of the step; whoever factors it owns it.
+        D: damping matrix, or None.
+        M: mass, only beside D.
+    """
+
+    layout: BlockLayout
+    whole: bool
+    order: NodeOrder | None
+    rows: slice | NDArray[np.intp]
+    K: PETSc.Mat
+    G: Array
+    S: PETSc.Mat
+    D: PETSc.Mat | None
+    M: PETSc.Mat | None
+
+    def agree(self) -> AbstractContextManager[None]:
+        """Guard of a block that is a rank's own affair when it holds everything, and collective otherwise. Collective.
+
+        The block must not communicate by itself.
+        """
+        return agree(self.layout.comm) if self.whole else nullcontext()
+
+    def gather(self, local: Array) -> Array:
+        """Rows held of a vector given by its owned rows. Collective."""
+        return self.enter(rows_on_all(self.layout.comm, local)) if self.whole else local
+
+    def enter(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Rows in the order of the layout as they are held. Not collective."""
+        return x if self.order is None else self.order.enter(x)
+
+    def leave(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Rows held in the order of the layout. Not collective."""
+        return x if self.order is None else self.order.leave(x)
+
+    def destroy(self) -> None:
+        """Free what is not the system's own. Collective."""
+        self.K.destroy()
+        if self.whole:
+            for A in (self.D, self.M):
+                if A is not None:
+                    A.destroy()
+
+
+def held_operators(system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool) -> Held:
+    """Operators of a system on the owned rows, or on all. Collective.
+
+    Args:
+        system: operators.
+        S: matrix of the step, consumed.
+        whole: every rank holds all rows.
+        ordered: in the order of elimination; all rows then.
+    """
+    layout, D = system.layout, system.damping.matrix
+    M = None if D is None else system.M_ee
+    first, last = layout.start, layout.start + layout.n_local
+    if not (whole or ordered):
+        K = system.K_ee.copy()
+        if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
+            K.convert("baij")
+        return Held(layout, False, None, slice(0, layout.n_local), K, np.asfortranarray(system.G), S, D, M)
+    K, step = whole_copy(system.K_ee), whole_copy(S)
+    D, M = (None if A is None else whole_copy(A) for A in (D, M))
+    S.destroy()
+    G = rows_on_all(layout.comm, system.G)
+    if not ordered:
+        K.convert("baij")
+        return Held(layout, True, None, slice(first, last), K, np.asfortranarray(G), step, D, M)
+    found = dissect(K, layout.dimension)
+    K, step = _moved(found, K), _moved(found, step)
+    D, M = (None if A is None else _moved(found, A) for A in (D, M))
+    order = found.order
+    return Held(layout, True, order, order.rows_of(first, last), K, np.asfortranarray(order.enter(G)), step, D, M)
+
+
+def _moved(found: Dissection, A: PETSc.Mat) -> PETSc.Mat:
+    """A in the order found; consumes A. Not collective."""
+    result = found.matrix(A)
+    A.destroy()
+    return result

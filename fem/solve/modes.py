@@ -1,0 +1,178 @@
+"""Lowest natural modes of the tissue clamped in the hand."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from slepc4py import SLEPc
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array, PETSc
+from softgrasp.fem.solve.solvers import FEW_LIMIT, SolverName, TissueSolver, make_solver
+from softgrasp.fem.system import BlockSystem
+
+PREFIX = "softgrasp_modes_"
+TOLERANCE = 1e-11  # of 1/omega^2 in the iteration; rounding in M-products is about 1e-15 n^(1/2)
+RESIDUAL = 1e-8  # bound on the relative error of omega^2 that is let pass
+ROUGH = 1e-3  # tolerance of the search for missed copies: enough when what is left lies ten times as far off
+
+
+def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
+    """Solve K_ee phi = omega^2 M_ee phi for the k smallest omega, with Phi' M_ee Phi = I.
+
+    Krylov-Schur on K_ee^-1 M_ee (shift-and-invert at 0, one Cholesky factor). A second run in the M-orthogonal
+    complement catches copies of multiple eigenvalues that one Krylov space cannot see. The sign of a mode does not
+    depend on the rank count. Collective.
+
+    Args:
+        system: operators.
+        k: number of modes, 1 <= k <= n_e.
+
+    Returns:
+        omega [1/s], ascending, (k,), on every rank; Phi, local rows (n_local, k), no ghosts.
+
+    Raises:
+        SolverError: k is out of range, the factorisation fails, or a mode does not converge.
+    """
+    n_e = system.layout.n_e
+    if not 1 <= k <= n_e:
+        raise SolverError(f"{k} modes are asked for; it must be between 1 and n_e = {n_e}")
+    solver = _factor(system)
+    eps = _make_eps(system, solver)
+    found: list[PETSc.Vec] = []
+    squares: list[float] = []
+    try:
+        _solve(eps, system, k, found, squares)
+        while len(found) < n_e:
+            last = sorted(squares)[k - 1]
+            _solve(eps, system, 1, found, squares, ROUGH)
+            if squares[-1] >= last * (1 + 10 * ROUGH):
+                break
+            found.pop().destroy()
+            squares.pop()
+            _solve(eps, system, 1, found, squares)
+            if squares[-1] >= last * (1 - RESIDUAL):
+                break
+        order = np.argsort(squares)[:k]
+        return _finish(eps, system, [found[i] for i in order])
+    finally:
+        eps.destroy()
+        solver.destroy()
+        for vector in found:
+            vector.destroy()
+
+
+def _generic(system: BlockSystem, number: int) -> Array:
+    """Local values of a function of the coordinates without symmetry, the same for every rank count."""
+    layout = system.layout
+    nodes, d = layout.nodes - layout.reference, layout.dimension
+    scale = layout.comm.allreduce(float(np.abs(nodes).max(initial=0.0)), op=MPI.MAX)
+    phase = nodes / (scale or 1.0) @ np.array([2.3, 5.1, 3.7])[:d] * (1 + number)
+    return np.column_stack([np.cos(phase * (1 + 0.3 * c) + 1 + c) for c in range(d)]).ravel()
+
+
+class _Factored:
+    """The preconditioner of an exact solve, for SLEPc."""
+
+    def __init__(self, solver: TissueSolver) -> None:
+        self.solver = solver
+
+    def apply(self, pc: PETSc.PC, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        """Set w = K_ee^-1 r. Collective."""
+        self.solver.solve(r, w)
+
+
+def _factor(system: BlockSystem) -> TissueSolver:
+    """The stiffness, factored. Collective."""
+    layout = system.layout
+    name: SolverName = "cholesky" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps"
+    try:
+        return make_solver(system.K_ee.copy(), name, layout, PREFIX, reproducible=False)
+    except SolverError as error:
+        raise SolverError(
+            f"modes: the factorisation of the {layout.n_e} x {layout.n_e} stiffness failed ({error}); "
+            "check material, mesh and contact zone"
+        ) from error
+
+
+def _make_eps(system: BlockSystem, solver: TissueSolver) -> SLEPc.EPS:
+    eps = SLEPc.EPS().create(system.layout.comm)
+    eps.setOptionsPrefix(PREFIX)
+    eps.setOperators(system.K_ee, system.M_ee)
+    eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+    eps.setType(SLEPc.EPS.Type.KRYLOVSCHUR)
+    eps.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
+    eps.setTarget(0.0)
+    eps.setPurify(False)  # for singular M_ee; costs one solve a mode
+    st = eps.getST()
+    st.setType(SLEPc.ST.Type.SINVERT)
+    ksp = st.getKSP()
+    ksp.setType("preonly")
+    pc = ksp.getPC()
+    pc.setType("python")
+    pc.setPythonContext(_Factored(solver))
+    return eps
+
+
+def _solve(
+    eps: SLEPc.EPS,
+    system: BlockSystem,
+    k: int,
+    found: list[PETSc.Vec],
+    squares: list[float],
+    tolerance: float = TOLERANCE,
+) -> None:
+    """Append the k lowest modes M-orthogonal to those found. Collective."""
+    eps.setDimensions(nev=k, ncv=min(max(2 * k, k + 15), system.layout.n_e))
+    eps.setTolerances(tolerance, 500)
+    if found:
+        eps.setDeflationSpace(found)
+    start = system.K_ee.createVecRight()
+    start.array_w[:] = _generic(system, len(found))
+    eps.setInitialSpace(start)
+    try:
+        eps.solve()
+    except (PETSc.Error, SystemError) as error:
+        raise SolverError(
+            f"modes: the iteration with the {system.layout.n_e} x {system.layout.n_e} stiffness failed ({error}); "
+            "check material, mesh and contact zone"
+        ) from error
+    finally:
+        start.destroy()
+    if eps.getConverged() < k:
+        raise SolverError(
+            f"modes: {eps.getConverged()} of {k} converged in {eps.getIterationNumber()} iterations "
+            f"(SLEPc reason {int(eps.getConvergedReason())}); ask for fewer modes or check the mesh"
+        )
+    for i in range(k):
+        vector = system.K_ee.createVecRight()
+        squares.append(float(eps.getEigenpair(i, vector).real))
+        found.append(vector)
+
+
+def _finish(eps: SLEPc.EPS, system: BlockSystem, modes: list[PETSc.Vec]) -> tuple[Array, Array]:
+    """Normalise, fix the signs and check the residuals |K phi - omega^2 M phi|_(K^-1) / omega. Collective."""
+    comm, ksp = system.layout.comm, eps.getST().getKSP()
+    omega, Phi = np.empty(len(modes)), np.empty((system.layout.n_local, len(modes)), order="F")
+    y, r = system.K_ee.createVecs()
+    compass = _generic(system, 0)
+    for i, phi in enumerate(modes):
+        system.M_ee.mult(phi, y)
+        side = comm.allreduce(float(np.dot(compass, y.array_r)))
+        phi.scale((-1.0 if side < 0 else 1.0) / np.sqrt(phi.dot(y)))
+        system.M_ee.mult(phi, y)
+        system.K_ee.mult(phi, r)
+        square = float(phi.dot(r))
+        r.axpy(-square, y)
+        ksp.solve(r, y)
+        error = np.sqrt(abs(r.dot(y)) / square) if square > 0 else np.inf
+        if not error <= RESIDUAL:
+            raise SolverError(
+                f"modes: mode {i + 1} has the relative residual {error:.1e}, allowed is {RESIDUAL:.0e}; "
+                "the stiffness is singular or badly scaled: check material, mesh and contact zone"
+            )
+        omega[i] = np.sqrt(square)
+        Phi[:, i] = phi.array_r
+    y.destroy()
+    r.destroy()
+    return omega, Phi

@@ -1,0 +1,290 @@
+"""One linear solver for S w = r, chosen by size, factored once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from softgrasp.fem.solve.cholesky import OrderedFactor, factor_blocks
+from softgrasp.fem.errors import SolverError, agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.solve.order import dissect
+from softgrasp.fem.petsc import PETSc, petsc_options, whole_copy
+
+SolverName = Literal["cholesky", "mumps", "cg"]
+Reproducible = Literal["auto"] | bool
+
+# Where each road ends on two ranks and 24 GiB: PETSc Cholesky in blocks is fastest per solve, but its factorisation is
+# the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (softgrasp.study.bench.switches), but
+# not the few solves of an equilibrium or of modes, nor when single entries must do. Beyond the last limits the factor
+# itself no longer fits.
+CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
+FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
+DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
+# Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
+# every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
+# (softgrasp.study.bench.switches), and each rank needs the memory of the whole factor.
+REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
+REPEATED_RANKS = 4
+# Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
+# which grows with the condition though w may be right. One step of refinement measures the error of w itself.
+DIRECT_RESIDUAL = 1e-8
+DIRECT_ERROR = 1e-6
+
+
+def choose_solver(layout: BlockLayout, wanted: str = "auto", few: bool = False) -> tuple[SolverName, str]:
+    """The solver for a size, with the reason in words; ``few`` solves with one factor. Not collective."""
+    n, d = layout.n_e, layout.dimension
+    limit = (FEW_LIMIT if few else CHOLESKY_LIMIT)[d]
+    if wanted != "auto":
+        return wanted, "asked for by the scene"  # type: ignore[return-value]
+    if n <= limit:
+        return "cholesky", f"n_e = {n} <= {limit} in {d}D: fastest per solve"
+    if n <= DIRECT_LIMIT[d]:
+        return "mumps", f"n_e = {n} <= {DIRECT_LIMIT[d]} in {d}D: the factor fits and factors fast"
+    return "cg", f"n_e = {n} > {DIRECT_LIMIT[d]} in {d}D: the factor would not fit"
+
+
+def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: Reproducible) -> bool:
+    """Whether every rank factors by itself: no message in a solve, and the same bits in every run. Not collective.
+
+    The distributed factor of MUMPS needs less memory, but adds in the order messages arrive, so that its last bits
+    differ from run to run.
+    """
+    ranks = layout.comm.size
+    if solver == "cholesky":
+        return True
+    if ranks == 1 or solver == "cg":
+        return False
+    if reproducible != "auto":
+        return bool(reproducible)
+    return ranks <= REPEATED_RANKS and layout.n_e * ranks <= REPEATED_LIMIT[layout.dimension]
+
+
+@dataclass(frozen=True)
+class TissueSolver:
+    """A factored (or preconditioned) symmetric positive definite matrix of the tissue block.
+
+    Attributes:
+        name: cholesky, mumps or cg.
+        ksp: the PETSc solver; its vectors are those of S with mumps and cg only, so solve by :meth:`solve`.
+        S: the matrix.
+        tolerance: relative residual that :meth:`check` accepts.
+        factor: what solves without a detour through ``ksp``: with cholesky the factor that every rank has whole, in an
+            order of its own (:mod:`fem.solve.cholesky`); with mumps that of one rank; else None.
+    """
+
+    name: SolverName
+    ksp: PETSc.KSP
+    S: PETSc.Mat
+    tolerance: float
+    factor: PETSc.Mat | OrderedFactor | None = None
+
+    @property
+    def remark(self) -> str:
+        """What to add to the reason of the choice: single entries make a slower step. Not collective."""
+        if self.name != "cholesky" or "sbaij" in self.ksp.getOperators()[0].getType():
+            return ""
+        by = self.ksp.getPC().getFactorSolverType().upper().replace("PETSC", "PETSc")
+        return f"; in single entries by {by}, since blocks would lose digits here"
+
+    def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
+        """Solve S w = r.
+
+        Collective. Raises :class:`SolverError` when the iteration does not converge.
+        """
+        if self.factor is not None:
+            self.factor.solve(r, w)
+            return
+        self.ksp.solve(r, w)
+        if self.ksp.getConvergedReason() < 0:
+            raise SolverError(
+                f"{self.name}: no convergence after {self.ksp.getIterationNumber()} iterations "
+                f"(PETSc reason {self.ksp.getConvergedReason()}); choose time.solver = 'mumps' or a larger time.rtol"
+            )
+
+    def residual(self, r: PETSc.Vec, w: PETSc.Vec, size: float = 0.0) -> float:
+        """Residual |S w - r| / max(|r|, size); ``size`` is that of the terms of r, which may cancel. Collective."""
+        y = self.S.createVecLeft()
+        self.S.mult(w, y)
+        y.axpy(-1.0, r)
+        scale = max(r.norm(), size)
+        value = y.norm() / scale if scale > 0 else y.norm()
+        y.destroy()
+        return float(value)
+
+    def check(self, r: PETSc.Vec, w: PETSc.Vec, where: str, size: float = 0.0) -> float:
+        """Raise unless S w = r is solved to the tolerance: direct solvers do not tell. Collective.
+
+        A direct solve with a larger residual passes when the correction of one refinement step, which is about its
+        error, is small against w. Returns the relative residual.
+
+        Raises:
+            SolverError: the iteration stopped early, or the matrix is singular, indefinite or badly scaled.
+        """
+        value = self.residual(r, w, size)
+        if value <= self.tolerance:
+            return value
+        if not np.isfinite(r.norm()):
+            raise SolverError(
+                f"{self.name}: the right-hand side is not finite at {where}; check material, dt and force"
+            )
+        text = f"relative residual {value:.1e} at {where} exceeds {self.tolerance:.0e}"
+        if self.name != "cg" and np.isfinite(value):
+            error = self.error(r, w)
+            if error <= DIRECT_ERROR:
+                return value
+            text = f"estimated error {error:.1e} at {where} exceeds {DIRECT_ERROR:.0e} (relative residual {value:.1e})"
+        raise SolverError(
+            f"{self.name}: {text}; the matrix is singular, indefinite or badly scaled: check material, mesh and "
+            "contact zone"
+        )
+
+    def error(self, r: PETSc.Vec, w: PETSc.Vec) -> float:
+        """Estimate |w - S^{-1} r| / |w| by the correction S^{-1} (r - S w) of one refinement step. Collective."""
+        y, e = self.S.createVecs()
+        self.S.mult(w, y)
+        y.aypx(-1.0, r)
+        self.solve(y, e)
+        size = w.norm()
+        value = float(e.norm() / size) if size > 0 else np.inf
+        y.destroy()
+        e.destroy()
+        return value
+
+    def destroy(self) -> None:
+        """Free solver and matrix. Collective."""
+        if isinstance(self.factor, OrderedFactor):
+            self.factor.destroy()
+        self.ksp.destroy()
+        self.S.destroy()
+
+
+def make_solver(
+    S: PETSc.Mat,
+    name: SolverName,
+    layout: BlockLayout,
+    prefix: str,
+    rtol: float = 1e-10,
+    reproducible: Reproducible = "auto",
+    ordered: bool = False,
+) -> TissueSolver:
+    """Factor S (or set up CG with GAMG). Collective.
+
+    Args:
+        S: symmetric positive definite, owned by the solver from here on.
+        name: cholesky (PETSc, every rank by itself), mumps (see ``reproducible``) or cg (GAMG [VMB96]).
+        layout: sizes and node coordinates.
+        prefix: PETSc options prefix.
+        rtol: relative tolerance of cg.
+        reproducible: see :func:`factor_on_every_rank`.
+        ordered: cholesky, S on one rank: its rows are in the order of elimination already, in blocks (BAIJ).
+
+    Raises:
+        SolverError: the factorisation fails.
+    """
+    S.setOption(PETSc.Mat.Option.SPD, True)
+    tolerance = max(DIRECT_RESIDUAL, 10 * rtol)
+    if name == "cholesky":
+        return _cholesky(S, layout, prefix, tolerance, ordered)
+    ksp = PETSc.KSP().create(S.comm)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setOperators(S)
+    if name == "cg":
+        _set_up_cg(ksp, S, layout, prefix, rtol)
+    else:
+        _set_up_mumps(ksp, prefix, S.comm.size > 1 and factor_on_every_rank(layout, name, reproducible))
+    try:
+        _factor(ksp, S, name)
+    except SolverError:
+        ksp.destroy()
+        S.destroy()
+        raise
+    factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
+    return TissueSolver(name, ksp, S, tolerance, factor)
+
+
+def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, ordered: bool) -> TissueSolver:
+    """Every rank factors the whole matrix. Collective."""
+    P, order = S, None
+    if not ordered:
+        every = whole_copy(S)
+        found = dissect(every, layout.dimension)
+        order, P = found.order, found.matrix(every)
+        every.destroy()
+    try:
+        with agree(S.comm.tompi4py()):
+            ksp = factor_blocks(P, prefix, "petsc" if layout.n_e <= FEW_LIMIT[layout.dimension] else "mumps")
+    except SolverError:
+        S.destroy()
+        raise
+    finally:
+        if P is not S:
+            P.destroy()  # the ksp holds what it needs
+    factor = ksp.getPC().getFactorMatrix()
+    if order is not None:
+        like = S.createVecLeft()
+        factor = OrderedFactor(factor, order, like)
+        like.destroy()
+    return TissueSolver("cholesky", ksp, S, tolerance, factor)
+
+
+def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
+    """The set-up, and what PETSc leaves of it to the first solve. Collective."""
+    try:
+        ksp.setUp()
+        if ksp.comm.size > 1 and name == "mumps":
+            _first_solve(ksp, S)
+    except PETSc.Error as error:
+        raise SolverError(
+            f"{name}: the factorisation of the tissue matrix (n_e = {S.getSize()[0]}) failed (PETSc error "
+            f"{error.ierr}); check material and mesh"
+        ) from error
+    reason = ksp.getPC().getFailedReason()
+    if reason:
+        raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
+
+
+def _first_solve(ksp: PETSc.KSP, S: PETSc.Mat) -> None:
+    """Solve for zero: PETSc makes a redundant factor in the first solve, which belongs to the set-up. Collective."""
+    w, r = S.createVecs()
+    ksp.solve(r, w)
+    r.destroy()
+    w.destroy()
+
+
+def _set_up_mumps(ksp: PETSc.KSP, prefix: str, repeated: bool) -> None:
+    """One factor spread over the ranks, or the whole of it on every rank and one gather a solve. Collective."""
+    ksp.setType("preonly")
+    if not repeated:
+        ksp.getPC().setType("cholesky")
+        ksp.getPC().setFactorSolverType("mumps")
+        return
+    options: dict[str, object] = {
+        "pc_type": "redundant",
+        "redundant_ksp_type": "preonly",
+        "redundant_pc_type": "cholesky",
+        "redundant_pc_factor_mat_solver_type": "mumps",
+    }
+    with petsc_options(prefix, options):
+        ksp.setFromOptions()
+
+
+def _set_up_cg(ksp: PETSc.KSP, S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> None:
+    d = layout.dimension
+    coordinates = PETSc.Vec().createWithArray(
+        layout.nodes.ravel().copy(), size=(layout.n_local, layout.n_e), bsize=d, comm=layout.comm
+    )
+    # the submatrix does not inherit it, and without rigid modes GAMG needs twice the iterations
+    near = PETSc.NullSpace().createRigidBody(coordinates)
+    S.setNearNullSpace(near)
+    near.destroy()
+    ksp.setType("cg")
+    # the preconditioned norm would stop at a true residual 1e3 times larger
+    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+    ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=500)
+    ksp.getPC().setType("gamg")
+    with petsc_options(prefix, {"pc_gamg_threshold": 0.01, "mg_levels_ksp_type": "chebyshev"}):
+        ksp.setFromOptions()

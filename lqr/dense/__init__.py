@@ -1,0 +1,1 @@
+"""Riccati equations of small plants, dense."""

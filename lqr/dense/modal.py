@@ -1,0 +1,307 @@
+"""The whole Riccati equation of a small scene, dense: the oracle of the low-rank solvers."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.errors import ResourceError, SolverError, agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns
+from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
+from softgrasp.lqr.dense.care import care as care
+from softgrasp.lqr.plant.checks import EPS, check_finite, check_weights, square_root
+from softgrasp.lqr.dense.poles import check_poles, closed_loop_rates
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+
+DENSE_MODES = 600  # a tenth of a second; SLEPc on several ranks is slower there
+FACTOR_TOLERANCE = 1e-10  # of the singular values of Z, hence 1e-20 of those of X
+NOISE = 100 * EPS  # of the largest row of Z: an entry of X beside it is rounding of X
+
+
+@dataclass(frozen=True)
+class TissueMatrices:
+    """Dense M_ee, K_ee, D_ee (n_e, n_e); T, G (n_e, n_s); C_z (n_e, p); B_z (n_e, m), in global numbering."""
+
+    M: Array
+    K: Array
+    D: Array
+    T: Array
+    G: Array
+    C_z: Array
+    B_z: Array | None = None
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """E x' = A x + B u, y = C x, dense."""
+
+    E: Array
+    A: Array
+    B: Array
+    C: Array
+
+
+@dataclass(frozen=True)
+class ModalPlant:
+    """The plant in xi = [q_s, v_s, omega eta, eta'], z = Phi eta, Phi' M_ee Phi = I: |xi_e|^2 / 2 is the energy.
+
+    E xi' = A xi + B u with E = L E_rel S, A = L A_rel S, B = L B_rel, C = C_rel S, S = blkdiag(I, I, Phi/omega, Phi),
+    L = blkdiag(I, I, omega Phi'M, Phi'); X_rel = L' X L and K_rel = K S^{-1}.
+
+    Attributes:
+        omega: natural frequencies [1/s], ascending, (k,).
+        Phi: modes, (n_e, k).
+        massed: M_ee Phi, (n_e, k).
+        D: Phi' D_ee Phi, (k, k).
+        g: Phi' G, (k, n_s); without a hand Phi' B_z, (k, m).
+        c: outputs of the modes, (p, k).
+        space: the matrices.
+    """
+
+    omega: Array
+    Phi: Array
+    massed: Array
+    D: Array
+    g: Array
+    c: Array
+    space: StateSpace
+
+
+def gather_matrix(layout: BlockLayout, A: PETSc.Mat) -> Array | None:
+    """A distributed tissue matrix, dense on rank 0, None elsewhere. Collective."""
+    indptr, columns, values = A.getValuesCSR()
+    local = np.zeros((layout.n_local, layout.n_e))
+    rows = np.repeat(np.arange(layout.n_local), np.diff(indptr))
+    local[rows, columns] = values
+    return rows_on_root(layout.comm, local)
+
+
+def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
+    """All tissue operators, dense on rank 0, None elsewhere. Collective."""
+    system, layout = problem.system, problem.layout
+    M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
+    matrix = system.damping.matrix
+    extra = None if matrix is None else gather_matrix(layout, matrix)
+    T, G, C_z = (rows_on_root(layout.comm, a) for a in (system.T, system.G, problem.C_z))
+    B_z = None if problem.B_z is None else rows_on_root(layout.comm, problem.B_z)
+    if M is None or K is None or T is None or G is None or C_z is None:
+        return None
+    D = system.damping.alpha * M + (system.damping.beta * K if extra is None else extra)
+    return TissueMatrices(M, K, D, T, G, C_z, B_z)
+
+
+def assemble_space(
+    problem: RiccatiProblem, M: Array, K: Array, D: Array, G: Array, C_z: Array, B_z: Array | None = None
+) -> StateSpace:
+    """E, A, B, C of x = [q_s, v_s, z, v_z] from dense blocks of the tissue in any basis of z. Not collective.
+
+    With drag = "space" and two-way coupling the hand row carries alpha M_rigid and alpha G' as well.
+    """
+    system = problem.system
+    n_s, n = system.layout.n_s, len(M)
+    s, v, z, w = (slice(a, b) for a, b in ((0, n_s), (n_s, 2 * n_s), (2 * n_s, 2 * n_s + n), (2 * n_s + n, None)))
+    E = np.eye(2 * (n_s + n))
+    A = np.zeros_like(E)
+    E[v, v], E[w, w], E[w, v] = problem.M_s, M, G
+    A[s, v], A[z, w] = np.eye(n_s), np.eye(n)
+    A[w, z], A[w, w] = -K, -D
+    if system.damping.in_space:
+        A[w, v] = -system.damping.alpha * G
+    if system.two_way:
+        E[v, w] = G.T
+        if system.damping.in_space:
+            A[v, v], A[v, w] = -system.damping.alpha * system.M_rigid, -system.damping.alpha * G.T
+    B = np.zeros((len(E), n_s if B_z is None else B_z.shape[1]))
+    if B_z is None:
+        B[v] = np.eye(n_s)
+    else:
+        B[w] = B_z
+    C = np.hstack([problem.C_s, np.zeros_like(problem.C_s), C_z.T, np.zeros_like(C_z.T)])
+    return StateSpace(E, A, B, C)
+
+
+def relative_space(problem: RiccatiProblem) -> StateSpace | None:
+    """E, A, B, C in hand-relative coordinates, dense on rank 0, None elsewhere. Collective."""
+    tissue = gather_tissue(problem)
+    if tissue is None:
+        return None
+    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
+
+
+def modal_plant(
+    problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, ...]
+) -> ModalPlant:
+    """The plant restricted to modes. Not collective.
+
+    Args:
+        problem: weights, hand and flags.
+        omega, Phi, massed: the modes.
+        parts: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi.
+    """
+    D, g, c = parts
+    G, B_z = (g, None) if problem.B_z is None else (g[:, :0], g)
+    plain = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
+    n_s = problem.layout.n_s
+    one = np.ones(2 * n_s)
+    S = np.concatenate([one, 1 / omega, np.ones_like(omega)])
+    L = np.concatenate([one, omega, np.ones_like(omega)])
+    space = StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, plain.B, plain.C * S)
+    return ModalPlant(omega, Phi, massed, D, g, c, space)
+
+
+def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
+    """The plant in all its modes, K_ee phi = omega^2 M_ee phi. Not collective.
+
+    Raises:
+        SolverError: the stiffness is not positive definite: the hand does not hold the body.
+    """
+    squares, Phi = scipy.linalg.eigh(tissue.K, tissue.M)
+    _check_held(float(squares[0]), float(squares[-1]))
+    reach = tissue.G if tissue.B_z is None else tissue.B_z
+    parts = (Phi.T @ tissue.D @ Phi, Phi.T @ reach, tissue.C_z.T @ Phi)
+    return modal_plant(problem, np.sqrt(squares), Phi, tissue.M @ Phi, parts)
+
+
+def some_modes(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
+    """The k lowest modes: LAPACK on rank 0 up to :data:`DENSE_MODES` unknowns, else SLEPc. Collective.
+
+    Returns:
+        omega (k,), Phi and M_ee Phi, local rows (n_local, k).
+    """
+    system, layout = problem.system, problem.layout
+    if layout.n_e > DENSE_MODES:
+        omega, Phi = lowest_modes(system, k)
+        return omega, Phi, times_columns(system.M_ee, Phi)
+    M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
+    found: tuple[Array, Array] | None = None
+    with agree(layout.comm):
+        if M is not None and K is not None:
+            squares, vectors = scipy.linalg.eigh(K, M, subset_by_index=[0, k - 1])
+            _check_held(squares[0], float(np.linalg.norm(K, 2) / np.diag(M).max()))
+            found = np.sqrt(squares), vectors
+    omega, whole = layout.comm.bcast(found)
+    Phi = np.asfortranarray(whole[layout.start : layout.start + layout.n_local])
+    return omega, Phi, times_columns(system.M_ee, Phi)
+
+
+def _check_held(lowest: float, largest: float) -> None:
+    if not lowest > 1e-12 * largest:  # rounding of eigh is about n eps of the largest
+        raise SolverError(f"the stiffness has the eigenvalue {lowest:.1e}; the contact zone must hold the body")
+
+
+def factor_psd(X: Array) -> Array:
+    """Z with Z Z' = X for X symmetric positive semidefinite to rounding, columns in descending order. Not collective.
+
+    Small rows keep their own relative accuracy: X is scaled to unit diagonal first. Lifting multiplies the rows of
+    fast modes by omega^2, and rounding relative to the largest entry of X would be seen in the residual. Rows of modes
+    that no output sees are nothing but rounding, which scaling would blow up: they are zero.
+    """
+    scale = np.sqrt(np.maximum(np.diag(X), 0.0))
+    noise = scale <= NOISE * scale.max(initial=0.0)
+    scale[noise] = 1.0
+    X = np.where(noise[:, None] | noise, 0.0, X)
+    values, vectors = np.linalg.eigh(X / scale[:, None] / scale)
+    keep = values > 0.1 * len(X) * EPS * values[-1]
+    Z = scale[:, None] * vectors[:, keep] * np.sqrt(values[keep])
+    _, sigma, right = np.linalg.svd(Z, full_matrices=False)
+    return np.asarray(Z @ right[sigma > FACTOR_TOLERANCE * sigma[0]].T)
+
+
+def dense_residual(problem: RiccatiProblem, space: StateSpace, Z: Array) -> float:
+    """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'. Not collective."""
+    moved, driven = space.E.T @ Z, space.A.T @ Z
+    gain = moved @ (Z.T @ space.B)
+    C = square_root(problem.Q) @ space.C
+    cross = driven @ moved.T
+    residual = cross + cross.T - gain @ np.linalg.solve(problem.R, gain.T) + C.T @ C
+    return float(np.abs(np.linalg.eigvalsh(residual)).max() / (np.linalg.norm(C @ C.T, 2) or 1.0))
+
+
+@dataclass(frozen=True)
+class DenseRiccati:
+    """Solve the Riccati equation of a small scene in energy-scaled modal coordinates, on rank 0.
+
+    Attributes:
+        tolerance: bound on the true relative residual in hand-relative coordinates.
+        limit: largest number of states; the work grows with its cube, memory is about 400 byte times its square.
+    """
+
+    tolerance: float = 1e-8
+    limit: int = 2500
+
+    def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
+        """All modes by LAPACK, Schur form, Newton steps; the result is spread over the ranks. Collective.
+
+        Raises:
+            ResourceError: more states than ``limit``.
+            ControlError: weights or data are refused, or feedback cannot stabilise some mode.
+            SolverError: the true residual misses ``tolerance``.
+        """
+        layout, comm = problem.layout, problem.layout.comm
+        if layout.states > self.limit:
+            raise ResourceError(
+                f"dense: {layout.states} states are more than {self.limit}; use newton_adi, radi or galerkin instead"
+            )
+        check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
+        tissue = gather_tissue(problem)
+        result: RiccatiSolution | None = None
+        with agree(comm):
+            if tissue is not None:
+                result = self._solve_on_root(problem, tissue)
+        return spread(layout, result)
+
+    def _solve_on_root(self, problem: RiccatiProblem, tissue: TissueMatrices) -> RiccatiSolution:
+        begin = time.perf_counter()
+        check_finite(M=tissue.M, K=tissue.K, D=tissue.D, G=tissue.G, C=tissue.C_z)
+        plant = dense_modes(problem, tissue)
+        check_poles(closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c))
+        middle = time.perf_counter()
+        space = plant.space
+        found = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)
+        n_s, k = problem.layout.n_s, len(plant.omega)
+        hand, q, v = slice(0, 2 * n_s), slice(2 * n_s, 2 * n_s + k), slice(2 * n_s + k, None)
+        small = factor_psd(found.X)
+        Z = np.vstack([small[hand], plant.massed @ (plant.omega[:, None] * small[q]), plant.Phi @ small[v]])
+        K_z = plant.massed @ (plant.omega[:, None] * found.K[:, q].T)
+        K_v = plant.massed @ found.K[:, v].T
+        relative = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
+        residual = dense_residual(problem, relative, Z)
+        if not residual <= self.tolerance:
+            raise SolverError(f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.0e}")
+        n_e = len(tissue.M)
+        return RiccatiSolution(
+            Z_s=Z[: 2 * n_s],
+            Z_z=Z[2 * n_s : 2 * n_s + n_e],
+            Z_v=Z[2 * n_s + n_e :],
+            K_s=found.K[:, hand],
+            K_z=K_z,
+            K_v=K_v,
+            residual=residual,
+            method="dense",
+            counts={"newton_steps": found.newton_steps, "adi_steps": 0, "solves": 0},
+            seconds={"modes": middle - begin, "schur": time.perf_counter() - middle},
+        )
+
+
+def spread(layout: BlockLayout, result: RiccatiSolution | None) -> RiccatiSolution:
+    """Give every rank its rows of a solution that rank 0 holds whole. Collective."""
+    ranges = layout.comm.gather((layout.start, layout.start + layout.n_local))
+    pieces: list[RiccatiSolution] | None = None
+    if result is not None and ranges is not None:
+        pieces = []
+        for a, b in ranges:
+            rows = (np.asfortranarray(x[a:b]) for x in (result.Z_z, result.Z_v, result.K_z, result.K_v))
+            Z_z, Z_v, K_z, K_v = rows
+            pieces.append(
+                RiccatiSolution(
+                    result.Z_s, Z_z, Z_v, result.K_s, K_z, K_v,
+                    result.residual, result.method, result.history, result.counts, result.seconds,
+                )
+            )  # fmt: skip
+    mine: RiccatiSolution = layout.comm.scatter(pieces)
+    return mine

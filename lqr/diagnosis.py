@@ -1,0 +1,217 @@
+"""Before any large solve: can this plant be stabilised by these inputs and outputs, in double precision?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.lqr.spectrum.modal_loop import modal_damping
+from softgrasp.lqr.dense.care import care
+from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
+from softgrasp.lqr.dense.modal import some_modes
+from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.reduced.riccati import project
+from softgrasp.lqr.reduced.bases import modal_basis
+from softgrasp.reduction.engines import on_root
+
+MODES = 60
+RANK_LEVEL = 1e-10  # singular values of X are counted down to this share of the largest
+WEAK = ENOUGH / 4  # damping ratio of the first mode where the low-rank solvers begin to need many hundred solves
+
+Kind = Literal["error", "warning"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence about the control problem; an error means that no solver should be started.
+
+    Attributes:
+        kind: error or warning.
+        topic: weights, data, outputs, inputs, damping.
+        sentence: what is wrong and what would be right.
+    """
+
+    kind: Kind
+    topic: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is known before the solve.
+
+    Attributes:
+        findings: problems, worst first.
+        rates: estimated closed-loop poles of the lowest modes; None when the data are unusable.
+        rank_estimate: singular values of X above :data:`RANK_LEVEL` of the largest on hand and these modes; a lower
+            bound of the rank when it is close to 2 (n_s + modes). 0 when there is no solution.
+        damping_enough: Kelvin-Voigt time beta [s] from which the low-rank solvers converge quickly; nan if unknown.
+    """
+
+    findings: tuple[Finding, ...]
+    rates: ModeRates | None
+    rank_estimate: int
+    damping_enough: float
+
+    @property
+    def solvable(self) -> bool:
+        """Whether a Riccati solver should be started."""
+        return all(f.kind != "error" for f in self.findings)
+
+    def require(self) -> None:
+        """Go on only when solvable. Not collective.
+
+        Raises:
+            ControlError: with the first error's sentence.
+        """
+        for finding in self.findings:
+            if finding.kind == "error":
+                raise ControlError(finding.sentence)
+
+
+def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
+    """Check weights and data, outputs and inputs, and the damping of the closed loop. Collective.
+
+    Args:
+        problem: the plant.
+        modes: lowest modes to look at.
+    """
+    unusable = _data(problem)
+    if unusable:
+        return Diagnosis(tuple(unusable), None, 0, float("nan"))
+    system, comm = problem.system, problem.layout.comm
+    findings = _outputs(problem)
+    k = min(modes, system.layout.n_e)
+    omega, Phi, massed = some_modes(problem, k)
+    damping = np.diag(modal_damping(problem, Phi))
+    g, c = reach(problem, Phi), total(comm, problem.C_z.T @ Phi)
+    rates = closed_loop_rates(problem, omega, damping, g, c, largest=_largest_frequency(problem))
+    findings += _damping(problem, rates)
+    findings.sort(key=lambda f: f.kind != "error")
+    rank = 0 if any(f.kind == "error" for f in findings) else _small_rank(problem, omega, Phi, massed)
+    return Diagnosis(tuple(findings), rates, rank, enough_damping(rates))
+
+
+def _data(problem: RiccatiProblem) -> list[Finding]:
+    """Weights that are refused and numbers that are none; agreed on by all ranks."""
+    system = problem.system
+    bad: list[Finding] = []
+    try:
+        check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
+    except ControlError as error:
+        bad.append(Finding("error", "weights", str(error)))
+    matrices = {"M_ee": system.M_ee, "K_ee": system.K_ee}
+    try:
+        check_finite(
+            C_s=problem.C_s,
+            C_z=problem.C_z,
+            G=system.G,
+            T=system.T,
+            M_hand=system.M_hand,
+            B_z=problem.B_z,
+            **{name: np.asarray(A.getValuesCSR()[2]) for name, A in matrices.items()},
+        )
+    except ControlError as error:
+        bad.append(Finding("error", "data", f"{error}; check material, mesh and outputs"))
+    whole = [f for part in problem.layout.comm.allgather(bad) for f in part]
+    return list(dict.fromkeys(whole))
+
+
+def _outputs(problem: RiccatiProblem) -> list[Finding]:
+    """The free hand has a double zero eigenvalue a freedom: x_T must be seen, C x_T = C_s."""
+    n_s = problem.layout.n_s
+    findings: list[Finding] = []
+    weighted = square_root(problem.Q) @ problem.C_s
+    _, sigma, right = np.linalg.svd(np.vstack([weighted, np.zeros((n_s, n_s))]), full_matrices=False)
+    size = float(np.linalg.norm(problem.C_s)) * float(np.sqrt(np.linalg.norm(problem.Q, 2)))
+    hidden = np.flatnonzero(sigma <= 1e3 * EPS * size)
+    if len(hidden):
+        motion = _motion(right[hidden[-1]], problem.layout.dimension)
+        findings.append(
+            Finding(
+                "error",
+                "outputs",
+                f"not detectable: the weighted outputs do not see {len(hidden)} of the {n_s} rigid motions of the "
+                f"hand, for example {motion}, which nothing else brings to rest; add outputs or give them "
+                "a weight in control.Q",
+            )
+        )
+    names = problem.names if len(problem.names) == len(problem.Q) else tuple(f"y{i + 1}" for i in range(len(problem.Q)))
+    rows = np.abs(problem.Q).sum(axis=1)
+    idle = [name for name, row in zip(names, rows, strict=True) if row == 0]
+    if idle and not len(hidden):
+        findings.append(
+            Finding("warning", "outputs", f"control.Q gives no weight to {', '.join(idle)}: the cost ignores it")
+        )
+    return findings
+
+
+def _motion(direction: Array, d: int) -> str:
+    """Name a direction of the hand's freedoms."""
+    if np.abs(direction[d:]).max(initial=0.0) > 1e-6 * np.abs(direction).max():
+        return "a rotation about a point that they see"
+    return f"the translation along {'xyz'[int(np.argmax(np.abs(direction[:d])))]}"
+
+
+def _damping(problem: RiccatiProblem, rates: ModeRates) -> list[Finding]:
+    """Modes that neither damping nor feedback brings to rest."""
+    n_e, enough = problem.layout.n_e, enough_damping(rates)
+    lost = int(rates.lost.sum())
+    way_out = f"set effects.damping.beta >= {enough:.2g} s, or control only the lowest modes with the method modal_lqr"
+    if not problem.system.damping.active:
+        slowest = float(rates.rate.min())
+        seen = f"{lost} of the lowest {len(rates.omega)} modes cannot be stabilised in double precision at all"
+        if not lost:
+            seen = f"the slowest of the lowest {len(rates.omega)} modes would decay at {slowest:.1e}/s"
+        return [
+            Finding(
+                "error",
+                "damping",
+                f"no damping: feedback alone has to stabilise all {n_e} modes, {seen}, and X is not of low rank; "
+                f"{way_out}",
+            )
+        ]
+    if lost:
+        return [Finding("error", "damping", lost_sentence(rates))]
+    zeta = float(rates.own[0] / rates.omega[0])
+    if zeta < WEAK:
+        return [
+            Finding(
+                "warning",
+                "damping",
+                f"nearly undamped: the first mode has the damping ratio {zeta:.1e}, so that X has a high rank and the "
+                f"low-rank solvers may not converge; {way_out}",
+            )
+        ]
+    return []
+
+
+def _largest_frequency(problem: RiccatiProblem) -> float:
+    """Bound of omega_max by row sums over lumped masses, (max |K_ii| row sum / min M_ii)^{1/2}. Collective."""
+    system, comm = problem.system, problem.layout.comm
+    indptr, _, values = system.K_ee.getValuesCSR()
+    rows = np.add.reduceat(np.abs(values), indptr[:-1]) if len(indptr) > 1 else np.zeros(0)
+    mass = system.M_ee.getDiagonal()
+    ratio = float((rows / mass.array_r).max(initial=0.0))
+    mass.destroy()
+    return float(np.sqrt(max(comm.allgather(ratio))))
+
+
+def _small_rank(problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array) -> int:
+    """Rank of X on hand and modes in energy coordinates, by a dense solve of that order. Collective."""
+    basis = modal_basis(problem, "diagnose", omega, Phi, massed)
+    m = project(problem, basis)
+
+    def count() -> int:
+        try:
+            values = np.linalg.eigvalsh(care(m.A, m.B, m.C, m.Q, m.R, m.E).X)
+        except ControlError:
+            return 0
+        return int(np.sum(values > RANK_LEVEL * values[-1]))
+
+    return on_root(problem.layout.comm, count)

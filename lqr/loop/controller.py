@@ -1,0 +1,307 @@
+"""The controller that a robot runs: a few numbers in, the hand load out, a thousand times a second."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.errors import agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.gain import Gain, PlantState
+from softgrasp.lqr.loop.small_plant import SmallPlant
+
+FORMAT = 1
+
+
+def layout_hash(layout: BlockLayout) -> str:
+    """SHA-256 of sizes, reference point and all free nodes in sorted order: the same on any rank count. Collective."""
+    order, nodes = _order(layout)
+    text = None
+    if nodes is not None and order is not None:
+        digest = hashlib.sha256(json.dumps([layout.dimension, layout.n_s, layout.n_e]).encode())
+        scale = float(np.abs(nodes).max(initial=0.0)) or 1.0
+        # rounded, so that the last bits of another mesh generator do not count; + 0.0 turns -0 into 0
+        digest.update((np.round(np.vstack([layout.reference, nodes[order]]) / scale, 9) + 0.0).tobytes())
+        text = digest.hexdigest()
+    return str(layout.comm.bcast(text))
+
+
+def _order(layout: BlockLayout) -> tuple[np.ndarray | None, Array | None]:
+    """Permutation that sorts the free nodes by coordinates, and the nodes, on rank 0. Collective."""
+    parts = layout.comm.gather(np.array(layout.nodes))
+    if parts is None:
+        return None, None
+    nodes = np.concatenate(parts)
+    scale = float(np.abs(nodes).max(initial=0.0)) or 1.0
+    return np.lexsort(np.round(nodes / scale, 9).T[::-1]), nodes
+
+
+@dataclass
+class Controller:
+    """u = clip(u_bar + K (x - x_bar)) for x = [q_s, v_s, eta, eta'], with eta = W'z a few numbers of the tissue.
+
+    A robot measures its hand, not the tissue. ``step`` therefore carries eta itself, without an observer: the tissue
+    hangs on the hand, so the measured hand motion drives the model's tissue by the midpoint rule,
+
+        M eta'' + D eta' + K eta = -G (a - g) [- alpha G v],   a = (v_k - v_{k-1}) / period,
+
+    ([...] where damping drags in space), and what is wrong at the start decays with the tissue's own damping. Nothing
+    here talks to MPI or PETSc.
+
+    Attributes:
+        K: (n_s, N).
+        x_bar: state at the target, (N,).
+        u_bar: steady input [N, N m], (n_s,).
+        plant: the reduced plant that K was made for.
+        period: time between two steps [s].
+        limits: bounds on |u| [N, N m], (n_s,), inf for none.
+        scene_hash, layout_hash: of the scene and the mesh it was made for.
+        about: free text: method, weights, output names.
+
+    Raises:
+        ControlError: a shape is wrong, the plant does not begin with the hand, or the period is not positive.
+    """
+
+    K: Array
+    x_bar: Array
+    u_bar: Array
+    plant: SmallPlant
+    period: float = 1e-3
+    limits: Array | None = None
+    scene_hash: str = ""
+    layout_hash: str = ""
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n_s, N = self.plant.B.shape[1], self.plant.N
+        shapes = {"K": (n_s, N), "x_bar": (N,), "u_bar": (n_s,), "limits": (n_s,)}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is not None and (value.shape != shape or (name != "limits" and not np.isfinite(value).all())):
+                raise ControlError(f"{name} of the controller must be finite and of shape {shape}, not {value.shape}")
+        one = np.eye(N)
+        if not (np.array_equal(self.plant.S_q, one[:n_s]) and np.array_equal(self.plant.S_v, one[n_s : 2 * n_s])):
+            raise ControlError(
+                "the plant of a controller must begin with q_s and v_s; make it with softgrasp.lqr.loop.small_plant.project"
+            )
+        if not self.period > 0:
+            raise ControlError(f"period = {self.period} s of the controller must be positive")
+        self._offset = self.u_bar - self.K @ self.x_bar
+        self._lower = np.full(n_s, -np.inf) if self.limits is None else -self.limits
+        self._upper = -self._lower
+        self._model = _tissue_step(self.plant, self.period)
+        self.reset()
+
+    @property
+    def n_s(self) -> int:
+        """Degrees of freedom of the hand."""
+        return int(self.plant.B.shape[1])
+
+    def reset(self, tissue: Array | None = None) -> None:
+        """Forget the past; the tissue starts at [eta, eta'] or, by default, hangs still. Not collective."""
+        n_s = self.n_s
+        still = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else np.array(tissue, dtype=float)
+        self._x = np.zeros(self.plant.N)
+        self._x[2 * n_s :] = still
+        self._fresh = True
+
+    def command(self, x: Array) -> Array:
+        """The load for a known reduced state x (N,). Not collective."""
+        u = self.K @ x
+        u += self._offset
+        return np.minimum(np.maximum(u, self._lower), self._upper)
+
+    def step(self, q_s: Array, v_s: Array) -> Array:
+        """One tick: take the measured hand, carry the tissue on, return the load [N, N m]. Not collective."""
+        n_s, x = self.n_s, self._x
+        step, accelerated, dragged, constant = self._model
+        if not self._fresh:
+            old = x[n_s : 2 * n_s]
+            tissue = step @ x[2 * n_s :]
+            tissue += accelerated @ (v_s - old)
+            if dragged is not None:
+                tissue += dragged @ (v_s + old)
+            x[2 * n_s :] = tissue + constant
+        self._fresh = False
+        x[:n_s], x[n_s : 2 * n_s] = q_s, v_s
+        return self.command(x)
+
+    @property
+    def tissue(self) -> Array:
+        """[eta, eta'] that the controller carries."""
+        return self._x[2 * self.n_s :].copy()
+
+    def towards(self, q_bar: Array) -> Controller:
+        """The same gain with another target of the hand. Not collective.
+
+        Raises:
+            ControlError: the plant has no state of rest there.
+        """
+        x_bar, u_bar = self.plant.rest_at(q_bar)
+        return replace(self, x_bar=x_bar, u_bar=u_bar)
+
+    def save(self, path: Path) -> Path:
+        """Write everything into one .npz file. Not collective: call it on one rank.
+
+        Raises:
+            ControlError: the file cannot be written.
+        """
+        meta = {
+            "format": FORMAT,
+            "period": self.period,
+            "scene_hash": self.scene_hash,
+            "layout_hash": self.layout_hash,
+            "names": list(self.plant.names),
+            "about": self.about,
+        }
+        arrays = {f"plant_{key}": getattr(self.plant, key) for key in ("E", "A", "B", "C", "f", "S_q", "S_v")}
+        arrays |= {"K": self.K, "x_bar": self.x_bar, "u_bar": self.u_bar}
+        if self.limits is not None:
+            arrays["limits"] = self.limits
+        return write_npz(path, meta, arrays)
+
+    @classmethod
+    def load(cls, path: Path, scene_hash: str | None = None, layout_hash: str | None = None) -> Controller:
+        """Read a file of :meth:`save`. Not collective.
+
+        Args:
+            path: the file.
+            scene_hash, layout_hash: refuse a controller that was made for another scene or mesh.
+
+        Raises:
+            ControlError: the file is missing, damaged, or made for something else.
+        """
+        meta, arrays = read_npz(path, {"scene_hash": scene_hash, "layout_hash": layout_hash})
+        try:
+            small = {key: arrays[f"plant_{key}"] for key in ("E", "A", "B", "C", "f", "S_q", "S_v")}
+            return cls(
+                arrays["K"],
+                arrays["x_bar"],
+                arrays["u_bar"],
+                SmallPlant(**small, names=tuple(meta["names"])),
+                meta["period"],
+                arrays.get("limits"),
+                meta["scene_hash"],
+                meta["layout_hash"],
+                meta["about"],
+            )
+        except KeyError as error:
+            raise ControlError(f"{path} holds no controller ({error} is missing); save it again") from error
+
+
+def _tissue_step(plant: SmallPlant, period: float) -> tuple[Array, Array, Array | None, Array]:
+    """Midpoint rule of the tissue rows of the plant for a hand whose velocity is known.
+
+    y_{k+1} = step y_k + accelerated (v_{k+1} - v_k) [+ dragged (v_{k+1} + v_k)] + constant
+    """
+    n_s = plant.B.shape[1]
+    e, v = slice(2 * n_s, None), slice(n_s, 2 * n_s)
+    left, right = plant.E[e, e] - period / 2 * plant.A[e, e], plant.E[e, e] + period / 2 * plant.A[e, e]
+    columns = np.hstack([right, -plant.E[e, v], period / 2 * plant.A[e, v], period * plant.f[e, None]])
+    k = len(left)
+    solved = np.ascontiguousarray(np.linalg.solve(left, columns))
+    step, accelerated, dragged, constant = np.split(solved, [k, k + n_s, k + 2 * n_s], axis=1)
+    parts = [np.ascontiguousarray(a) for a in (step, accelerated, dragged)]
+    return parts[0], parts[1], parts[2] if plant.A[e, v].any() else None, constant[:, 0].copy()
+
+
+def save_gain(path: Path, gain: Gain, target: PlantState, layout: BlockLayout, scene_hash: str) -> Path:
+    """Write a full-order gain and its target into one .npz file, rows in the order of the nodes. Collective.
+
+    Raises:
+        ControlError: the file cannot be written.
+    """
+    order, nodes = _order(layout)
+    tall = np.column_stack([gain.K_z, gain.K_v, target.z, target.v_z])
+    parts = layout.comm.gather(tall)
+    meta = {"format": FORMAT, "scene_hash": scene_hash, "layout_hash": layout_hash(layout)}
+    with agree(layout.comm):
+        if parts is not None and order is not None and nodes is not None:
+            arrays = {"K_s": gain.K_s, "q_s": target.q_s, "v_s": target.v_s}
+            arrays["tissue"] = np.concatenate(parts)[_dofs(order, layout.dimension)]
+            write_npz(path, meta, arrays)
+    return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+
+
+def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) -> tuple[Gain, PlantState]:
+    """Read a file of :func:`save_gain` on any number of ranks; gain and target. Collective.
+
+    Raises:
+        ControlError: the file is missing or damaged, or belongs to another mesh (or scene).
+    """
+    order, nodes = _order(layout)
+    wanted = {"layout_hash": layout_hash(layout), "scene_hash": scene_hash}
+    answer: tuple[Array, Array, Array, Array] | None = None
+    with agree(layout.comm):
+        if order is not None and nodes is not None:
+            _, arrays = read_npz(path, wanted)
+            try:
+                rows = np.empty_like(arrays["tissue"])
+                rows[_dofs(order, layout.dimension)] = arrays["tissue"]
+                answer = (arrays["K_s"], arrays["q_s"], arrays["v_s"], rows)
+            except (KeyError, IndexError, ValueError) as error:
+                raise ControlError(f"{path} holds no full-order gain ({error}); save it again") from error
+    # each rank is sent its own rows; the whole block stays on rank 0
+    ranges = layout.comm.gather((layout.start, layout.start + layout.n_local))
+    pieces = None
+    if ranges is not None and answer is not None:
+        pieces = [(*answer[:3], np.array(answer[3][a:b])) for a, b in ranges]
+    K_s, q_s, v_s, rows = layout.comm.scatter(pieces)
+    n_s = layout.n_s
+    K_z, K_v = np.asfortranarray(rows[:, :n_s]), np.asfortranarray(rows[:, n_s : 2 * n_s])
+    return Gain(K_s, K_z, K_v), PlantState(q_s, v_s, rows[:, -2].copy(), rows[:, -1].copy())
+
+
+def _dofs(order: np.ndarray, d: int) -> np.ndarray:
+    return np.asarray((order[:, None] * d + np.arange(d)).ravel())
+
+
+def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Path:
+    """Write arrays and their description; a torn file never replaces a good one. Not collective.
+
+    Raises:
+        ControlError: the folder cannot be written.
+    """
+    path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+    fresh = path.with_name("new-" + path.name)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with fresh.open("wb") as file:
+            np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+        fresh.replace(path)
+    except OSError as error:
+        raise ControlError(f"{path} cannot be written ({error}); free the disk or choose another folder") from error
+    return path
+
+
+def read_npz(path: Path, wanted: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Read a file of :func:`write_npz` and check what it was made for. Not collective.
+
+    Raises:
+        ControlError: the file is missing or damaged, or a hash differs.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            meta: dict[str, Any] = json.loads(str(file["meta"]))
+            arrays = {key: np.asarray(file[key]) for key in file.files if key != "meta"}
+    except FileNotFoundError:
+        raise ControlError(f"{path} does not exist; save the controller first") from None
+    except Exception as error:  # zip, json and numpy have errors of their own for damaged files
+        raise ControlError(f"{path} is damaged or no controller ({error}); save it again") from error
+    if meta.get("format") != FORMAT:
+        raise ControlError(f"{path} has the format {meta.get('format')}, this version reads {FORMAT}; save it again")
+    kinds = {"layout_hash": "mesh or hand", "scene_hash": "scene"}
+    for key, value in wanted.items():
+        if value is not None and meta.get(key) != value:
+            raise ControlError(
+                f"{path} was made for another {kinds[key]} ({key} {str(meta.get(key))[:12]}..., here {value[:12]}...); "
+                "design the controller again for this one"
+            )
+    return meta, arrays

@@ -1,0 +1,46 @@
+"""What a run costs, and what the Riccati equation says it costs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.lowrank.compress import gram
+from softgrasp.lqr.plant.coordinates import factor_of
+from softgrasp.lqr.plant.gain import PlantState
+from softgrasp.lqr.plant.operators import descriptor
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+
+
+def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: float) -> Array:
+    """J(t_n) = sum_k dt (y_mid' Q y_mid + u_k' R u_k), the midpoint quadrature of the run's own step.
+
+    With u = K x_mid and X from the Riccati equation every step satisfies, exactly and for every dt,
+
+        V(x_{n+1}) - V(x_n) = -(J(t_{n+1}) - J(t_n)),    V(x) = x'E'XE x,
+
+    because the midpoint rule keeps quadratic balances [HLW06]; so J(T) + V(x(T)) = V(x(0)) up to the residual of X.
+    Input that is sampled and held costs more: by the integral of |u - K x|^2 weighted with R, second order in the
+    length of the tick. Not collective.
+
+    Args:
+        outputs: y - y_bar at the grid points [m], (steps + 1, p).
+        inputs: u - u_bar of each step [N, N m], (steps, n_s).
+        Q: (p, p).
+        R: (n_s, n_s).
+        dt: step [s].
+
+    Returns:
+        J at the grid points, (steps + 1,), J[0] = 0.
+    """
+    y = (outputs[1:] + outputs[:-1]) / 2
+    rate = np.einsum("ki,ij,kj->k", y, Q, y, optimize=True) + np.einsum("ki,ij,kj->k", inputs, R, inputs, optimize=True)
+    return np.concatenate([[0.0], dt * np.cumsum(rate)])
+
+
+def predicted_cost(problem: RiccatiProblem, solution: RiccatiSolution, error: PlantState) -> float:
+    """V = e'E'XE e = |Z'E e|^2 for e = x - x_bar: the cost from here to infinity. Collective."""
+    hand, tall = np.concatenate([error.q_s, error.v_s]), np.concatenate([error.z, error.v_z])
+    moved = descriptor(problem, Block(hand[:, None], tall[:, None]))
+    return float(np.sum(gram(problem.layout.comm, factor_of(solution), moved) ** 2))

@@ -1,0 +1,269 @@
+"""The full-order plant under feedback, run by PETSc TS with the midpoint step of the forward run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.snapshots import Snapshots, make_store
+from softgrasp.fem.solve.solvers import Reproducible, choose_solver
+from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.lqr.loop.actuation import Actuation
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.loop.cost import accumulated_cost
+from softgrasp.lqr.loop.drive import Drive, HeldDrive, ImplicitDrive, PlantStep
+from softgrasp.lqr.plant.gain import Gain, PlantState
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.plant.target import Target, rest
+
+CHUNKS = 50  # segments of a run without frames: progress, and the check that the numbers are finite
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """What to keep of a run and whom to tell.
+
+    Attributes:
+        snapshots: where states go.
+        every: a snapshot every so many steps.
+        directory: where streamed snapshots go.
+        frames: steps at which ``frame`` is called.
+        frame: observer with ``run.state``, ``run.drive.q``, ``run.drive.v``, ``run.reached`` and ``run.dt``, the same
+            as in a forward run.
+        progress: called between segments, with ``run.reached`` and ``run.steps``.
+    """
+
+    snapshots: Literal["none", "memory", "hdf5"] = "none"
+    every: int = 1
+    directory: Path = Path("out")
+    frames: Sequence[int] = ()
+    frame: Callable[[Any], None] | None = None
+    progress: Callable[[Any], None] | None = None
+
+
+@dataclass(frozen=True)
+class LoopTrajectory:
+    """What a closed-loop run returns; small arrays are on every rank.
+
+    Attributes:
+        times: grid [s], (steps + 1,).
+        q_s, v_s: hand, (steps + 1, n_s).
+        inputs: u of each step [N, N m], (steps, n_s).
+        outputs: y = C_s q_s + C_z' z [m, rad], (steps + 1, p).
+        outputs_rigid: C_s q_s, the same without deformation, (steps + 1, p).
+        output_names: one per component.
+        cost: J up to each grid point, (steps + 1,).
+        final: the state at the end.
+        snapshots: stored states, or None.
+        saturated: share of the steps in which an input sat at its limit.
+        residuals: relative residual of the first and the last solve.
+        solver: name and reason.
+        seconds: factor (with the responses) and steps; the slowest rank.
+    """
+
+    times: Array
+    q_s: Array
+    v_s: Array
+    inputs: Array
+    outputs: Array
+    outputs_rigid: Array
+    output_names: tuple[str, ...]
+    cost: Array
+    final: PlantState
+    snapshots: Snapshots | None
+    saturated: float
+    residuals: tuple[float, float]
+    solver: tuple[str, str]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class ClosedLoop:
+    """E x' = A x + B u + F g under u = u_bar + K (x - x_bar), in hand-relative coordinates.
+
+    The step matrix is factored once, here; gains, targets and actuation change from run to run.
+
+    Args:
+        problem: plant, outputs and weights.
+        dt: time step [s].
+        solver: cholesky, mumps, cg or auto.
+        rtol: tolerance of cg.
+        reproducible: see :func:`fem.solve.solvers.factor_on_every_rank`.
+
+    Raises:
+        ControlError: dt is not a positive number.
+        SolverError: the factorisation fails.
+    """
+
+    def __init__(
+        self,
+        problem: RiccatiProblem,
+        dt: float,
+        solver: str = "auto",
+        rtol: float = 1e-10,
+        reproducible: Reproducible = "auto",
+    ) -> None:
+        if not (np.isfinite(dt) and dt > 0):
+            raise ControlError(f"dt = {dt} s must be a positive number")
+        self.problem, self.dt = problem, dt
+        self.solver = choose_solver(problem.layout, solver)
+        begin = time.perf_counter()
+        self.midpoint = TissueMidpoint(problem.system, dt, self.solver[0], rtol, reproducible)
+        self.solver = self.solver[0], self.solver[1] + self.midpoint.solver.remark
+        try:
+            self.plant = PlantStep(problem.system, self.midpoint)
+        except Exception:
+            self.midpoint.destroy()
+            raise
+        self.factor_seconds = problem.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+
+    def run(
+        self,
+        gain: Gain,
+        target: Target,
+        steps: int,
+        actuation: Actuation | None = None,
+        start: PlantState | None = None,
+        options: LoopOptions | None = None,
+    ) -> LoopTrajectory:
+        """Run from ``start`` (default: at rest at 0, in equilibrium under gravity) for some steps. Collective.
+
+        Raises:
+            ControlError: the actuation does not fit, or the implicit input of a step is singular.
+            SolverError: a solve failed, or the loop diverged; the message names the time.
+        """
+        actuation, options = actuation or Actuation(), options or LoopOptions()
+        bound = actuation.bound(self.problem.layout.n_s)
+        held = actuation.ticks(self.dt) > 0
+        start = start or rest(self.problem.system)
+        drive: Drive = (
+            HeldDrive(self.plant, gain, target, actuation, steps)
+            if held
+            else ImplicitDrive(self.plant, gain, target, bound, steps)
+        )
+        run = LoopRun(self, drive, start, steps, options)
+        run.execute()
+        return run.trajectory(target, bound)
+
+    def destroy(self) -> None:
+        """Free all PETSc objects. Collective."""
+        self.midpoint.destroy()
+
+
+class LoopRun(Stepped):
+    """One closed-loop run in progress: the TS context, with the fields that observers of a forward run read.
+
+    Args:
+        loop: factor and plant.
+        drive: feedback law.
+        start: state at t = 0.
+        steps: number of steps.
+        options: what to keep.
+    """
+
+    def __init__(self, loop: ClosedLoop, drive: Drive, start: PlantState, steps: int, options: LoopOptions) -> None:
+        if steps < 1:
+            raise ControlError(f"steps = {steps} must be at least 1")
+        problem = loop.problem
+        store = make_store(problem.system, options.snapshots, steps, options.every, options.directory, False)
+        super().__init__(problem.layout, loop.dt, steps, loop.midpoint, store, loop.solver)
+        self.loop, self.problem, self.drive, self.options = loop, problem, drive, options
+        n = problem.layout.n_local
+        self.state.z.array_w[:] = start.z
+        self.state.v.array_w[:] = start.v_z
+        drive.q[0], drive.v[0] = start.q_s, start.v_s
+        self.rows = np.flatnonzero(problem.C_z.any(axis=1)) if n else np.zeros(0, dtype=int)
+        self.C_rows = np.ascontiguousarray(problem.C_z[self.rows].T)
+        self.seen = np.zeros((steps + 1, len(self.rows)))
+        self.residual_first = self.residual_last = 0.0
+        self.midpoint.dissipated = 0.0
+        self.midpoint.start(self.state)
+        self.record(0)
+
+    def solve_step(self, n: int) -> None:
+        """Feedback and one solve. Collective."""
+        self.drive.solve(n, self.state)
+
+    def record(self, n: int) -> None:
+        """Keep the entries of z that this rank gives to the outputs. Not collective."""
+        if len(self.rows):
+            self.seen[n] = self.state.array[self.rows]
+
+    def execute(self) -> None:
+        """Let TS run to the last step, in segments. Collective.
+
+        Raises:
+            SolverError: a solve failed or the state is no longer finite.
+        """
+        frames = {int(n) for n in self.options.frames} if self.options.frame is not None else set()
+        ends = set(np.linspace(0, self.steps, min(CHUNKS, self.steps) + 1).round().astype(int).tolist())
+        boundaries = sorted(n for n in ends | frames | {1} if 0 < n <= self.steps)
+        ts = make_ts(self)
+        try:
+            if self.options.frame is not None and 0 in frames:
+                self.options.frame(self)
+            for end in boundaries:
+                while self.reached < end:
+                    goal = min(end, self.store.limit(self.reached))
+                    if goal in (1, self.steps):
+                        self.residual_last = self.check_step(ts, goal)
+                    else:
+                        self.advance_to(ts, goal)
+                    self.store.flush(self.reached)
+                    if goal == 1:
+                        self.residual_first = self.residual_last
+                self._check_finite()
+                if self.options.frame is not None and end in frames:
+                    self.options.frame(self)
+                if self.options.progress is not None:
+                    self.options.progress(self)
+        finally:
+            ts.destroy()
+
+    def _check_finite(self) -> None:
+        n = self.reached
+        # far above any state of use, far below overflow of the squares in cost and energy
+        size = max(float(np.abs(self.drive.q[n]).max()), float(np.abs(self.state.array).max(initial=0.0)))
+        fine = bool(np.isfinite(size)) and size < 1e100
+        if not self.problem.layout.comm.allreduce(fine, MPI.LAND):
+            raise SolverError(
+                f"the closed loop diverged before t = {n * self.dt:.6g} s; this gain does not stabilise the plant "
+                "at this rate, delay and limit"
+            )
+
+    def trajectory(self, target: Target, bound: Array | None) -> LoopTrajectory:
+        """Gather the small results; the tissue stays distributed. Collective."""
+        problem, drive = self.problem, self.drive
+        comm, n = problem.layout.comm, problem.layout.n_local
+        rigid = drive.q @ problem.C_s.T
+        outputs = rigid + total(comm, self.seen @ self.C_rows.T)
+        cost = accumulated_cost(outputs - target.y, drive.u - target.u, problem.Q, problem.R, self.dt)
+        times = np.asarray(self.dt * np.arange(self.steps + 1), dtype=np.float64)
+        saturated = 0.0
+        if bound is not None:
+            saturated = float((np.abs(drive.u) >= bound).any(axis=1).mean())
+        array = self.state.array
+        return LoopTrajectory(
+            times=times,
+            q_s=drive.q,
+            v_s=drive.v,
+            inputs=drive.u,
+            outputs=outputs,
+            outputs_rigid=rigid,
+            output_names=problem.names,
+            cost=cost,
+            final=PlantState(drive.q[-1].copy(), drive.v[-1].copy(), array[:n].copy(), array[n:].copy()),
+            snapshots=self.store.finish(times, drive.q, drive.v),
+            saturated=saturated,
+            residuals=(self.residual_first, self.residual_last),
+            solver=self.solver,
+            seconds={"factor": self.loop.factor_seconds, "steps": comm.allreduce(self.seconds, MPI.MAX)},
+        )

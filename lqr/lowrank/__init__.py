@@ -1,0 +1,1 @@
+"""Riccati equations of large plants, low rank."""

@@ -1,0 +1,268 @@
+"""Structured Galerkin: the Riccati equation on a small second-order space of modes, static and frequency responses."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array, total
+from softgrasp.lqr.lowrank.adi import Progress
+from softgrasp.lqr.lowrank.solution import Outcome, make_solution
+from softgrasp.lqr.lowrank.modal_start import MODES, SmallPlant, SmallSolution, check_damped, plant_modes, project, solve_small
+from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
+from softgrasp.lqr.lowrank.shifts import shift_range
+from softgrasp.reduction.engines import on_root
+
+NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
+ROUNDING = 1e-13  # of a Gram matrix: columns independent to 3e-7
+BUDGET = 0.45  # share of omega at which a response's damping ratio is held below critical
+
+
+@dataclass
+class Space:
+    """A displacement basis with its products, grown by blocks of columns.
+
+    Attributes:
+        V, M_V, K_V: local rows (n_local, r).
+    """
+
+    V: Array
+    M_V: Array
+    K_V: Array
+
+    def grown(self, plant: Plant, columns: Array) -> Space:
+        """With the parts of more columns that are new: M-orthogonal to V, which is M-orthonormal. Collective."""
+        comm, size = plant.comm, _m_norms(plant, columns)
+        columns = columns / np.where(size > 0, size, 1.0)
+        M_columns = columns
+        for _ in range(2):  # a small part is orthogonal to rounding only after it is scaled to 1
+            for _ in range(2):  # twice is enough for orthogonality to rounding
+                columns = columns - self.V @ total(comm, self.M_V.T @ columns)
+            M_columns = plant.mass(columns)
+            gram = total(comm, columns.T @ M_columns)
+            S: Array = on_root(comm, partial(_normalising, gram))
+            columns, M_columns = columns @ S, M_columns @ S
+        more = (columns, M_columns, plant.stiff(columns))
+        return Space(*(np.hstack([a, b]) for a, b in zip((self.V, self.M_V, self.K_V), more, strict=True)))
+
+    def ritz(self, plant: Plant) -> tuple[Space, Array, Array]:
+        """M-orthonormal Ritz basis V'M V = I, V'K V = diag(omega^2), omega, and S with new basis = V S. Collective."""
+        r = self.V.shape[1]
+        products = total(plant.comm, self.V.T @ np.hstack([self.M_V, self.K_V]))
+
+        def rotate() -> tuple[Array, Array]:
+            G, H = ((P + P.T) / 2 for P in (products[:, :r], products[:, r:]))
+            squares, rotation = scipy.linalg.eigh(H, G)
+            return np.sqrt(squares), rotation
+
+        omega, S = on_root(plant.comm, rotate)
+        return Space(self.V @ S, self.M_V @ S, self.K_V @ S), omega, S
+
+
+@dataclass(frozen=True)
+class Level:
+    """One Galerkin space with its solution.
+
+    Attributes:
+        small: the projected plant.
+        solution: its Riccati equation.
+        Z: X ~ Z Z', costate form.
+        a, b: tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m).
+        gain: K', z-row as it stands.
+    """
+
+    small: SmallPlant
+    solution: SmallSolution
+    Z: Block
+    a: Array
+    b: Array
+    gain: Block
+
+
+def _normalising(gram: Array) -> Array:
+    """S with S'gram S = I on the part of gram that is not rounding. Not collective."""
+    sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
+    keep = sizes > max(NEW**2, ROUNDING * float(sizes.max(initial=0.0)))
+    return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
+
+
+def _m_norms(plant: Plant, columns: Array) -> Array:
+    return np.sqrt(total(plant.comm, np.einsum("ij,ij->j", columns, plant.mass(columns))))
+
+
+def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
+    """X of a level in the basis of the next: V_old = V_new T, T the columns of S^{-1} that the old basis filled.
+
+    Not collective.
+    """
+    s, r = 2 * plant.n_s, old.small.order
+    T = np.linalg.inv(S)[:, :r]
+    W = np.zeros((s + 2 * len(omega), s + 2 * r))
+    W[:s, :s] = np.eye(s)
+    W[s : s + len(omega), s : s + r] = omega[:, None] * T / old.small.omega
+    W[s + len(omega) :, s + r :] = T
+    return np.asarray(W @ old.solution.X @ W.T)
+
+
+def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[Level, Space]:
+    """Project, solve and lift: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
+
+    Args:
+        plant: the plant.
+        space: the Ritz basis of ``old`` and more.
+        old: the level before, near the solution.
+    """
+    ritz, omega, S = space.ritz(plant)
+    small = project(plant, ritz.V, omega, ritz.M_V)
+    solution = solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
+    values, vectors = np.linalg.eigh(solution.X)
+    keep = values > 1e-17 * values[-1]
+    root = vectors[:, keep] * np.sqrt(values[keep])
+    s, r = 2 * plant.n_s, len(omega)
+    q, v = root[s : s + r] / omega[:, None], root[s + r :]
+    Z = Block(root[:s], np.vstack([ritz.V @ q, ritz.V @ v]))
+    small_gain = plant.felt(Z)
+    a, b = ritz.V @ (q @ small_gain), ritz.V @ (v @ small_gain)
+    hand = np.vstack([root[: plant.n_s], plant.M_s @ root[plant.n_s : s]]) @ small_gain
+    hand[plant.n_s :] += total(plant.comm, plant.G.T @ b)
+    tall = np.vstack([ritz.K_V @ (q @ small_gain), ritz.M_V @ (v @ small_gain)])
+    if plant.two_way:
+        tall[plant.n_local :] += plant.G @ (root[plant.n_s : s] @ small_gain)
+    return Level(small, solution, Z, a, b, Block(hand, tall)), ritz
+
+
+def gain_change(plant: Plant, new: Level, old: Level) -> float:
+    """Relative change of the gain, the larger of hand (2-norm) and tissue (dual energy norm). Collective."""
+    comm = plant.comm
+
+    def tissue(a: Array, b: Array) -> float:
+        return float(np.sqrt(total(comm, np.array([np.sum(a * plant.stiff(a)) + np.sum(b * plant.mass(b))]))[0]))
+
+    hand = 0.0
+    if plant.n_s:
+        hand = float(np.linalg.norm(new.gain.hand - old.gain.hand) / np.linalg.norm(new.gain.hand))
+    size = tissue(new.a, new.b)
+    change = max(hand, tissue(new.a - old.a, new.b - old.b) / size if size > 0 else 0.0)
+    return float(comm.bcast(change))  # the same bits on every rank: they decide when all stop
+
+
+def frequencies(low: float, high: float, count: int) -> Array:
+    """Points that fill [low, high] on a log scale evenly at every stage (van der Corput). Not collective."""
+    position = []
+    for i in range(count):
+        x, share, k = 0.0, 0.5, i + 1
+        while k:
+            x, share, k = x + share * (k & 1), share / 2, k >> 1
+        position.append(x)
+    return np.asarray(low * (high / low) ** np.array(position))
+
+
+@dataclass(frozen=True)
+class StructuredGalerkin:
+    """Solve the Riccati equation on z = V eta, v_z = V eta' with V of modes and responses to the outputs.
+
+    V starts with the lowest modes and K_ee^{-1} C_z and grows by S(p)^{-1} C_z (one complex solve each) at
+    frequencies between the last mode and the highest one, until the gain changes by less than the tolerance between
+    two spaces. The small problem keeps the second-order form and the energy, so it is stable whenever the tissue is
+    damped. The residual of such a solution is large although the gain is right; it is reported, not judged.
+
+    Attributes:
+        tol: bound on the relative change of the gain between the last two spaces, see :func:`gain_change`.
+        max_iterations: bound on the number of spaces.
+        modes: number of modes.
+        per_step: responses added at a time.
+        tissue: gathered, distributed or auto, see :mod:`lqr.lowrank.shifted`.
+        progress: called on every rank after each space with the history entry.
+    """
+
+    tol: float = 1e-6
+    max_iterations: int = 24
+    modes: int = MODES
+    per_step: int = 2
+    tissue: str = "auto"
+    progress: Progress | None = None
+
+    def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
+        """Grow the space until the gain settles. Collective. The problem is not changed.
+
+        Raises:
+            ControlError: weights or data are refused, no damping, not stabilisable or not detectable.
+            SolverError: the gain has not settled within the bound.
+        """
+        begin = time.perf_counter()
+        plant = Plant(problem)
+        check_damped(plant)
+        omega, Phi = plant_modes(plant, min(self.modes, plant.layout.n_e))
+        space = Space(Phi, plant.mass(Phi), plant.stiff(Phi))
+        seconds = {"start": time.perf_counter() - begin}
+        history: list[dict[str, float]] = []
+        tissue = make_shifted(plant.system, self.tissue)
+        try:
+            level, solves = self._grow(plant, tissue, space, (float(omega[0]), float(omega[-1])), history)
+            counts = {"newton_steps": 0, "adi_steps": 0, "solves": solves, "factorisations": tissue.factors}
+            counts |= {"basis": level.small.order, "spaces": len(history) + 1}
+            seconds |= tissue.seconds
+        finally:
+            tissue.destroy()
+        reason = f"galerkin: {level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
+        outcome = Outcome(level.Z, level.gain, reason, 1e-10, history, counts, seconds, lean=True)
+        result = make_solution(plant, outcome, check=False)
+        result.seconds["total"] = time.perf_counter() - begin
+        return result
+
+    def _grow(
+        self,
+        plant: Plant,
+        tissue: ShiftedTissue,
+        space: Space,
+        span: tuple[float, float],
+        history: list[dict[str, float]],
+    ) -> tuple[Level, int]:
+        """Spaces one after the other; returns the last level and the number of solves."""
+        first, low = span
+        limits = shift_range(plant, [])
+        count = self.per_step * self.max_iterations
+        if plant.viscous is not None:
+            low = first  # the modes do not decouple, so the responses have to cover their range too
+        wanted = frequencies(low, max(limits.fastest, 2 * low), count).tolist()
+        # two-way the reaction of the hand loads the tissue as well
+        loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
+        level, space = solve_level(plant, space)
+        change, used = np.inf, 0
+        for i in range(self.max_iterations):
+            # the static response first; shift number k + 1 belongs to frequency number k
+            take = [0j] if i == 0 else [_response_shift(plant, w) for w in wanted[used - 1 :][: self.per_step]]
+            for j, p in enumerate(take):
+                response = tissue.solve(p, loads, take[j + 1 :])
+                parts = [response.real] if p.imag == 0 else [response.real, response.imag]
+                space = space.grown(plant, np.hstack(parts))
+            used += len(take)
+            if space.V.shape[1] < level.small.order + len(take):  # nothing new: no evidence either
+                continue
+            new, space = solve_level(plant, space, level)
+            change, level = gain_change(plant, new, level), new
+            entry = {"basis": float(new.small.order), "solve": float(used), "change": change}
+            history.append(entry)
+            if self.progress is not None:
+                self.progress(entry)
+            if change <= self.tol:
+                return level, used
+        raise SolverError(
+            f"galerkin: the gain still changes by {change:.1e} at {level.small.order} basis vectors, tolerance "
+            f"{self.tol:.0e}; allow more iterations, or use newton_adi"
+        )
+
+
+def _response_shift(plant: Plant, omega: float) -> complex:
+    """Shift on the circle |p| = omega at the damping ratio of a mode there, at most :data:`BUDGET`."""
+    damping = plant.system.damping
+    beta = max([damping.beta, *(m.beta for m in plant.system.materials)])
+    zeta = min(max((damping.alpha / omega + beta * omega) / 2, 1e-3), BUDGET)
+    return complex(-zeta * omega, omega * np.sqrt(1 - zeta * zeta))

@@ -1,0 +1,267 @@
+"""Start of the low-rank solvers: the Riccati equation of the hand and the lowest modes, lifted by the modal filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.system import BlockSystem
+from softgrasp.lqr.dense.care import care, lyapunov, riccati_residual
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.dense.modal import StateSpace, assemble_space
+from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.dense.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
+from softgrasp.reduction.engines import on_root
+
+MODES = 30
+MORE_MODES = 60  # when the last of MODES is still lightly damped
+LIGHT = 0.02  # damping ratio below which it is
+FEW_MODES = 8  # whose Riccati equation starts Newton's method for all of them, from twice as many on
+CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost as much as a Schur form
+
+
+@dataclass(frozen=True)
+class SmallPlant:
+    """Galerkin projection of the plant on a displacement basis, z = V eta, in xi = [q_s, v_s, omega eta, eta'].
+
+    Attributes:
+        V: local rows of the basis, (n_local, r).
+        omega: frequencies of the basis vectors, V' K_ee V = diag(omega^2), (r,).
+        space: E, A, B, C of xi.
+    """
+
+    V: Array
+    omega: Array
+    space: StateSpace
+
+    @property
+    def order(self) -> int:
+        """Number of basis vectors."""
+        return len(self.omega)
+
+
+@dataclass(frozen=True)
+class SmallSolution:
+    """X of the small equation, the gain K = B'XE (weights folded in) and the closed loop.
+
+    Attributes:
+        X: (N, N) for E = E of the small plant.
+        gain: (m, N), acting on xi.
+    """
+
+    X: Array
+    gain: Array
+
+
+@dataclass(frozen=True)
+class ModalStart:
+    """Gain and shifts of the modal problem.
+
+    Attributes:
+        small: the plant on the modes.
+        solution: its Riccati equation.
+        gain: K', local rows, z-row as it stands.
+        poles: its closed-loop poles, most important first, one of each pair, Im >= 0.
+    """
+
+    small: SmallPlant
+    solution: SmallSolution
+    gain: Block
+    poles: np.ndarray
+
+
+class _MovedMass:
+    """M_ee - G M_s^{-1} G': inertia of the tissue when the hand gives way (two-way coupling)."""
+
+    def __init__(self, system: BlockSystem, M_s: Array) -> None:
+        self.M, self.G, self.comm = system.M_ee, system.G, system.layout.comm
+        self.M_s = M_s
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.M.mult(x, y)
+        y.array_w[:] -= self.G @ np.linalg.solve(self.M_s, total(self.comm, self.G.T @ x.array_r))
+
+    multTranspose = mult  # noqa: N815  (name of PETSc)
+
+
+def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
+    """Frequencies and modes of the coupled free motion: clamped one-way, with the hand floating two-way. Collective."""
+    system = plant.system
+    if k == 0:
+        return np.zeros(0), np.zeros((plant.n_local, 0))
+    if not plant.two_way:
+        return lowest_modes(system, k)
+    sizes = system.M_ee.getSizes()
+    shell = PETSc.Mat().createPython(sizes, _MovedMass(system, plant.M_s), comm=system.layout.comm)
+    shell.setUp()
+    try:
+        return lowest_modes(replace(system, M_ee=shell), k)
+    finally:
+        shell.destroy()
+
+
+def project(plant: Plant, V: Array, omega: Array, M_V: Array) -> SmallPlant:
+    """Galerkin projection on V with V' K_ee V = diag(omega^2). Collective."""
+    r = len(omega)
+    columns = [M_V, plant.damp(V, M_b=M_V), plant.G, plant.C_z]
+    products = total(plant.comm, V.T @ np.hstack(columns))
+    M, D, G, C_z = np.split(products, [r, 2 * r, 2 * r + plant.n_s], axis=1)
+    folded = replace(plant.problem, C_s=plant.C_s)  # weights are in the outputs already
+    plain = assemble_space(folded, (M + M.T) / 2, np.diag(omega**2), (D + D.T) / 2, G, C_z)
+    one = np.ones(2 * plant.n_s)
+    S = np.concatenate([one, 1 / omega, np.ones(r)])
+    L = np.concatenate([one, omega, np.ones(r)])
+    C = plain.C * S
+    B = np.zeros((len(S), plant.inputs))
+    if plant.B_z is None:
+        B[plant.n_s : 2 * plant.n_s] = plant.B
+    else:
+        B[2 * plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
+    return SmallPlant(V, omega, StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, B, C))
+
+
+def solve_small(plant: Plant, small: SmallPlant, guess: Array | None = None) -> SmallSolution:
+    """Riccati equation of the small plant on rank 0, the result on all. Collective.
+
+    Args:
+        plant: the plant.
+        small: its projection.
+        guess: an X near the solution, (N, N).
+
+    Raises:
+        ControlError: not stabilisable or not detectable.
+    """
+
+    def solve() -> SmallSolution:
+        E, A, B, C = small.space.E, small.space.A, small.space.B, small.space.C
+        start = _few_modes(small) if guess is None else guess
+        X = None if start is None else _corrected(small.space, start)
+        if X is None:
+            X = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+        if X is None:
+            X = care(A, B, C, np.eye(len(C)), np.eye(B.shape[1]), E).X
+        return SmallSolution(X, B.T @ X @ E)
+
+    return on_root(plant.comm, solve)
+
+
+def _few_modes(small: SmallPlant) -> Array | None:
+    """X of the lowest modes alone, zero for the others; None where all are few. Not collective.
+
+    With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
+    """
+    N, r, k = len(small.space.E), small.order, FEW_MODES
+    if r < 2 * k:
+        return None
+    at = np.r_[: N - 2 * r + k, N - r : N - r + k]
+    E, A, B, C = (small.space.E[np.ix_(at, at)], small.space.A[np.ix_(at, at)], small.space.B[at], small.space.C[:, at])
+    found = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+    if found is None:
+        return None
+    X = np.zeros((N, N))
+    X[np.ix_(at, at)] = found
+    return X
+
+
+def _corrected(space: StateSpace, X: Array) -> Array | None:
+    """Newton's method from a stabilising X near the solution; None when it is not. Not collective."""
+    n = len(space.E)
+    lu, pivots, info = scipy.linalg.lapack.dgetrf(space.E)
+    if info:
+        return None
+    solved, _ = scipy.linalg.lapack.dgetrs(lu, pivots, np.hstack([space.A, space.B]))
+    A, B = solved[:, :n], solved[:, n:]
+    G, H, Y = B @ B.T, space.C.T @ space.C, space.E.T @ X @ space.E
+    for _ in range(CORRECTIONS):
+        residual = riccati_residual(A, G, H, Y)
+        if np.linalg.norm(residual) <= FAST_RESIDUAL * np.linalg.norm(H):
+            half, _ = scipy.linalg.lapack.dgetrs(lu, pivots, Y, trans=1)
+            X, _ = scipy.linalg.lapack.dgetrs(lu, pivots, half.T, trans=1)
+            return np.asarray((X + X.T) / 2)
+        T, U = scipy.linalg.schur(A - G @ Y, output="real", check_finite=False)
+        if not np.diag(T).max() < 0:
+            return None
+        Y = Y + lyapunov(T, U, residual)
+    return None
+
+
+def ordered_poles(plant: Plant, small: SmallPlant, solution: SmallSolution) -> np.ndarray:
+    """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost. Collective."""
+    return on_root(plant.comm, lambda: _ordered(plant, small, solution.gain))
+
+
+def _ordered(plant: Plant, small: SmallPlant, gain: Array) -> np.ndarray:
+    poles, vectors = np.linalg.eig(np.linalg.solve(small.space.E, small.space.A - small.space.B @ gain))
+    kinetic = np.real(np.einsum("ij,ij->j", vectors.conj(), small.space.E @ vectors))
+    s, r = plant.n_s, small.order
+    potential = np.sum(np.abs(vectors[:s]) ** 2, axis=0) + np.sum(np.abs(vectors[2 * s : 2 * s + r]) ** 2, axis=0)
+    seen = np.sum(np.abs(small.space.C @ vectors) ** 2, axis=0)
+    score = seen / (np.abs(poles.real) * np.maximum(kinetic - potential, 1e-12 * kinetic))
+    # the hand first: its poles carry most of the cost and its energy is in q_s, which has none
+    hand = np.sum(np.abs(vectors[:s]) ** 2, axis=0) / np.sum(np.abs(vectors) ** 2, axis=0)
+    score = np.where(hand > 0.5, np.inf, score)
+    order = np.lexsort((np.abs(poles), -score))
+    keep = [i for i in order if poles[i].imag >= 0]
+    return np.asarray(poles[keep])
+
+
+def lift_gain(plant: Plant, small: SmallPlant, solution: SmallSolution, M_V: Array) -> Block:
+    """K'x of the small gain through the modal filter: other modes are neither seen nor moved.
+
+    eta = V'M~ z and, two-way, q_s + M_s^{-1} G'(z - V eta) instead of q_s; M~ = M_ee - G M_s^{-1} G'. For modes
+    (V'M~V = I) the closed loop is block triangular, so every mode that was stable stays so. Collective.
+    """
+    s, r = plant.n_s, small.order
+    K_s, K_q, K_v = np.split(solution.gain, [2 * s, 2 * s + r], axis=1)
+    z, v = M_V @ (small.omega[:, None] * K_q.T), M_V @ K_v.T
+    if plant.two_way:
+        g = total(plant.comm, small.V.T @ plant.G)
+        rest = np.linalg.solve(plant.M_s, (plant.G - M_V @ g).T).T
+        z, v = z + rest @ K_s[:, :s].T, v + rest @ K_s[:, s:].T
+    return Block(np.ascontiguousarray(K_s.T), np.vstack([z, v]))
+
+
+def check_damped(plant: Plant) -> None:
+    """The tissue is damped at all. Not collective.
+
+    Raises:
+        ControlError: it is not.
+    """
+    if not plant.system.damping.active:
+        raise ControlError(
+            "without damping X has no low rank and the high modes cannot be stabilised in double precision; "
+            "set effects.damping.beta, or control only the lowest modes with the method modal_lqr"
+        )
+
+
+def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
+    """Riccati equation of the hand and the lowest ``modes`` modes. Collective.
+
+    Args:
+        plant: the plant.
+        modes: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
+
+    Raises:
+        ControlError: there is no damping at all, or the small problem has no stabilising solution.
+    """
+    check_damped(plant)
+    count = MODES if modes is None else modes
+    omega, Phi = plant_modes(plant, min(count, plant.layout.n_e))
+    M_Phi = plant.mass(Phi)
+    small = project(plant, Phi, omega, M_Phi)
+    if modes is None and plant.layout.n_e > MORE_MODES and _light(small):
+        return modal_start(plant, MORE_MODES)
+    solution = solve_small(plant, small)
+    if plant.two_way:
+        M_Phi = M_Phi - plant.G @ np.linalg.solve(plant.M_s, total(plant.comm, plant.G.T @ Phi))
+    gain = lift_gain(plant, small, solution, M_Phi)
+    return ModalStart(small, solution, gain, ordered_poles(plant, small, solution))
+
+
+def _light(small: SmallPlant) -> bool:
+    damping = -np.diag(small.space.A)[-small.order :]
+    return bool(damping[-1] < 2 * LIGHT * small.omega[-1])

@@ -1,0 +1,159 @@
+"""The plant in the form the low-rank solvers use: weights folded in, products with E' and A' for a few columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import scipy.sparse
+
+from softgrasp.fem.errors import agree
+from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.problem import RiccatiProblem
+
+
+@dataclass(frozen=True)
+class Block:
+    """A few columns of the size of the state.
+
+    Attributes:
+        hand: rows of q_s and v_s, (2 n_s, k), on every rank.
+        tall: local rows of z and v_z, one below the other, (2 n_local, k).
+    """
+
+    hand: Array
+    tall: Array
+
+    @property
+    def columns(self) -> int:
+        """Number of columns."""
+        return int(self.hand.shape[1])
+
+    def __getitem__(self, part: slice | Array) -> Block:
+        return Block(self.hand[:, part], self.tall[:, part])
+
+    def times(self, small: Array) -> Block:
+        """Block @ small. Not collective."""
+        return Block(self.hand @ small, self.tall @ small)
+
+    @classmethod
+    def join(cls, blocks: list[Self]) -> Block:
+        """Columns side by side. Not collective."""
+        return Block(np.hstack([b.hand for b in blocks]), np.hstack([b.tall for b in blocks]))
+
+
+class TallProduct:
+    """A X for local rows X; one sparse product on one rank, one PETSc product a column on more."""
+
+    def __init__(self, A: PETSc.Mat) -> None:
+        self.A = A
+        self.serial: scipy.sparse.csr_matrix | None = None
+        if A.comm.size == 1:
+            rows, columns, values = A.getValuesCSR()
+            self.serial = scipy.sparse.csr_matrix((values, columns, rows), shape=A.getSize())
+        else:
+            self.x, self.y = A.createVecs()
+
+    def __call__(self, X: Array) -> Array:
+        """Return the local rows of A X. Collective."""
+        if self.serial is not None:
+            return np.asarray(self.serial @ X)
+        result = np.empty(X.shape, order="F")
+        for j in range(X.shape[1]):
+            self.x.array_w[:] = X[:, j]
+            self.A.mult(self.x, self.y)
+            result[:, j] = self.y.array_r
+        return result
+
+
+class Plant:
+    """E x' = A x + B u, y = C x with B <- B R^{-1/2}, C <- Q^{1/2} C, in hand-relative coordinates.
+
+    Costates are kept as [a_s, b_s, a, b] with the displacement part scaled by the stiffness, z-row = K_ee a: in this
+    form the energy [K_ee, M_ee] is their natural inner product. The adjoint operators are
+
+        E'X = [a_s; M_s b_s + G'b; K a; M b + H b_s],
+        A'X = [0; a_s - D_ss b_s - D_es'b; -K b; K a - D b - D_se'b_s],
+
+    with H = G, D_ss = alpha M_rigid, D_se = alpha G' for two-way coupling (alpha only when damping acts in space).
+    Without a hand its rows are empty and the inputs act on the tissue, B = [0; B_z].
+
+    Args:
+        problem: the operators and weights.
+
+    Raises:
+        ControlError: R is not positive definite, Q has a negative eigenvalue or sees nothing, or a number is not
+            finite.
+    """
+
+    def __init__(self, problem: RiccatiProblem) -> None:
+        system = problem.system
+        self.problem, self.system, self.layout, self.comm = problem, system, system.layout, system.layout.comm
+        self.n_s, self.n_local = self.layout.n_s, self.layout.n_local
+        with agree(self.comm):
+            check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
+            check_finite(C_s=problem.C_s, C_z=problem.C_z, G=system.G, M_hand=system.M_hand, B_z=problem.B_z)
+            check_finite(K_ee=_values(system.K_ee), M_ee=_values(system.M_ee))
+        weight = np.linalg.inv(np.linalg.cholesky(problem.R)).T
+        self.B = weight if problem.B_z is None else np.zeros((0, len(weight)))
+        self.B_z = None if problem.B_z is None else problem.B_z @ weight
+        F = square_root(problem.Q)
+        self.C_s, self.C_z = F @ problem.C_s, problem.C_z @ F.T
+        self.M_s, self.G = problem.M_s, system.G
+        self.two_way = system.two_way
+        drag = system.damping.alpha if system.damping.in_space else 0.0
+        self.drag_es = drag
+        self.drag_hand = drag if self.two_way else 0.0
+        self.mass, self.stiff = TallProduct(system.M_ee), TallProduct(system.K_ee)
+        self.viscous = None if system.damping.matrix is None else TallProduct(system.damping.matrix)
+        self.scale = float(np.linalg.norm(self.C_s @ self.C_s.T + total(self.comm, self.C_z.T @ self.C_z), 2))
+        if self.scale == 0:
+            raise ControlError("the outputs weighted with Q are all zero; give an output and a Q that is not zero")
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs."""
+        return int(self.B.shape[1])
+
+    def damp(self, b: Array, M_b: Array | None = None, K_b: Array | None = None) -> Array:
+        """D_ee b for local rows. Collective."""
+        damping = self.system.damping
+        result = damping.alpha * (self.mass(b) if M_b is None else M_b) if damping.alpha else np.zeros_like(b)
+        if damping.beta:
+            result = result + damping.beta * (self.stiff(b) if K_b is None else K_b)
+        if self.viscous is not None:
+            result = result + self.viscous(b)
+        return result
+
+    def felt(self, V: Block) -> Array:
+        """V'B, (k, m), on every rank. Collective without a hand."""
+        if self.B_z is None:
+            return np.asarray(V.hand[self.n_s :].T @ self.B)
+        return total(self.comm, V.tall[self.n_local :].T @ self.B_z)
+
+    def outputs(self) -> Block:
+        """C' as a block (z-row unscaled). Not collective."""
+        hand = np.vstack([self.C_s.T, np.zeros_like(self.C_s.T)])
+        return Block(hand, np.vstack([self.C_z, np.zeros_like(self.C_z)]))
+
+    def mass_adjoint(self, V: Block, out: Array | None = None) -> Block:
+        """E'V of a costate block; the z-row of the result is unscaled. Collective.
+
+        Args:
+            V: the block.
+            out: room for the tissue rows of the result.
+        """
+        n, s = self.n_local, self.n_s
+        a, b, b_s = V.tall[:n], V.tall[n:], V.hand[s:]
+        tall = np.empty(V.tall.shape) if out is None else out
+        tall[:n] = self.stiff(a)
+        tall[n:] = self.mass(b)
+        if self.two_way:
+            tall[n:] += self.G @ b_s
+        return Block(np.vstack([V.hand[:s], self.M_s @ b_s + total(self.comm, self.G.T @ b)]), tall)
+
+
+def _values(A: PETSc.Mat) -> Array:
+    return np.asarray(A.getValuesCSR()[2])

@@ -1,0 +1,182 @@
+"""RADI: low-rank Riccati iteration from X_0 = 0, the independent second opinion on Newton-ADI."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, Columns, Progress
+from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, make_right, mass_right
+from softgrasp.lqr.lowrank.compress import gram
+from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
+from softgrasp.lqr.lowrank.modal_start import modal_start
+from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
+from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
+from softgrasp.reduction.engines import on_root
+
+
+@dataclass
+class RadiState:
+    """W with Res(X_k) = W W', K_k' and Z.
+
+    Attributes:
+        both: [K', W], (B'X_k E)' and the residual factor with p columns.
+        Z: X_k = Z Z'.
+        solves: tissue solves done.
+    """
+
+    both: Right
+    Z: Columns
+    solves: int = 0
+    history: list[dict[str, float]] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
+
+    @property
+    def W(self) -> Right:
+        """Residual factor (views)."""
+        return self.both[self.Z.plant.inputs :]
+
+    @property
+    def gain(self) -> Right:
+        """K' (views)."""
+        return self.both[: self.Z.plant.inputs]
+
+
+def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, Array, float]:
+    """Real columns V_1 of the update X += V_1 Y^{-1} V_1', with Y, V_1'B and the factor of W [BBKS18].
+
+    s real: V_1 = sqrt(-2s) V, Y = I - V_1'B B'V_1 / (2s). s complex: V_1 = sqrt(-2 Re s) [Re V, Im V] and the Y of the
+    pair. Collective.
+    """
+    q = V.columns
+    one = np.eye(q)
+    c = float(np.sqrt(-2 * s.real))
+    if s.imag == 0:
+        columns = V.real(np.asarray(c * one, dtype=complex))
+        V_B = plant.felt(columns)
+        return columns, one - V_B @ V_B.T / (2 * s.real), V_B, c
+    columns = V.real(np.asarray(c * np.hstack([one, -1j * one]), dtype=complex))
+    V_B = plant.felt(columns)
+    real, imag = V_B[:q], V_B[q:]
+    a, b = s.real / abs(s), s.imag / abs(s)
+    F_1 = np.vstack([-a * real - b * imag, b * real - a * imag])
+    F_3 = np.vstack([b * one, a * one])
+    Y = np.diag(np.repeat([1.0, 0.5], q)) - (F_1 @ F_1.T + V_B @ V_B.T) / (4 * s.real) - F_3 @ F_3.T / 2
+    return columns, Y, V_B, c
+
+
+def radi_step(plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: ShiftQueue) -> complex:
+    """One solve with p + m right-hand sides; W, K and Z are updated. Collective. Returns the shift.
+
+    Raises:
+        SolverError: Y is not positive definite: rounding has destroyed the step.
+    """
+    begin = time.perf_counter()
+    if queue.short(state.solves):
+        queue.refill(plant, state.Z.recent(), state.W.block, state.gain)
+    s, ahead = queue.next()
+    middle = time.perf_counter()
+    q = state.W.columns
+    V = closed_adjoint(plant, tissue, s, state.both, ahead)
+    last = time.perf_counter()
+    columns, Y, V_B, c = radi_columns(plant, s, V)
+    try:
+        root = np.linalg.cholesky((Y + Y.T) / 2)
+    except np.linalg.LinAlgError as error:
+        raise SolverError(f"radi: the step at the shift {s:.4g} is not definite; use newton_adi") from error
+    inverse = np.linalg.inv(root)
+    weight = inverse.T @ inverse
+    state.both = state.both.plus(mass_right(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
+    state.Z.append(columns.times(inverse.T))
+    state.solves += 1
+    state.seconds["shifts"] += middle - begin
+    state.seconds["products"] += time.perf_counter() - last
+    return s
+
+
+@dataclass(frozen=True)
+class RADI:
+    """Solve A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 for X = Z Z' by RADI [BBKS18] from X_0 = 0.
+
+    Each step is one solve (A - B K + s E)'V = W with the p columns of the residual factor, Res(X_k) = W W'. No
+    stabilising start is needed; the modal problem gives shifts only. X_k grows monotonically to the stabilising
+    solution when the plant is stabilisable and detectable.
+
+    Attributes:
+        tol: bound on the true relative residual, 2-norm, hand-relative coordinates.
+        max_iterations: bound on the solves.
+        tissue: gathered, distributed or auto, see :mod:`lqr.lowrank.shifted`.
+        progress: called on every rank after each solve with the history entry.
+    """
+
+    tol: float = 1e-10
+    max_iterations: int = 1500
+    tissue: str = "auto"
+    progress: Progress | None = None
+
+    def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
+        """Run to the tolerance. Collective. The problem is not changed.
+
+        Raises:
+            ControlError: weights or data are refused, no damping, not stabilisable or not detectable.
+            SolverError: not converged within the bound, or the true residual misses the tolerance.
+        """
+        begin = time.perf_counter()
+        plant = Plant(problem)
+        start = modal_start(plant)
+        poles = start.poles
+        after_start = time.perf_counter()
+        tissue = make_shifted(plant.system, self.tissue)
+        try:
+            W = make_right(plant, tissue, plant.outputs())
+            gain = Right(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.rows), plant.inputs)))
+            state = RadiState(Right.join([gain, W]), Columns(plant, SHARE * self.tol * plant.scale))
+            state.seconds["start"] = after_start - begin
+            queue = ShiftQueue.start(shift_range(plant, poles), poles)
+            self._iterate(plant, tissue, state, queue)
+            state.seconds |= tissue.seconds
+            counts = {
+                "newton_steps": 0,
+                "adi_steps": state.solves,
+                "solves": state.solves,
+                "factorisations": tissue.factors,
+                "columns": state.Z.appended,
+            }
+            reason = f"radi: low rank from X = 0, {tissue.name} tissue solves"
+            result = make_solution(
+                plant,
+                Outcome(state.Z.block, state.gain.block, reason, self.tol, state.history, counts, state.seconds),
+            )
+            result.seconds["total"] = time.perf_counter() - begin
+            return result
+        finally:
+            tissue.destroy()
+
+    def _iterate(self, plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: ShiftQueue) -> None:
+        relative = 1.0
+        while state.solves < self.max_iterations:
+            s = radi_step(plant, tissue, state, queue)
+            begin = time.perf_counter()
+            products = gram(plant.comm, state.W.block, state.W.block)
+            # the same bits on every rank: they decide when all stop
+            relative = on_root(plant.comm, partial(np.linalg.norm, products, 2)) / plant.scale
+            state.seconds["small"] += time.perf_counter() - begin
+            entry = {"solve": float(state.solves), "shift_re": s.real, "shift_im": s.imag, "residual": relative}
+            state.history.append(entry)
+            if self.progress is not None:
+                self.progress(entry)
+            if relative <= STOP * self.tol:
+                return
+            if not relative <= GROWTH:
+                break
+        raise SolverError(
+            f"radi: relative residual {relative:.1e} after {state.solves} solves, tolerance {self.tol:.0e}; add "
+            "damping, or use the method modal_lqr, which leaves the high modes alone"
+        )

@@ -1,0 +1,102 @@
+"""The true residual of a low-rank Riccati solution, recomputed from Z; of the solvers' code it shares PETSc's products.
+
+    Res = A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = U D U',   X = Z Z',   U = [A'Z, E'Z, C'],
+    D = [0 I 0; I -Z'B R^{-1} B'Z 0; 0 0 Q]
+
+and with the thin QR factorisation U = q r the 2-norm is the largest |eigenvalue| of r D r', a matrix of order
+2 rank + p. Nothing of the order n x n is formed.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.petsc import Array, times_columns
+from softgrasp.lqr.plant.problem import RiccatiProblem
+
+ROWS = 4_000  # rows of U that are reduced at a time
+
+
+class Candidate(Protocol):
+    """Anything with the rows of Z, see :class:`lqr.plant.problem.RiccatiSolution`."""
+
+    @property
+    def Z_s(self) -> Array:
+        """(2 n_s, rank)."""
+
+    @property
+    def Z_z(self) -> Array:
+        """Local rows (n_local, rank)."""
+
+    @property
+    def Z_v(self) -> Array:
+        """Local rows (n_local, rank)."""
+
+
+def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
+    """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'.
+
+    Collective. Inputs are not changed.
+
+    Args:
+        problem: operators and weights.
+        candidate: Z_s (2 n_s, rank) on every rank, Z_z and Z_v local rows (n_local, rank).
+
+    Returns:
+        The relative residual; 2-norm in hand-relative coordinates.
+    """
+    system, comm = problem.system, problem.layout.comm
+    n_s, rank, p = problem.layout.n_s, candidate.Z_s.shape[1], problem.C_s.shape[0]
+    a_s, b_s = candidate.Z_s[:n_s], candidate.Z_s[n_s:]
+    felt = b_s if problem.B_z is None else comm.allreduce(problem.B_z.T @ candidate.Z_v)  # B'Z
+    n, h = len(candidate.Z_z), 2 * n_s if comm.rank == 0 else 0
+    U = np.zeros((h + 2 * n, 2 * rank + p), order="F")
+    _fill_tissue(problem, candidate, U[h : h + n], U[h + n :])
+    G_b = comm.allreduce(system.G.T @ candidate.Z_v)
+    drag = system.damping.alpha if system.damping.in_space else 0.0
+    own = drag * (system.M_rigid @ b_s) if system.two_way else 0.0
+    if comm.rank == 0:
+        U[n_s:h, :rank] = a_s - drag * G_b - own
+        U[:n_s, rank : 2 * rank] = a_s
+        U[n_s:h, rank : 2 * rank] = problem.M_s @ b_s + G_b
+        U[:n_s, 2 * rank :] = problem.C_s.T
+    r = _triangular(comm, U)
+    rates, momenta, seen = r[:, :rank], r[:, rank : 2 * rank], r[:, 2 * rank :]
+    product, pushed = rates @ momenta.T, momenta @ felt.T
+    small = product + product.T - pushed @ np.linalg.solve(problem.R, pushed.T) + seen @ problem.Q @ seen.T
+    size = float(np.abs(np.linalg.eigvalsh(small)).max())
+    C = np.linalg.qr(seen, mode="r")
+    return size / (float(np.linalg.norm(C @ problem.Q @ C.T, 2)) or 1.0)
+
+
+def _fill_tissue(problem: RiccatiProblem, candidate: Candidate, top: Array, bottom: Array) -> None:
+    """Local rows z and v_z of [A'Z, E'Z, C']. Collective."""
+    system, damping = problem.system, problem.system.damping
+    rank, b_s = candidate.Z_z.shape[1], candidate.Z_s[problem.layout.n_s :]
+    stiff, mass = times_columns(system.K_ee, candidate.Z_v), times_columns(system.M_ee, candidate.Z_v)
+    np.negative(stiff, out=top[:, :rank])
+    bottom[:, :rank] = candidate.Z_z - damping.beta * stiff - damping.alpha * mass
+    if damping.matrix is not None:
+        bottom[:, :rank] -= times_columns(damping.matrix, candidate.Z_v)
+    top[:, rank : 2 * rank] = candidate.Z_z
+    bottom[:, rank : 2 * rank] = mass
+    top[:, 2 * rank :] = problem.C_z
+    if system.two_way:
+        G_b_s = system.G @ b_s
+        bottom[:, rank : 2 * rank] += G_b_s
+        if damping.in_space:
+            bottom[:, :rank] -= damping.alpha * G_b_s
+
+
+def _triangular(comm: MPI.Intracomm, U: Array) -> Array:
+    """R of the thin QR factorisation of rows spread over the ranks, on every rank. Collective."""
+    r = np.linalg.qr(U[:ROWS], mode="r")
+    for first in range(ROWS, len(U), ROWS):
+        r = np.linalg.qr(np.vstack([r, U[first : first + ROWS]]), mode="r")
+    if comm.size == 1:
+        return np.asarray(r)
+    gathered = comm.gather(r)
+    return np.asarray(comm.bcast(None if gathered is None else np.linalg.qr(np.vstack(gathered), mode="r")))

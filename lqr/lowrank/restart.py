@@ -1,0 +1,149 @@
+"""Restart files of Newton-ADI: one file a rank, replaced only when complete."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.errors import CheckpointError, agree
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.lowrank.adi import SHARE, Columns, Sweep
+from softgrasp.lqr.lowrank.adjoint import Right
+from softgrasp.lqr.lowrank.plant import Block, Plant
+
+FORMAT = 2
+
+
+@dataclass
+class Iteration:
+    """What Newton's method carries from step to step.
+
+    Attributes:
+        gain: K_j'.
+        step: Newton steps done.
+        solves: tissue solves done.
+        factor: (U, signs) with R_j = U diag(signs) U', unknown before the first step.
+        achieved: relative Riccati residual of the last finished step.
+        history: one dictionary a solve.
+        seconds: time by stage.
+    """
+
+    gain: Right
+    step: int = 0
+    solves: int = 0
+    factor: tuple[Block, Array] | None = None
+    achieved: float = np.inf
+    history: list[dict[str, float]] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def fingerprint(plant: Plant) -> str:
+    """Digest of the problem that this rank sees, to refuse a foreign restart file. Not collective."""
+    digest = hashlib.sha256(repr((plant.comm.size, plant.layout.n_e, plant.two_way, plant.drag_es)).encode())
+    for A in (plant.system.M_ee, plant.system.K_ee):
+        digest.update(np.ascontiguousarray(A.getValuesCSR()[2]))
+    damping = plant.system.damping
+    digest.update(repr((damping.alpha, damping.beta)).encode())
+    digest.update(b"" if damping.matrix is None else np.ascontiguousarray(damping.matrix.getValuesCSR()[2]))
+    for array in (plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G):
+        digest.update(np.ascontiguousarray(array))
+    digest.update(b"" if plant.B_z is None else np.ascontiguousarray(plant.B_z))
+    return digest.hexdigest()
+
+
+def _file(folder: Path, plant: Plant) -> Path:
+    return folder / f"newton-rank{plant.comm.rank}.npz"
+
+
+def _pack(name: str, right: Right) -> dict[str, Array]:
+    return {f"{name}_hand": right.hand, f"{name}_rows": right.rows}
+
+
+def _unpack(name: str, data: np.lib.npyio.NpzFile) -> Right:
+    return Right(data[f"{name}_hand"], data[f"{name}_rows"])
+
+
+def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> None:
+    """Write everything a resumed run needs. Collective.
+
+    Raises:
+        CheckpointError: the folder cannot be written.
+    """
+    keys = sorted(set.intersection(*map(set, state.history))) if state.history else []  # the last of a sweep has more
+    entries: dict[str, Any] = {
+        "format": np.array(FORMAT),
+        "fingerprint": np.array(fingerprint(plant)),
+        "numbers": np.array([state.step, state.solves, sweep.steps]),
+        "norms": np.array([state.achieved, sweep.first]),
+        "widths": np.array(sweep.Z.widths),
+        "Z_hand": sweep.Z.block.hand,
+        "Z_tall": sweep.Z.block.tall,
+        "compressed_to": np.array(sweep.Z.compressed_to),
+        "appended": np.array(sweep.Z.appended),
+        "history_keys": np.array(keys, dtype=str),
+        "history": np.array([[entry[key] for key in keys] for entry in state.history]),
+        **_pack("sweep", sweep.state),
+    }
+    if state.factor is not None:
+        U, signs = state.factor
+        entries |= {"factor_hand": U.hand, "factor_tall": U.tall, "factor_signs": signs}
+    path = _file(folder, plant)
+    fresh = path.with_suffix(".new.npz")
+
+    def write() -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez(fresh, allow_pickle=False, **entries)
+
+    for act in (write, lambda: fresh.replace(path)):  # no rank replaces its file before all have written theirs
+        with agree(plant.comm):
+            try:
+                act()
+            except OSError as error:
+                raise CheckpointError(f"{path}: the restart file cannot be written ({error}); free the disk") from error
+
+
+def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> Sweep | None:
+    """Put ``state`` back and return the sweep in progress; None without restart files. Collective.
+
+    Raises:
+        CheckpointError: the files are damaged or belong to another problem, tolerance apart, or rank count.
+    """
+    path = _file(folder, plant)
+    if not any(plant.comm.allgather(path.exists())):
+        return None
+    sweep: Sweep | None = None
+    with agree(plant.comm):
+        try:
+            with np.load(path) as data:
+                if int(data["format"]) != FORMAT or str(data["fingerprint"]) != fingerprint(plant):
+                    raise CheckpointError(
+                        f"{path} belongs to another control problem or rank count; remove it or name another folder"
+                    )
+                sweep = _restore(plant, state, data, tol)
+        except (OSError, KeyError, ValueError) as error:
+            raise CheckpointError(f"{path} is damaged or missing ({error}); remove the folder {folder}") from error
+    steps = plant.comm.allgather(None if sweep is None else (state.solves, sweep.steps))
+    if len(set(steps)) > 1:
+        raise CheckpointError(f"the restart files in {folder} are of different solves; remove the folder")
+    return sweep
+
+
+def _restore(plant: Plant, state: Iteration, data: np.lib.npyio.NpzFile, tol: float) -> Sweep:
+    state.step, state.solves, steps = (int(value) for value in data["numbers"])
+    state.achieved, first = (float(value) for value in data["norms"])
+    keys = [str(key) for key in data["history_keys"]]
+    state.history = [dict(zip(keys, map(float, row), strict=True)) for row in data["history"]]
+    if "factor_signs" in data:
+        state.factor = (Block(data["factor_hand"], data["factor_tall"]), data["factor_signs"])
+    Z = Columns(plant, SHARE * tol * plant.scale)
+    Z.hand, Z.tall = np.ascontiguousarray(data["Z_hand"]), np.ascontiguousarray(data["Z_tall"])
+    Z.count, Z.compressed_to = Z.hand.shape[1], int(data["compressed_to"])
+    Z.appended = int(data["appended"])
+    Z.widths = [int(width) for width in data["widths"]]
+    sweep = Sweep(_unpack("sweep", data), Z, steps, first)
+    state.gain = sweep.gain
+    return sweep

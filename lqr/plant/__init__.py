@@ -1,0 +1,1 @@
+"""The optimal control problem: plant, weights, gain, coordinates."""

@@ -1,0 +1,53 @@
+"""The feedback u = K x of a plant as blocks, apart from the solver it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.lqr.plant.problem import RiccatiSolution
+
+
+@dataclass(frozen=True)
+class PlantState:
+    """x = [q_s, v_s, z, v_z] with z = q_e - T q_s.
+
+    Attributes:
+        q_s, v_s: hand [m, rad] and [m/s, rad/s], (n_s,), on every rank.
+        z, v_z: relative displacement [m] and velocity [m/s] of the tissue, local rows (n_local,).
+    """
+
+    q_s: Array
+    v_s: Array
+    z: Array
+    v_z: Array
+
+    def __sub__(self, other: PlantState) -> PlantState:
+        return PlantState(self.q_s - other.q_s, self.v_s - other.v_s, self.z - other.z, self.v_z - other.v_z)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z.
+
+    Attributes:
+        K_s: gain on the hand, (n_s, 2 n_s), on every rank.
+        K_z, K_v: gain on z and v_z, transposed, local rows (n_local, n_s).
+    """
+
+    K_s: Array
+    K_z: Array
+    K_v: Array
+
+    @classmethod
+    def of(cls, solution: RiccatiSolution) -> Gain:
+        """The gain of a solution. Not collective."""
+        return cls(solution.K_s, solution.K_z, solution.K_v)
+
+    def apply(self, comm: MPI.Intracomm, x: PlantState) -> Array:
+        """K x, (n_s,), on every rank. Collective."""
+        tissue = total(comm, self.K_z.T @ x.z + self.K_v.T @ x.v_z)
+        return np.asarray(self.K_s @ np.concatenate([x.q_s, x.v_s]) + tissue)

@@ -1,0 +1,90 @@
+"""The linear-quadratic problem of a hand that carries tissue, as operators in hand-relative coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.system import BlockSystem
+
+
+@dataclass(frozen=True)
+class RiccatiProblem:
+    """A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 with x = [q_s, v_s, z, v_z], z = q_e - T q_s.
+
+    In these coordinates (one-way; [...] two-way only)
+
+        E = [I 0 0 0; 0 M_s 0 [G']; 0 0 I 0; 0 G 0 M_ee],  B = [0; I; 0; 0],  M_s = M_hand [+ M_rigid],
+        A = [0 I 0 0; 0 [-D_ss] 0 [-D_es']; 0 0 0 I; 0 -D_es -K_ee -D_ee],
+        D_es = alpha G, [D_ss = alpha M_rigid] when the damping acts in space, else 0.
+
+    A second-order system without a hand, M_ee z'' + D_ee z' + K_ee z = B_z u, is the case n_s = 0, B = [0; B_z]; see
+    :func:`lqr.plant.second_order.second_order`.
+
+    Attributes:
+        system: the operators; never a dense n x n array.
+        C_s: outputs of the hand's displacement, (p, n_s), on every rank.
+        C_z: outputs of the relative displacement, transposed, local rows (n_local, p).
+        Q: (p, p), symmetric positive semidefinite [1/(m2 s)].
+        R: (m, m), symmetric positive definite [1/(N2 s)], m = n_s.
+        names: one per output component.
+        B_z: forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None.
+    """
+
+    system: BlockSystem
+    C_s: Array
+    C_z: Array
+    Q: Array
+    R: Array
+    names: tuple[str, ...] = ()
+    B_z: Array | None = None
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs m."""
+        return self.layout.n_s if self.B_z is None else int(self.B_z.shape[1])
+
+    @property
+    def layout(self) -> BlockLayout:
+        """Sizes and ownership."""
+        return self.system.layout
+
+    @property
+    def M_s(self) -> Array:
+        """Inertia that the input has to move, (n_s, n_s)."""
+        return self.system.M_hand + (self.system.M_rigid if self.system.two_way else 0.0)
+
+
+@dataclass(frozen=True)
+class RiccatiSolution:
+    """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`.
+
+    Attributes:
+        Z_s: rows of Z that belong to q_s and v_s (in this order), (2 n_s, rank), on every rank.
+        Z_z, Z_v: local rows of Z for z and v_z, (n_local, rank).
+        K_s: gain on [q_s, v_s], (n_s, 2 n_s), on every rank.
+        K_z, K_v: gain on z and v_z, transposed, local rows (n_local, n_s).
+        residual: true relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z at the end.
+        method: name of the solver and why it was chosen.
+        history: one dictionary per iteration.
+        counts: newton_steps, adi_steps, solves.
+        seconds: time by stage.
+    """
+
+    Z_s: Array
+    Z_z: Array
+    Z_v: Array
+    K_s: Array
+    K_z: Array
+    K_v: Array
+    residual: float
+    method: str
+    history: tuple[dict[str, float], ...] = ()
+    counts: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def rank(self) -> int:
+        """Columns of Z."""
+        return int(self.Z_s.shape[1])

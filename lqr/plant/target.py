@@ -1,0 +1,117 @@
+"""Where the closed loop goes: a state at rest, and the steady input that keeps the plant there.
+
+At rest, with the hand at q_bar, the equations of motion leave
+
+    K_ee z_bar = G g,    u_bar = -(weight of the hand) [- M_rigid g],    y_bar = C_s q_bar + C_z' z_bar
+
+([...] two-way only); without gravity the target is a rigid translation, z_bar = 0, u_bar = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.system import BlockSystem
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.gain import PlantState
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.reduction.inner import solve_columns
+
+
+@dataclass(frozen=True)
+class Target:
+    """State, input and outputs at rest.
+
+    Attributes:
+        state: x_bar.
+        u: steady input u_bar [N, N m], (n_s,).
+        y: outputs there [m], (p,).
+    """
+
+    state: PlantState
+    u: Array
+    y: Array
+
+
+def sag(system: BlockSystem) -> Array:
+    """Static displacement relative to the hand, K_ee z = G g; local rows (n_local,). Collective.
+
+    Raises:
+        SolverError: the stiffness is singular or the residual too large.
+    """
+    if system.gravity is None:
+        return np.zeros(system.layout.n_local)
+    load = (system.G @ system.gravity)[:, None]
+    return solve_columns(system.K_ee, system.layout, load, "the equilibrium of the target")[:, 0]
+
+
+def steady_input(system: BlockSystem) -> Array:
+    """u_bar that holds hand (and, two-way, tissue) against gravity [N, N m], (n_s,). Not collective."""
+    u = np.zeros(system.layout.n_s)
+    if system.gravity is None:
+        return u
+    if system.hand_weight:
+        u -= system.M_hand @ system.gravity
+    if system.two_way:
+        u -= system.M_rigid @ system.gravity
+    return u
+
+
+def rest(system: BlockSystem, *, deformed: bool = True) -> PlantState:
+    """The plant at rest with the hand at 0, in equilibrium or undeformed. Collective."""
+    n_s, n = system.layout.n_s, system.layout.n_local
+    return PlantState(np.zeros(n_s), np.zeros(n_s), sag(system) if deformed else np.zeros(n), np.zeros(n))
+
+
+def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
+    """Rest with the hand at q_bar: d entries move it without turning, n_s entries turn it too. Collective.
+
+    Raises:
+        ControlError: q_bar has another number of entries, or one that is not finite.
+        SolverError: the equilibrium under gravity fails.
+    """
+    layout = problem.layout
+    given = np.asarray(q_bar, dtype=np.float64).ravel()
+    if len(given) not in (layout.dimension, layout.n_s) or not np.isfinite(given).all():
+        raise ControlError(
+            f"the target {given.tolist()} of the hand must have {layout.dimension} or {layout.n_s} finite entries"
+        )
+    q = np.zeros(layout.n_s)
+    q[: len(given)] = given
+    return _at(problem, q, sag(problem.system))
+
+
+def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
+    """Rest with the outputs at y_bar: the hand moves there plus what gravity makes them sag. Collective.
+
+    Solves C_s q_bar = y_bar - C_z' z_bar; among several hand positions the one nearest to 0 is taken.
+
+    Raises:
+        ControlError: y_bar has another number of entries, or no position of the hand brings the outputs there.
+        SolverError: the equilibrium under gravity fails.
+    """
+    wanted = np.asarray(y_bar, dtype=np.float64).ravel()
+    C_s = problem.C_s
+    if len(wanted) != len(C_s) or not np.isfinite(wanted).all():
+        raise ControlError(f"the target {wanted.tolist()} of the outputs must have {len(C_s)} finite entries")
+    z = sag(problem.system)
+    right = wanted - total(problem.layout.comm, problem.C_z.T @ z)
+    q = np.linalg.lstsq(C_s, right)[0]
+    miss = float(np.abs(C_s @ q - right).max())
+    # rounding of the least squares, far below any length that counts
+    if miss > 1e-9 * (1.0 + float(np.abs(right).max())):
+        raise ControlError(
+            f"no position of the hand brings the outputs to {wanted.tolist()}, the nearest misses by {miss:.3g} m; "
+            "give a target that the body reaches at rest"
+        )
+    return _at(problem, np.asarray(q), z)
+
+
+def _at(problem: RiccatiProblem, q: Array, z: Array) -> Target:
+    n_s, n = problem.layout.n_s, problem.layout.n_local
+    state = PlantState(q, np.zeros(n_s), z, np.zeros(n))
+    y = problem.C_s @ q + total(problem.layout.comm, problem.C_z.T @ z)
+    return Target(state, steady_input(problem.system), y)

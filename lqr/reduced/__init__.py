@@ -1,0 +1,1 @@
+"""The reduced Riccati equations and their gains."""

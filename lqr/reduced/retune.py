@@ -1,0 +1,165 @@
+"""New lambda, mu with the basis of one parameter: affine reduced components, one small Riccati equation a setting."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.system import LayerMaterial
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.coordinates import gain_of
+from softgrasp.lqr.plant.operators import descriptor_adjoint
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.reduced.riccati import GainJudge, gain_error, project
+from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
+from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
+from softgrasp.reduction.engines import on_root
+
+Materials = tuple[LayerMaterial, ...]
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Gain for one setting of the materials.
+
+    Attributes:
+        P_N: (N, N), in the retuner's scaled basis.
+        K_N: gain on reduced states, u = K_N x_N, (n_s, N).
+        seconds: to combine the components and solve the equation.
+    """
+
+    P_N: Array
+    K_N: Array
+    seconds: float
+
+
+class Retuner:
+    """A_N = A_0 + sum_layers sum_{mu, lambda} theta (A_j + beta A'_j), A_j = -W_v'K_j U_z, A'_j = -W_v'K_j U_v.
+
+    K_ee and D_ee are affine in the Lame constants; E, B, C and the rigid extension T do not depend on them. Nothing of
+    the size of the tissue is touched in :meth:`solve`. Collective to make, not collective to use.
+
+    Args:
+        problem: the plant at the reference materials.
+        basis: the basis built there.
+    """
+
+    def __init__(self, problem: RiccatiProblem, basis: RiccatiBasis) -> None:
+        self.problem = problem
+        self.basis = basis = energy_scaled(problem, basis)
+        self.reference: Materials = problem.system.materials
+        self.matrices = project(problem, basis)
+        comm, n = problem.layout.comm, problem.layout.n_local
+        W_v, U_z, U_v = basis.W.tall[n:], basis.U.tall[:n], basis.U.tall[n:]
+        self.parts: list[tuple[tuple[Array, Array], tuple[Array, Array]]] = []
+        for layer in problem.system.layers:
+            pairs = []
+            for component in (layer.K_mu, layer.K_lambda):
+                elastic, viscous = (total(comm, W_v.T @ times_columns(component.ee, U)) for U in (U_z, U_v))
+                pairs.append((-elastic, -viscous))
+            self.parts.append((pairs[0], pairs[1]))
+        self.A_0 = self.matrices.A - self._stiffness(self.reference)
+        self.lift = descriptor_adjoint(problem, basis.W)
+
+    @property
+    def N(self) -> int:
+        """Order of the reduced equation."""
+        return self.basis.N
+
+    def _stiffness(self, materials: Materials) -> Array:
+        result = np.zeros_like(self.matrices.A)
+        for (mu, lam), m in zip(self.parts, materials, strict=True):
+            result += m.mu * (mu[0] + m.beta * mu[1]) + m.lam * (lam[0] + m.beta * lam[1])
+        return result
+
+    def at(self, materials: Materials) -> ReducedMatrices:
+        """The reduced equation for other Lame constants and viscosities. Not collective.
+
+        Raises:
+            ControlError: the number of layers or a density differs from the reference.
+        """
+        if len(materials) != len(self.reference):
+            raise ControlError(f"{len(materials)} materials are given; the body has {len(self.reference)} layers")
+        for old, new in zip(self.reference, materials, strict=True):
+            if new.rho != old.rho:
+                raise ControlError(f"rho = {new.rho:g} differs from {old.rho:g}; re-tuning covers lambda, mu and beta")
+        return replace(self.matrices, A=self.A_0 + self._stiffness(materials))
+
+    def solve(self, materials: Materials) -> Tuned:
+        """Combine, solve, gain. Not collective.
+
+        Raises:
+            ControlError: the setting is refused, or its reduced equation has no stabilising solution.
+        """
+        begin = time.perf_counter()
+        m = self.at(materials)
+        P_N = solve_reduced(m)
+        K_N = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
+        return Tuned(P_N, K_N, time.perf_counter() - begin)
+
+    def full_gain(self, tuned: Tuned) -> Block:
+        """K_hat of the full plant, transposed, hand-relative: E'W does not depend on the materials. Not collective."""
+        return self.lift.times(-tuned.P_N @ np.linalg.solve(self.problem.R, self.matrices.B.T).T)
+
+
+@dataclass(frozen=True)
+class BoxPoint:
+    """One setting of the box: errors against the full Riccati solution there.
+
+    ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop.
+    """
+
+    materials: Materials
+    error_K: float  # noqa: N815
+    cost_excess: float
+    abscissa_full: float
+    seconds: float
+    reason: str = ""
+    certified: bool = True
+
+    @property
+    def stable(self) -> bool:
+        """Whether the full closed loop was computed and is stable."""
+        return not self.reason and self.certified and self.abscissa_full < 0
+
+
+def over_box(
+    retuner: Retuner,
+    settings: Sequence[Materials],
+    solve: Callable[[RiccatiProblem], RiccatiSolution],
+    start: Block,
+    modes: int | None = None,
+) -> tuple[BoxPoint, ...]:
+    """Error of the re-tuned gain at every setting of a box. Collective.
+
+    Args:
+        retuner: the reduced components.
+        settings: materials of all layers, one tuple per point.
+        solve: full solver, the reference.
+        start: start minus target, see :func:`lqr.reduced.riccati.hand_start`.
+        modes: modes of the full closed loop, see :class:`lqr.spectrum.modal_loop.ModalLoop`.
+    """
+    result = []
+    comm = retuner.problem.layout.comm
+    for materials in settings:
+        problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
+        try:
+            tuned = on_root(comm, lambda materials=materials: retuner.solve(materials))  # type: ignore[misc]
+        except ControlError as error:
+            nothing = float("nan")
+            result.append(BoxPoint(materials, nothing, nothing, nothing, nothing, str(error)))
+            continue
+        gain = retuner.full_gain(tuned)
+        best = solve(problem)
+        found = GainJudge(problem, best, start, ModalLoop(problem, modes)).quality(gain)
+        miss = gain_error(problem, gain_of(best), gain)
+        result.append(
+            BoxPoint(materials, miss, found.cost_excess, found.abscissa, tuned.seconds, certified=found.certified)
+        )
+    return tuple(result)

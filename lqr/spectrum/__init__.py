@@ -1,0 +1,1 @@
+"""Is the closed loop stable: exact abscissa and certificates."""

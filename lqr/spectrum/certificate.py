@@ -1,0 +1,278 @@
+"""Closed-loop abscissa of a large plant: shift-and-invert for what lies near the axis, a bound on everything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from slepc4py import SLEPc
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import PETSc, combine, total
+from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
+from softgrasp.lqr.plant.checks import EPS, ControlError
+from softgrasp.lqr.dense.modal import some_modes
+from softgrasp.lqr.plant.operators import damp, descriptor
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
+
+PREFIX = "softgrasp_spectrum_"
+TOLERANCE = 1e-9  # of 1/(sigma - lambda)
+ERROR = 1e-6  # relative residual of an eigenpair that is let pass
+GROWTH = (24, 48, 96)  # eigenvalues asked for until they cover what the bound leaves open, after a first guess
+ITERATIONS = 60  # restarts; eigenvalues that accumulate need any number, those before them few
+SAFE = 0.9  # of the small gain, for the radius that is aimed at
+ENOUGH = 0.7  # share of the radius aimed at, where the bound holds already
+SHOWN = 10  # modes that the circle should hold, so that the abscissa is that of the slowest of them
+GAP = 1e-3  # relative distance of two eigenvalues that the circle may pass between
+NEARLY = 1e-3  # share of the abscissa by which an eigenvalue outside may exceed it
+
+
+@dataclass(frozen=True)
+class Abscissa:
+    """Largest real part of the closed-loop spectrum.
+
+    Attributes:
+        value: over the eigenvalues found [1/s]: a lower bound of the abscissa, which exceeds it by at most a thousandth
+            where ``exact``.
+        certified: the sign of ``value`` is that of the abscissa: it is >= 0, or no eigenvalue with Re s >= 0 lies
+            outside the radius.
+        radius: all eigenvalues with Re s >= 0 and |s| <= radius are among those found [1/s].
+        bound: of |K (sE - A)^{-1} B| over Re s >= 0, |s| >= radius; below 1 it excludes eigenvalues there.
+        eigenvalues: those found, nearest to ``shift`` first, (k,).
+        reason: why it is not certified; empty when it is.
+        exact: no eigenvalue outside lies right of ``value`` by more than a thousandth of it.
+        shift: real point whose neighbours were searched [1/s].
+    """
+
+    value: float
+    certified: bool
+    radius: float
+    bound: float
+    eigenvalues: np.ndarray
+    reason: str = ""
+    exact: bool = False
+    shift: float = 0.0
+
+    @property
+    def stable(self) -> bool:
+        """Certified and left of the axis."""
+        return self.certified and self.value < 0
+
+
+def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
+    """Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it. Collective.
+
+    :class:`lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle |s - sigma| <= d with
+    d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely many eigenvalues
+    accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them outside. One solve
+    with sigma^2 M_ee + sigma D_ee + K_ee a step, factored once; the few inputs enter by Sherman-Morrison-Woodbury.
+
+    The Krylov space starts from a vector without symmetry, and only eigenvalues before the first one that has not
+    converged count; the circle passes through a gap between two of them.
+
+    Args:
+        problem: the plant; damped in every layer for a certificate.
+        K: gain, transposed, hand-relative.
+
+    Raises:
+        ControlError: the plant has no hand.
+        SolverError: no eigenvalue converges.
+    """
+    n_s = problem.layout.n_s
+    if n_s == 0:
+        raise ControlError("the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop")
+    K_q = K.hand[:n_s].T
+    if not np.linalg.svd(K_q, compute_uv=False)[-1] > 100 * EPS * np.linalg.norm(K.hand):
+        reason = "the gain on a rigid displacement is singular: the hand is not held"
+        return Abscissa(0.0, True, 0.0, np.inf, np.zeros(1, dtype=complex), reason)
+    why = why_no_bound(problem)
+    tail = None if why else Tail(problem, K)
+    # the same bits on every rank: they decide how often all search
+    wanted, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
+    resolvent = Resolvent(problem, K, shift)
+    try:
+        for count in (guess, *(more for more in GROWTH if more > guess)):
+            asked = min(count, problem.layout.states - 2)
+            values = resolvent.nearest(asked)
+            result: Abscissa = problem.layout.comm.bcast(_judge(values, shift, tail, why))
+            short = len(values) < asked  # asking for more would not help
+            enough = result.certified and (result.exact or result.radius >= ENOUGH * wanted)
+            if result.value >= 0 or short or enough or why:
+                break
+    finally:
+        resolvent.free()
+    return result
+
+
+def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, int]:
+    """Radius to cover, centre sigma of the search, and how many eigenvalues lie there if feedback moved none.
+
+    Collective.
+    """
+    k = min(SHOWN, problem.layout.n_e)
+    omega = some_modes(problem, k)[0] if tail is None else tail.omega[:k]
+    beta = problem.system.damping.beta if tail is None else tail.beta
+    needed = 0.0 if tail is None else tail.radius(SAFE)
+    shown = 1.05 * float(omega[-1])
+    if beta > 0:  # modes beyond 1 / beta are overdamped and accumulate there
+        shown = min(shown, 1 / beta)
+    radius = max(needed, shown) if np.isfinite(needed) else shown
+    # of all centres beta r^2 keeps the circle farthest from -1/beta, relative to its size
+    inside = int(np.sum(omega < radius)) if tail is None else int(np.sum(tail.omega < radius))
+    # the poles of the hand, and a pair a mode; one more would be sought among those that accumulate
+    return radius, max(radius / 4, beta * radius**2), min(2 * problem.layout.n_s + 2 * inside, GROWTH[-1])
+
+
+def _judge(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:
+    """What the eigenvalues nearest to the shift say. Not collective."""
+    distance = np.abs(values - shift)
+    order = np.argsort(distance)
+    values, distance = values[order], distance[order]
+    wide = np.flatnonzero(np.diff(distance) > GAP * distance[1:])
+    last = int(wide[-1]) if len(wide) else len(values) - 1
+    d = float(0.1 * distance[last] + 0.9 * distance[min(last + 1, len(distance) - 1)])
+    value = float(values.real.max())
+    a = max(-value, 0.0) * (1 - NEARLY)
+    radius = float(np.sqrt(max(d**2 - shift**2, 0.0)))
+    if value >= 0:
+        return Abscissa(value, True, radius, np.inf, values, "", True, shift)
+    if tail is None:
+        return Abscissa(value, False, radius, np.inf, values, why, False, shift)
+    bound = tail.bound(radius) if radius > 0 else np.inf
+    # |s| <= r, Re s >= -a lies in the circle while r^2 + 2 a sigma + sigma^2 <= d^2
+    inner = float(np.sqrt(max(d**2 - shift**2 - 2 * a * shift, 0.0)))
+    exact = inner > a and tail.bound(inner, a) < 1
+    reason = ""
+    if not bound < 1:
+        reason = f"the gain reaches modes beyond {radius:.3g}/s: the bound there is {bound:.2g}, not below 1"
+    return Abscissa(value, not reason, radius, bound, values, reason, exact, shift)
+
+
+class Resolvent:
+    """y = (sigma E - A - B K)^{-1} E x as a PETSc shell; local rows [hand on rank 0; z; v]."""
+
+    def __init__(self, problem: RiccatiProblem, K: Block, shift: float) -> None:
+        self.problem, self.K, self.shift = problem, K, shift
+        self.system, self.layout, self.comm = problem.system, problem.layout, problem.layout.comm
+        self.n_s, self.n = self.layout.n_s, self.layout.n_local
+        damping = self.system.damping
+        self.drag = damping.alpha if damping.in_space else 0.0
+        terms = [(1 + shift * damping.beta, self.system.K_ee), (shift * (shift + damping.alpha), self.system.M_ee)]
+        S = combine(terms + ([] if damping.matrix is None else [(shift, damping.matrix)]))
+        name = choose_solver(self.layout, few=True)[0]
+        self.solver: TissueSolver = make_solver(S, name, self.layout, PREFIX, rtol=1e-12)
+        self.r, self.w = self.system.K_ee.createVecs()
+        self.extra = 2 * self.n_s if self.comm.rank == 0 else 0
+        local = 2 * self.n + self.extra
+        self.shell = PETSc.Mat().createPython(((local, self.layout.states),) * 2, self, comm=self.comm)
+        self.shell.setUp()
+        try:
+            self._prepare()
+        except Exception:
+            self.free()
+            raise
+
+    def _prepare(self) -> None:
+        """The hand's Schur complement, and the inputs' columns for the feedback. Collective."""
+        system, sigma, n_s = self.system, self.shift, self.n_s
+        hand = sigma**2 * self.problem.M_s
+        if system.two_way:
+            self.S_G = np.column_stack([self._solve(column) for column in system.G.T]).reshape(self.n, n_s)
+            factor = sigma**2 + sigma * self.drag
+            hand = hand + sigma * self.drag * system.M_rigid
+            hand = hand - factor**2 * total(self.comm, system.G.T @ self.S_G)
+        self.hand = np.linalg.inv(hand)
+        columns = []
+        for unit in np.eye(n_s):
+            load = Block(np.concatenate([np.zeros(n_s), unit])[:, None], np.zeros((2 * self.n, 1)))
+            columns.append(self._open(load))
+        self.columns = Block.join(columns)
+        felt = self.K.hand.T @ self.columns.hand + total(self.comm, self.K.tall.T @ self.columns.tall)
+        self.small = np.linalg.inv(np.eye(n_s) - felt)
+
+    def _open(self, b: Block) -> Block:
+        """(sigma E - A)^{-1} b for one column. Collective."""
+        system, sigma, n, s = self.system, self.shift, self.n, self.n_s
+        a_s, a, b_s, f = b.hand[:s], b.tall[:n], b.hand[s:], b.tall[n:]
+        # v = sigma q - a: the displacements alone remain
+        moved = descriptor(self.problem, Block(np.concatenate([0 * a_s, a_s]), np.concatenate([0 * a, a])))
+        right = b_s + sigma * moved.hand[s:]
+        force = f + sigma * moved.tall[n:] + damp(system, a) + self.drag * (system.G @ a_s)
+        if system.two_way and self.drag:
+            right = right + self.drag * (system.M_rigid @ a_s + total(self.comm, system.G.T @ a))
+        factor = sigma**2 + sigma * self.drag
+        if system.two_way:
+            z = self._solve(force[:, 0])[:, None]
+            q_s = self.hand @ (right - factor * total(self.comm, system.G.T @ z))
+            z = z - factor * (self.S_G @ q_s)
+        else:
+            q_s = self.hand @ right
+            z = self._solve((force - factor * (system.G @ q_s))[:, 0])[:, None]
+        return Block(np.concatenate([q_s, sigma * q_s - a_s]), np.concatenate([z, sigma * z - a]))
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Apply y = (sigma E - A - B K)^{-1} E x. Collective."""
+        local = x.array_r
+        hand = np.array(local[: self.extra]) if self.extra else np.empty(2 * self.n_s)
+        self.comm.Bcast(hand)
+        state = Block(hand[:, None], np.array(local[self.extra :])[:, None])
+        answer = self._open(descriptor(self.problem, state))
+        felt = self.K.hand.T @ answer.hand + total(self.comm, self.K.tall.T @ answer.tall)
+        input_ = self.small @ felt
+        out = y.array_w
+        out[: self.extra] = (answer.hand + self.columns.hand @ input_)[: self.extra, 0]
+        out[self.extra :] = (answer.tall + self.columns.tall @ input_)[:, 0]
+
+    def _solve(self, right: np.ndarray) -> np.ndarray:
+        self.r.array_w[:] = right
+        self.solver.solve(self.r, self.w)
+        return np.array(self.w.array_r)
+
+    def nearest(self, count: int) -> np.ndarray:
+        """The ``count`` eigenvalues nearest to the shift, or as many as converge before the first that does not.
+
+        Collective.
+
+        Raises:
+            SolverError: none converges, or an eigenpair has a large residual.
+        """
+        eps = SLEPc.EPS().create(self.comm)
+        eps.setOptionsPrefix(PREFIX)
+        eps.setOperators(self.shell)
+        eps.setProblemType(SLEPc.EPS.ProblemType.NHEP)
+        eps.setType(SLEPc.EPS.Type.KRYLOVSCHUR)
+        eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_MAGNITUDE)
+        eps.setDimensions(nev=count, ncv=min(2 * count + 16, self.layout.states))
+        eps.setTolerances(TOLERANCE, ITERATIONS)
+        start = self.shell.createVecRight()
+        nodes = self.layout.nodes.ravel()
+        start.array_w[: self.extra] = 1.0
+        start.array_w[self.extra :] = np.concatenate([np.cos(1 + 3 * nodes), np.sin(2 + 5 * nodes)])
+        eps.setInitialSpace(start)
+        try:
+            eps.solve()
+            found = eps.getConverged()
+            if found == 0:
+                raise SolverError(
+                    f"closed-loop spectrum: none of {count} eigenvalues converged in {eps.getIterationNumber()} "
+                    "iterations; judge the gain by a time simulation or a smaller scene"
+                )
+            theta = np.array([eps.getEigenvalue(i) for i in range(found)])
+            worst = max(eps.computeError(i) for i in range(0, found, max(1, found // 6)))
+            if not worst <= ERROR:
+                raise SolverError(
+                    f"closed-loop spectrum: an eigenpair has the residual {worst:.1e}, allowed {ERROR:.0e}"
+                )
+        finally:
+            eps.destroy()
+            start.destroy()
+        return np.asarray(self.comm.bcast(self.shift - 1 / theta))
+
+    def free(self) -> None:
+        """Free all PETSc objects. Collective."""
+        self.shell.destroy()
+        self.solver.destroy()
+        for vector in (self.r, self.w):
+            vector.destroy()

@@ -1,0 +1,141 @@
+"""Spectrum and cost of the full plant under any gain, in energy-scaled modal coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
+from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
+from softgrasp.lqr.plant.operators import damp, reach
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.reduction.engines import on_root
+
+ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
+DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
+SOME_MODES = 150
+
+
+@dataclass(frozen=True)
+class LoopQuality:
+    """The full plant under one gain.
+
+    Attributes:
+        abscissa: largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``.
+        cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
+        certified: its sign is certain: from the whole spectrum, or from :func:`lqr.spectrum.certificate.certified_abscissa`.
+        exact: the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth.
+    """
+
+    abscissa: float
+    cost_excess: float
+    certified: bool = True
+    exact: bool = True
+
+    @property
+    def stable(self) -> bool:
+        """Whether every eigenvalue is known to lie left of the imaginary axis."""
+        return self.certified and self.abscissa < 0
+
+
+class ModalLoop:
+    """xi' = (A + B K) xi, xi = [q_s, v_s, omega eta, eta'], all modes of a small scene or the lowest of a large one.
+
+    With all modes the spectrum is that of the full plant. With some, the modes left out are not in it: use
+    :func:`lqr.spectrum.certificate.certified_abscissa` for large scenes.
+
+    Args:
+        problem: the plant.
+        modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`SOME_MODES`. All modes are
+            allowed up to :data:`DENSE_LIMIT`.
+    """
+
+    def __init__(self, problem: RiccatiProblem, modes: int | None = None) -> None:
+        self.problem, self.comm = problem, problem.layout.comm
+        n_e = problem.layout.n_e
+        self.complete = n_e <= (ALL_MODES if modes is None else min(modes, DENSE_LIMIT))
+        self.Phi, self.massed, plant = (
+            _all(problem) if self.complete else _lowest(problem, min(modes or SOME_MODES, n_e))
+        )
+        self.plant = plant
+        space = plant.space
+        solved = np.linalg.solve(space.E, np.hstack([space.A, space.B]))
+        self.A, self.B = solved[:, : len(space.A)], solved[:, len(space.A) :]
+
+    def gain(self, K: Block) -> Array:
+        """K on modal states from a transposed gain in hand-relative coordinates, (n_s, 2 n_s + 2 k). Collective."""
+        n = self.problem.layout.n_local
+        z, v = total(self.comm, np.stack([self.Phi.T @ K.tall[:n], self.Phi.T @ K.tall[n:]]))
+        return np.asarray(np.vstack([K.hand, z / self.plant.omega[:, None], v]).T)
+
+    def state(self, x: Block) -> Array:
+        """Modal states of full ones. Collective."""
+        n = self.problem.layout.n_local
+        z, v = total(self.comm, np.stack([self.massed.T @ x.tall[:n], self.massed.T @ x.tall[n:]]))
+        return np.asarray(np.vstack([x.hand, z * self.plant.omega[:, None], v]))
+
+    def poles(self, K: Block) -> np.ndarray:
+        """Eigenvalues of the closed loop. Collective."""
+        k = self.gain(K)
+        return on_root(self.comm, lambda: np.asarray(scipy.linalg.eigvals(self.A + self.B @ k)))
+
+    def quality(self, K: Block, best: Block, x: Block, optimal: float) -> LoopQuality:
+        """Abscissa and cost of a gain against the optimal one. Collective.
+
+        With d = K_hat - K:  J(K_hat) - J(K) = x' Y x,  F'Y + Y F + d'R d = 0,  F = A + B K_hat, which has none of
+        the cancellation of J(K_hat) - J(K).
+
+        Args:
+            K: the gain to judge, transposed, hand-relative.
+            best: the optimal gain.
+            x: start minus target, one column.
+            optimal: J(K) from there.
+        """
+        k, difference, xi = self.gain(K), self.gain(K) - self.gain(best), self.state(x)
+
+        def judge() -> LoopQuality:
+            F = self.A + self.B @ k
+            if not np.isfinite(F).all():
+                return LoopQuality(np.inf, np.inf)
+            T, U = scipy.linalg.schur(F, output="real")
+            abscissa = float(block_eigenvalues(T).real.max())
+            if not abscissa < 0:
+                return LoopQuality(abscissa, np.inf)
+            Y = lyapunov(T, U, difference.T @ self.problem.R @ difference)
+            return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal)
+
+        return on_root(self.comm, judge)
+
+
+def _all(problem: RiccatiProblem) -> tuple[Array, Array, ModalPlant]:
+    layout = problem.layout
+    tissue = gather_tissue(problem)
+
+    def modes() -> ModalPlant:
+        if tissue is None:
+            raise RuntimeError("only rank 0 has the matrices")
+        return dense_modes(problem, tissue)
+
+    plant = on_root(layout.comm, modes)
+    rows = slice(layout.start, layout.start + layout.n_local)
+    return plant.Phi[rows], plant.massed[rows], plant
+
+
+def _lowest(problem: RiccatiProblem, k: int) -> tuple[Array, Array, ModalPlant]:
+    comm = problem.layout.comm
+    omega, Phi, massed = some_modes(problem, k)
+    parts = (
+        modal_damping(problem, Phi),
+        reach(problem, Phi),
+        total(comm, problem.C_z.T @ Phi),
+    )
+    return Phi, massed, modal_plant(problem, omega, Phi, massed, parts)
+
+
+def modal_damping(problem: RiccatiProblem, Phi: Array) -> Array:
+    """Phi' D_ee Phi. Collective."""
+    return total(problem.layout.comm, Phi.T @ damp(problem.system, Phi))

@@ -1,0 +1,109 @@
+"""Projection of a full model onto a basis: distributed products, then small matrices that are equal on every rank."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.canonical import canonical_parts
+from softgrasp.reduction.galerkin import galerkin_parts, relative_rows
+from softgrasp.reduction.model import Lift, Outputs, ReducedModel
+
+
+class OutputLike(Protocol):
+    """What an output needs to be projected; :class:`fem.model.outputs.Output` has it."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One label per component."""
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+
+    @property
+    def dofs(self) -> np.ndarray:
+        """Local tissue dofs that enter, (k, size)."""
+
+    @property
+    def weight(self) -> float:
+        """Every listed dof enters with this factor."""
+
+    @property
+    def C_s(self) -> Array:
+        """Rigid part, (size, n_s)."""
+
+
+def project(
+    basis: Basis,
+    system: BlockSystem,
+    outputs: Sequence[OutputLike] = (),
+    scene_hash: str = "",
+) -> ReducedModel:
+    """Reduced model of a basis: (q, v) Galerkin, or canonical when the basis is in (q, p). Collective.
+
+    Costs a product with every component for each basis vector; a canonical model also one factorisation of M_ee and a
+    solve for each vector with a momentum.
+
+    Args:
+        basis: V in the blocks of hand and tissue.
+        system: operators; a canonical model is affine around their densities.
+        outputs: outputs of the scene.
+        scene_hash: kept for the archive.
+
+    Raises:
+        SolverError: the mass matrix cannot be factored.
+        SoftgraspError: a canonical basis with fixed solid modes whose hand columns reach into the tissue.
+    """
+    layout = system.layout
+    layout.comm.Barrier()
+    begin = time.perf_counter()
+    if basis.coordinates == "qv":
+        parts = galerkin_parts(basis, system)
+        L_q, L_v = relative_rows(basis, system)
+        lift = Lift(layout, L_q, L_v)
+    else:
+        parts, velocity = canonical_parts(basis, system)
+        lift = Lift(layout, velocity.L_q, velocity.Y, velocity.W_G)
+    # sums over ranks may differ in the last bit from rank to rank
+    parts = layout.comm.bcast(parts)
+    damping = system.damping
+    seconds = layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+    return ReducedModel(
+        name=basis.name,
+        N=basis.N,
+        coordinates=basis.coordinates,
+        frame=basis.frame,
+        structure=basis.structure,
+        fixed_solid=basis.fixed_solid,
+        parts=parts,
+        materials=system.materials,
+        outputs=project_outputs(outputs, lift),
+        alpha=damping.alpha,
+        in_space=damping.in_space,
+        damped=damping.active,
+        hand_weight=system.hand_weight,
+        two_way=system.two_way,
+        gravity=system.gravity,
+        lift=lift,
+        scene_hash=scene_hash,
+        seconds={**basis.seconds, "projection": seconds},
+    )
+
+
+def project_outputs(outputs: Sequence[OutputLike], lift: Lift) -> Outputs:
+    """C_z = C_e L_q on every rank, with the rigid parts. Collective."""
+    n_s, N = lift.layout.n_s, lift.L_q.shape[1]
+    rows = [o.weight * lift.L_q[o.dofs].sum(axis=0) for o in outputs]
+    local = np.concatenate(rows) if rows else np.zeros((0, N))
+    C_z = lift.layout.comm.bcast(total(lift.layout.comm, local))
+    C_s = np.vstack([o.C_s for o in outputs]) if rows else np.zeros((0, n_s))
+    names = tuple(name for o in outputs for name in o.names)
+    return Outputs(C_z, C_s, names)

@@ -1,0 +1,1 @@
+"""Benchmarks against other codes, and of the limits in the source."""

@@ -1,0 +1,278 @@
+"""What the engines of a reduced basis cost and how far they are right: ``python -m softgrasp.study.bench.bases``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from mpi4py import MPI
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.reduction.engines import factor, small_svd
+from softgrasp.study.bench.forward import parse_ranks
+from softgrasp.study.bench.forward_rows import interleave, medians, timed
+from softgrasp.study.shell.doctor import IN_MPI_JOB
+from softgrasp.study.shell.jobs import launch_worker, leave_result
+
+SIZES = "10000x600,100000x600"
+KEPT = 60  # basis vectors that are made
+CHUNK = 2_000  # rows in extended precision at a time
+DECADES = 16  # of singular values, evenly spread
+RIGHT, ROUGH = 1e-8, 0.1  # relative errors of a singular value
+GOAL = 1e-10  # sigma / sigma_1 down to which the default has to be right
+SCALAPACK_LIMIT = 20_000  # rows; minutes beyond
+NUMPY_LIMIT = 200_000
+WORKER_LIMIT = 3600.0  # [s]
+TITLES = {
+    "tsqr": "POD, SLEPc BV TSQR (default)",
+    "svd": "POD, SLEPc SVD trlanczos, leading 60",
+    "svd_all": "POD, SLEPc SVD scalapack, all",
+    "gram": "POD, Gram (method of snapshots)",
+    "numpy": "POD, numpy.linalg.svd",
+    "psd_tsqr": "PSD complex SVD, SLEPc BV TSQR (default)",
+    "psd_gram": "PSD complex SVD, Gram",
+    "psd_numpy": "PSD complex SVD, numpy.linalg.svd",
+}
+HELP = f"""Measure the engines that factor snapshots: seconds beside accuracy, in one table.
+
+The matrix is made with known singular values, {DECADES} decades evenly spread, as m columns for POD and as m / 2
+complex columns q + i p for PSD. Every size and rank count is a program of its own under mpiexec; in it the engines
+take turns and the median counts. Columns: seconds for singular values and {KEPT} vectors; sigma / sigma_1 down to which
+all that are computed are right to {RIGHT:g}, and to {ROUGH:g}; largest entry of U' U - I. numpy.linalg.svd of the whole
+matrix stands beside them on one rank.
+
+Keep the machine quiet while it runs. A fast look: --sizes 2000x100 --ranks 1 --repeats 3."""
+
+Row = dict[str, Any]
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def parse_shapes(text: str) -> list[tuple[int, int]]:
+    """``10000x600`` as pairs of rows and columns. Not collective.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    result = []
+    for part in text.split(","):
+        n, _, m = part.strip().partition("x")
+        if not (n.isdigit() and m.isdigit() and int(m) >= 4 and int(n) >= int(m)):
+            raise typer.BadParameter(f"'{part}' is no shape; write 10000x600 with at least 4 columns and more rows")
+        result.append((int(n), int(m)))
+    return result
+
+
+def spectrum_of(m: int) -> Array:
+    """Singular values from 1 to 10^-DECADES. Not collective."""
+    return 10.0 ** (-DECADES * np.arange(m) / (m - 1))
+
+
+def known_matrix(comm: MPI.Intracomm, n: int, m: int, complex_valued: bool) -> NDArray[Any]:
+    """U diag(sigma) C^H with known sigma: U are cosines, orthonormal on n points, C mixes all columns. F order.
+
+    It is made in extended precision and rounded once: a product in double precision alone would change
+    sigma = 1e-10 in its eighth digit. Every rank makes its own rows. Not collective.
+    """
+    start, stop = n * comm.rank // comm.size, n * (comm.rank + 1) // comm.size
+    X = np.empty((stop - start, m), dtype=complex if complex_valued else float, order="F")
+    j, wide = np.arange(1, m + 1), np.longdouble
+    turn = 2 * np.arccos(wide(-1)) / (4 * n)
+    sigma = wide(10) ** (-DECADES * np.arange(m, dtype=wide) / (m - 1))
+    for first in range(start, stop, CHUNK):
+        i = np.arange(first, min(first + CHUNK, stop))[:, None]
+        # whole turns go first, in integers
+        rows = np.sqrt(wide(2) / n) * np.cos(turn * ((2 * i + 1) * j % (4 * n)).astype(wide)) * sigma
+        real, imaginary = rows, np.zeros_like(rows)
+        random = np.random.default_rng(0)
+        for _ in range(3):  # reflections I - 2 w w^H
+            a, b = random.standard_normal((2, m)).astype(wide)
+            b = b if complex_valued else np.zeros_like(b)
+            factor_2 = 2 / (np.sum(a * a) + np.sum(b * b))
+            x = (factor_2 * (real * a - imaginary * b).sum(axis=1))[:, None]
+            y = (factor_2 * (real * b + imaginary * a).sum(axis=1))[:, None]
+            real, imaginary = real - (x * a + y * b), imaginary - (y * a - x * b)
+        X[first - start : first - start + len(i)] = real + 1j * imaginary if complex_valued else real
+    return X
+
+
+def reach(found: Array, true: Array, tolerance: float) -> float:
+    """Smallest sigma / sigma_1 down to which all values are right to a relative tolerance. Not collective."""
+    k = min(len(found), len(true))
+    wrong = np.abs(found[:k] / true[:k] - 1) > tolerance
+    count = int(np.argmax(wrong)) if wrong.any() else k
+    return float(true[count - 1] / true[0]) if count else float("inf")
+
+
+Answer = tuple[Array, NDArray[Any]]
+
+
+def methods_for(comm: MPI.Intracomm, n: int, m: int) -> dict[str, tuple[Callable[[], Answer], Array]]:
+    """Every engine as a call that returns sigma and local U, with the true singular values. Collective."""
+    X = known_matrix(comm, n, m, False)
+    half = known_matrix(comm, n, m // 2, True)
+    beside = np.asfortranarray(np.hstack([half.real, half.imag]))
+
+    def pod(engine: Any, k: int | None) -> Callable[[], Answer]:
+        def call() -> Answer:
+            f = factor(comm, X, engine, k)
+            u, s, _ = small_svd(comm, f.R)
+            return f.scale * s, f.Q @ u[:, :KEPT]
+
+        return call
+
+    def psd(engine: Any) -> Callable[[], Answer]:
+        def call() -> Answer:
+            f = factor(comm, beside, engine)
+            u, s, _ = small_svd(comm, f.R[:, : m // 2] + 1j * f.R[:, m // 2 :])
+            return f.scale * s, f.Q @ u[:, :KEPT]
+
+        return call
+
+    def peer(A: NDArray[Any]) -> Callable[[], Answer]:
+        def call() -> Answer:
+            u, s, _ = np.linalg.svd(A, full_matrices=False)
+            return s, u[:, :KEPT]
+
+        return call
+
+    true, true_half = spectrum_of(m), spectrum_of(m // 2)
+    result = {name: (pod(name, None), true) for name in ("tsqr", "gram")}
+    result["svd"] = pod("svd", min(KEPT, m // 3 - 1)), true
+    if n <= SCALAPACK_LIMIT:
+        result["svd_all"] = pod("svd", None), true
+    result |= {f"psd_{name}": (psd(name), true_half) for name in ("tsqr", "gram")}
+    if comm.size == 1 and n <= NUMPY_LIMIT:
+        result["numpy"] = peer(X), true
+        result["psd_numpy"] = peer(half), true_half
+    return result
+
+
+def measure(comm: MPI.Intracomm, n: int, m: int, repeats: int) -> Row:
+    """One size on this many ranks: seconds, reach and orthonormality of every engine. Collective."""
+    methods = methods_for(comm, n, m)
+    rows: dict[str, Row] = {}
+    for name, (call, true) in methods.items():
+        sigma, U = call()  # also warms up
+        gram = total(comm, np.array([(U.conj().T @ U).real, (U.conj().T @ U).imag]))
+        off = np.abs(gram[0] + 1j * gram[1] - np.eye(U.shape[1])).max()
+        rows[name] = {"right": reach(sigma, true, RIGHT), "rough": reach(sigma, true, ROUGH), "off": float(off)}
+    samples = interleave({name: partial(timed, comm, call) for name, (call, _) in methods.items()}, repeats)
+    for name, seconds in medians(samples).items():
+        rows[name] |= {"seconds": seconds, "samples": samples[name]}
+    return {"rows": n, "columns": m, "ranks": comm.size, "repeats": repeats, "engines": rows}
+
+
+def launch(n: int, m: int, ranks: int, repeats: int) -> Row:
+    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
+    spec = {"n": n, "m": m, "repeats": repeats}
+    return {"rows": n, "columns": m, "ranks": ranks} | launch_worker("softgrasp.study.bench.bases", spec, ranks, WORKER_LIMIT)
+
+
+def table_of(results: Sequence[Row]) -> Table:
+    """The one table, accuracy against time. Not collective."""
+    table = Table(box=None, pad_edge=False, title=f"factoring snapshots: {KEPT} vectors, median seconds")
+    table.add_column("engine", no_wrap=True)
+    for head in ("rows", "columns", "ranks", "s", "/ default", f"right to {RIGHT:g}", f"to {ROUGH:g}", "|U'U - I|"):
+        table.add_column(head, justify="right", no_wrap=True)
+    for row in results:
+        size = [str(row["rows"]), str(row["columns"]), str(row["ranks"])]
+        if "error" in row:
+            table.add_row("failed", *size)
+            continue
+        for name, title in TITLES.items():
+            if name not in row["engines"]:
+                continue
+            found = row["engines"][name]
+            default = row["engines"]["psd_tsqr" if name.startswith("psd") else "tsqr"]["seconds"]
+            numbers = [f"{found['seconds']:.3g}", f"{found['seconds'] / default:.2f}"]
+            table.add_row(title, *size, *numbers, *(f"{found[key]:.0e}" for key in ("right", "rough", "off")))
+    return table
+
+
+def missed(results: Sequence[Row]) -> list[str]:
+    """Sentences for defaults that are not right down to the goal. Not collective."""
+
+    def last(m: int) -> float:
+        """Smallest value of the spectrum that the goal speaks of, with room for rounding."""
+        sigma = spectrum_of(m)
+        return 1.001 * float(sigma[sigma >= GOAL].min())
+
+    columns = {"tsqr": 1, "psd_tsqr": 2}
+    return [
+        f"{TITLES[name]}, {row['rows']} x {row['columns']}, {row['ranks']} rank(s): "
+        f"right down to {row['engines'][name]['right']:.1e}, goal {GOAL:g}"
+        for row in results
+        if "error" not in row
+        for name, halves in columns.items()
+        if row["engines"][name]["right"] > last(row["columns"] // halves)
+    ]
+
+
+def write_csv(path: Path, results: Sequence[Row]) -> None:
+    """One line an engine, numbers in full. Not collective."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["engine", "rows", "columns", "ranks", "seconds", "right", "rough", "orthonormality"])
+        for row in results:
+            for name, found in row.get("engines", {}).items():
+                values = [found[key] for key in ("seconds", "right", "rough", "off")]
+                writer.writerow([name, row["rows"], row["columns"], row["ranks"], *values])
+
+
+def run_worker(spec: dict[str, Any]) -> None:
+    """Measure what the driver asks for and leave the numbers in its file. Collective."""
+    leave_result(spec["file"], lambda: measure(MPI.COMM_WORLD, spec["n"], spec["m"], spec["repeats"]))
+
+
+@app.command(help=HELP)
+def main(
+    sizes: Annotated[str, typer.Option(help="rows x columns")] = SIZES,
+    ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
+    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 3,
+    out: Annotated[Path, typer.Option(help="folder for bench_bases.json and bench_bases.csv")] = Path("out"),
+    worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",
+) -> None:
+    """See HELP."""
+    if worker:
+        run_worker(json.loads(worker))
+        return
+    wanted, counts = parse_shapes(sizes), parse_ranks(ranks)
+    if any(variable in os.environ for variable in IN_MPI_JOB):
+        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
+    terminal = Console(highlight=False)
+    console = Console(highlight=False, width=max(terminal.width, 130), soft_wrap=True)
+    results = []
+    for n, m in wanted:
+        for k in counts:
+            with console.status(f"{n} x {m}, {k} rank(s)"):
+                results.append(launch(n, m, k, repeats))
+    console.print(table_of(results))
+    for row in results:
+        if "error" in row:
+            console.print(f"{row['rows']} x {row['columns']}, {row['ranks']} rank(s): {row['error']}", markup=False)
+    late = missed(results)
+    for sentence in late:
+        console.print(f"goal [red]missed[/red]: {sentence}")
+    if not late and not any("error" in row for row in results):
+        console.print(f"goal [green]ok[/green]: the defaults are right to {RIGHT:g} down to sigma / sigma_1 = {GOAL:g}")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "bench_bases.json").write_text(json.dumps({"command": "bench_bases", "results": results}, indent=2) + "\n")
+    write_csv(out / "bench_bases.csv", results)
+    for file in (out / "bench_bases.json", out / "bench_bases.csv"):
+        console.print(f"  {file}")
+    if late or any("error" in row for row in results):
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,340 @@
+"""What the forward run costs, as one table, JSON, CSV and figure: ``python -m softgrasp.study.bench.forward``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from softgrasp.study.shell.doctor import IN_MPI_JOB
+from softgrasp.study.shell.jobs import launch_worker
+
+SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"
+LARGE = (("2d", 1_000_000), ("3d", 200_000))
+LARGE_STEPS, LARGE_RANKS = 60, 2
+LIMIT_SMALL, LIMIT = 1.5, 1.15  # TS step over bare solve, below and from n_e = 9000 on
+BIG = 9_000
+MEMORY_LIMIT_MB = 24 * 1024
+MEMORY_FLOOR_MB = 8.0  # growth of memory above the libraries is noise below
+WORKER_LIMIT = 3600.0  # [s]
+METHODS = {
+    "ts": "PETSc TS",
+    "solve": "bare solve",
+    "own": "bare solve, blocks",
+    "loop": "textbook loop",
+    "scipy": "SciPy",
+    "pymor": "pyMOR",
+}
+HELP = f"""Measure what a forward run costs and print one table.
+
+Every row is a program of its own under mpiexec. In it all methods take turns, several times, and the median
+counts, so that noise of the machine hits all alike. Columns: assembly and factor [s]; microseconds of one time step
+by PETSc TS (what `softgrasp simulate` does) and by the bare triangular solves alone, as PETSc's solver gives them
+(-pc_type cholesky, or MUMPS); the median of their quotient, with its goal; the same for the solves that the step
+itself does, with a Cholesky factor of d x d blocks: what a step adds to them is the product with K, vectors and TS;
+microseconds by a textbook loop (PETSc's solve, on several ranks ours; products with K and M), by SciPy (sparse LU,
+same loop) and by pyMOR's implicit midpoint (up to n_e = 12 000, where installed); energy drift; peak memory of all
+ranks before SciPy and pyMOR start. Below: set-up of the factor here, by PETSc and by SciPy; the paper's scene as a
+whole run; growth exponents p of cost ~ n^p over the 2D sizes.
+
+Keep the machine quiet while it runs. A fast look: --sizes 2d:1000 --ranks 1 --repeats 3.
+--large adds 2D with 1e6 and 3D with 2e5 unknowns, {LARGE_STEPS} steps each on {LARGE_RANKS} ranks: minutes, GiB."""
+
+Row = dict[str, Any]
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A number to reach: ``value <= limit``."""
+
+    text: str
+    value: float
+    limit: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether it is reached."""
+        return self.value <= self.limit
+
+
+def parse_sizes(text: str) -> list[tuple[str, int]]:
+    """``2d:1000,3d:50000`` as pairs; a bare number is 2D. Not collective.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    result = []
+    for part in text.split(","):
+        kind, _, number = part.strip().rpartition(":")
+        if kind not in ("", "2d", "3d") or not number.isdigit() or int(number) < 20:
+            raise typer.BadParameter(f"'{part}' is no size; write 2d:1000 or 3d:50000 with at least 20 unknowns")
+        result.append((kind or "2d", int(number)))
+    return result
+
+
+def parse_ranks(text: str) -> list[int]:
+    """``1,2`` as numbers. Not collective.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdigit() and int(part) > 0 for part in parts):
+        raise typer.BadParameter(f"'{text}' is no list of rank counts; write 1,2")
+    return [int(part) for part in parts]
+
+
+def launch(spec: dict[str, Any], ranks: int) -> Row:
+    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
+    return {"ranks": ranks} | launch_worker("softgrasp.study.bench.forward", spec, ranks, WORKER_LIMIT)
+
+
+def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
+    """Exponent p of cost ~ n^p by least squares on logarithms; None for fewer than two positive points.
+
+    Not collective.
+    """
+    points = [(a, b) for a, b in zip(n, cost, strict=True) if a > 0 and b > 0]
+    if len({a for a, _ in points}) < 2:
+        return None
+    x, y = np.log(np.array(points)).T
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
+    """Growth over the 2D sizes for each rank count, memory counted above that of the libraries. Not collective."""
+    result = {}
+    good = [row for row in rows if "error" not in row and row["dimension"] == 2 and not row["large"]]
+    for ranks in sorted({row["ranks"] for row in good}):
+        mine = [row for row in good if row["ranks"] == ranks]
+        n = [row["n_e"] for row in mine]
+        memory = [row["memory_mb"] - row["memory_base_mb"] for row in mine]
+        result[str(ranks)] = {
+            "assembly": growth(n, [row["seconds"]["assembly"] for row in mine]),
+            "factor": growth(n, [row["seconds"]["factor"] for row in mine]),
+            "step": growth(n, [row["step_us"]["ts"] for row in mine]),
+            "memory": growth(n, [m if m > MEMORY_FLOOR_MB else 0.0 for m in memory]),
+        }
+    return result
+
+
+def ratio_goal(row: Row) -> Goal | None:
+    """TS over bare solve; None where nothing was compared. Not collective."""
+    if "ratio" not in row:
+        return None
+    limit = LIMIT if row["n_e"] >= BIG else LIMIT_SMALL
+    return Goal(f"{row['problem']}, {row['ranks']} rank(s): TS step / bare solve", row["ratio"], limit)
+
+
+def goals(rows: Sequence[Row]) -> list[Goal]:
+    """All goals that the rows can speak for. Not collective."""
+    result = []
+    for row in rows:
+        if "error" in row:
+            continue
+        ratio = ratio_goal(row)
+        if ratio is not None:
+            result.append(ratio)
+        seconds = (row["whole"] or {}).get("seconds", {})
+        if "scipy" in seconds:
+            # both keep every state
+            text = f"{row['problem']}, whole run: TS / SciPy"
+            result.append(Goal(text, seconds["ts_memory"] / seconds["scipy"], 1.0))
+        if row["large"]:
+            text = f"{row['problem']}, {row['ranks']} rank(s), {row['drift_steps']} steps end to end: MiB"
+            result.append(Goal(text, row["memory_mb"], MEMORY_LIMIT_MB))
+    return result
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
+
+
+def table_of(rows: Sequence[Row]) -> Table:
+    """The one table. Not collective."""
+    heads = ["problem", "n_e", "ranks", "solver", "assembly s", "factor s", "TS us", "solve us", "TS/solve", "goal"]
+    heads += ["own us", "TS/own", "loop us", "SciPy us", "pyMOR us", "drift", "MiB"]
+    table = Table(box=None, pad_edge=False, title="cost of a forward run, medians; us are per time step")
+    for head in heads:
+        table.add_column(head, justify="left" if head in ("problem", "solver", "goal") else "right", no_wrap=True)
+    for row in rows:
+        if "error" in row:
+            table.add_row(row["problem"], "-", str(row["ranks"]), "failed")
+            continue
+        step, goal = row["step_us"], ratio_goal(row)
+        verdict = "" if goal is None else f"<= {goal.limit:g} {'ok' if goal.ok else 'missed'}"
+        table.add_row(
+            row["problem"],
+            str(row["n_e"]),
+            str(row["ranks"]),
+            row["solver"],
+            _number(row["seconds"]["assembly"]),
+            _number(row["seconds"]["factor"]),
+            _number(step["ts"]),
+            _number(step.get("solve")),
+            _number(row.get("ratio")),
+            verdict,
+            _number(step.get("own")),
+            _number(row.get("ratio_own")),
+            *(_number(step.get(name)) for name in ("loop", "scipy", "pymor")),
+            f"{row['drift']:.0e}",
+            _number(row["memory_mb"]),
+        )
+    return table
+
+
+def show(console: Console, rows: Sequence[Row]) -> None:
+    """Table, whole runs, exponents and goals."""
+    console.print(table_of(rows))
+    for row in rows:
+        if "error" in row:
+            console.print(f"{row['problem']}, {row['ranks']} rank(s) failed: {row['error']}", markup=False)
+            continue
+        factors = {"here": row["seconds"]["factor"], **row.get("factor_peer_s", {})}
+        if len(factors) > 1:
+            names = {"here": "here", "petsc": "PETSc's Cholesky", "scipy": "SciPy (SuperLU)"}
+            parts = [f"{names[name]} {_number(value)} s" for name, value in factors.items()]
+            console.print(f"set-up of the factor, {row['problem']}, {row['ranks']} rank(s): {', '.join(parts)}")
+        if row["whole"]:
+            seconds = row["whole"]["seconds"]
+            names = {"ts_none": "TS", "ts_memory": "TS storing every state", "scipy": "SciPy storing", "pymor": "pyMOR"}
+            parts = [f"{names[name]} {1e3 * value:.3g} ms" for name, value in seconds.items()]
+            console.print(
+                f"whole run, {row['problem']}, 2n = {row['states']}, {row['whole']['steps']} steps, "
+                f"{row['ranks']} rank(s), factor included: {', '.join(parts)}; drift {row['whole']['drift']:.0e}"
+            )
+    for ranks, powers in exponents(rows).items():
+        parts = [f"{name} {power:.2f}" for name, power in powers.items() if power is not None]
+        if parts:
+            console.print(f"growth exponents in n_e over the 2D sizes, {ranks} rank(s): {', '.join(parts)}")
+    for goal in goals(rows):
+        verdict = "[green]ok[/green]" if goal.ok else "[red]missed[/red]"
+        console.print(f"goal {verdict}: {goal.text} {_number(goal.value)} <= {goal.limit:g}")
+
+
+def write_markdown(path: Path, rows: Sequence[Row]) -> None:
+    """The table as the README shows it. Not collective."""
+    heads = ["problem", "n_e", "ranks", "solver", "assembly [s]", "factor [s]", "TS step [µs]", "bare solve [µs]"]
+    heads += ["TS / solve", "own solve [µs]", "TS / own", "SciPy step [µs]", "pyMOR step [µs]", "memory [MiB]"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
+    for row in rows:
+        if "error" in row:
+            continue
+        step, seconds = row["step_us"], row["seconds"]
+        cells = [row["problem"], str(row["n_e"]), str(row["ranks"]), row["solver"]]
+        numbers = [seconds["assembly"], seconds["factor"], step["ts"], step.get("solve"), row.get("ratio")]
+        numbers += [step.get("own"), row.get("ratio_own"), step.get("scipy"), step.get("pymor"), row["memory_mb"]]
+        lines.append("| " + " | ".join(cells + [_number(value) for value in numbers]) + " |")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """One line a row, numbers in full. Not collective."""
+    names = ["problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats"]
+    stages = ["mesh", "assembly", "factor"]
+    last = ["ratio", "ratio_own", "drift", "residual", "memory_mb", "memory_base_mb", "error"]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(names + [f"{s}_s" for s in stages] + [f"{m}_us" for m in METHODS] + last)
+        for row in rows:
+            seconds, step = row.get("seconds", {}), row.get("step_us", {})
+            values = [row.get(n) for n in names] + [seconds.get(s) for s in stages]
+            writer.writerow(values + [step.get(m) for m in METHODS] + [row.get(n) for n in last])
+
+
+def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
+    """Per-step time against size for every method, log-log, 2D full and 3D hollow, on one rank (else the fewest)."""
+    import matplotlib.pyplot as plt
+
+    from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, SKY, paper_style, save
+
+    good = [row for row in rows if "error" not in row]
+    fewest = min((row["ranks"] for row in good), default=1)
+    good = [row for row in good if row["ranks"] == fewest]
+    with paper_style():
+        figure, axes = plt.subplots(figsize=(5.4, 3.1))
+        colours = dict(zip(METHODS, (BLUE, HAND, SKY, GREEN, ORANGE, PURPLE), strict=True))
+        for name, label in METHODS.items():
+            for d, fill in ((2, "full"), (3, "none")):
+                points = sorted(
+                    (row["n_e"], row["step_us"][name])
+                    for row in good
+                    if row["dimension"] == d and name in row["step_us"]
+                )
+                if points:
+                    n, us = zip(*points, strict=True)
+                    style = "--" if name in ("solve", "own") else "-"
+                    axes.loglog(n, us, style, marker="o", ms=4, fillstyle=fill, color=colours[name], label=label)
+                    label = f"_{label}"  # named once
+        axes.set_xlabel("tissue unknowns $n_e$")
+        axes.set_ylabel("time of one step [µs]")
+        axes.set_title(f"median, {'one rank' if fewest == 1 else f'{fewest} ranks'}; hollow: 3D", loc="left")
+        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5))
+        return save(figure, path)
+
+
+def collect(console: Console, sizes: list[tuple[str, int]], ranks: list[int], repeats: int, large: bool) -> list[Row]:
+    """Launch all workers one after the other. Not collective."""
+    rows: list[Row] = []
+    jobs: list[tuple[str, int, int, bool]] = [(kind, size, k, False) for kind, size in sizes for k in ranks]
+    if large:
+        jobs += [(kind, size, LARGE_RANKS, True) for kind, size in LARGE]
+    for kind, size, k, big in jobs:
+        paper = (kind, size) == ("2d", 1000)
+        problem = f"{kind.upper()} paper" if paper else f"{kind.upper()} {size:.0e}".replace("e+0", "e")
+        spec: dict[str, Any] = {"dimension": int(kind[0]), "size": size, "large": big}
+        spec |= {"steps": LARGE_STEPS} if big else {"repeats": repeats, "whole": paper}
+        with console.status(f"{problem}, {k} rank(s)"):
+            row = launch(spec, k)
+        rows.append(row | {"problem": problem, "large": big})
+    return rows
+
+
+@app.command(help=HELP)
+def main(
+    sizes: Annotated[str, typer.Option(help="tissue unknowns; 2d:1000 is the paper's scene exactly")] = SIZES,
+    ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
+    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 25,
+    out: Annotated[Path, typer.Option(help="folder for bench.json, bench.csv, bench.png and bench.pdf")] = Path("out"),
+    large: Annotated[bool, typer.Option("--large", help=f"also 1e6 (2D) and 2e5 (3D), {LARGE_STEPS} steps")] = False,
+    worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",
+) -> None:
+    """See HELP."""
+    if worker:
+        from softgrasp.study.bench.forward_rows import run_worker
+
+        run_worker(json.loads(worker))
+        return
+    wanted, counts = parse_sizes(sizes), parse_ranks(ranks)
+    if any(variable in os.environ for variable in IN_MPI_JOB):
+        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
+    terminal = Console(highlight=False)
+    console = Console(highlight=False, width=max(terminal.width, 175), soft_wrap=True)
+    rows = collect(console, wanted, counts, repeats, large)
+    show(console, rows)
+    out.mkdir(parents=True, exist_ok=True)
+    reached = [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals(rows)]
+    report = {"command": "bench_forward", "rows": rows, "exponents": exponents(rows), "goals": reached}
+    (out / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
+    write_csv(out / "bench.csv", rows)
+    write_markdown(out / "bench.md", rows)
+    for file in (out / "bench.json", out / "bench.csv", out / "bench.md", *draw(out / "bench.png", rows)):
+        console.print(f"  {file}")
+    if any("error" in row for row in rows):
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    app()

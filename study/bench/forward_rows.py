@@ -1,0 +1,326 @@
+"""What one row of the benchmark measures, inside the ranks that ``study.bench.forward`` launches."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import resource
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.run.drive import TableDrive
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.run.midpoint import midpoint_matrix
+from softgrasp.fem.petsc import Array, whole_copy
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.fem.solve.solvers import make_solver
+from softgrasp.fem.run.stepping import make_ts
+from softgrasp.study.bench.peers import BareSolve, PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, has_pymor, to_scipy
+from softgrasp.study.shell.jobs import leave_result
+
+DT = 0.005  # [s], that of the paper: 600 steps in 3 s
+PAPER_STEPS = 600
+REPEAT_SECONDS = 0.1  # of the TS steps: long against the timer, short against the moods of a shared machine
+BUILD_SECONDS = 20.0  # assembly and factor are repeated at most this long
+PYMOR_LIMIT = 12_000  # [n_e]; its LU of size 2 n_e takes minutes beyond
+PEER_SHARE = 3  # SciPy and pyMOR need about so many times longer a step
+
+
+def cells_for(dimension: int, size: int) -> list[int]:
+    """Cells of the 1 x 2 rectangle (1 x 1 x 2 box) whose free nodes come nearest to ``size`` unknowns. Not collective.
+
+    Size 1000 in 2D gives 15 x 30, the mesh of the paper.
+    """
+
+    def unknowns(n: int) -> float:
+        if dimension == 2:
+            return 2 * ((n + 1) * (2 * n + 1) - 2 * (n / 2 + 1.5))
+        return 3 * ((n + 1) ** 2 * (2 * n + 1) - 2 * (n + 1) * (n / 2 + 1.5))
+
+    start = max(2, int((size / (4 if dimension == 2 else 6)) ** (1 / dimension)))
+    n = min(range(max(2, start - 3), start + 4), key=lambda m: abs(unknowns(m) - size))
+    return [n] * (dimension - 1) + [2 * n]
+
+
+def bench_scene(comm: MPI.Intracomm, dimension: int, cells: list[int], steps: int, snapshots: str = "none") -> Scene:
+    """The paper's scene on another mesh, or its 3D sister; the step stays 0.005 s. Collective."""
+    changes = [f"tissue.cells={cells}", f"time.steps={steps}", f"time.end={steps * DT!r}"]
+    changes.append(f"output.snapshots={snapshots}")
+    if dimension == 3:
+        changes += ["tissue.size=[1.0, 1.0, 2.0]", "contact.box=[[0.0, 0.0, 1.5], [1.0, 1.0, 2.0]]"]
+        changes += ["motion.target=[5.0, 3.0, 0.0]", "control.outputs.0.point=[0.5, 0.5, 0.0]"]
+    return load_scene_collective(comm, shipped_scenes()["paper_forward"], changes)
+
+
+def peak_mb(comm: MPI.Intracomm) -> float:
+    """Largest resident memory so far, summed over the ranks [MiB]. Collective.
+
+    Linux's VmHWM starts anew with this program, unlike ``ru_maxrss``, which may show that of the launcher.
+    """
+    try:
+        text = Path("/proc/self/status").read_text()
+        mine = next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):
+        mine = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return float(comm.allreduce(mine))
+
+
+def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
+    """Seconds of a call on the slowest rank. Collective."""
+    gc.collect()
+    comm.Barrier()
+    begin = time.perf_counter()
+    call()
+    return float(comm.allreduce(time.perf_counter() - begin, MPI.MAX))
+
+
+def warm(count: int) -> int:
+    """Steps before the timed ones: the method before left the caches full of its own factor. Not collective."""
+    return max(1, count // 20)
+
+
+def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
+    """Call every method once a repeat, in rotated order, and keep what each returns. Collective if the methods are.
+
+    Noise of the machine then hits all methods alike, and none is always the first.
+    """
+    names = list(methods)
+    samples: dict[str, list[float]] = {name: [] for name in names}
+    for i in range(repeats):
+        shift = i % len(names)
+        for name in names[shift:] + names[:shift]:
+            samples[name].append(methods[name]())
+    return samples
+
+
+def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:
+    """Median of each list. Not collective."""
+    return {name: float(statistics.median(values)) for name, values in samples.items()}
+
+
+def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dict[str, list[float]], float, float]:
+    """Build and factor several times: last model, seconds, peak memory after the first, seconds of a TS step."""
+    seconds: dict[str, list[float]] = {"mesh": [], "assembly": [], "factor": []}
+    begin, memory, pace = time.perf_counter(), 0.0, 0.0
+    for i in range(repeats):
+        model = build(scene, comm)
+        run = Run(model, RunOptions())
+        for name, values in seconds.items():
+            values.append(model.watch.seconds[name])
+        if i == 0:
+            ts = make_ts(run)
+            run.start()
+            run.advance_to(ts, 3)
+            n = comm.bcast(int(np.clip(0.05 * run.reached / run.seconds, 1, 400)))
+            pace = timed(comm, lambda: run.advance_to(ts, 3 + n)) / n  # noqa: B023  (called at once)
+            memory = peak_mb(comm)
+            ts.destroy()
+        run.midpoint.destroy()
+        gc.collect()
+        if comm.bcast(time.perf_counter() - begin) > BUILD_SECONDS:
+            break
+    return model, seconds, memory, float(comm.bcast(pace))
+
+
+def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int, peers: bool) -> dict[str, Any]:
+    """Per-step times of all methods [us] and the energy drift of the TS run."""
+    run = Run(model, RunOptions())
+    ts = make_ts(run)
+    run.start()
+    run.advance_to(ts, 2)
+
+    def advance() -> None:
+        run.advance_to(ts, run.reached + k)
+
+    def of_ts() -> float:
+        run.advance_to(ts, run.reached + warm(k))
+        seconds = timed(comm, advance)
+        run.watch_energy()
+        return 1e6 * seconds / k
+
+    def of(loop: Any, count: int) -> Callable[[], float]:
+        def steps() -> float:
+            loop.advance(warm(count))
+            return 1e6 * timed(comm, lambda: loop.advance(count)) / count
+
+        return steps
+
+    factor: dict[str, float] = {}
+    loops, made = _loops(run, factor)
+    methods = {"ts": of_ts} | {name: of(loop, k) for name, loop in loops.items()}
+    if peers and comm.size == 1:
+        methods |= {name: of(loop, peer_k) for name, loop in _peers(run, factor).items()}
+    samples = interleave(methods, repeats)
+
+    def ratio(name: str) -> float | None:
+        if name not in samples:
+            return None
+        return statistics.median(a / b for a, b in zip(samples["ts"], samples[name], strict=True))
+
+    residual = run.check_step(ts, run.reached + 1)
+    result = {
+        "step_us": medians(samples),
+        "samples_us": samples,
+        "ratio": ratio("solve"),
+        "ratio_own": ratio("own"),
+        "factor_peer_s": factor,
+        "drift": run.drift(),
+        "drift_steps": run.reached,
+        "residual": residual,
+        "solver": run.solver[0],
+    }
+    ts.destroy()
+    for thing in (run.midpoint, *made):
+        thing.destroy()
+    return result
+
+
+def _loads(run: Run) -> Array:
+    if not isinstance(run.drive, TableDrive):
+        raise SolverError("the benchmark needs a hand with a prescribed motion")
+    return run.drive.c
+
+
+def _loops(run: Run, factor: dict[str, float]) -> tuple[dict[str, Any], list[Any]]:
+    """The bare solves and the textbook loop, and what is to be freed after them; notes PETSc's factor time. Collective.
+
+    The textbook loop takes PETSc's plain solve on one rank; on several, where vectors are distributed, ours.
+    """
+    system, midpoint, name = run.model.system, run.midpoint, run.solver[0]
+    bare = BareSolve(midpoint.solver, midpoint.r)
+    loops: dict[str, Any] = {"solve": bare}
+    made: list[Any] = []
+    solve = midpoint.solver.solve
+    if name == "cholesky":
+        S = midpoint_matrix(system, DT)
+        begin = time.perf_counter()
+        plain = PlainCholesky(whole_copy(S))
+        factor["petsc"] = time.perf_counter() - begin
+        S.destroy()
+        loops, solve, made = {"solve": plain, "own": bare}, plain.solve, [plain.ksp]
+    if midpoint.held.whole and system.layout.comm.size > 1:
+        made.append(make_solver(midpoint_matrix(system, DT), name, system.layout, "textbook_"))
+        solve = made[-1].solve
+    loops["loop"] = TextbookLoop(system, DT, solve, _loads(run))
+    return loops, made
+
+
+def _peers(run: Run, factor: dict[str, float]) -> dict[str, Any]:
+    """SciPy's loop and pyMOR's where it is installed and small enough; notes SciPy's factor time. Not collective."""
+    system = run.model.system
+    K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
+    begin = time.perf_counter()
+    found: dict[str, Any] = {"scipy": ScipyLoop(K, M, system.G, DT, _loads(run))}
+    factor["scipy"] = time.perf_counter() - begin
+    if has_pymor() and system.layout.n_e <= PYMOR_LIMIT:
+        found["pymor"] = PymorLoop(K, M, system.G, DT, _loads(run))
+    return found
+
+
+def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repeats: int) -> dict[str, Any]:
+    """Seconds of the whole run from the assembled model on, factor included."""
+    scenes = {kind: bench_scene(comm, 2, cells, steps, kind) for kind in ("none", "memory")}
+    system, table = model.system, Run(dataclasses.replace(model, scene=scenes["none"]), RunOptions())
+    drive = table.drive
+    table.midpoint.destroy()
+    drifts: list[float] = []
+
+    def of_ts(kind: str) -> Callable[[], float]:
+        wanted = dataclasses.replace(model, scene=scenes[kind])
+        return lambda: timed(comm, lambda: drifts.append(simulate(wanted).energy_drift))
+
+    methods = {"ts_none": of_ts("none"), "ts_memory": of_ts("memory")}
+    if comm.size == 1 and isinstance(drive, TableDrive):
+        K, M, loads = to_scipy(system.K_ee), to_scipy(system.M_ee), drive.c
+        methods["scipy"] = lambda: timed(comm, lambda: ScipyLoop(K, M, system.G, DT, loads).store(steps))
+        if has_pymor():
+            methods["pymor"] = lambda: timed(comm, lambda: PymorLoop(K, M, system.G, DT, loads).advance(steps))
+    interleave(methods, 1)  # warm up
+    samples = interleave(methods, repeats)
+    return {"steps": steps, "seconds": medians(samples), "samples": samples, "drift": max(drifts)}
+
+
+def measure(
+    comm: MPI.Intracomm,
+    dimension: int,
+    size: int,
+    repeats: int,
+    repeat_seconds: float = REPEAT_SECONDS,
+    whole: bool = False,
+    peers: bool = True,
+) -> dict[str, Any]:
+    """One row of the table. Collective.
+
+    Args:
+        comm: ranks.
+        dimension: 2 or 3.
+        size: wanted number of tissue unknowns.
+        repeats: how often each number is taken.
+        repeat_seconds: aimed length of one repeat [s].
+        whole: also run the paper's 600 steps as a whole.
+        peers: also SciPy and pyMOR (one rank only).
+    """
+    cells = cells_for(dimension, size)
+    build(bench_scene(comm, dimension, [2] * (dimension - 1) + [4], 1), comm)  # compiles the forms
+    base = peak_mb(comm)
+    model, seconds, memory, pace = _builds(comm, bench_scene(comm, dimension, cells, PAPER_STEPS), repeats)
+    k = int(np.clip(repeat_seconds / pace, 3, 50_000))
+    scene = bench_scene(comm, dimension, cells, repeats * (k + warm(k)) + 10)
+    result = _row(comm, model, cells, {name: statistics.median(values) for name, values in seconds.items()})
+    result |= {"memory_mb": memory, "memory_base_mb": base, "repeats": repeats, "steps_per_repeat": k}
+    result |= _steps(comm, dataclasses.replace(model, scene=scene), k, max(2, k // PEER_SHARE), repeats, peers)
+    result["whole"] = _whole(comm, model, cells, PAPER_STEPS, repeats) if whole else None
+    return result
+
+
+def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int) -> dict[str, Any]:
+    """A large scene once, from the mesh to the end, nothing stored. Collective."""
+    cells = cells_for(dimension, size)
+    base = peak_mb(comm)
+    begin = time.perf_counter()
+    model = build(bench_scene(comm, dimension, cells, steps), comm)
+    run = simulate(model)
+    result = _row(comm, model, cells, {name: run.seconds[name] for name in ("mesh", "assembly", "factor")})
+    return result | {
+        "memory_mb": peak_mb(comm),
+        "memory_base_mb": base,
+        "repeats": 1,
+        "steps_per_repeat": steps,
+        "step_us": {"ts": 1e6 * run.seconds["steps"] / steps},
+        "drift": run.energy_drift,
+        "drift_steps": steps,
+        "residual": run.residuals[1],
+        "solver": run.solver[0],
+        "total_s": comm.allreduce(time.perf_counter() - begin, MPI.MAX),
+        "whole": None,
+    }
+
+
+def _row(comm: MPI.Intracomm, model: Model, cells: list[int], seconds: dict[str, float]) -> dict[str, Any]:
+    layout = model.system.layout
+    return {
+        "dimension": layout.dimension,
+        "cells": cells,
+        "n_e": layout.n_e,
+        "states": layout.states,
+        "ranks": comm.size,
+        "seconds": seconds,
+    }
+
+
+def run_worker(spec: dict[str, Any]) -> None:
+    """Measure what the driver asks for and leave the numbers in its file. Collective."""
+    comm = MPI.COMM_WORLD
+    arguments = {key: value for key, value in spec.items() if key not in ("file", "large")}
+    leave_result(
+        spec["file"], lambda: measure_large(comm, **arguments) if spec["large"] else measure(comm, **arguments)
+    )

@@ -1,0 +1,273 @@
+"""Reduced online time stays flat while the full model grows: ``python -m softgrasp.study.bench.meshes``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from mpi4py import MPI
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
+from softgrasp.fem.model.build import build
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.study.forward.result import package_version
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.reduction.registry import METHODS, find_method
+from softgrasp.study.shell.session import list_files, machine, write_json
+from softgrasp.reduction.replay import reference
+from softgrasp.study.reduce.sweep import Point, sweep
+
+SIZES = "1e3,1e4,1e5,1e6"
+KEPT = 60  # snapshots of a run, the same on every mesh: those of all steps would not fit in memory at n_e = 1e6
+HELP = f"""Mesh study of the paper's block: tissue unknowns from 1e3 to 1e6, one method and one N.
+
+Prints for every mesh the full run, the offline time (basis and projection, from {KEPT} snapshots) and the online time
+of the reduced model, then the exponents with which they grow and the mesh from which a reduced run is faster than a
+full one. LONG: the full run at n_e = 1e6 takes many minutes and several GB; a fast look: --sizes 1e3,3e3,1e4. Keep the
+machine quiet."""
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@dataclass(frozen=True)
+class MeshRow:
+    """One mesh; times in seconds.
+
+    Attributes:
+        cells: of the short side.
+        n_e: tissue unknowns.
+        time_factor, time_full: factorisation and all steps of the full run.
+        time_offline: basis and projection.
+        time_setup, time_online: of the reduced model.
+        N: its dimension.
+        error, error_deformation: see :class:`study.reduce.sweep.Point`.
+        stable: of the reduced model.
+    """
+
+    cells: int
+    n_e: int
+    time_factor: float
+    time_full: float
+    time_offline: float
+    time_setup: float
+    time_online: float
+    N: int
+    error: float
+    error_deformation: float
+    stable: bool
+
+
+def block(n_e: int, steps: int, method: str, N: int) -> Scene:
+    """The paper's block with about n_e tissue unknowns, 4 nx^2 on nx x 2 nx cells."""
+    nx = max(4, round(math.sqrt(n_e / 4)))
+    return Scene.model_validate(
+        {
+            "name": f"mesh_study_{nx}",
+            "description": "The paper's block on another mesh.",
+            "tissue": {"size": [1.0, 2.0], "cells": [nx, 2 * nx], "material": {"lambda": 50.0, "mu": 50.0, "rho": 1.0}},
+            "contact": {"sides": ["left", "right"], "box": [[0.0, 1.5], [1.0, 2.0]]},
+            "hand": {"mass": 20.0},
+            "motion": {"target": [5.0, 3.0], "duration": 3.0},
+            "time": {"steps": steps},
+            "output": {"every": max(1, steps // KEPT)},
+            "reduction": {"methods": [method], "N": [N]},
+        }
+    )
+
+
+def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
+    """One mesh. Collective.
+
+    Raises:
+        SoftgraspError: a solve failed, the snapshots do not fit, or no model has this N.
+    """
+    model = build(scene, comm)
+    run = simulate(model)
+    steps = scene.time.steps
+    swept = sweep(scene.reduction.methods[0], reference(model, run), scene.reduction)
+    if not swept.points:
+        reason = next(iter(swept.refused.values()), f"reduction.N = {scene.reduction.N} fits no basis of this method")
+        raise SoftgraspError(f"{scene.reduction.methods[0]}: {reason}")
+    point: Point = swept.points[0]
+    return MeshRow(
+        cells=scene.tissue.cells[0] if scene.tissue.cells else 0,
+        n_e=model.system.layout.n_e,
+        time_factor=run.seconds["factor"],
+        time_full=run.seconds["steps"] / max(steps - 1, 1) * steps,
+        time_offline=point.time_offline,
+        time_setup=point.time_setup,
+        time_online=point.time_online,
+        N=point.N,
+        error=point.error,
+        error_deformation=point.error_deformation,
+        stable=point.stable,
+    )
+
+
+def exponent(rows: Sequence[MeshRow], key: str) -> float:
+    """Slope of log time against log n_e by least squares; nan for one mesh."""
+    if len(rows) < 2:
+        return math.nan
+    n_e, seconds = (np.log([getattr(row, k) for row in rows]) for k in ("n_e", key))
+    return float(np.polyfit(n_e, seconds, 1)[0])
+
+
+def break_even(rows: Sequence[MeshRow]) -> float:
+    """n_e from which a reduced run is faster than a full one, by the straight line through log times."""
+    if len(rows) < 2:
+        return math.nan
+    n_e = np.log([row.n_e for row in rows])
+    ratio = np.log([row.time_full / row.time_online for row in rows])
+    slope, constant = np.polyfit(n_e, ratio, 1)
+    return float(np.exp(-constant / slope)) if slope > 0 else math.nan
+
+
+def findings(rows: Sequence[MeshRow]) -> dict[str, Any]:
+    """Exponents, spread of the online time, break-even mesh; None where one mesh does not tell."""
+    online = [row.time_online for row in rows]
+    values = {
+        "exponent_full": exponent(rows, "time_full"),
+        "exponent_offline": exponent(rows, "time_offline"),
+        "exponent_online": exponent(rows, "time_online"),
+        "online_spread": max(online) / min(online),
+        "break_even_n_e": break_even(rows),
+    }
+    return {key: value if math.isfinite(value) else None for key, value in values.items()}
+
+
+def show(console: Console, rows: Sequence[MeshRow], found: dict[str, Any], title: str) -> None:
+    """Print table and exponents."""
+    header = ("n_e", "factor", "full", "offline", "online", "speed-up", "error", "deform.")
+    console.print(f"{title}; seconds, online in milliseconds")
+    table = Table(box=None, pad_edge=False)
+    for name in header:
+        table.add_column(escape(name), no_wrap=True)
+    for row in rows:
+        table.add_row(
+            str(row.n_e), f"{row.time_factor:.3g}", f"{row.time_full:.3g}", f"{row.time_offline:.3g}",
+            f"{1e3 * row.time_online:.3g}", f"{row.time_full / row.time_online:.0f}", f"{row.error:.1e}",
+            f"{row.error_deformation:.1e}" + ("" if row.stable else " !"),
+        )  # fmt: skip
+    console.print(table)
+    if found["exponent_offline"] is None:
+        return
+    console.print(
+        f"growth with n_e: full run n_e^{found['exponent_full']:.2f}, offline n_e^{found['exponent_offline']:.2f}, "
+        f"online n_e^{found['exponent_online']:.2f} (largest over least online time {found['online_spread']:.2f})"
+    )
+    if found["break_even_n_e"] is not None:
+        console.print(
+            f"break-even mesh: a reduced run is faster than a full one from n_e = {found['break_even_n_e']:.0f}"
+        )
+
+
+def draw(path: Path, rows: Sequence[MeshRow], found: dict[str, Any]) -> tuple[Path, Path]:
+    """Times against n_e; PNG and PDF."""
+    import matplotlib.pyplot as plt
+
+    from softgrasp.study.pictures.style import BLUE, COLUMN, GREEN, ORANGE, paper_style, save
+
+    with paper_style():
+        figure, ax = plt.subplots(figsize=(COLUMN, 2.9), layout="constrained")
+        n_e = [row.n_e for row in rows]
+        curves = (
+            ("time_full", "full run", "exponent_full", ORANGE, "o"),
+            ("time_offline", "offline", "exponent_offline", BLUE, "s"),
+            ("time_online", "online run", "exponent_online", GREEN, "^"),
+        )
+        for key, label, slope, colour, marker in curves:
+            power = "" if found[slope] is None else rf", $n_e^{{{found[slope]:.2f}}}$"
+            seconds = [getattr(row, key) for row in rows]
+            ax.loglog(n_e, seconds, marker=marker, ms=3.5, color=colour, label=label + power)
+        ax.set_xlabel("tissue unknowns $n_e$")
+        ax.set_ylabel("time [s]")
+        ax.grid(axis="y", color="#e6e6e6", lw=0.5)
+        figure.legend(loc="outside upper center", ncols=3, handlelength=1.8, columnspacing=1.0)
+        return save(figure, path)
+
+
+def run_mesh_study(
+    sizes: Sequence[int], steps: int, method: str, N: int, out: Path, console: Console, comm: MPI.Intracomm
+) -> dict[str, Any]:
+    """Measure all meshes and write mesh_study.json, mesh_study.png and .pdf. Collective.
+
+    Raises:
+        SoftgraspError: with one sentence.
+    """
+    find_method(method)
+    rows = []
+    for size in sizes:
+        scene = block(size, steps, method, N)
+        console.print(f"n_e about {size}: {scene.tissue.cells} cells, {steps} steps", markup=False)
+        rows.append(measure_mesh(scene, comm))
+    found = findings(rows)
+    title = METHODS[method].title
+    show(console, rows, found, f"{title}, N = {N}, {comm.size} rank(s); !: unstable")
+    result = {
+        "command": "mesh_study",
+        "method": method,
+        "N": N,
+        "steps": steps,
+        "version": package_version(),
+        "ranks": comm.size,
+        "machine": machine(),
+        "rows": [asdict(row) for row in rows],
+        **found,
+    }
+    if comm.rank == 0:
+        out.mkdir(parents=True, exist_ok=True)
+        numbers = write_json(out / "mesh_study.json", result)
+        list_files(console, [numbers, *draw(out / "mesh_study.png", rows, found)])
+    comm.Barrier()
+    return result
+
+
+def parse_sizes(text: str) -> list[int]:
+    """Tissue unknowns from "1e3,1e4".
+
+    Raises:
+        typer.BadParameter: a part is no number from 50 on.
+    """
+    result = []
+    for part in text.split(","):
+        try:
+            value = float(part)
+        except ValueError:
+            value = math.nan
+        if not 50 <= value < 1e9:
+            raise typer.BadParameter(f"{part!r} is no number of unknowns; give numbers from 50 on, such as 1e3,1e4")
+        result.append(round(value))
+    return result
+
+
+@app.command(help=HELP)
+def main(
+    sizes: Annotated[str, typer.Option(help="tissue unknowns")] = SIZES,
+    steps: Annotated[int, typer.Option(help="time steps of a run", min=2)] = 600,
+    method: Annotated[str, typer.Option(help="basis by key")] = "psd_fixed",
+    dimension: Annotated[int, typer.Option("--N", help="dimension of the reduced model", min=2)] = 14,
+    out: Annotated[Path, typer.Option(help="folder for mesh_study.json, .png and .pdf")] = Path("out"),
+) -> None:
+    """See HELP."""
+    comm = MPI.COMM_WORLD
+    wanted = parse_sizes(sizes)
+    console = Console(quiet=comm.rank != 0, highlight=False)
+    try:
+        run_mesh_study(wanted, steps, method, dimension, out, console, comm)
+    except SoftgraspError as error:
+        if comm.rank == 0:
+            Console(stderr=True, highlight=False).print(f"error: {error}", soft_wrap=True, markup=False)
+        raise typer.Exit(1) from None
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,342 @@
+"""What the large Riccati equation costs, as one table, JSON, CSV and figure: ``python -m softgrasp.study.bench.riccati``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from softgrasp.study.bench.forward import Goal, growth, parse_ranks
+from softgrasp.study.shell.doctor import IN_MPI_JOB
+from softgrasp.study.shell.jobs import launch_worker
+
+SIZES = "10,20,40,80,160"
+LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
+PEER_LIMIT = {"scipy": 10, "slycot": 10, "pymor": 40}  # nx; minutes beyond
+WORKER_LIMIT = 3600.0  # [s]
+LIMITS = {("newton_adi", 10): 0.2, ("newton_adi", 80): 20.0, ("galerkin", 10): 0.03, ("galerkin", 80): 4.0}  # [s]
+LARGE_SECONDS, LARGE_MB = 900.0, 24 * 1024
+RESIDUAL, GAIN = 1e-10, 1e-6
+SPLIT = ("factor", "solve", "shifts", "dense", "residual")
+HELP = f"""Measure the large Riccati equation of the paper's control scene and print one table.
+
+Every row is a program of its own under mpiexec: Newton-ADI, RADI and structured Galerkin on nx x 2 nx cells. Columns:
+solves with a complex tissue matrix, rank of Z, seconds (median) split into factorisations, triangular solves, start
+and shifts, products with small dense algebra and compression, and the recomputation of the residual; the true relative
+residual from Z; the relative difference of the gain to that of Newton-ADI; peak memory of all ranks. Below: SciPy,
+slycot and pyMOR on the paper's own matrices where they are installed and can run (slycot and SciPy to nx = 10, pyMOR to
+nx = 40), growth exponents over the meshes, and the goals. On one rank Newton-ADI and RADI make the next factor on a
+second core where there is one. bench_riccati.json is written after every row; --resume keeps the rows it has.
+
+Keep the machine quiet while it runs. A fast look: --sizes 10 --ranks 1 --no-peers.
+--large adds nx = {LARGEST} (2n > 1e6) on {LARGEST_RANKS} ranks by Newton-ADI and Galerkin: up to half an hour."""
+
+Row = dict[str, Any]
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def parse_meshes(text: str) -> list[int]:
+    """``10,20`` as numbers of cells. Not collective.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdigit() and int(part) >= 2 for part in parts):
+        raise typer.BadParameter(f"'{text}' is no list of meshes; write 10,20,40")
+    return [int(part) for part in parts]
+
+
+def launch(spec: dict[str, Any], ranks: int) -> Row:
+    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective.
+
+    The methods that were through when a worker ran out of time or memory keep their numbers.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        partial = Path(folder) / "partial.json"
+        extra = {"partial": str(partial)} if "methods" in spec else {}
+        row = {"ranks": ranks} | launch_worker("softgrasp.study.bench.riccati", spec | extra, ranks, WORKER_LIMIT)
+        if "error" in row and partial.is_file():
+            reason = row.pop("error")
+            row |= json.loads(partial.read_text())
+            row["methods"] = {name: {"error": reason} for name in spec["methods"]} | row["methods"]
+    return row
+
+
+@dataclass
+class Record:
+    """Rows as they come, in a file that outlives whatever goes wrong with the next one.
+
+    Attributes:
+        file: bench_riccati.json; None keeps nothing.
+        beta: Kelvin-Voigt time of all rows [s].
+        rows, peers: what is measured.
+    """
+
+    file: Path | None
+    beta: float
+    rows: list[Row] = field(default_factory=list)
+    peers: list[Row] = field(default_factory=list)
+
+    def resume(self) -> None:
+        """Take over the rows of an earlier run with the same damping that have no error. Not collective."""
+        if self.file is None or not self.file.is_file():
+            return
+        old = json.loads(self.file.read_text())
+        if old.get("beta") == self.beta:
+            self.rows = [row for row in old["rows"] if not any("error" in entry for entry in [row, *flat([row])])]
+            self.peers = [row for row in old["peers"] if "error" not in row and not row.get("missing")]
+
+    def save(self) -> None:
+        """Write the file. Not collective."""
+        if self.file is None:
+            return
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        reached = [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals(self.rows)]
+        report = {"command": "bench_riccati", "beta": self.beta, "rows": self.rows, "peers": self.peers}
+        report |= {"exponents": exponents(self.rows), "goals": reached}
+        self.file.write_text(json.dumps(report, indent=2) + "\n")
+
+
+def flat(rows: Sequence[Row]) -> list[Row]:
+    """One entry for each mesh, rank count and method that ran. Not collective."""
+    result = []
+    for row in rows:
+        for name, method in row.get("methods", {}).items():
+            common = {key: row[key] for key in ("nx", "states", "ranks")}
+            result.append(common | {"method": name} | method)
+    return result
+
+
+def exponents(rows: Sequence[Row]) -> dict[str, float | None]:
+    """Growth of time with the number of states, from nx = 20 on, by method and rank count. Not collective."""
+    result: dict[str, float | None] = {}
+    good = [entry for entry in flat(rows) if "error" not in entry and entry["nx"] >= 20]
+    for key in sorted({(entry["method"], entry["ranks"]) for entry in good}):
+        mine = [entry for entry in good if (entry["method"], entry["ranks"]) == key]
+        result[f"{key[0]}, {key[1]} rank(s)"] = growth([e["states"] for e in mine], [e["seconds"] for e in mine])
+    return result
+
+
+def goals(rows: Sequence[Row]) -> list[Goal]:
+    """All goals that the rows can speak for. Not collective."""
+    result = []
+    good = [entry for entry in flat(rows) if "error" not in entry]
+    for entry in good:
+        label = f"{entry['method']}, 2n = {entry['states']}, {entry['ranks']} rank(s)"
+        limit = LIMITS.get((entry["method"], entry["nx"]))
+        if limit is not None and entry["ranks"] == 1:
+            result.append(Goal(f"{label}: seconds", entry["seconds"], limit))
+        if entry["method"] != "galerkin":
+            result.append(Goal(f"{label}: true residual", entry["residual"], RESIDUAL))
+        elif "gain_difference" in entry:
+            result.append(Goal(f"{label}: gain difference", entry["gain_difference"], GAIN))
+        if entry["states"] >= 1_000_000:
+            result.append(Goal(f"{label}: seconds", entry["seconds"], LARGE_SECONDS))
+            result.append(Goal(f"{label}: MiB", entry["memory_mb"], LARGE_MB))
+    newton = [e for e in good if e["method"] == "newton_adi" and e["ranks"] == 1]
+    if len(newton) > 1:
+        counts = [e["solves"] for e in sorted(newton, key=lambda e: e["nx"])]
+        result.append(Goal("newton_adi: solves on the finest mesh / coarsest", counts[-1] / counts[0], 1.5))
+    for label, power in exponents(rows).items():
+        if power is not None and len({e["nx"] for e in good if e["nx"] >= 20}) > 2:
+            result.append(Goal(f"{label}: growth exponent", power, 1.3))
+    return result
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
+
+
+HEADS = ["nx", "2n", "ranks", "method", "solves", "rank", "total s", *(f"{name} s" for name in SPLIT)]
+HEADS += ["true residual", "gain diff.", "MiB"]
+
+
+def cells_of(entry: Row) -> list[str]:
+    """One table line. Not collective."""
+    first = [str(entry["nx"]), str(entry["states"]), str(entry["ranks"]), entry["method"]]
+    if "error" in entry:
+        return [*first, "failed", *[""] * (len(HEADS) - 5)]
+    split = [_number(entry["split"][name]) for name in SPLIT]
+    middle = [str(entry["solves"]), str(entry["rank"]), _number(entry["seconds"]), *split]
+    difference = entry.get("gain_difference")
+    last = [f"{entry['residual']:.1e}", "-" if difference is None else f"{difference:.1e}"]
+    return [*first, *middle, *last, _number(entry["memory_mb"])]
+
+
+def peer_line(peer: Row) -> str:
+    """One sentence about a peer. Not collective."""
+    label = f"{peer['peer']}, nx = {peer['nx']}"
+    if peer.get("missing"):
+        return f"{label}: not installed"
+    if "skipped" in peer:
+        return f"{label}: left out, {peer['skipped']}"
+    if "error" in peer:
+        return f"{label}: failed, {peer['error']}"
+    return (
+        f"{label}: {_number(peer['seconds'])} s, rank {peer['rank']}, true residual {peer['residual']:.1e}, "
+        f"gain difference {peer['gain_difference']:.1e}"
+    )
+
+
+def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
+    """Table, failures, peers, exponents and goals. Not collective."""
+    table = Table(box=None, pad_edge=False, title="large Riccati equation, paper scene; seconds are medians")
+    for head in HEADS:
+        table.add_column(head, justify="left" if head == "method" else "right", no_wrap=True)
+    for entry in flat(rows):
+        table.add_row(*cells_of(entry))
+    console.print(table)
+    for row in [*rows, *flat(rows)]:
+        if "error" in row:
+            label = f"nx = {row['nx']}, {row.get('ranks', '?')} rank(s) {row.get('method', '')}"
+            console.print(f"{label} failed: {row['error']}", markup=False)
+    for peer in peers:
+        console.print(peer_line(peer), markup=False)
+    for label, power in exponents(rows).items():
+        if power is not None:
+            console.print(f"growth exponent of the time in 2n from nx = 20 on, {label}: {power:.2f}")
+    for goal in goals(rows):
+        verdict = "[green]ok[/green]" if goal.ok else "[red]missed[/red]"
+        console.print(f"goal {verdict}: {goal.text} {_number(goal.value)} <= {goal.limit:g}")
+
+
+def write_tables(folder: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, Path]:
+    """bench_riccati.csv and .md. Not collective."""
+    lines = ["| " + " | ".join(HEADS) + " |", "|" + " --- |" * len(HEADS)]
+    lines += ["| " + " | ".join(cells_of(entry)) + " |" for entry in flat(rows)]
+    lines += ["", *(f"- {peer_line(peer)}" for peer in peers)]
+    markdown, table = folder / "bench_riccati.md", folder / "bench_riccati.csv"
+    markdown.write_text("\n".join(lines) + "\n")
+    names = ["nx", "states", "ranks", "method", "solves", "newton_steps", "rank", "seconds", "residual"]
+    names += ["gain_difference", "memory_mb", "memory_base_mb", "error"]
+    with table.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(names + [f"{name}_s" for name in SPLIT])
+        for entry in flat(rows):
+            split = entry.get("split", {})
+            writer.writerow([entry.get(name) for name in names] + [split.get(name) for name in SPLIT])
+    return markdown, table
+
+
+def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, Path]:
+    """Time against states for every method on the fewest ranks, peers as single marks, log-log. Not collective."""
+    import matplotlib.pyplot as plt
+
+    from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, paper_style, save
+
+    good = [entry for entry in flat(rows) if "error" not in entry]
+    fewest = min((entry["ranks"] for entry in good), default=1)
+    with paper_style():
+        figure, axes = plt.subplots(figsize=(4.2, 3.1))
+        for name, colour in zip(("newton_adi", "radi", "galerkin"), (BLUE, GREEN, ORANGE), strict=True):
+            points = sorted((e["states"], e["seconds"]) for e in good if e["method"] == name and e["ranks"] == fewest)
+            if points:
+                axes.loglog(*zip(*points, strict=True), marker="o", ms=4, color=colour, label=name)
+        marks = {"scipy": ("s", HAND), "slycot": ("^", HAND), "pymor": ("x", PURPLE)}
+        for name, (mark, colour) in marks.items():
+            points = sorted((p["states"], p["seconds"]) for p in peers if p["peer"] == name and "residual" in p)
+            if points:
+                worst = max(p["residual"] for p in peers if p["peer"] == name and "residual" in p)
+                label = f"{name} (residual to {worst:.0e})"
+                axes.loglog(*zip(*points, strict=True), mark, ms=5, color=colour, label=label)
+        axes.set_xlabel("states 2n")
+        axes.set_ylabel("time [s]")
+        axes.set_title(f"{fewest} rank(s), median", loc="left")
+        axes.legend(fontsize=7)
+        return save(figure, path)
+
+
+def collect(
+    console: Console, meshes: list[int], ranks: list[int], repeats: int, large: bool, record: Record
+) -> list[Row]:
+    """Launch all workers one after the other, the largest last. Not collective."""
+    every = ["newton_adi", "radi", "galerkin"]
+    jobs = [(nx, k, every, repeats) for nx in meshes for k in ranks]
+    if large:
+        jobs.append((LARGEST, LARGEST_RANKS, ["newton_adi", "galerkin"], 1))
+    known = {(row["nx"], row["ranks"]): row for row in record.rows}
+    record.rows = [known[job[:2]] for job in jobs if job[:2] in known]
+    for i, (nx, k, methods, count) in enumerate(jobs):
+        if (nx, k) in known:
+            console.print(f"row {i + 1} of {len(jobs)}, nx = {nx}, {k} rank(s): kept")
+            continue
+        with console.status(f"row {i + 1} of {len(jobs)}, nx = {nx}, {k} rank(s)"):
+            row = launch({"nx": nx, "beta": record.beta, "methods": methods, "repeats": count}, k) | {"nx": nx}
+        record.rows.append(row)
+        record.save()
+        times = [f"{e['method']} {'failed' if 'error' in e else _number(e['seconds']) + ' s'}" for e in flat([row])]
+        console.print(f"row {i + 1} of {len(jobs)}, nx = {nx}, {k} rank(s): {', '.join(times) or 'failed'}")
+    return record.rows
+
+
+def collect_peers(console: Console, meshes: list[int], record: Record) -> list[Row]:
+    """The peers on the meshes they can do, one rank. Not collective."""
+    known = {(row["peer"], row["nx"]): row for row in record.peers}
+    record.peers = []
+    for peer, limit in PEER_LIMIT.items():
+        for nx in meshes:
+            if (peer, nx) in known:
+                row = known[peer, nx]
+            elif nx > limit:
+                row = {"skipped": f"it takes many minutes or too much memory beyond nx = {limit}"}
+            else:
+                with console.status(f"{peer}, nx = {nx}"):
+                    row = launch({"nx": nx, "beta": record.beta, "peer": peer}, 1)
+            record.peers.append(row | {"nx": nx, "peer": peer})
+            record.save()
+            if row.get("missing"):
+                break
+    return record.peers
+
+
+@app.command(help=HELP)
+def main(
+    sizes: Annotated[str, typer.Option(help="meshes nx; 10 is the paper's")] = SIZES,
+    ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
+    beta: Annotated[float, typer.Option(help="Kelvin-Voigt time [s]")] = 0.002,
+    repeats: Annotated[int, typer.Option(help="repeats behind each median, fewer for long runs", min=1)] = 7,
+    out: Annotated[Path, typer.Option(help="folder for bench_riccati.json, .csv, .md, .png and .pdf")] = Path("out"),
+    peers: Annotated[bool, typer.Option(help="also SciPy, slycot and pyMOR")] = True,
+    large: Annotated[bool, typer.Option("--large", help=f"also nx = {LARGEST}, 2n > 1e6")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="keep the good rows of bench_riccati.json in --out")] = False,
+    worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",
+) -> None:
+    """See HELP."""
+    if worker:
+        from softgrasp.study.bench.riccati_rows import run_worker
+
+        run_worker(json.loads(worker))
+        return
+    meshes, counts = parse_meshes(sizes), parse_ranks(ranks)
+    if any(variable in os.environ for variable in IN_MPI_JOB):
+        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
+    terminal = Console(highlight=False)
+    console = Console(highlight=False, width=max(terminal.width, 160), soft_wrap=True)
+    record = Record(out / "bench_riccati.json", beta)
+    if resume:
+        record.resume()
+    rows = collect(console, meshes, counts, repeats, large, record)
+    others = collect_peers(console, meshes, record) if peers else record.peers
+    record.save()
+    show(console, rows, others)
+    files = [*write_tables(out, rows, others), *draw(out / "bench_riccati.png", rows, others)]
+    for file in (out / "bench_riccati.json", *files):
+        console.print(f"  {file}")
+    if any("error" in entry for entry in [*rows, *flat(rows)]):
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,321 @@
+"""What stands behind the sizes at which softgrasp changes its method: ``python -m softgrasp.study.bench.switches``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from mpi4py import MPI
+from rich.console import Console
+from rich.table import Table
+
+import softgrasp.fem.solve.solvers
+import softgrasp.lqr.lowrank.modal_start
+import softgrasp.lqr.lowrank.shifted
+import softgrasp.lqr.riccati
+import softgrasp.reduction.online
+from softgrasp.fem.model.build import build
+from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.fem.solve.solvers import SolverName
+from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.lowrank.modal_start import plant_modes, project, solve_small
+from softgrasp.lqr.lowrank.newton import NewtonADI
+from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.lowrank.shifted import make_shifted
+from softgrasp.reduction.online import run, run_batch
+from softgrasp.reduction.projection import project as project_model
+from softgrasp.reduction.propagator import propagator
+from softgrasp.reduction.registry import make_basis
+from softgrasp.reduction.states import States
+from softgrasp.study.bench.forward import parse_ranks
+from softgrasp.study.bench.riccati_rows import problem_for
+from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for, interleave, timed
+from softgrasp.study.shell.doctor import IN_MPI_JOB
+from softgrasp.study.shell.jobs import launch_worker, leave_result
+
+BATCH = 100  # models of a batch
+STEPS = 600
+SHIFT = -0.5 + 5.0j  # a shift in the middle of the paper's spectrum
+WORKER_LIMIT = 3600.0  # [s]
+HELP = """Measure two methods at sizes near those at which softgrasp changes from one to the other.
+
+Each row compares a first and a second method at one size, medians of runs in turn (set-ups and the largest sizes are
+timed once); 'second / first' above 1 means that the first is the faster one. The switches:
+
+batch: many reduced models step together (first) or one after the other (second), up to softgrasp.reduction.online.TOGETHER byte.
+start: the modal Riccati equation from few modes (first) or from one Schur form (second), softgrasp.lqr.lowrank.modal_start.FEW_MODES.
+dense: the dense Riccati solver (first, used up to softgrasp.lqr.riccati.DENSE_STATES states) or Newton-ADI (second).
+shift: a shifted factor and solve for each rank, SuperLU on whole matrices (first) or MUMPS (second), GATHER_LIMIT of
+softgrasp.lqr.lowrank.shifted.
+set-up, step: of the forward run with PETSc Cholesky (first) or MUMPS (second), softgrasp.fem.solve.solvers.CHOLESKY_LIMIT.
+whole: the same with MUMPS' whole factor on every rank (first) or a spread one (second), softgrasp.fem.solve.solvers.REPEATED_LIMIT.
+
+Keep the machine quiet. A fast look: --switches batch,start --repeats 3."""
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Two methods at one size.
+
+    Attributes:
+        switch: which one.
+        limit: the constant and its value.
+        setting: the size.
+        ranks: MPI ranks.
+        first, second: median seconds.
+    """
+
+    switch: str
+    limit: str
+    setting: str
+    ranks: int
+    first: float
+    second: float
+
+
+def compare(
+    comm: MPI.Intracomm,
+    names: tuple[str, str],
+    setting: str,
+    calls: tuple[Callable[[], Any], Callable[[], Any]],
+    n: int,
+) -> Row:
+    """Time two calls in turn, after one run of each. Collective."""
+    for call in calls:
+        call()
+    samples = interleave({str(i): partial(timed, comm, call) for i, call in enumerate(calls)}, n)
+    first, second = (float(statistics.median(samples[key])) for key in ("0", "1"))
+    return Row(*names, setting, comm.size, first, second)
+
+
+def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """Reduced models of random materials, together and one by one. One rank."""
+    changes = ["effects.damping={kind='kelvin-voigt', beta=0.002}", "motion={drive='force', profile='hold'}"]
+    model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm)
+    system = model.system
+    material, rng = system.materials[0], np.random.default_rng(0)
+    force = np.ones((STEPS, system.layout.n_s))
+    for N in (12, 18, 26, 34, 50):
+        basis = make_basis("craig_bampton", States(system), N)
+        rom = project_model(basis, system, make_outputs(model.scene, system), "")
+        many = [
+            propagator(rom.at((replace(material, lam=a, mu=b),)), DT)
+            for a, b in zip(rng.uniform(30, 500, BATCH), rng.uniform(20, 500, BATCH), strict=True)
+        ]
+        size = sum(p.block.nbytes for p in many)
+
+        def together(many: list[Any] = many) -> None:
+            kept, softgrasp.reduction.online.TOGETHER = softgrasp.reduction.online.TOGETHER, 2**62
+            try:
+                run_batch(many, DT, force)
+            finally:
+                softgrasp.reduction.online.TOGETHER = kept
+
+        def alone(many: list[Any] = many) -> None:
+            for p in many:
+                run(p, None, force)
+
+        limit = f"TOGETHER = {softgrasp.reduction.online.TOGETHER / 1e6:g} MB"
+        yield compare(
+            comm, ("batch", limit), f"{BATCH} models, N = {N}, {size / 1e6:.1f} MB", (together, alone), repeats
+        )
+
+
+def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """The Riccati equation of the modal start. One rank."""
+    few = softgrasp.lqr.lowrank.modal_start.FEW_MODES
+    plant = Plant(problem_for(comm, 10, 0.002))
+    for k in (15, 16, 30, 60):
+        omega, V = plant_modes(plant, k)
+        small = project(plant, V, omega, plant.mass(V))
+
+        def from_all(small: Any = small) -> None:
+            softgrasp.lqr.lowrank.modal_start.FEW_MODES = 2**30
+            try:
+                solve_small(plant, small)
+            finally:
+                softgrasp.lqr.lowrank.modal_start.FEW_MODES = few
+
+        calls = (lambda small=small: solve_small(plant, small), from_all)
+        yield compare(comm, ("start", f"FEW_MODES = {few}"), f"2D, {k} modes", calls, repeats)
+
+
+def dense(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """All modes against low rank. One rank."""
+    for nx in (2, 3, 4, 5, 8):
+        problem = problem_for(comm, nx, 0.002)
+        calls = (lambda p=problem: DenseRiccati().solve(p), lambda p=problem: NewtonADI().solve(p))
+        limit = f"DENSE_STATES = {softgrasp.lqr.riccati.DENSE_STATES}"
+        yield compare(comm, ("dense", limit), f"2D, {problem.layout.states} states", calls, repeats)
+
+
+def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """Factor and solve at one shift a rank, with whole matrices and spread ones."""
+    for d, size in ((2, 10_000), (2, 100_000), (3, 8_000), (3, 20_000), *(((3, 39_000),) if large else ())):
+        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
+        layout = model.system.layout
+        F = np.ones((layout.n_local, 3))
+        solvers = [make_shifted(model.system, name) for name in ("gathered", "distributed")]
+        turn = [0]
+
+        def once(solver: Any, F: np.ndarray = F, turn: list[int] = turn, p: int = comm.size) -> None:
+            """As many shifts as there are ranks, new ones each time."""
+            shifts = [SHIFT * (1 + 1e-3 * (turn[0] * p + i)) for i in range(p)]
+            turn[0] += 1
+            for i, s in enumerate(shifts):
+                solver.solve(s, F, shifts[i + 1 :])
+
+        calls = (lambda s=solvers[0]: once(s), lambda s=solvers[1]: once(s))
+        limit = f"GATHER_LIMIT = {softgrasp.lqr.lowrank.shifted.GATHER_LIMIT[d]}"
+        yield compare(comm, ("shift", limit), f"{d}D, n_e = {layout.n_e}", calls, 1 if layout.n_e > 30_000 else repeats)
+        for solver in solvers:
+            solver.destroy()
+
+
+def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """Set-up and step of the forward run with PETSc's Cholesky and with MUMPS."""
+    for d, size in ((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000), (3, 20_000)):
+        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
+        names = f"CHOLESKY_LIMIT = {softgrasp.fem.solve.solvers.CHOLESKY_LIMIT[d]}"
+        yield from _two(comm, model, ("cholesky", "auto"), ("mumps", "auto"), ("set-up", "step"), names, repeats)
+
+
+def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """Set-up and step with MUMPS, its factor whole on every rank or spread. Two ranks or more."""
+    if comm.size == 1:
+        return
+    for d, size in ((3, 10_000), (3, 50_000), *(((3, 200_000), (2, 1_000_000)) if large else ())):
+        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
+        names = f"REPEATED_LIMIT = {softgrasp.fem.solve.solvers.REPEATED_LIMIT[d]} / ranks"
+        heads = ("whole, set-up", "whole, step")
+        yield from _two(comm, model, ("mumps", True), ("mumps", False), heads, names, 1 if size > 60_000 else repeats)
+
+
+def _two(
+    comm: MPI.Intracomm,
+    model: Any,
+    one: tuple[SolverName, Any],
+    other: tuple[SolverName, Any],
+    heads: tuple[str, str],
+    limit: str,
+    repeats: int,
+) -> Iterator[Row]:
+    """Set-up and step with two solvers."""
+    system = model.system
+    setting = f"{system.layout.dimension}D, n_e = {system.layout.n_e}"
+    seconds, made = [], []
+    for name, reproducible in (one, other):
+        comm.Barrier()
+        begin = time.perf_counter()
+        made.append(TissueMidpoint(system, DT, name, reproducible=reproducible))
+        seconds.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
+    yield Row(heads[0], limit, setting, comm.size, *seconds)
+    c = np.ones(system.layout.n_s)
+    states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in made]
+    for midpoint, state in zip(made, states, strict=True):
+        midpoint.start(state)
+
+    def step(i: int) -> None:
+        made[i].solve_midpoint(c)
+        made[i].advance(states[i], states[i])
+
+    yield compare(comm, (heads[1], limit), setting, (partial(step, 0), partial(step, 1)), max(repeats, 3))
+    for midpoint in made:
+        midpoint.destroy()
+
+
+SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
+    "batch": batch,
+    "start": start,
+    "dense": dense,
+    "shift": shift,
+    "step": step_and_set_up,
+    "whole": whole,
+}
+SERIAL = ("batch", "start", "dense")
+
+
+def run_worker(spec: dict[str, Any]) -> None:
+    """Measure one switch and leave the rows in the file. Collective."""
+
+    def measure() -> dict[str, Any]:
+        return {"rows": [asdict(r) for r in SWITCHES[spec["switch"]](MPI.COMM_WORLD, spec["repeats"], spec["large"])]}
+
+    leave_result(spec["file"], measure)
+
+
+def table_of(rows: list[Row]) -> Table:
+    """The one table. Not collective."""
+    table = Table(box=None, pad_edge=False, title="two methods around the sizes of a switch, median seconds")
+    for head in ("switch", "constant", "size"):
+        table.add_column(head, no_wrap=True)
+    for head in ("ranks", "first s", "second s", "second / first"):
+        table.add_column(head, justify="right", no_wrap=True)
+    for row in rows:
+        numbers = (f"{row.first:.3g}", f"{row.second:.3g}", f"{row.second / row.first:.2f}")
+        table.add_row(row.switch, row.limit, row.setting, str(row.ranks), *numbers)
+    return table
+
+
+@app.command(help=HELP)
+def main(
+    switches: Annotated[str, typer.Option(help="which, with commas")] = ",".join(SWITCHES),
+    ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
+    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 5,
+    large: Annotated[bool, typer.Option("--large", help="also sizes that take minutes")] = False,
+    out: Annotated[Path, typer.Option(help="folder for bench_switches.json and bench_switches.csv")] = Path("out"),
+    worker: Annotated[str, typer.Option(hidden=True, help="job of one switch as JSON")] = "",
+) -> None:
+    """See HELP."""
+    if worker:
+        run_worker(json.loads(worker))
+        return
+    wanted, counts = [name.strip() for name in switches.split(",")], parse_ranks(ranks)
+    for name in wanted:
+        if name not in SWITCHES:
+            raise typer.BadParameter(f"'{name}' is no switch; choose from {', '.join(SWITCHES)}")
+        if name == "whole" and max(counts) == 1 and len(wanted) == 1:
+            raise typer.BadParameter("whole and spread factors are the same on one rank; add --ranks 2")
+    if any(variable in os.environ for variable in IN_MPI_JOB):
+        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
+    console = Console(highlight=False, width=max(Console().width, 130), soft_wrap=True)
+    rows: list[Row] = []
+    failed = False
+    for name in wanted:
+        for k in [k for k in counts if k == 1 or name not in SERIAL]:
+            with console.status(f"{name}, {k} rank(s)"):
+                spec = {"switch": name, "repeats": repeats, "large": large}
+                found = launch_worker("softgrasp.study.bench.switches", spec, k, WORKER_LIMIT)
+            if "error" in found:
+                failed = True
+                console.print(f"{name}, {k} rank(s): {found['error']}", markup=False)
+            rows += [Row(**row) for row in found.get("rows", [])]
+    console.print(table_of(rows))
+    out.mkdir(parents=True, exist_ok=True)
+    content = {"command": "bench_switches", "rows": [asdict(row) for row in rows]}
+    (out / "bench_switches.json").write_text(json.dumps(content, indent=2) + "\n")
+    with (out / "bench_switches.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(list(Row.__dataclass_fields__))
+        writer.writerows(asdict(row).values() for row in rows)
+    for path in (out / "bench_switches.json", out / "bench_switches.csv"):
+        console.print(f"  {path}")
+    if failed:
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    app()

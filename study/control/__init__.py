@@ -1,0 +1,1 @@
+"""`softgrasp control`: feedback, reduced gains, closed loop."""

@@ -1,0 +1,217 @@
+"""Figures of ``softgrasp control``: errors of the reduced gains against N, re-tuning, histories, the move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from softgrasp.lqr.plant.coordinates import gain_of
+from softgrasp.study.control.sweep import TITLES, SweptBasis, fast_order
+from softgrasp.study.pictures.loop import figure_decay, figure_histories, figure_loop_move
+from softgrasp.study.pictures.style import BLUE, COLUMN, GREEN, HAND, ORANGE, PURPLE, SKY, UNSTABLE, WIDTH, paper_style, save
+
+if TYPE_CHECKING:
+    from softgrasp.fem.petsc import Array
+    from softgrasp.study.control.loop import LoopRuns
+    from softgrasp.study.control.sweep import Retuned
+    from softgrasp.study.control.solve import Design
+    from softgrasp.study.pictures.frames import Frames
+    from softgrasp.study.pictures.loop import Poles
+
+LOOKS = {
+    "pod": (BLUE, "-", "o"),
+    "weighted_pod": (SKY, "--", "s"),
+    "pod_fixed_solid": (ORANGE, "-", "^"),
+    "componentwise_pod": (PURPLE, "--", "D"),
+    "pod_decomposed": (GREEN, "-", "v"),
+    "structured": (HAND, "-", "P"),
+}
+QUANTITIES = (
+    ("error_P", "error of $P$"),
+    ("error_K", "error of the gain $K$"),
+    ("cost_excess", r"excess cost $J(\hat K)/J(K) - 1$"),
+)
+TOP = 1.0  # errors above 100 % are not drawn
+LOWEST = 1e-12  # smaller excess cost is rounding
+SHOWN_MODES = 20
+
+
+def drawn(basis: SweptBasis, key: str) -> tuple[list[int], list[float]]:
+    """Orders and values of the line of a method; nan, which breaks the line, for errors above 100 %. Not collective."""
+    values = [getattr(r, key) for r in basis.reports]
+    return [r.N for r in basis.reports], [max(v, LOWEST) if v <= TOP else float("nan") for v in values]
+
+
+def unstable(basis: SweptBasis, key: str) -> tuple[list[int], list[float]]:
+    """Orders and values of gains not known to stabilise; nan for errors above 100 %. Not collective."""
+    bad = [r for r in basis.reports if not r.stable and not r.reason]
+    return [r.N for r in bad], [getattr(r, key) if getattr(r, key) <= TOP else float("nan") for r in bad]
+
+
+def figure_reduced(swept: Sequence[SweptBasis], out_png: Path) -> tuple[Path, Path]:
+    """Relative error of P, of K, and excess cost against N for all methods; unstable gains marked; PNG and PDF."""
+    ran = [s for s in swept if s.reports]
+    bad = False
+    with paper_style():
+        figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 3.1), layout="constrained", sharex=True)
+        for ax, (key, label) in zip(axes, QUANTITIES, strict=True):
+            for j, s in enumerate(ran):
+                colour, dashes, marker = LOOKS.get(s.name, (HAND, ":", "x"))
+                look: dict[str, Any] = {"color": colour, "marker": marker, "ms": 3.4, "mfc": "none", "mew": 0.9}
+                ax.plot(*drawn(s, key), ls=dashes, lw=1.1, **look)
+                N, values = unstable(s, key)
+                bad |= bool(N)
+                ax.plot(N, values, ls="", marker="x", ms=6.0, mew=1.2, color=UNSTABLE, zorder=4)
+                edge = [n + 0.6 * (j - 2) for n, v in zip(N, values, strict=True) if np.isnan(v)]  # methods may meet
+                if edge:
+                    place = {"transform": ax.get_xaxis_transform(), "clip_on": False, "ls": "", "in_layout": False}
+                    ax.plot(edge, [1.0] * len(edge), **place, **look)
+                    ax.plot(edge, [1.0] * len(edge), marker="x", ms=6.0, mew=1.2, color=UNSTABLE, **place)
+            ax.set_yscale("log")
+            ax.set_ylim(top=2.5 * TOP)
+            ax.yaxis.set_major_locator(LogLocator(numticks=12))
+            ax.yaxis.set_minor_formatter(NullFormatter())
+            ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+            ax.grid(axis="y", color="#e6e6e6", lw=0.5)
+            ax.set_axisbelow(True)
+            ax.set_title(label, pad=8)
+            ax.set_xlabel("$N$")
+        figure.legend(handles=_entries(ran, bad), loc="outside upper center", ncols=3, columnspacing=1.4)
+        return save(figure, out_png)
+
+
+def _entries(ran: Sequence[SweptBasis], bad: bool) -> list[Line2D]:
+    entries = []
+    for s in ran:
+        colour, dashes, marker = LOOKS.get(s.name, (HAND, ":", "x"))
+        entries.append(
+            Line2D([], [], color=colour, ls=dashes, marker=marker, ms=3.4, mfc="none", mew=0.9, lw=1.1, label=s.title)
+        )
+    if bad:
+        entries.append(
+            Line2D(
+                [],
+                [],
+                ls="",
+                marker="x",
+                ms=6.0,
+                mew=1.2,
+                color=UNSTABLE,
+                label="unstable loop; on the edge: error > 1",
+            )
+        )
+    return entries
+
+
+def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, Path]:
+    """Excess cost of the re-tuned gains over the box of lambda and mu, one panel a basis; PNG and PDF."""
+    with paper_style():
+        count = len(retuned)
+        figure, axes = plt.subplots(
+            1, count, figsize=(max(COLUMN, 0.5 * WIDTH * count), 2.7), squeeze=False, sharey=True, layout="constrained"
+        )
+        values = [p.cost_excess for r in retuned for p in r.points if p.stable]
+        low, high = min(values, default=LOWEST), max(values, default=TOP)
+        low, high = max(low, LOWEST) / 1.5, max(high, 10 * LOWEST) * 1.5
+        norm = LogNorm(low, high)
+        picture: Any = None
+        for ax, r in zip(axes[0], retuned, strict=True):
+            lam = [p.materials[0].lam for p in r.points]
+            mu = [p.materials[0].mu for p in r.points]
+            fine = [i for i, p in enumerate(r.points) if p.stable]
+            picture = ax.scatter(
+                [lam[i] for i in fine], [mu[i] for i in fine], s=260, marker="s", norm=norm, cmap="viridis_r",
+                c=[max(r.points[i].cost_excess, LOWEST) for i in fine],
+            )  # fmt: skip
+            rest = [i for i in range(len(lam)) if i not in fine]
+            ax.plot([lam[i] for i in rest], [mu[i] for i in rest], "x", color=UNSTABLE, ms=8, mew=1.6)
+            ax.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]")
+            ax.margins(0.25)
+            _few_ticks(ax, sorted(set(lam)), sorted(set(mu)))
+            ax.set_title(f"{TITLES.get(r.name, r.name)}, $N = {r.N}$")
+        axes[0, 0].set_ylabel(r"$\mu$ [Pa]")
+        if picture is not None:
+            figure.colorbar(picture, ax=axes[0].tolist(), label=QUANTITIES[2][1])
+        return save(figure, out_png)
+
+
+def _few_ticks(ax: Any, lam: Sequence[float], mu: Sequence[float]) -> None:
+    """Ticks at the settings themselves."""
+    for axis, values in ((ax.xaxis, lam), (ax.yaxis, mu)):
+        axis.set_ticks(values, [f"{v:.3g}" for v in values])
+        axis.set_minor_formatter(NullFormatter())
+        axis.set_ticks([], minor=True)
+
+
+def pole_sets(found: Design, swept: Sequence[SweptBasis]) -> dict[str, Poles]:
+    """Poles with the optimal and the a-priori gain and without any, on the lowest modes. Collective."""
+    loop: ModalLoop = found.judge.loop
+    K = gain_of(found.solution)
+    sets = {
+        "without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))),
+        ("modal gain" if found.modal else "optimal gain"): loop.poles(K),
+    }
+    basis = next((s for s in swept if s.name == "structured"), None)
+    best = None if basis is None else basis.best(fast_order(found.problem.layout.n_s))
+    if basis is not None and best is not None:
+        sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(basis.reduced(found.problem, best.N).gain)
+    return {name: p[np.argsort(np.abs(p))][: 2 * SHOWN_MODES] for name, p in sets.items()}
+
+
+def draw_all(
+    out: Path, found: Design, swept: Sequence[SweptBasis], retuned: Sequence[Retuned], poles: dict[str, Poles],
+    runs: LoopRuns, frames: Frames,
+) -> list[Path]:  # fmt: skip
+    """All figures and the animation. Rank 0 only."""
+    files: list[Path] = []
+    if frames.picture is not None and frames.states:
+        files += _move(out, found, runs, frames)
+    full, d = runs.full, found.problem.layout.dimension
+    others = compared(runs)
+    files += figure_histories(
+        full.times, full.outputs, full.inputs, _names(full.output_names), out / "histories.png", target=found.target.y,
+        others=others, settle=runs.plan.settle, dimension=d,
+    )  # fmt: skip
+    if any(s.reports for s in swept):
+        files += figure_reduced(swept, out / "errors.png")
+    if retuned:
+        files += figure_retune(retuned, out / "retune.png")
+    # rounding of the eigenvalues of the lowest modes
+    noise = 1e-13 * max(float(np.abs(p).max(initial=0.0)) for p in poles.values())
+    files += figure_decay(poles, out / "decay.png", noise=noise)
+    return files
+
+
+def compared(runs: LoopRuns) -> dict[str, tuple[Array, Array]]:
+    """Outputs and inputs under the a-priori gain and under the dearest of the others. Not collective."""
+    ran = {name: (title, N, run) for name, (title, N, run) in runs.reduced.items() if not isinstance(run, str)}
+    paper = sorted((float(run.cost[-1]), name) for name, (_, _, run) in ran.items() if name != "structured")
+    names = [name for name in ("structured", *(name for _, name in paper[-1:])) if name in ran]
+    return {f"{ran[n][0]}, $N = {ran[n][1]}$": (ran[n][2].outputs, ran[n][2].inputs) for n in names}
+
+
+def _names(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name.replace(".", "_") for name in names)
+
+
+def _move(out: Path, found: Design, runs: LoopRuns, frames: Frames) -> list[Path]:
+    from softgrasp.study.pictures.animation import gif_move
+
+    states, times, full = np.stack(frames.states), np.array(frames.times), runs.full
+    table = np.column_stack([full.times, full.q_s])
+    target = found.target.state.q_s
+    files = [*figure_loop_move(frames.picture, states, times, table, target, out / "move.png")]  # type: ignore[arg-type]
+    if not frames.few:
+        # nothing moves between the settling time and the end of the run
+        keep = slice(None) if len(times) < 3 or times[-1] <= 1.5 * times[-2] else slice(-1)
+        part = table[table[:, 0] <= times[keep][-1] + runs.plan.dt / 2]
+        files.append(gif_move(frames.picture, states[keep], times[keep], part, target, out / "move.gif"))  # type: ignore[arg-type]
+    return files

@@ -1,0 +1,1 @@
+"""`softgrasp effects`: what every effect costs and changes."""

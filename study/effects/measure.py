@@ -1,0 +1,393 @@
+"""What an effect costs and what it changes: builds, factors, steps, memory and outputs of several scenes side by side.
+
+Times are interleaved, so that the noise of the machine hits all scenes alike; work and memory are counted, not timed:
+PETSc counts the operations of a step, and every matrix, vector and array that a run holds is added up.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.run.drive import Force
+from softgrasp.fem.run.motion import motion_table
+from softgrasp.fem.solve.order import dissect
+from softgrasp.fem.petsc import Array, PETSc, whole_copy
+from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.run.stepping import make_ts
+from softgrasp.study.bench.forward_rows import interleave, medians
+from softgrasp.study.effects.objects import STEPS, counting
+from softgrasp.study.effects.switch import changed
+
+BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
+BURST_SECONDS = 0.02  # of the steps of one; long against the timer
+BUILD_SECONDS = 6.0  # the builds are repeated at most about this long
+MOST_STEPS = 20_000  # in one sample
+
+
+@dataclass
+class Case:
+    """One scene under measurement.
+
+    Attributes:
+        model: the last one built.
+        seconds: samples of each stage: mesh, assembly, setup (factor and the drive's own solves), step.
+        prints: hash of each operator, see `fingerprint`.
+        bytes: memory of what the run holds, over all ranks [byte].
+        flops: operations of PETSc in a step, over all ranks [1].
+        spread: distance of the quartiles of its single step times, over their median [1].
+        objects: what PETSc's log counts as created by build, factor, start and the first step, by class.
+        objects_in_steps: the same of the next steps.
+    """
+
+    model: Model
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+    prints: dict[str, str] = field(default_factory=dict)
+    bytes: dict[str, float] = field(default_factory=dict)
+    flops: float = 0.0
+    spread: float = 0.0
+    objects: dict[str, int] = field(default_factory=dict)
+    objects_in_steps: dict[str, int] = field(default_factory=dict)
+
+
+class Stepper:
+    """A run that can be taken back to its start, to time its steps as often as wanted. Collective."""
+
+    def __init__(self, model: Model) -> None:
+        self.comm: MPI.Intracomm = model.system.layout.comm
+        self.run = Run(model, RunOptions())
+        self.ts = make_ts(self.run)
+        self.run.start()
+        self.begin = self.run.state.array.copy()
+
+    def rewind(self) -> None:
+        """Back to step 0. Collective."""
+        run = self.run
+        run.state.array[:] = self.begin
+        run.state.z.stateIncrease()
+        run.state.v.stateIncrease()
+        run.midpoint.start(run.state)
+        run.midpoint.dissipated = 0.0
+        run.reached = 0
+        self.ts.setStepNumber(0)
+
+    def seconds_per_step(self, count: int) -> float:
+        """Seconds of a step on the slowest rank, over at least ``count`` steps. Collective."""
+        run, before, done = self.run, self.run.seconds, 0
+        while done < count:
+            self.rewind()
+            n = min(run.steps, count - done)
+            self.comm.Barrier()
+            run.advance_to(self.ts, n)
+            done += n
+        return float(self.comm.allreduce(run.seconds - before, MPI.MAX)) / done
+
+    def flops(self) -> float:
+        """Operations that PETSc counts in one step, over all ranks. Collective."""
+        self.rewind()
+        few, many = min(1, self.run.steps), min(11, self.run.steps)
+        self.run.advance_to(self.ts, few)
+        before = PETSc.Log.getFlops()
+        self.run.advance_to(self.ts, many)
+        local = PETSc.Log.getFlops() - before
+        return float(self.comm.allreduce(local)) / max(many - few, 1)
+
+    def advance(self, count: int) -> None:
+        """Go on by so many steps, or to the end. Collective."""
+        self.run.advance_to(self.ts, min(self.run.reached + count, self.run.steps))
+
+    def destroy(self) -> None:
+        """Free the PETSc objects. Collective."""
+        self.ts.destroy()
+        self.run.midpoint.destroy()
+
+
+def bare_output(scene: Scene) -> Scene:
+    """The scene without snapshots: their memory and copies belong to no effect. Not collective."""
+    return changed(scene, lambda table: table["output"].update(snapshots="none"))
+
+
+# --- hashes and memory
+
+
+def digest(comm: MPI.Intracomm, parts: Iterable[Array]) -> str:
+    """SHA-256 of arrays on all ranks, in the order of the ranks, 64 hex digits. Collective."""
+    local = hashlib.sha256()
+    for part in parts:
+        local.update(str(part.shape).encode())
+        local.update(np.ascontiguousarray(part).tobytes())
+    return hashlib.sha256(b"".join(comm.allgather(local.digest()))).hexdigest()
+
+
+def fingerprint(model: Model, run: Run) -> dict[str, str]:
+    """Hash of pattern and values of every operator that the steps use, and of the hand's part. Collective."""
+    system, comm = model.system, model.system.layout.comm
+    matrices = {"M_ee": system.M_ee, "K_ee": system.K_ee, "S": run.midpoint.solver.S}
+    if system.damping.matrix is not None:
+        matrices["D_ee"] = system.damping.matrix
+    arrays: dict[str, list[Array]] = {name: list(A.getValuesCSR()) for name, A in matrices.items()}
+    arrays |= {name: [getattr(system, name)] for name in ("T", "G", "M_hand", "M_rigid")}
+    arrays["hand"] = [getattr(run.drive, name) for name in ("c", "lhs", "Y") if hasattr(run.drive, name)]
+    return {name: digest(comm, parts) for name, parts in arrays.items()}
+
+
+def matrix_memory(A: PETSc.Mat) -> float:
+    """Values and indices of a sparse matrix over all ranks [byte]. Collective.
+
+    Counted from its entries, for PETSc itself reports no memory in an optimised build.
+    """
+    integer = np.dtype(PETSc.IntType).itemsize
+    entries = A.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_allocated"]
+    block = A.getBlockSize() ** 2 if "baij" in A.getType() else 1
+    return float(entries * (8 + integer / block) + integer * (A.getSize()[0] + 1))
+
+
+def holdings(model: Model, run: Run) -> dict[str, float]:
+    """Memory of each matrix, vector and array that model and run hold, over all ranks [byte]. Collective.
+
+    Found by looking through the objects, so that nothing an effect allocates can be forgotten. Views count once; what
+    every rank holds for itself counts on each.
+    """
+    system, comm = model.system, model.system.layout.comm
+    holders: list[tuple[str, Any]] = [("", system), ("", system.damping), ("step.", run.midpoint), ("hand.", run.drive)]
+    holders.append(("step.", run.midpoint.held))
+    if run.midpoint.held.order is not None:
+        holders.append(("step.order.", run.midpoint.held.order))
+    for layer in system.layers:
+        holders += [(f"{key}[{layer.name}].", getattr(layer, key)) for key in ("K_mu", "K_lambda", "M_1")]
+    seen: set[int] = set()
+    found: dict[str, float] = {}
+
+    def everywhere(size: float, thing: Any) -> float:
+        return float(comm.allreduce(size)) if thing.comm.size < comm.size else size
+
+    for prefix, holder in holders:
+        for name, value in vars(holder).items():
+            if isinstance(value, PETSc.Mat) and value.handle not in seen:
+                seen.add(value.handle)
+                found[prefix + name] = everywhere(matrix_memory(value), value)
+            elif isinstance(value, PETSc.Vec):
+                seen.add(value.array_r.ctypes.data)
+                found[prefix + name] = everywhere(8.0 * value.getSize(), value)
+    for prefix, holder in holders:
+        for name, value in vars(holder).items():
+            if isinstance(value, np.ndarray):
+                new = value.ctypes.data not in seen or value.size == 0
+                seen.add(value.ctypes.data)
+                found[prefix + name] = found.get(prefix + name, 0.0) + float(comm.allreduce(value.nbytes * new))
+    solver = run.midpoint.solver
+    found["S"] = everywhere(matrix_memory(solver.S), solver.S)
+    factored = solver.ksp.getOperators()[0]
+    if factored.handle != solver.S.handle:
+        found["S, factored"] = everywhere(matrix_memory(factored), factored)
+    if solver.name != "cg" and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
+        found["factor"] = everywhere(matrix_memory(solver.ksp.getPC().getFactorMatrix()), solver.S)
+    return {name: size for name, size in found.items() if size > 0}
+
+
+def _as_stepped(S: PETSc.Mat, d: int) -> Iterator[list[Array]]:
+    """The entries of a matrix as the steps may hold them: spread, whole, whole in the order of Cholesky. Collective."""
+    yield list(S.getValuesCSR())
+    whole = whole_copy(S)
+    ordered = dissect(whole, d).matrix(whole)
+    for copy in (whole, ordered):
+        yield list(copy.getValuesCSR())
+        copy.destroy()
+
+
+def nothing_of(name: str, case: Case) -> bool:
+    """Whether the operators are free of the effect: made again without its term they have the same bits. Collective."""
+    system, comm = case.model.system, case.model.system.layout.comm
+    layout, scene = system.layout, case.model.scene
+    if name == "damping":
+        s = 2 * scene.time.steps / scene.time_end
+        S = system.K_ee.copy()
+        S.axpy(s * s, system.M_ee, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        same = case.prints["S"] in (digest(comm, found) for found in _as_stepped(S, layout.dimension))
+        S.destroy()
+        return same and not system.damping.active and "step.k_old" not in case.bytes
+    if name == "gravity":
+        free = system.gravity is None
+        if scene.motion.drive == "motion" and not system.damping.in_space:
+            loads = -motion_table(scene, layout.n_s).a
+            free = free and digest(comm, [loads]) == case.prints["hand"]
+        return free
+    if name == "reaction":
+        return not system.two_way and not any(name.endswith(".Y") for name in case.bytes)
+    if name == "rotation":
+        return bool(layout.n_s == layout.dimension == system.T.shape[1])
+    return len(system.layers) == 1
+
+
+# --- times
+
+
+def measure_builds(
+    comm: MPI.Intracomm, scenes: dict[str, Scene], repeats: int, tick: Callable[[], None]
+) -> dict[str, Case]:
+    """Build and factor every scene several times, in rotated order. Collective.
+
+    Args:
+        comm: ranks.
+        scenes: by name.
+        repeats: how often; fewer when that takes longer than `BUILD_SECONDS`, at least once.
+        tick: called after each build.
+    """
+    cases: dict[str, Case] = {}
+    names = list(scenes)
+    spent = 0.0
+    for i in range(repeats):
+        shift = i % len(names)
+        gc.collect()
+        for name in names[shift:] + names[:shift]:
+            model = build(scenes[name], comm)
+            with model.watch.stage("setup"):
+                run = Run(model, RunOptions())
+            seconds = cases[name].seconds if name in cases else {}
+            for stage in ("mesh", "assembly", "setup"):
+                seconds.setdefault(stage, []).append(model.watch.seconds[stage])
+                spent += model.watch.seconds[stage]
+            if name not in cases:
+                cases[name] = Case(model, seconds)
+            run.midpoint.destroy()
+            tick()
+        if comm.bcast(spent) > BUILD_SECONDS * (i + 1) / (i + 2):  # one round more would be too long
+            break
+    return cases
+
+
+def measure_steps(comm: MPI.Intracomm, cases: dict[str, Case], repeats: int, tick: Callable[[], None]) -> None:
+    """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective.
+
+    Args:
+        comm: ranks.
+        cases: filled in.
+        repeats: samples of each.
+        tick: called after each sample.
+    """
+    steppers = {name: Stepper(case.model) for name, case in cases.items()}
+    try:
+        pace = next(iter(steppers.values())).seconds_per_step(5)
+        for stepper in steppers.values():
+            stepper.seconds_per_step(5)
+        count = comm.bcast(int(np.clip(BURST_SECONDS / pace, 5, MOST_STEPS)))
+
+        def sampler(stepper: Stepper) -> Callable[[], float]:
+            def sample() -> float:
+                return stepper.seconds_per_step(count)
+
+            return sample
+
+        samplers = {name: sampler(stepper) for name, stepper in steppers.items()}
+        bursts: dict[str, list[float]] = {name: [] for name in cases}
+        for _ in range(repeats):
+            samples = interleave(samplers, BURSTS)
+            for name, seconds in medians(samples).items():
+                cases[name].seconds.setdefault("step", []).append(seconds)
+                bursts[name] += samples[name]
+                tick()
+        for name, case in cases.items():
+            low, median, high = np.quantile(bursts[name], [0.25, 0.5, 0.75])
+            case.spread = float((high - low) / median)
+            case.flops = steppers[name].flops()
+            case.prints = fingerprint(case.model, steppers[name].run)
+            case.bytes = holdings(case.model, steppers[name].run)
+    finally:
+        for stepper in steppers.values():
+            stepper.destroy()
+
+
+def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
+    """Objects that PETSc's log sees created up to the first step, and in the next ones. Collective.
+
+    Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
+    """
+    with counting(comm) as made:
+        stepper = Stepper(build(scene, comm))
+        stepper.advance(1)
+    with counting(comm) as in_steps:
+        stepper.advance(STEPS)
+    stepper.destroy()
+    return made, in_steps
+
+
+def count_objects(comm: MPI.Intracomm, cases: dict[str, Case], scenes: dict[str, Scene]) -> None:
+    """Let PETSc count what each case creates, in order. Collective."""
+    for name, case in cases.items():
+        case.objects, case.objects_in_steps = objects_of(comm, scenes[name])
+
+
+# --- changes
+
+
+@dataclass(frozen=True)
+class Change:
+    """Largest change of the outputs over the run.
+
+    Attributes:
+        outputs: max |y - y'| over max |y|, y the displacements of all outputs [1].
+        deformation: the same of the outputs relative to the rigid motion of the hand [1].
+        absolute: max |y - y'| [m].
+    """
+
+    outputs: float
+    deformation: float
+    absolute: float
+
+
+def compare(model: Model, a: Trajectory, other: Model, b: Trajectory) -> Change:
+    """Change between two runs of the same outputs; angles of a hand output do not count. Not collective."""
+    d = model.system.layout.dimension
+
+    def places(model: Model, values: Array) -> Array:
+        """Displacements, shape (steps + 1, outputs, d)."""
+        control = model.scene.control
+        kinds = [o.kind for o in control.outputs] if control is not None and control.outputs else ["node"]
+        widths = [model.system.layout.n_s if kind == "hand" else d for kind in kinds]
+        starts = np.cumsum([0, *widths[:-1]])
+        return np.stack([values[:, at : at + d] for at in starts], axis=1)
+
+    def gap(x: Array, y: Array) -> tuple[float, float]:
+        scale = max(float(np.linalg.norm(v, axis=2).max()) for v in (x, y))
+        largest = float(np.linalg.norm(x - y, axis=2).max())
+        return largest, (largest / scale if scale > 0 else 0.0)
+
+    x, y = places(model, a.outputs), places(other, b.outputs)
+    rigid = places(model, a.outputs_rigid), places(other, b.outputs_rigid)
+    absolute, outputs = gap(x, y)
+    return Change(outputs, gap(x - rigid[0], y - rigid[1])[1], absolute)
+
+
+def force_of_motion(scene: Scene, model: Model) -> Force:
+    """The force that would carry the bare hand along the prescribed motion, u_n = M_hand a_n. Not collective.
+
+    A hand with more freedoms than the scene's gets no load on them, one with fewer none of those it lacks.
+
+    Raises:
+        SceneError: a csv file does not fit.
+    """
+    u = motion_table(scene, model.system.layout.n_s).a @ model.system.M_hand.T
+
+    def force(n: int, t: float, q: Array, v: Array) -> Array:
+        result, shared = np.zeros(len(q)), min(len(q), u.shape[1])
+        result[:shared] = u[n, :shared]
+        return result
+
+    return force
+
+
+def run_case(case: Case, force: Force | None = None) -> Trajectory:
+    """The whole run of a case. Collective.
+
+    Raises:
+        SolverError: a solve failed.
+    """
+    return simulate(case.model, RunOptions(), force)

@@ -1,0 +1,150 @@
+"""Change against cost of every effect, in one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, OUTLINE, STEPS, WIDTH, paper_style, save
+
+COLOURS = {"needed": GREEN, "optional": BLUE, "wasted": ORANGE}
+BAND = "#e4e4e4"
+ROUNDING = 1e-15  # a smaller change is drawn as none
+ROW, BELOW = 0.34, 0.8  # [inch]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One effect in the picture.
+
+    Attributes:
+        name: the effect.
+        on: the scene has it on.
+        verdict: needed, optional or wasted.
+        label: the verdict in words.
+        change: of the outputs of the run [1].
+        control: of the outputs under a force [1]; None when that is no question.
+        step: added share of a step's time, median [1].
+        quartiles: of its samples [1].
+        memory: added share of the memory [1].
+    """
+
+    name: str
+    on: bool
+    verdict: str
+    label: str
+    change: float
+    control: float | None
+    step: float
+    quartiles: tuple[float, float]
+    memory: float
+
+
+def figure_effects(
+    marks: Sequence[Mark], tolerance: float, noise: tuple[float, float], out_png: Path
+) -> tuple[Path, Path]:
+    """Each effect in a row: what it changes on the left, what it costs on the right; PNG and PDF.
+
+    Args:
+        marks: one for each effect that was tried.
+        tolerance: change that counts [1].
+        noise: quartiles of the step times of one scene against itself [1].
+        out_png: name of the picture; the PDF gets its stem.
+
+    Returns:
+        Names of PNG and PDF.
+    """
+    with paper_style():
+        height = ROW * len(marks)
+        size = (WIDTH, height + BELOW + 0.25)
+        figure = plt.figure(figsize=size)
+        axes = [
+            figure.add_axes((x / size[0], BELOW / size[1], w / size[0], height / size[1]))
+            for x, w in ((1.1, 2.6), (3.95, 1.85))
+        ]
+        axes[1].tick_params(labelleft=False)
+        rows = np.arange(len(marks))[::-1]
+        _changes(axes[0], marks, rows, tolerance)
+        _costs(axes[1], marks, rows, noise)
+        axes[0].set_yticks(rows, [f"{m.name} ({'on' if m.on else 'off'})" for m in marks])
+        for ax in axes:
+            ax.set_ylim(-0.6, len(marks) - 0.4)
+            ax.tick_params(axis="y", length=0)
+            ax.spines["left"].set_visible(False)
+            for row in rows:
+                ax.axhline(row, color="#eeeeee", lw=0.8, zorder=0)
+        return save(figure, out_png)
+
+
+def _changes(ax: Any, marks: Sequence[Mark], rows: Any, tolerance: float) -> None:
+    values = [v for m in marks for v in (m.change, m.control) if v is not None and v > ROUNDING]
+    low, high = min([*values, tolerance]), max([*values, tolerance])
+    left = 10.0 ** (np.floor(np.log10(low)) - 1)  # a decade for those that change nothing
+    nothing = 1.5 * left
+    for mark, row in zip(marks, rows, strict=True):
+        colour = COLOURS[mark.verdict]
+        look: dict[str, Any] = {"color": colour, "mfc": colour if mark.on else "white", "mew": 1.3, "ls": "none"}
+        if mark.control is not None and mark.control > ROUNDING:
+            ax.plot(mark.control, row, marker="D", ms=4.5, zorder=2, **look)
+        if mark.change > ROUNDING:
+            ax.plot(mark.change, row, marker="o", ms=7, zorder=3, **look)
+        else:
+            ax.plot(nothing, row, marker="<", ms=6.5, zorder=3, **look)
+            ax.annotate("none", (nothing, row), (7, 0), textcoords="offset points", va="center", color=OUTLINE)
+    ax.axvline(tolerance, color=HAND, lw=0.9, ls=(0, (4, 3)), zorder=1)
+    ax.annotate(
+        f"tolerance {tolerance:g}", (tolerance, 1.0), (0, 2), xycoords=("data", "axes fraction"),
+        textcoords="offset points", ha="center", va="bottom", color=HAND,
+    )  # fmt: skip
+    ax.set_xscale("log")
+    ax.set_xlim(left, 3 * high)
+    ax.xaxis.set_major_locator(LogLocator(numticks=6))
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.set_xlabel("relative change of the outputs")
+    grey: dict[str, Any] = {"color": OUTLINE, "ls": "none", "mew": 1.3}
+    entries = [Line2D([], [], marker="o", ms=6, label="this run", **grey)]
+    if any(m.control is not None and m.control > ROUNDING for m in marks):
+        entries.append(Line2D([], [], marker="D", ms=4.5, label="under a force", **grey))
+    if not all(m.on for m in marks):
+        entries.append(Line2D([], [], marker="o", ms=6, mfc="white", label="off, tried", **grey))
+    _legend(ax, entries)
+
+
+def _costs(ax: Any, marks: Sequence[Mark], rows: Any, noise: tuple[float, float]) -> None:
+    ax.axvspan(100 * min(noise[0], 0.0), 100 * max(noise[1], 0.0), color=BAND, lw=0, zorder=0)
+    for mark, row in zip(marks, rows, strict=True):
+        colour = COLOURS[mark.verdict]
+        face = colour if mark.on else "white"
+        error = 100 * np.array([[mark.step - mark.quartiles[0]], [mark.quartiles[1] - mark.step]])
+        ax.errorbar(
+            100 * mark.step, row + 0.13, xerr=error, fmt="o", ms=5.5, color=colour, mfc=face, mew=1.3, elinewidth=0.8,
+            capsize=2, zorder=3,
+        )  # fmt: skip
+        ax.plot(100 * mark.memory, row - 0.17, marker="s", ms=4.5, color=colour, mfc=face, mew=1.3, zorder=3)
+        ax.annotate(
+            mark.label, (1.02, row), xycoords=("axes fraction", "data"), va="center", color=colour, weight="bold"
+        )
+    ax.axvline(0.0, color=HAND, lw=0.7, zorder=1)
+    ax.xaxis.set_major_locator(MaxNLocator(6, steps=STEPS))
+    ax.margins(x=0.08)
+    ax.set_xlabel("added cost [%]")
+    grey: dict[str, Any] = {"color": OUTLINE, "ls": "none", "mew": 1.3}
+    entries: list[Any] = [Line2D([], [], marker="o", ms=5.5, label="time of a step", **grey)]
+    entries.append(Line2D([], [], marker="s", ms=4.5, label="memory", **grey))
+    _legend(ax, [*entries, Patch(color=BAND, label="noise of the time")])
+
+
+def _legend(ax: Any, entries: list[Any]) -> None:
+    below = -0.52 / (ax.get_position().height * ax.figure.get_figheight())
+    ax.legend(
+        handles=entries, loc="upper left", bbox_to_anchor=(-0.1, below),
+        ncols=len(entries), handlelength=1.2, columnspacing=1.2, borderaxespad=0.0,
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""`softgrasp simulate` and `softgrasp explain`."""

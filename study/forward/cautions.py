@@ -1,0 +1,184 @@
+"""What deserves a warning in a scene or in its result: `explain` asks before a run, `simulate` after it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from rich.padding import Padding
+from rich.text import Text
+
+from softgrasp.fem.fields.series import FullField
+from softgrasp.fem.mesh.make import cell_nodes
+from softgrasp.fem.scene.materials import young_poisson
+from softgrasp.fem.petsc import Array, times_columns, total
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+    from softgrasp.fem.run.simulate import Trajectory
+    from softgrasp.fem.system import BlockSystem
+
+LOCKING = 0.49  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu)
+COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
+SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
+SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain of any fine mesh is large
+SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
+EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
+LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
+LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
+SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to count: far above rounding
+
+
+def poisson_ratios(system: BlockSystem) -> dict[str, float]:
+    """Poisson's ratio of each material by the name of its layer [1]. Not collective."""
+    names = [blocks.name for blocks in system.layers]
+    return {n: young_poisson(m.lam, m.mu)[1] for n, m in zip(names, system.materials, strict=True)}
+
+
+def locking(poisson: dict[str, float], order: int) -> list[str]:
+    """P1 elements in a material that hardly changes its volume. Not collective."""
+    return [
+        f"nu = {_near_half(nu)} of {name} is above {LOCKING}: P1 locks and is far too stiff, use tissue.order = 2."
+        for name, nu in poisson.items()
+        if nu > LOCKING + 1e-9 and order == 1
+    ]
+
+
+def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
+    """A step too long for a period 2 pi / omega. Not collective.
+
+    Args:
+        omega: angular frequency [1/s].
+        dt, end: step and end of the run [s].
+        period: what the period is, in words.
+    """
+    share = omega * dt / (2 * np.pi)
+    if not share > COARSE_STEP:
+        return []
+    steps = int(np.ceil(end * omega / (2 * np.pi * COARSE_STEP)))
+    return [f"dt is {share:.2g} of {period}, so even that is coarse in time: use at least {steps} steps."]
+
+
+def turned(angle: float) -> list[str]:
+    """A hand angle [rad] beyond the linearised rotation. Not collective."""
+    if angle <= SMALL_ANGLE:
+        return []
+    return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
+
+
+def inexact(drift: float, residual: float, solver: str, nu: float) -> list[str]:
+    """Drift of the energy or residual of a solve above rounding, as the digits they leave. Not collective.
+
+    Args:
+        drift: energy that nothing explains, over the largest seen [1]; counts for direct solvers.
+        residual: largest relative residual of the checked solves [1].
+        solver: cholesky, mumps or cg.
+        nu: largest Poisson's ratio [1].
+    """
+    worst, name = max((residual, "residual"), (0.0 if solver == "cg" else drift, "energy drift"))
+    if not worst > EXACT:
+        return []
+    if solver == "cg":
+        reason = "time.rtol lets cg stop there; a smaller one brings more"
+    elif nu > 0.4999:
+        reason = f"nu = {_near_half(nu)} makes the matrix of a step nearly singular, which magnifies rounding"
+    else:
+        reason = "the matrix of a step is badly conditioned (materials, cells or masses of very different size)"
+    digits = max(int(-np.log10(worst)), 0)
+    left = f"only about {digits} digit{'' if digits == 1 else 's'}" if digits else "no digit"
+    return [f"{name} {worst:.1e}: the numbers carry {left}, because {reason}."]
+
+
+def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None = None) -> list[str]:
+    """What the result of a run warns of, without an eigenvalue problem. Collective.
+
+    Strain is that of the largest of at most `LOOKED_AT` stored displacements, the last one and ``most``; the period is
+    that of :func:`slowest`, which needs snapshots in memory.
+
+    Args:
+        model: the model.
+        run: its run.
+        most: time [s] and local rows (n_local,) [m] of a large displacement that was seen on the way.
+    """
+    scene, system, d = model.scene, model.system, model.space.mesh.dimension
+    poisson = poisson_ratios(system)
+    Z, times = _instants(run, system)
+    found = locking(poisson, scene.tissue.order)
+    omega = slowest(system, Z)
+    if omega > 0:
+        period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"
+        found += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
+    sizes = total(system.layout.comm, np.einsum("ij,ij->j", Z, Z))
+    z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]
+    if most is not None and total(system.layout.comm, np.array([np.dot(most[1], most[1])]))[0] > sizes.max():
+        t, z = most
+    steepest, share = gradients(model, z)
+    if share > SMALL_SHARE:
+        found.append(
+            f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {share:.0%} of the body at "
+            f"t = {t:.3g} s, at most {steepest:.2g}: linear elasticity assumes small strains and rotations."
+        )
+    found += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
+    return found + inexact(run.energy_drift, max(run.residuals), run.solver[0], max(poisson.values()))
+
+
+def _near_half(nu: float) -> str:
+    return f"{nu:.4g}" if nu < 0.4999 else f"0.5 - {0.5 - nu:.1e}"
+
+
+def _instants(run: Trajectory, system: BlockSystem) -> tuple[Array, list[float]]:
+    """Displacements against the hand, local rows (n_local, k) [m], and their times [s]. Not collective."""
+    n = system.layout.n_local
+    if run.snapshots is None:
+        return run.final[:n, None], [float(run.times[-1])]
+    last = len(run.snapshots.times) - 1
+    count = int(np.clip(LARGEST // system.layout.n_e, 4, LOOKED_AT))
+    columns = np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
+    times = [*run.snapshots.times[columns].tolist(), float(run.times[-1])]
+    return np.column_stack([run.snapshots.Z[:n, columns], run.final[:n]]), times
+
+
+def slowest(system: BlockSystem, Z: Array) -> float:
+    """Lowest frequency [1/s] of the clamped tissue in the span of Z - mean(Z), 0 when nothing moves. Collective.
+
+    A Ritz value, omega^2 = min_z z'K z / z'M z: at least the lowest frequency, near it if the run excites its mode.
+
+    Args:
+        system: the model's operators.
+        Z: displacements against the hand, local rows (n_local, k) [m].
+    """
+    comm, centre = system.layout.comm, np.eye(Z.shape[1]) - 1 / Z.shape[1]
+    M, K = (total(comm, Z.T @ times_columns(A, Z)) for A in (system.M_ee, system.K_ee))
+    squares, Q = np.linalg.eigh(centre @ (M + M.T) @ centre / 2)
+    kept = squares > SEEN * np.trace(M)
+    if not kept.any():
+        return 0.0
+    Q = centre @ (Q[:, kept] / np.sqrt(squares[kept]))
+    return float(np.sqrt(max(np.linalg.eigvalsh(Q.T @ (K + K.T) @ Q / 2)[0], 0.0)))
+
+
+def gradients(model: Model, z: Array) -> tuple[float, float]:
+    """Largest |grad z| between the vertices of a cell [1], and share of the volume above `SMALL_STRAIN`. Collective.
+
+    Args:
+        model: the model.
+        z: displacement against the hand, local rows (n_local,) [m].
+    """
+    space, d = model.space, model.space.mesh.dimension
+    mesh = space.mesh.mesh
+    cells = mesh.topology.index_map(d).size_local
+    nodal = FullField(model).fill(z, np.zeros(space.layout.n_s)).x.array.reshape(-1, d)
+    u = nodal[space.V.dofmap.list[:cells, : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
+    x = mesh.geometry.x[cell_nodes(mesh)[:cells], :d]
+    edges = x[:, 1:] - x[:, :1]
+    size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))
+    volume = np.abs(np.linalg.det(edges))
+    large, whole = total(space.layout.comm, np.array([volume[size > SMALL_STRAIN].sum(), volume.sum()]))
+    return max(space.layout.comm.allgather(float(size.max(initial=0.0)))), float(large / whole)
+
+
+def show_warnings(console: Console, found: list[str]) -> None:
+    """Print warnings in yellow. Not collective."""
+    for text in found:
+        console.print(Padding.indent(Text(f"warning: {text}", "yellow"), 0), highlight=False)

@@ -1,0 +1,1 @@
+"""`softgrasp hardcases`: stay stable or refuse with a reason."""

@@ -1,0 +1,200 @@
+"""What a hard case is: a number from our way and from the plain one, a bound with its reason, and a verdict."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.scene.file import load_scene, shipped_scenes
+
+Array = NDArray[np.float64]
+Verdict = Literal["pass", "fail", "refused"]
+EPS = float(np.finfo(float).eps)
+LENGTH = 400  # characters of a message that are kept
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one way gave: a number, or the sentence with which it ended.
+
+    Attributes:
+        value: the measured number; None when there is none.
+        text: the refusal or failure in words, or a remark on the number.
+        refused: whether it ended by one of our own errors.
+    """
+
+    value: float | None
+    text: str = ""
+    refused: bool = False
+
+    def __str__(self) -> str:
+        """Number and remark as a table shows them."""
+        number = "" if self.value is None else f"{self.value:.3g}" if self.value >= 100 else f"{self.value:.2g}"
+        return f"{number} ({self.text})" if number and self.text else number or self.text
+
+
+@dataclass(frozen=True)
+class Row:
+    """One case.
+
+    Attributes:
+        case: what is special, in words.
+        x: the varied number, the position in the picture.
+        ours, plain: what our way and the textbook way gave.
+        bound: ours must not exceed it; None when the case has to be refused.
+        reason: where the bound comes from.
+        may_refuse: a refusal is as good as a number within the bound.
+        group: curve of the picture it belongs to.
+    """
+
+    case: str
+    x: float
+    ours: Outcome
+    plain: Outcome
+    bound: float | None
+    reason: str
+    may_refuse: bool = False
+    group: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Within the bound, beyond it, or refused with a sentence. NaN is beyond every bound."""
+        if self.ours.refused:
+            return "refused"
+        if self.ours.value is None or self.bound is None:
+            return "fail"
+        return "pass" if self.ours.value <= self.bound else "fail"
+
+    @property
+    def ok(self) -> bool:
+        """Whether the promise is kept: stable where it can be, refused where it must be."""
+        if self.verdict == "refused":
+            return self.bound is None or self.may_refuse
+        return self.verdict == "pass"
+
+    @property
+    def verdict_text(self) -> str:
+        """The verdict with the sentence of a refusal."""
+        if self.verdict == "refused":
+            return f"refused: {self.ours.text}" if self.ok else f"fail, refused: {self.ours.text}"
+        return self.verdict
+
+    @property
+    def bound_text(self) -> str:
+        """The bound as a table shows it."""
+        if self.bound is None:
+            return "must be refused"
+        return f"<= {self.bound:.2g}" + (" or refused" if self.may_refuse else "")
+
+
+@dataclass(frozen=True)
+class Family:
+    """Cases that vary one thing.
+
+    Attributes:
+        name: short name, as `--family` takes it.
+        title: what is hard, in words.
+        varied: label of the varied number with its unit.
+        quantity: label of the measured number with its unit.
+        plain: the textbook way in a few words.
+        lesson: what the comparison shows, one or two sentences.
+        rows: makes the rows; True for the quick half.
+        axis: of the varied number in the picture: a logarithm, linear, or the cases one below the other.
+    """
+
+    name: str
+    title: str
+    varied: str
+    quantity: str
+    plain: str
+    lesson: str
+    rows: Callable[[bool], list[Row]]
+    axis: Literal["log", "linear", "listed"] = "log"
+
+
+def _short(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    text = re.sub(r"/\S*/(?=[^/\s])", "", lines[0]) if lines else type(error).__name__  # no folders of this machine
+    return text if len(text) <= LENGTH else text[: LENGTH - 3] + "..."
+
+
+def ours(work: Callable[..., float], *arguments: Any) -> Outcome:
+    """Run our way; one of our own errors is a refusal, any other exception goes through. Not collective."""
+    try:
+        return Outcome(float(work(*arguments)))
+    except SoftgraspError as error:
+        return Outcome(None, _short(error), refused=True)
+
+
+def plain(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
+    """Run the textbook way; whatever it raises or warns is its outcome. Not collective."""
+    with np.errstate(all="ignore"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            result = work(*arguments)
+        except Exception as error:  # the point of the comparison is how it fails
+            return Outcome(None, f"{type(error).__name__}: {_short(error)}")
+    if isinstance(result, Outcome):
+        return result
+    value = float(result)
+    notes = [str(w.message) for w in caught if not issubclass(w.category, DeprecationWarning)]
+    text = "" if math.isfinite(value) else "overflow" if math.isinf(value) else "not a number"
+    note = f"warns: {notes[0].splitlines()[0][:80]}" if notes and not text else text
+    return Outcome(value, note)
+
+
+def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Model:
+    """Build a shipped scene with overrides of the form `section.key=value`. Collective.
+
+    Raises:
+        SceneError, MeshError: as :func:`fem.model.build.build`.
+    """
+    return build(load_scene(shipped_scenes()[name], overrides), comm)
+
+
+def sparse(A: PETSc.Mat) -> Any:
+    """A matrix of one rank as SciPy CSR. Not collective."""
+    import scipy.sparse
+
+    indptr, columns, values = A.getValuesCSR()
+    return scipy.sparse.csr_matrix((values, columns, indptr), shape=A.getSize())
+
+
+def scaled_condition(A: PETSc.Mat) -> float:
+    """Condition of a symmetric positive definite matrix with its diagonal scaled to one [VDS69]. Not collective.
+
+    Up to the size of the matrix it is the least that any diagonal scaling reaches, and what Cholesky's error depends
+    on. For matrices of hundreds of rows.
+    """
+    dense = np.asarray(sparse(A).toarray())
+    scale = 1 / np.sqrt(np.diag(dense))
+    values = np.linalg.eigvalsh(scale[:, None] * dense * scale)
+    return float(values[-1] / values[0])
+
+
+def qr_rounding(rows: int, columns: int) -> float:
+    """Bound on |Q'Q - I| of Householder's QR without its constant, rows x columns x eps [H02]. Not collective."""
+    return rows * columns * EPS
+
+
+def relative(a: Array, b: Array) -> float:
+    """Largest difference over the largest entry of b; infinite when it is not finite. Not collective."""
+    if not np.isfinite(a).all():
+        return math.inf
+    return float(np.abs(a - b).max() / np.abs(b).max())
+
+
+def thin(values: Sequence[float], quick: bool) -> list[float]:
+    """All values, or for the quick half the first, the middle and the last. Not collective."""
+    return list(dict.fromkeys([values[0], values[len(values) // 2], values[-1]])) if quick else list(values)

@@ -1,0 +1,254 @@
+"""Hard cases of the time loop: any step, many steps, any damping, any hand, interrupted and gone on."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.errors import Interrupted
+from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
+from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.system import BlockSystem, Damping
+from softgrasp.study.hardcases.textbook import leapfrog, staggered_hand, textbook_midpoint
+from softgrasp.study.hardcases.cases import EPS, Family, Row, make, ours, plain, scaled_condition, sparse, thin
+
+SMALL = ("tissue.cells=[3, 6]", "control=false")
+REST = "motion={profile='hold'}"
+
+
+def mixed_state(system: BlockSystem) -> Array:
+    """A displacement in which every mode takes part, of the size of the body's cells. Not collective."""
+    return 0.05 * np.random.default_rng(3).standard_normal(system.layout.n_e)
+
+
+def first_period(system: BlockSystem) -> float:
+    """T_1 = 2 pi / omega_1 [s]. Not collective."""
+    return float(2 * math.pi / lowest_modes(system, 1)[0][0])
+
+
+def let_go(system: BlockSystem, z: Array, dt: float, steps: int) -> tuple[float, float]:
+    """Free vibration from rest; |E_N + lost - E_0| / E_0 and the largest E_n / E_0. Not collective."""
+    midpoint = TissueMidpoint(system, dt, "cholesky")
+    state = state_on(np.concatenate([z, np.zeros_like(z)]), system)
+    midpoint.start(state)
+    start, highest = midpoint.energy(state), 1.0
+    nothing = np.zeros(system.layout.n_s)
+    for n in range(steps):
+        midpoint.solve_midpoint(nothing)
+        if n == steps - 1:
+            midpoint.residual()
+        midpoint.advance(state, state)
+        if n % 50 == 0:
+            highest = max(highest, midpoint.energy(state) / start)
+    lost = midpoint.over_ranks(midpoint.dissipated)
+    midpoint.start(state)  # so that the last energy comes from M v and K z, as the first one did
+    end = midpoint.energy(state)
+    midpoint.destroy()
+    return abs(end + lost - start) / start, max(highest, end / start)
+
+
+def _drift(system: BlockSystem, z: Array, dt: float, steps: int) -> float:
+    return let_go(system, z, dt, steps)[0]
+
+
+def _balance(system: BlockSystem, z: Array, dt: float, steps: int) -> float:
+    """Defect of the balance, or what the energy exceeds the first one by, which is as wrong. Not collective."""
+    defect, highest = let_go(system, z, dt, steps)
+    return max(defect, highest - 1)
+
+
+def solve_rounding(system: BlockSystem, dt: float) -> float:
+    """What one solve of a step may change the energy by, relatively: 2 p eps kappa(S). Not collective.
+
+    kappa is the condition with the diagonal scaled to one [VDS69], p the most entries in a row, the constant of a
+    factor's backward error [H02]; the energy is quadratic, hence 2.
+    """
+    S = midpoint_matrix(system, dt)
+    result = 2 * int(np.diff(S.getValuesCSR()[0]).max()) * EPS * scaled_condition(S)
+    S.destroy()
+    return result
+
+
+def drift_bound(system: BlockSystem, ratio: float, dt: float, steps: int) -> tuple[float, str]:
+    """Bound on the relative energy drift and its reason. Not collective."""
+    one = solve_rounding(system, dt)
+    if ratio < 1:
+        return math.sqrt(steps) * one, "the rounding of one solve, 2 p eps cond(S), times sqrt(steps): a random walk"
+    return steps * one, (
+        "the rounding of one solve, 2 p eps cond(S), times the steps: from the period on K z outweighs the momentum "
+        "carried beside it, so roundings may all add up"
+    )
+
+
+def step_rows(quick: bool) -> list[Row]:
+    """Energy of a free vibration for steps from a thousandth to a thousand first periods."""
+    system = make("paper_forward", *SMALL, REST).system
+    z, period, steps = mixed_state(system), first_period(system), 400 if quick else 2000
+    M, K = sparse(system.M_ee), sparse(system.K_ee)
+    rows = []
+    for ratio in thin([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e3], quick):
+        dt = ratio * period
+        mine = ours(_drift, system, z, dt, steps)
+        explicit = plain(leapfrog, M, K, None, z, dt, steps)
+        rows.append(
+            Row(f"dt = {ratio:g} T1, {steps} steps", ratio, mine, explicit, *drift_bound(system, ratio, dt, steps))
+        )
+    return rows
+
+
+def long_rows(quick: bool) -> list[Row]:
+    """Energy after 1e5 steps of free vibration."""
+    system = make("paper_forward", *SMALL, REST).system
+    z, period, steps = mixed_state(system), first_period(system), 3000 if quick else 100_000
+    M, K = sparse(system.M_ee), sparse(system.K_ee)
+    rows = []
+    for ratio in [1e-3] if quick else [1e-3, 1e-2, 1.0, 100.0]:
+        dt = ratio * period
+        mine = ours(_drift, system, z, dt, steps)
+        loop = plain(textbook_midpoint, M, K, z, dt, steps)
+        rows.append(Row(f"{steps} steps of {ratio:g} T1", ratio, mine, loop, *drift_bound(system, ratio, dt, steps)))
+    return rows
+
+
+def damping_rows(quick: bool) -> list[Row]:
+    """Energy balance of a let-go body for damping from none to a million times critical."""
+    system = make("paper_forward", *SMALL, REST).system
+    z, period, steps = mixed_state(system), first_period(system), 200 if quick else 1000
+    omega, dt = 2 * math.pi / period, period / 500
+    M, K = sparse(system.M_ee), sparse(system.K_ee)
+    rows = []
+    for zeta in thin([0.0, 1e-14, 1e-8, 1e-2, 1.0, 1e3, 1e6], quick):
+        beta = 2 * zeta / omega
+        damped = replace(system, damping=Damping(beta=beta))
+        explicit = plain(leapfrog, M, K, beta * K if beta else None, z, dt, steps)
+        name = "undamped" if zeta == 0 else f"{zeta:g} of critical in the first mode"
+        reason = "what is lost must be what damping took, up to 2 p eps cond(S) sqrt(steps), a random walk of roundings"
+        bound = math.sqrt(steps) * solve_rounding(damped, dt)
+        rows.append(Row(name, zeta, ours(_balance, damped, z, dt, steps), explicit, bound, reason))
+    return rows
+
+
+def _momentum_error(model: Model, push: Array) -> float:
+    """Momentum of hand and tissue at the end of a run, pushed in the first step only, against the push."""
+    system, dt = model.system, model.scene.time_end / model.scene.time.steps
+    still = np.zeros_like(push)
+    run = simulate(model, force=lambda n, t, q, v: push / dt if n == 0 else still)
+    v_z = run.final[system.layout.n_local :]
+    found = (system.M_hand + system.M_rigid) @ run.v_s[-1] + system.G.T @ v_z
+    return float(np.abs(found - push).max() / push.max())
+
+
+def mass_rows(quick: bool) -> list[Row]:
+    """Momentum of hand and tissue after a short push, for hands from a thousandth to a million tissue masses."""
+    rows = []
+    tissue, push, dt, steps = 2.0, np.array([1.0, 0.5]), 0.005, 200 if quick else 1000
+    for ratio in thin([1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3, 1e6], quick):
+        scene = (f"hand.mass={tissue * ratio!r}", "effects={reaction=true}", "motion={profile='hold', drive='force'}")
+        model = make("paper_forward", *SMALL, *scene, f"time={{steps={steps}, end={dt * steps!r}}}")
+        system = model.system
+        operators = sparse(system.M_ee), sparse(system.K_ee), system.G, system.M_rigid, system.M_hand
+        turns = plain(staggered_hand, *operators, push, dt, steps)
+        reason = "without outer force the momentum is constant: ten sums and products a step, each rounded once"
+        bound = 10 * steps * EPS
+        rows.append(Row(f"hand / tissue = {ratio:g}", ratio, ours(_momentum_error, model, push), turns, bound, reason))
+    return rows
+
+
+RESTARTS = {
+    "undamped": (),
+    "Rayleigh damping": ("effects={damping={kind='rayleigh', alpha=0.4, beta=0.01}}",),
+    "two-way, driven by force": ("effects={reaction=true}", "motion.drive='force'"),
+    "snapshots in HDF5": ("output={snapshots='hdf5', every=3}",),
+    "gravity, turning hand, P2": (
+        "effects={gravity={g=[1.0, -9.0]}, rotation=true}", "hand={mass=20.0, inertia=3.0}", "tissue.order=2",
+        "motion.target=[5.0, 3.0, 0.3]",
+    ),
+}  # fmt: skip
+
+
+def differing(a: Trajectory, b: Trajectory) -> int:
+    """Number of doubles whose bits differ between two runs. Not collective."""
+    pairs = [(a.q_s, b.q_s), (a.v_s, b.v_s), (a.outputs, b.outputs), (a.final, b.final)]
+    pairs.append((np.array([a.energy_drift]), np.array([b.energy_drift])))
+    if a.snapshots is not None and b.snapshots is not None:
+        pairs.append((a.snapshots.Z, b.snapshots.Z))
+    return sum(int((x.view(np.int64) != y.view(np.int64)).sum()) for x, y in pairs)
+
+
+def _interrupted(model: Model, stop: int) -> float:
+    """Doubles that differ between an unbroken run and one that was stopped and resumed. Not collective."""
+    with tempfile.TemporaryDirectory() as name:
+        whole, part = Path(name) / "whole", Path(name) / "part"
+        unbroken = simulate(model, RunOptions(whole))
+        with suppress(Interrupted):
+            simulate(model, RunOptions(part, until=stop))
+        return float(differing(unbroken, simulate(model, RunOptions(part, resume=True))))
+
+
+def _from_state_only(model: Model, stop: int) -> float:
+    """Go on from the exact q_s, v_s, z, v of a step but without the carried vectors; doubles that differ at the end."""
+    with tempfile.TemporaryDirectory() as name:
+        whole = simulate(model, RunOptions(Path(name) / "whole"))
+        folder = Path(name)
+        first = Run(model, RunOptions(folder / "a"))
+        ts = make_ts(first)
+        first.start()
+        first.advance_to(ts, stop)
+        ts.destroy()
+        second = Run(model, RunOptions(folder / "b"))
+        ts = make_ts(second)
+        second.start()
+        for name in ("q", "v"):
+            getattr(second.drive, name)[: stop + 1] = getattr(first.drive, name)[: stop + 1]
+        second.reached = stop
+        second.state = second.store.target(stop)
+        second.state.array[:] = first.state.array
+        second.midpoint.start(second.state)  # M v and K z anew from the state
+        ts.setStepNumber(stop)
+        second.advance_to(ts, second.steps)
+        ts.destroy()
+        final = second.state.array
+    return float((final.view(np.int64) != whole.final.view(np.int64)).sum())
+
+
+def restart_rows(quick: bool) -> list[Row]:
+    """Stop in the middle, go on from the restart file, and count the doubles that differ from an unbroken run."""
+    rows = []
+    names = list(RESTARTS)[: 2 if quick else None]
+    for i, name in enumerate(names):
+        model = make("paper_forward", "tissue.cells=[4, 8]", "time.steps=60", *RESTARTS[name])
+        mine, lost = ours(_interrupted, model, 23), plain(_from_state_only, model, 23)
+        rows.append(Row(name, i + 1, mine, lost, 0.0, "the same bits, not nearly the same"))
+    return rows
+
+
+FAMILIES = (
+    Family("step", "Time steps from tiny to huge", "time step / first period", "relative energy drift",
+           "explicit leapfrog",
+           "The explicit rule blows up beyond the period of the smallest cell; the midpoint rule keeps the energy.",
+           step_rows),
+    Family("long", "Very many steps", "time step / first period", "relative energy drift",
+           "midpoint rule with M v computed anew",
+           "Up to the period, carrying the momentum is up to a thousand times better than M v computed anew; far "
+           "beyond it, where no motion is resolved, M v anew rounds less.",
+           long_rows),
+    Family("damping", "None, almost none, far too much damping", "share of critical damping",
+           "relative defect of the energy balance", "explicit leapfrog",
+           "Viscosity makes explicit steps explode at once; the implicit balance closes from none to overdamped.",
+           damping_rows),
+    Family("mass", "Light and heavy hands", "mass of the hand / mass of the tissue", "relative error of the momentum",
+           "hand and tissue solved in turn",
+           "Solved in turn, a hand lighter than the tissue blows up (added mass); solved together, nothing is lost.",
+           mass_rows),
+    Family("restart", "Stopped and gone on", "case", "doubles that differ", "restart from displacement and velocity",
+           "Displacement and velocity alone lose the last bits of the carried momentum.", restart_rows, axis="listed"),
+)  # fmt: skip

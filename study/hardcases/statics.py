@@ -1,0 +1,222 @@
+"""Hard cases of the static full-order model: nearly incompressible, layered, slender and badly meshed tissue."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse.linalg
+
+from softgrasp.fem.scene import materials
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.simulate import equilibrium
+from softgrasp.fem.solve.solvers import choose_solver
+from softgrasp.study.hardcases.textbook import conjugate_gradients, linear_triangles
+from softgrasp.study.hardcases.cases import EPS, Family, Outcome, Row, make, ours, plain, scaled_condition, sparse, thin
+
+CELLS = 4  # over the height 1 of the beam
+REFUSED = 1e-6  # estimated error at which a static solve is refused
+HOLD = ("motion={profile='hold'}", "time={steps=1, end=1.0}", "hand={mass=1.0}")
+BEAM = ("tissue.size=[4.0, 1.0]", "contact={sides=['left']}", "effects={gravity={g=[0.0, -1.0]}}", *HOLD)
+COLUMN = ("tissue.size=[1.0, 2.0]", "contact={sides=['top']}", "effects={gravity={g=[0.0, -1.0]}}", *HOLD)
+
+
+def static(model: Model) -> Array:
+    """Displacement under gravity with the residual checked, all dofs of one rank. Not collective.
+
+    Raises:
+        SolverError: the stiffness is singular or the residual is too large.
+    """
+    name, _ = choose_solver(model.system.layout)
+    return equilibrium(model.system, name, model.scene.time)
+
+
+def unchecked(model: Model) -> Array:
+    """The same by SuperLU, believed as it is. Not collective."""
+    load = model.system.G @ np.array([0.0, -1.0])
+    return np.asarray(scipy.sparse.linalg.spsolve(sparse(model.system.K_ee).tocsc(), load))
+
+
+def tip(model: Model, z: Array) -> float:
+    """Last component of the scene's only output. Not collective."""
+    output = make_outputs(model.scene, model.system)[0]
+    return float(z[output.dofs[0, -1]])
+
+
+# --- nearly incompressible
+
+
+def _sag(nu: float, order: int, cells: str, check: bool = True) -> float:
+    overrides = (f"tissue.material={{young=1000.0, poisson={nu!r}, rho=1.0}}", f"tissue.order={order}")
+    node = "control.outputs=[{kind='node', point=[4.0, 0.5]}]"
+    model = make("paper_forward", *BEAM, *overrides, f"tissue.cells={cells}", node)
+    return tip(model, static(model) if check else unchecked(model))
+
+
+def _sag_error(nu: float, order: int, reference: float, check: bool) -> float:
+    return abs(_sag(nu, order, f"[{4 * CELLS}, {CELLS}]", check) / reference - 1)
+
+
+def _lame(nu: float) -> Outcome:
+    return Outcome(None, f"goes on with lambda = {materials.lame(1000.0, nu)[0]:g}")
+
+
+def locking_rows(quick: bool) -> list[Row]:
+    """Tip of a heavy beam against P2 on a finer mesh by SuperLU, for nu up to 0.49999."""
+    rows = []
+    for nu in thin([0.3, 0.45, 0.49, 0.499, 0.4999, 0.49999], quick):
+        reference = _sag(nu, 2, "[32, 8]" if quick else "[64, 16]", check=False)
+        mine, locked = ours(_sag_error, nu, 2, reference, True), plain(_sag_error, nu, 1, reference, False)
+        reason = "P2 keeps one order of h in the energy for every nu [BS92], so its square at the tip: h = 1/4"
+        rows.append(Row(f"nu = {nu:g}", 1 - 2 * nu, mine, locked, CELLS**-2.0, reason))
+    for value in (0.5, 0.6):
+        refusal = ours(_sag, value, 2, "[4, 1]")
+        lame = plain(_lame, value)
+        rows.append(Row(f"nu = {value!r}", 0.0, refusal, lame, None, "lambda is infinite or negative"))
+    return rows
+
+
+# --- layers
+
+
+def stretch_error(model: Model, z: Array, height: float = 1.0, contrast: float = 1.0) -> float:
+    """Worst relative error of the mean stretch of a hanging column below and above a height, exact by one integral.
+
+    With lambda = 0 the column of height 2 is in uniaxial stress rho g y, so that u(y) = -int_y^2 rho g s / (2 mu) ds;
+    below ``height`` mu is ``contrast`` times larger. The mean over x leaves out that the lower part may turn as a
+    whole, which is no stretch. Not collective.
+    """
+    y, u, mu = model.system.layout.nodes[:, 1], z[1::2], 50.0
+    bottom, edge = (float(u[np.abs(y - level) < 1e-9].mean()) for level in (0.0, height))
+    upper, lower = -(4 - height**2) / (4 * mu), -(height**2) / (4 * mu * contrast)
+    return max(abs(edge / upper - 1), abs((bottom - edge) / lower - 1))
+
+
+def _stretch_ours(model: Model, height: float, contrast: float) -> float:
+    return stretch_error(model, static(model), height, contrast)
+
+
+def _stretch_cg(model: Model, height: float, contrast: float) -> Outcome:
+    z, info = conjugate_gradients(sparse(model.system.K_ee), model.system.G @ np.array([0.0, -1.0]))
+    return Outcome(stretch_error(model, z, height, contrast), f"stops at {info} iterations" if info else "")
+
+
+def contrast_rows(quick: bool) -> list[Row]:
+    """A stiff and a soft layer hanging from each other; both stretches are known exactly."""
+    rows = []
+    for power in thin([-6, -4, -2, 0, 2, 4, 6], quick):
+        c = 10.0**power
+        low = f"tissue.layers.low={{box=[[0.0, 0.0], [1.0, 1.0]], material={{lambda=0.0, mu={50 * c!r}, rho=1.0}}}}"
+        column = ("tissue.material={lambda=0.0, mu=50.0, rho=1.0}", "tissue.cells=[4, 8]", "tissue.order=2", low)
+        model = make("paper_forward", *COLUMN, *column)
+        bound = EPS * scaled_condition(model.system.K_ee)
+        reason = "eps times the condition of K scaled to a unit diagonal [VDS69]: what a direct factor may lose"
+        name = f"lower layer {c:g} times as stiff"
+        rows.append(Row(name, c, ours(_stretch_ours, model, 1.0, c), plain(_stretch_cg, model, 1.0, c), bound, reason))
+    return rows
+
+
+# --- shape
+
+
+def _beam_error(slender: float, order: int, check: bool) -> float:
+    """Relative error of the tip of a heavy cantilever of height 1 against Timoshenko: E = 1, G = 1/2, I = 1/12."""
+    shape = (f"tissue.size=[{slender!r}, 1.0]", "tissue.cells=[32, 2]", f"tissue.order={order}")
+    beam = (
+        "tissue.material={lambda=0.0, mu=0.5, rho=1.0}",
+        f"control.outputs=[{{kind='node', point=[{slender!r}, 0.5]}}]",
+    )
+    model = make("paper_forward", *shape, *beam, *BEAM[1:])
+    exact = slender**4 / (8 / 12) + slender**2 / (2 * 0.5 * 5 / 6)  # shear factor 5/6
+    return abs(-tip(model, static(model) if check else unchecked(model)) / exact - 1)
+
+
+def slender_rows(quick: bool) -> list[Row]:
+    """Tip of a slender cantilever under its weight against Timoshenko's beam, 32 cells along it."""
+    rows = []
+    for slender in thin([5.0, 20.0, 100.0, 300.0, 1e3, 1e4, 1e5], quick):
+        mine, locked = ours(_beam_error, slender, 2, True), plain(_beam_error, slender, 1, False)
+        bound = 32**-2 + slender**-2
+        reason = (
+            "32 cells along the beam follow its curvature to 1/32^2 and beam theory leaves out (height / length)^2; "
+            "the condition grows with the fourth power of the slenderness, past 100 rounding may leave too few digits"
+        )
+        may = slender > 100
+        rows.append(Row(f"length / height = {slender:g}", slender, mine, locked, bound, reason, may_refuse=may))
+    return rows
+
+
+def _medit(path: Path, gap: float, columns: int = 4) -> None:
+    """A column of 1 x 2 with two rows of nodes ``gap`` apart at mid height, as a Medit file."""
+    heights = [0.0, 0.5, 1.0 - gap / 2, 1.0 + gap / 2, 1.5, 2.0]
+    nodes = [(i / columns, y) for y in heights for i in range(columns + 1)]
+    cells = []
+    for row in range(len(heights) - 1):
+        for i in range(columns):
+            a, b = row * (columns + 1) + i + 1, (row + 1) * (columns + 1) + i + 1
+            cells += [(a, a + 1, b + 1), (a, b + 1, b)]
+    lines = ["MeshVersionFormatted 2", "Dimension 2", f"Vertices\n{len(nodes)}"]
+    lines += [f"{x!r} {y!r} 0" for x, y in nodes] + [f"Triangles\n{len(cells)}"]
+    lines += [f"{a} {b} {c} 0" for a, b, c in cells] + ["End", ""]
+    path.write_text("\n".join(lines))
+
+
+def by_hand(path: Path) -> Outcome:
+    """P1 assembled by hand from the same cells, solved by SciPy's CG, for meshes that the reader refuses."""
+    lines = path.read_text().split("\n")
+    at, to, end = (next(i for i, x in enumerate(lines) if x.startswith(w)) for w in ("Vertices", "Triangles", "End"))
+    nodes = np.array([[float(x) for x in line.split()[:2]] for line in lines[at + 2 : to]])
+    cells = np.array([[int(x) - 1 for x in line.split()[:3]] for line in lines[to + 2 : end]])
+    K, f = linear_triangles(nodes, cells, 50.0)
+    free = np.repeat(nodes[:, 1] < 2.0, 2)
+    z = np.zeros(2 * len(nodes))
+    z[free], info = conjugate_gradients(K[free][:, free], -f[free])
+    u, y = z[1::2], nodes[:, 1]
+    bottom, edge = (float(u[np.abs(y - level) < 1e-9].mean()) for level in (0.0, 0.5))
+    error = max(abs(edge / (-(4 - 0.25) / 200) - 1), abs((bottom - edge) / (-0.25 / 200) - 1))
+    return Outcome(error, f"P1 by hand, stops at {info} iterations" if info else "P1 by hand")
+
+
+def _sliver(mesh: str) -> Model:
+    return make("paper_forward", mesh, *COLUMN[1:], "control=false")
+
+
+def sliver_rows(quick: bool) -> list[Row]:
+    """A row of ever flatter cells through a hanging column whose displacement is known exactly."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for power in thin([-1, -3, -5, -7, -9, -11, -13, -15], quick):
+            gap, path = 10.0**power, Path(folder) / f"sliver{-power:g}.mesh"
+            _medit(path, gap)
+            mesh = f"tissue={{mesh='{path}', order=2, material={{lambda=0.0, mu=50.0, rho=1.0}}}}"
+            mine = ours(lambda m: _stretch_ours(_sliver(m), 0.5, 1.0), mesh)
+            read = power > -12  # flatter than 1e-12 must be refused
+            textbook = plain(lambda m: _stretch_cg(_sliver(m), 0.5, 1.0), mesh) if read else plain(by_hand, path)
+            condition = scaled_condition(_sliver(mesh).system.K_ee) if read else 0.0
+            bound = min(EPS * condition, 10 * REFUSED) if read else None
+            reason = (
+                "eps times the condition of K scaled to a unit diagonal [VDS69], which grows as 1 / height, but at "
+                "most ten times the estimate at which a solve is refused; below 1e-12 the cells have no area in doubles"
+            )
+            rows.append(Row(f"cells of height {gap:.0e}", gap, mine, textbook, bound, reason, may_refuse=power < -6))
+    return rows
+
+
+FAMILIES = (
+    Family("locking", "Nearly incompressible tissue", "$1 - 2\\nu$", "relative error of the sag", "P1 on the same mesh",
+           "P1 displacements lock as nu goes to 1/2 and report a body that hardly moves; P2 keeps its error.",
+           locking_rows),
+    Family("contrast", "Stiffness contrast between layers", "stiffness of the lower layer over the upper",
+           "relative error of the layers' stretch", "SciPy's CG to 1e-8",
+           "A small residual says little when stiffness differs by 1e6: only a direct factor keeps both layers right.",
+           contrast_rows),
+    Family("slender", "Slender body", "length / height", "relative error of the tip", "P1 on the same mesh",
+           "P1 cells lock in bending; P2 follows beam theory until rounding ends it, and then the run is refused.",
+           slender_rows),
+    Family("sliver", "Sliver cells", "height of the flattest cells [m]", "relative error of the displacement",
+           "SciPy's CG to 1e-8", "Flat cells spoil the condition number; below 1e-12 the mesh is refused.",
+           sliver_rows),
+)  # fmt: skip

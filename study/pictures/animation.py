@@ -1,0 +1,147 @@
+"""The move as an animated GIF, at the speed at which it happens unless the eye cannot follow."""
+
+from __future__ import annotations
+
+import io
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import numpy.typing as npt
+from matplotlib.colors import to_rgb
+from PIL import Image
+
+from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
+from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
+
+if TYPE_CHECKING:
+    from softgrasp.fem.fields.picture import PictureMesh
+
+Array = npt.NDArray[np.float64]
+
+MOST_FRAMES = 60
+SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them the animation runs slower or faster than the move
+TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
+MOST_BYTES = 3_000_000
+REST = 1.0  # [s] the last frame stays longer
+
+
+def gif_move(
+    picture: PictureMesh,
+    frames: Array,
+    times: Array,
+    table: Array,
+    target: npt.ArrayLike | None,
+    out_gif: Path,
+) -> Path:
+    """Body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
+
+    Args:
+        picture: the body.
+        frames: absolute vertex displacements, shape (k, n, d) [m]; too many are thinned out.
+        times: instants of the frames, shape (k,) [s].
+        table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
+        target: hand coordinates aimed at, d or n_s entries, or None.
+        out_gif: name of the file.
+
+    Returns:
+        The name of the file.
+    """
+    kept, ticks = _timing(np.asarray(times, dtype=np.float64))
+    frames, times = np.asarray(frames, dtype=np.float64)[kept], np.asarray(times, dtype=np.float64)[kept]
+    shot = make_shot(picture, frames, times, np.asarray(table, dtype=np.float64), target)
+    images = _render(shot, frames, times)
+    durations = [int(10 * n) for n in ticks] + [int(1000 * REST)]
+    for scale in (1.0, 0.8, 0.6, 0.45):
+        data = _encode(images, durations, scale)
+        if len(data) <= MOST_BYTES:
+            break
+    out_gif.write_bytes(data)
+    return out_gif
+
+
+def speed_up(times: Array) -> float:
+    """How many times faster than the move its animation runs: 1 from 0.3 to 30 s, else steps of 1, 2, 5 [1].
+
+    Longer moves are shown in at most 30 s, shorter ones in at least 1 s.
+    """
+    total = float(times[-1] - times[0])
+    if SHORTEST <= total <= LONGEST or total <= 0.0:
+        return 1.0
+    ratio = total / LONGEST if total > LONGEST else total
+    power = 10.0 ** np.floor(np.log10(ratio) + 1e-9)
+    steps = [m * power for m in (1, 2, 5, 10)]
+    if total > LONGEST:
+        return float(next(m for m in steps if m >= ratio * (1 - 1e-9)))
+    return float(max(m for m in steps if m <= ratio * (1 + 1e-9)))
+
+
+def _timing(times: Array) -> tuple[list[int], list[int]]:
+    """Frames to show and how long each but the last [1/100 s]; rounding errors do not add up."""
+    some = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
+    at = np.round(100 * (times - times[0]) / speed_up(times)).astype(int)  # GIF counts in hundredths of a second
+    kept = some[:1]
+    for i in some[1:]:
+        if at[i] - at[kept[-1]] >= TICKS:
+            kept.append(i)
+    if len(some) > 1 and kept[-1] != some[-1]:
+        kept = [*(kept[:-1] if len(kept) > 1 else kept), some[-1]]
+    return kept, [max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)]
+
+
+def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
+    """One picture per frame, all of one size."""
+    images = []
+    fast = speed_up(times)
+    digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
+    note = f" ({fast:g}$\\times$)" if fast != 1 else ""
+    with paper_style():
+        figure, axes = make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
+        ax = axes[0]
+        # The longest text first, so that all frames have the size of the first.
+        stamp = ax.set_title(f"$t$ = {times[-1]:.{digits}f} s{note}", pad=3)
+        colour_bar(figure, axes, shot)
+        legend(figure, axes, shot)
+        figure.set_dpi(110)
+        draw_scene(ax, shot, frames[:1], None, shot.hands[:1])
+        figure.canvas.draw()
+        box = figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
+        for i in range(len(frames)):
+            for artist in [*ax.collections, *ax.lines, *ax.texts]:
+                artist.remove()
+            draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
+            name_layers(ax, shot, frames[i], inside=True)  # beside the body they would change sides
+            stamp.set_text(f"$t$ = {times[i]:.{digits}f} s{note}")
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format="png", dpi=110, bbox_inches=box)
+            images.append(Image.open(buffer).convert("RGB"))
+        plt.close(figure)
+    return images
+
+
+def _encode(images: list[Any], durations: list[int], scale: float) -> bytes:
+    """GIF of the pictures with one palette."""
+    size = tuple(round(scale * n) for n in images[0].size)
+    small = images if scale == 1.0 else [image.resize(size, Image.Resampling.LANCZOS) for image in images]
+    palette = _palette()
+    flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in small]
+    buffer = io.BytesIO()
+    flat[0].save(
+        buffer, format="GIF", save_all=True, append_images=flat[1:], duration=durations, loop=0, optimize=False
+    )
+    return buffer.getvalue()
+
+
+def _palette() -> Any:
+    """The 256 colours that occur: colour map in four shades, greys to pure white, and the target fading out."""
+    shades = np.linspace(0.75, 1.0, 4)[:, None, None] * colour_map()(np.linspace(0.0, 1.0, 48))[:, :3]
+    greys = np.repeat(
+        np.append(np.linspace(0.0, 0.92, 47), 1.0)[:, None], 3, axis=1
+    )  # Pillow rounds: nothing near white
+    fade = np.linspace(0.0, 0.8, 16)[:, None]
+    target = (1 - fade) * np.array(to_rgb(TARGET)) + fade
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.round(255 * np.vstack([shades.reshape(-1, 3), greys, target])).astype(np.uint8).tobytes())
+    return palette

@@ -1,0 +1,387 @@
+"""Figures of a move: the deformed body with hand, path and target.
+
+Everything comes in as arrays; nothing here computes a simulation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import numpy.typing as npt
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+
+from softgrasp.study.pictures.shapes import (
+    AZIMUTH,
+    chained,
+    contact_centre,
+    facet_normals,
+    hand_polygons,
+    hands_at,
+    interfaces,
+    overlap,
+    seen,
+    shadow,
+    subdivision,
+    view_direction,
+)
+from softgrasp.study.pictures.style import COLUMN, HAND, OUTLINE, STEPS, TARGET, WIDTH, colour_map, length_unit, paper_style, save
+
+if TYPE_CHECKING:
+    from softgrasp.fem.fields.picture import PictureMesh
+
+Array = npt.NDArray[np.float64]
+
+MANY_CELLS = 300_000  # above, a picture shows the outline only
+PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
+ROUNDING = 1e-12  # of the size of the body: what is smaller is no deformation
+CAPTION = 0.72  # width of a caption [inch]
+DOTS: Any = (0, (1, 1.2))
+DASHES: Any = (0, (5, 3))
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What every view of one move shares.
+
+    Attributes:
+        picture: the body.
+        hands: hand coordinates at the instants, shape (k, n_s).
+        path: where the grip of the hand passes, shape (steps, d) [m].
+        norm: scale of the colours [unit]; from 0 to 0 when nothing deforms.
+        unit: factor and name of the unit of the colours.
+        low, high: corners of the scene in the plane of the picture, shape (2,) [m].
+        hand: polygons of the hand where it starts, each (corners, d); empty in 3D.
+        aim: closed lines around the body at the target in the plane of the picture, each (k, 2) [m].
+    """
+
+    picture: PictureMesh
+    hands: Array
+    path: Array
+    norm: Any
+    unit: tuple[float, str]
+    low: Array
+    high: Array
+    hand: list[Array]
+    aim: list[Array]
+
+    def values(self, displacement: Array, q_s: Array) -> Array:
+        """|u - R q_s| at the vertices in the unit of the colour bar, shape (n,)."""
+        return np.asarray(self.unit[0] * np.linalg.norm(displacement - self.picture.rigid(q_s), axis=1))
+
+
+def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> Shot:
+    """Prepare the views of a move; see `figure_move` for the arguments. Not collective."""
+    hands = hands_at(table, times)
+    aim = None
+    if target is not None:
+        aim = np.zeros(picture.n_s)
+        given = np.asarray(target, dtype=np.float64)
+        aim[: len(given)] = given
+    relative = [np.linalg.norm(u - picture.rigid(q), axis=1).max() for u, q in zip(states, hands, strict=True)]
+    largest = float(max(relative))
+    if largest <= ROUNDING * float(np.ptp(picture.points, axis=0).max()):
+        largest = 0.0
+    unit = length_unit(largest)
+    norm = mpl.colors.Normalize(0.0, unit[0] * largest)
+    polygons, grip = hand_polygons(picture) if picture.dimension == 2 else ([], contact_centre(picture))
+    path = np.vstack([grip + picture.rigid(q, grip[None, :]) for q in table[:, 1:]])
+    boxes = [_box(picture.points + u) for u in states] + [_box(path)]
+    boxes += [_box(p + picture.rigid(q, p)) for p in polygons for q in hands]
+    if aim is not None:
+        boxes += [_box(p + picture.rigid(aim, p)) for p in (picture.points, *polygons)]
+    low, high = _box(np.vstack(boxes))
+    lines = [] if aim is None else _outline(picture, picture.points + picture.rigid(aim))
+    return Shot(picture, hands, path, norm, unit, low, high, polygons, lines)
+
+
+def figure_move(
+    picture: PictureMesh,
+    states: Array,
+    times: Array,
+    table: Array,
+    target: npt.ArrayLike | None,
+    out_png: Path,
+) -> tuple[Path, Path]:
+    """The deformed body at a few instants with hand, path and target; PNG and PDF.
+
+    Bodies that would hide each other get a panel each.
+
+    Args:
+        picture: the body.
+        states: absolute vertex displacements, shape (k, n, d) [m].
+        times: instants of the states, shape (k,) [s].
+        table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
+        target: hand coordinates aimed at, d or n_s entries, or None.
+        out_png: name of the picture; the PDF gets its stem.
+
+    Returns:
+        Names of PNG and PDF.
+    """
+    states, times = np.asarray(states, dtype=np.float64), np.asarray(times, dtype=np.float64)
+    shot = make_shot(picture, states, times, np.asarray(table, dtype=np.float64), target)
+    with paper_style():
+        apart = len(states) > 1 and overlap(picture, states)
+        groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
+        figure, axes = make_axes(shot, len(groups), captions=True)
+        for ax, group in zip(axes, groups, strict=True):
+            draw_scene(ax, shot, states[group], None if apart else times[group], shot.hands[group])
+            if apart:
+                ax.set_title(_time(times[group[0]]), pad=3)
+        name_layers(axes[-1], shot, states[-1])
+        colour_bar(figure, axes, shot)
+        legend(figure, axes, shot)
+        return save(figure, out_png)
+
+
+def draw_scene(ax: Any, shot: Shot, states: Array, times: Array | None, hands: Array) -> None:
+    """Bodies, hand, path, target and, if given, the times beside the bodies on axes from `make_axes`."""
+    picture = shot.picture
+    ax.plot(*seen(shot.path).T, ls=DASHES, color=OUTLINE, lw=0.9, zorder=1)
+    for i, (u, q) in enumerate(zip(states, hands, strict=True)):
+        if picture.dimension == 2:
+            _draw_2d(ax, shot, u, q)
+        else:
+            _draw_3d(ax, shot, u, q)
+        if times is not None:
+            hand = [p + picture.rigid(q, p) for p in shot.hand]
+            _caption(ax, shot, _box(seen(np.vstack([picture.points + u, *hand]))), _time(times[i]))
+    for line in shot.aim:
+        ax.plot(*line.T, ls=DOTS, color=TARGET, lw=1.3, zorder=5)
+
+
+def make_axes(
+    shot: Shot, panels: int, *, captions: bool, width: float | None = None, tallest: float | None = None
+) -> tuple[Any, list[Any]]:
+    """Figure and axes of the right shape for the scene; call within `paper_style`.
+
+    Args:
+        shot: the move.
+        panels: how many pictures side by side; one fills a column unless it is flat, several the page.
+        captions: leave room for them, beside the bodies of one panel or above each of several.
+        width, tallest: of the figure and of all panels together [inch].
+    """
+    solid, many = shot.picture.dimension == 3, panels > 1
+    span = np.maximum(shot.high - shot.low, 1e-3 * float((shot.high - shot.low).max()))
+    flat = span[0] > 2.2 * span[1]
+    width = width or (WIDTH if many or flat else COLUMN)
+    tallest = tallest or (3.9 if many else 2.8)
+    corner = _free_corner(shot) if solid else ""
+    left, right, bottom = (0.1 if corner else 0.9, 0.72, 0.05) if solid else (0.56, 0.72, 0.42)
+    title = LINE if captions and many else 0.0
+    pads = np.array([[PAD, PAD], [PAD, PAD]])  # [[left, bottom], [right, top]]
+    if captions and not many:
+        pads += np.array([[0.0, 0.0], [CAPTION, 0.0]]) if _upright(shot) else np.array([[PAD, LINE], [PAD, 0.0]])
+
+    def scale_of(shape: tuple[int, int]) -> float:
+        """Inches per metre with that many rows and columns."""
+        free = np.array([width - left - right - GAP * (shape[1] - 1), tallest - (GAP + title) * (shape[0] - 1)])
+        return float(((free / shape[::-1] - pads.sum(axis=0)) / span).min())
+
+    shapes = [(r, -(-panels // r)) for r in range(1, panels + 1) if panels % r == 0]
+    rows, columns = max(shapes, key=scale_of)
+    scale = scale_of((rows, columns))
+    low, high = shot.low - pads[0] / scale, shot.high + pads[1] / scale
+    w, h = (high - low) * scale
+    size = (left + columns * w + (columns - 1) * GAP + right, bottom + rows * h + (rows - 1) * (GAP + title) + 0.05)
+    figure, axes = plt.figure(figsize=size), []
+    for i in range(panels):
+        x, y = left + (i % columns) * (w + GAP), bottom + (rows - 1 - i // columns) * (h + GAP + title)
+        ax = figure.add_axes((x / size[0], y / size[1], w / size[0], h / size[1]))
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.append(ax)
+        if solid:
+            ax.set_axis_off()
+            continue
+        ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=STEPS))
+        ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=STEPS))
+        ax.tick_params(labelbottom=i // columns == rows - 1, labelleft=i % columns == 0)
+        ax.set_xlabel("$x$ [m]" if i // columns == rows - 1 else "")
+        ax.set_ylabel("$y$ [m]" if i % columns == 0 else "")
+    if solid:
+        _tripod(figure, size, scale, corner == "top")
+    return figure, axes
+
+
+def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
+    """Colour bar of the relative displacement beside the axes, at most 2.4 inch high.
+
+    None for outlines, nor where nothing deforms: one colour needs no scale.
+    """
+    if len(shot.picture.cells) > MANY_CELLS or not shot.norm.vmax > 0:
+        return
+    boxes = [ax.get_position() for ax in axes]
+    inch = 1 / figure.get_figheight()
+    low, high = min(b.y0 for b in boxes), max(b.y1 for b in boxes)
+    middle, height = (low + high) / 2, min(high - low, 2.4 * inch)
+    x, gap = max(b.x1 for b in boxes), 0.1 / figure.get_figwidth()
+    place = figure.add_axes((x + gap, middle - height / 2, gap, height))
+    words = "displacement relative to the hand" if height > 2.2 * inch else "displacement relative\nto the hand"
+    words = words if height > 1.2 * inch else "displacement\nrelative to\nthe hand"
+    label = f"{words} [{shot.unit[1]}]"
+    bar = figure.colorbar(mpl.cm.ScalarMappable(shot.norm, colour_map()), cax=place, label=label)
+    bar.outline.set_linewidth(0.5)
+    bar.ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(height / inch / 0.35, 2, 6)), steps=STEPS))
+
+
+def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
+    """One row above the axes, where nothing is hidden."""
+    entries: list[Any] = []
+    filled = len(shot.picture.cells) <= MANY_CELLS
+    if shot.hand or filled:
+        entries.append(Patch(color=HAND, label="hand" if shot.hand else "held by the hand"))
+    if filled and not shot.norm.vmax > 0:
+        entries.append(Patch(color=colour_map()(0.0), label="tissue, not deformed"))
+    if np.ptp(shot.path, axis=0).max() > 0:
+        entries.append(Line2D([], [], ls=DASHES, color=OUTLINE, lw=0.9, label="path of the hand"))
+    if shot.aim:
+        entries.append(Line2D([], [], ls=DOTS, color=TARGET, lw=1.3, label="target"))
+    title = LINE if axes[0].get_title() else 0.0
+    top = max(ax.get_position().y1 for ax in axes) + (0.05 + title) / figure.get_figheight()
+    figure.legend(
+        handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=4, borderaxespad=0.0, columnspacing=1.2,
+        handlelength=1.8,
+    )  # fmt: skip
+
+
+def _time(t: float) -> str:
+    return f"$t$ = {t:.3g} s"
+
+
+def _upright(shot: Shot) -> bool:
+    """Whether the hand goes more up or down than sideways in the picture."""
+    along, up = np.ptp(seen(shot.path), axis=0)
+    return bool(up > along)
+
+
+def _caption(ax: Any, shot: Shot, box: Array, text: str) -> None:
+    """A caption below the box of a body, or to its right if the bodies stand above each other."""
+    if _upright(shot):
+        look: dict[str, Any] = {"xytext": (4, 0), "ha": "left", "va": "center"}
+        ax.annotate(text, (box[1, 0], box[:, 1].mean()), textcoords="offset points", zorder=6, **look)
+        return
+    left, right = ax.get_xlim()
+    half = CAPTION / 2 * (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
+    middle, way = float(box[:, 0].mean()), seen(shot.path[-1] - shot.path[0])
+    # The body next to it and lower lies to the left if the hand goes up to the right: keep off it.
+    middle = max(middle, box[0, 0] + half) if way.prod() > 0 else middle
+    middle = min(middle, box[1, 0] - half) if way.prod() < 0 else middle
+    middle = min(max(middle, left + half), max(right - half, left + half))
+    look = {"xytext": (0, -3), "ha": "center", "va": "top"}
+    ax.annotate(text, (middle, box[0, 1]), textcoords="offset points", zorder=6, **look)
+
+
+def _free_corner(shot: Shot) -> str:
+    """The left corner that the bodies leave free: "top", "bottom" or "" for none."""
+    way = seen(shot.path[-1] - shot.path[0])
+    if abs(float(way[0])) < 0.5 * float((shot.high - shot.low)[0]):
+        return ""
+    return "top" if way.prod() > 0 else "bottom"
+
+
+def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> None:
+    """The directions of a 3D scene, each arm of the same length in space, in a left corner."""
+    length = 0.55 / scale  # [m], rounded down to 1, 2 or 5 times a power of ten
+    power = 10.0 ** np.floor(np.log10(length))
+    length = power * max(m for m in (1, 2, 5) if m * power <= length * 1.001)
+    ends = seen(length * np.eye(3))
+    low = np.minimum(ends.min(axis=0), 0.0)
+    reach = np.maximum(ends.max(axis=0), 0.0) - low
+    y = size[1] - 0.25 - scale * reach[1] if top else 0.4
+    ax = figure.add_axes((0.08 / size[0], y / size[1], *(scale * reach / size)))
+    ax.set(xlim=(low[0], low[0] + reach[0]), ylim=(low[1], low[1] + reach[1]))
+    ax.set_axis_off()
+    for name, end in zip("xyz", ends, strict=True):
+        ax.annotate("", end, (0.0, 0.0), arrowprops={"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0})
+        away = 5 * end / np.linalg.norm(end)
+        ax.annotate(f"${name}$", end, away, textcoords="offset points", ha="center", va="center")
+    ax.annotate(
+        f"{length:g} m each", (0.0, 0.0), (0, -9), xycoords="axes fraction", textcoords="offset points", va="top"
+    )
+
+
+def name_layers(ax: Any, shot: Shot, u: Array, *, inside: bool = False) -> None:
+    """Names of the layers in 2D beside the body on the side with more room; without room, or on request, in it."""
+    picture, x = shot.picture, shot.picture.points + u
+    if len(picture.names) == 1 or picture.dimension == 3:
+        return
+    (left, right), (low, high) = ax.get_xlim(), _box(x)
+    room = (low[0] - left, right - high[0])
+    inch = (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
+    place, align = (low[0] - 0.06 * inch, "right") if room[0] > room[1] else (high[0] + 0.06 * inch, "left")
+    look: dict[str, Any] = {"color": OUTLINE}
+    if inside or max(room) < CAPTION * inch:
+        place, align = (low[0] + high[0]) / 2, "center"
+        look = {"color": HAND, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
+    heights = x[:, 1][picture.cells].mean(axis=1)
+    for i, name in enumerate(picture.names):
+        ax.text(place, heights[picture.layers == i].mean(), name, ha=align, va="center", zorder=6, **look)
+
+
+def _box(x: Array) -> Array:
+    """Lower and upper corner of points in the plane of the picture, shape (2, 2)."""
+    flat = seen(x)
+    return np.stack([flat.min(axis=0), flat.max(axis=0)])
+
+
+def _outline(picture: PictureMesh, x: Array) -> list[Array]:
+    """Closed lines around a body with its vertices at x, each (k, 2) [m]."""
+    if picture.dimension == 2:
+        return [x[line] for line in chained(picture.facets)]
+    return shadow(seen(x), picture.facets)
+
+
+def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
+    picture = shot.picture
+    x = picture.points + u
+    if len(picture.cells) <= MANY_CELLS:
+        ax.tripcolor(
+            x[:, 0], x[:, 1], picture.cells, shot.values(u, q), shading="gouraud", cmap=colour_map(),
+            norm=shot.norm, rasterized=True, zorder=2,
+        )  # fmt: skip
+    lines = np.vstack([picture.facets, interfaces(picture)])
+    ax.add_collection(LineCollection(list(x[lines]), colors=OUTLINE, linewidths=0.5, zorder=3), autolim=False)
+    hand = [p + picture.rigid(q, p) for p in shot.hand]
+    ax.add_collection(PolyCollection(hand, facecolors=HAND, edgecolors=HAND, linewidths=0.3, zorder=4), autolim=False)
+
+
+def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
+    picture = shot.picture
+    x = picture.points + u
+    if len(picture.cells) > MANY_CELLS:
+        lines = LineCollection(_outline(picture, x), colors=OUTLINE, linewidths=0.6, zorder=3)
+        ax.add_collection(lines, autolim=False)
+        return
+    faces, colours = _paint(shot, u, q)
+    look: dict[str, Any] = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.5, "joinstyle": "round"}
+    ax.add_collection(PolyCollection(list(seen(faces)), zorder=2, rasterized=True, **look), autolim=False)
+
+
+def _paint(shot: Shot, u: Array, q: Array) -> tuple[Array, Array]:
+    """Visible boundary of one instant from back to front, (m, 3, 3) [m], and its shaded colours (m, 3)."""
+    picture, view = shot.picture, view_direction()
+    code = np.array([1, len(picture.points), len(picture.points) ** 2])
+    held = np.isin(np.sort(picture.facets, axis=1) @ code, np.sort(picture.contact, axis=1) @ code)
+    corners = (picture.points + u)[picture.facets]
+    normals = facet_normals(corners)
+    front = normals @ view > 0
+    weights = subdivision(int(np.clip(np.sqrt(4000 / len(corners)), 1, 4)))
+    faces = np.einsum("sck,fkd->fscd", weights, corners[front])
+    values = shot.values(u, q)[picture.facets[front]] @ weights.mean(axis=1).T
+    rgb = colour_map()(shot.norm(values))[..., :3]
+    turn = np.radians(AZIMUTH - 35.0)
+    light = np.array([0.6 * np.cos(turn), 0.6 * np.sin(turn), 0.8])
+    lit = np.clip(normals[front] @ light, 0.0, 1.0)[:, None, None]
+    dark = np.array(mpl.colors.to_rgb(HAND)) + 0.14 * lit
+    rgb = np.where(held[front][:, None, None], dark, rgb * (0.75 + 0.25 * lit))
+    faces, rgb = faces.reshape(-1, 3, 3), rgb.reshape(-1, 3)
+    order = np.argsort(faces.mean(axis=1) @ view)
+    return faces[order], rgb[order]

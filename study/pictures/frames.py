@@ -1,0 +1,207 @@
+"""What a run leaves for the eye: field files for ParaView while it runs, figures and animation afterwards."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.errors import CheckpointError, agree
+from softgrasp.fem.fields.series import SeriesWriter
+from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.simulate import Run, Trajectory, frame_steps
+from softgrasp.study.pictures.shapes import pick_instants, way_done
+
+MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
+SUFFIXES = (".bp", ".xdmf", ".h5")
+SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run when few instants are kept
+
+
+class Frames:
+    """Observer of a run: writes field files and keeps vertex displacements on rank 0.
+
+    A run that is stopped and resumed leaves one field series a leg, named by the step it starts from. What the pictures
+    need lies beside its checkpoint, one small file a frame.
+
+    Args:
+        model: the model.
+        directory: where the field files go, and of the run.
+        pictures: keep what figures and animation need.
+
+    Attributes:
+        most: of the frame with the largest displacement since the start or resume: |z|^2, time [s], z (local rows).
+    """
+
+    def __init__(self, model: Model, directory: Path, pictures: bool = True) -> None:
+        self.model, self.directory, self.pictures = model, directory, pictures
+        self.writer = None
+        if model.scene.output.fields != "none":
+            self.writer = SeriesWriter(model, directory, model.scene.output.fields)
+        self.legs = [0]
+        self.saved = 0  # of the frames below, how many lie beside the checkpoint
+        self.swept = False
+        self.steps: list[int] = []
+        self.most: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(0))
+        self.picture = gather_picture(model) if pictures else None
+        vertices = model.space.mesh.mesh.geometry.index_map().size_global
+        self.few = vertices > MANY_VERTICES
+        self.chosen: set[int] = set()
+        self.times: list[float] = []
+        self.hands: list[Array] = []
+        self.states: list[np.ndarray] = []
+
+    def begin(self, run: Run) -> None:
+        """Join the legs that led here: field files get their name, pictures what lies beside the checkpoint.
+
+        Collective.
+
+        Raises:
+            CheckpointError: a frame cannot be read.
+        """
+        self.legs = run.legs
+        if self.writer is not None:
+            self.writer.rename(_series(run.begun))
+        with agree(run.layout.comm):
+            if run.layout.comm.rank == 0:
+                self._remove_series(run.begun)
+            if self.picture is not None and run.begun:  # rank 0
+                self._load(run.begun)
+
+    def _remove_series(self, begun: int) -> None:
+        """Field files from steps that this run has not reached: those of an earlier run in the same folder."""
+        for path in self.directory.glob("fields-from*"):
+            number = path.stem.removeprefix("fields-from")
+            if number.isdecimal() and (int(number) > begun or begun == 0) and path.suffix in SUFFIXES:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    def _load(self, begun: int) -> None:
+        for step, path in _kept(self.directory):
+            if step > begun:
+                break
+            try:
+                with np.load(path) as file:
+                    t, hand, state = float(file["t"]), file["hand"], file["state"]
+            except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+                raise CheckpointError(
+                    f"{path} cannot be read; resume with --no-pictures, or run again without --resume"
+                ) from error
+            self.steps.append(step)
+            self.times.append(t)
+            self.hands.append(hand)
+            self.states.append(state)
+        self.saved = len(self.steps)
+
+    def keep(self, run: Run) -> None:
+        """Write the new frames beside the checkpoint that is about to be written. Collective.
+
+        Raises:
+            CheckpointError: they cannot be written.
+        """
+        with agree(run.layout.comm):
+            if run.layout.comm.rank == 0:
+                try:
+                    self._save(run.begun)
+                except OSError as error:
+                    raise CheckpointError(
+                        f"{self.directory}: the frames cannot be written ({error}); free the disk"
+                    ) from error
+
+    def _save(self, begun: int) -> None:
+        folder = self.directory / "checkpoint"
+        folder.mkdir(parents=True, exist_ok=True)
+        if not self.swept:  # what a run that was killed, or another one, left behind
+            for step, path in _kept(self.directory):
+                if step > begun or begun == 0:
+                    path.unlink(missing_ok=True)
+            self.swept = True
+        for i in range(self.saved, len(self.states)):
+            path = folder / f"frame{self.steps[i]}.npz"
+            fresh = path.with_suffix(".new")
+            with fresh.open("wb") as file:
+                np.savez(file, t=self.times[i], hand=self.hands[i], state=self.states[i])
+            fresh.replace(path)
+        self.saved = len(self.states)
+
+    def lacking(self, begun: int) -> int:
+        """How many frames before a step the pictures must do without; rank 0 only."""
+        if self.picture is None or self.few:
+            return 0
+        expected = sum(step <= begun for step in frame_steps(self.model.scene))
+        return max(0, expected - len(self.steps))
+
+    def __call__(self, run: Run) -> None:
+        """Take one frame. Collective."""
+        n = self.model.system.layout.n_local
+        z, v = run.state.array[:n], run.state.array[n:]
+        t, q_s, v_s = run.reached * run.dt, run.drive.q[run.reached], run.drive.v[run.reached]
+        if self.few and not self.chosen:
+            self.chosen = self._ahead(run)
+        size = float(total(run.layout.comm, np.array([np.dot(z, z)]))[0])
+        if size > self.most[0]:
+            self.most = size, t, z.copy()
+        if self.writer is not None:
+            self.writer.write(t, z, v, q_s, v_s)
+        if self.pictures and (not self.few or run.reached in self.chosen):
+            state = vertex_displacement(self.model, z, q_s)
+            self.steps.append(run.reached)
+            self.times.append(t)
+            self.hands.append(q_s.copy())
+            if state is not None:
+                self.states.append(state.astype(np.float32))
+
+    def _ahead(self, run: Run) -> set[int]:
+        """Steps of the still picture before they are reached; the hand's table is known unless forces drive it."""
+        grid = frame_steps(self.model.scene)
+        times = np.arange(len(run.drive.q), dtype=np.float64)
+        done = way_done(np.column_stack([times, run.drive.q]), times[grid])
+        return {grid[int(np.argmin(abs(done - share)))] for share in SHOWN[:-1]} | {grid[-1]}
+
+    def close(self) -> list[Path]:
+        """Finish the field files; those of all legs. Collective."""
+        own = list(self.writer.close()) if self.writer is not None else []
+        names = [f"{_series(leg)}{suffix}" for leg in self.legs[:-1] for suffix in SUFFIXES]
+        return [path for name in names if (path := self.directory / name).exists()] + own
+
+    def draw(self, directory: Path, run: Trajectory) -> list[Path]:
+        """Figures and animation; rank 0 only."""
+        from softgrasp.study.pictures.animation import gif_move
+        from softgrasp.study.pictures.body import figure_move
+        from softgrasp.study.pictures.traces import figure_traces
+
+        scene = self.model.scene
+        if self.picture is None or not self.states:
+            return []
+        table = np.column_stack([run.times, run.q_s])
+        target = scene.motion.target
+        states = np.stack(self.states)
+        times = np.array(self.times)
+        chosen = list(range(len(times))) if self.few else pick_instants(self.picture, states, times, table)
+        files = [*figure_move(self.picture, states[chosen], times[chosen], table, target, directory / "move.png")]
+        files += figure_traces(
+            run.times,
+            run.outputs,
+            run.output_names,
+            run.q_s,
+            directory / "traces.png",
+            rigid=run.outputs_rigid,
+            dimension=self.picture.dimension,
+        )
+        if not self.few:
+            files.append(gif_move(self.picture, states, times, table, target, directory / "move.gif"))
+        return files
+
+
+def _series(begun: int) -> str:
+    """Stem of the field files of the leg that starts from a step."""
+    return f"fields-from{begun}" if begun else "fields"
+
+
+def _kept(directory: Path) -> list[tuple[int, Path]]:
+    """Steps of the frames beside the checkpoint and their files, in order."""
+    files = (directory / "checkpoint").glob("frame*.npz")
+    numbers = ((path.stem.removeprefix("frame"), path) for path in files)
+    return sorted((int(number), path) for number, path in numbers if number.isdecimal())

@@ -1,0 +1,109 @@
+"""Hand and outputs of a move against time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import numpy.typing as npt
+from matplotlib.ticker import MaxNLocator
+
+from softgrasp.fem.model.outputs import hand_axes
+from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style, save
+
+Array = npt.NDArray[np.float64]
+
+
+def figure_traces(
+    times: Array,
+    outputs: Array,
+    names: tuple[str, ...],
+    q_s: Array,
+    out_png: Path,
+    *,
+    rigid: Array | None = None,
+    dimension: int | None = None,
+) -> tuple[Path, Path]:
+    """Hand and outputs against time, and below what the outputs move relative to the hand; PNG and PDF.
+
+    An output that is the hand again is drawn once, as the hand, and has no share in what moves relative to it.
+
+    Args:
+        times: shape (m,) [s].
+        outputs: absolute displacements, shape (m, c) [m].
+        names: one per output, ending in _x, _y or _z.
+        q_s: hand, shape (m, n_s) [m, rad].
+        out_png: name of the picture; the PDF gets its stem.
+        rigid: share of the outputs that moves with the hand, shape (m, c); by default the hand's translation.
+        dimension: 2 or 3; needed when a 2D hand turns.
+
+    Returns:
+        Names of PNG and PDF.
+    """
+    d = dimension or min(q_s.shape[1], 3)
+    ends = [name.rsplit("_", 1)[-1] for name in names]
+    axes_of = ["xyz".find(end) if len(end) == 1 else -1 for end in ends]  # rotations have a panel of their own
+    shown = _not_the_hand(outputs, names, axes_of, q_s, d)
+    moving = q_s[:, [axes_of[i] for i in shown]] if rigid is None else rigid[:, shown]
+    relative = outputs[:, shown] - moving
+    bodies = list(dict.fromkeys(names[i].rsplit("_", 1)[0] for i in shown))
+    angles = q_s.shape[1] > d
+    with paper_style():
+        panels = 1 + bool(shown) + angles
+        figure, axes = plt.subplots(
+            panels, 1, figsize=(COLUMN, 0.4 + 1.5 * panels), sharex=True, layout="constrained", squeeze=False
+        )
+        axes = axes[:, 0]
+        factors = [
+            length_unit(float(np.abs(a).max(initial=0.0)))
+            for a in (np.hstack([outputs[:, shown], q_s[:, :d]]), relative)
+        ]
+        for k, i in enumerate(shown):
+            body = names[i].rsplit("_", 1)[0]
+            look: dict[str, Any] = {"color": CYCLE[axes_of[i]], "ls": ("-", "-.", ":")[bodies.index(body) % 3]}
+            axes[0].plot(times, factors[0][0] * outputs[:, i], label=f"{body}, ${'xyz'[axes_of[i]]}$", **look)
+            axes[1].plot(times, factors[1][0] * relative[:, k], **look)
+        # The hand last: its thin dashes lie on the lines of the outputs.
+        for j in np.flatnonzero(np.abs(q_s[:, :d]).max(axis=0) > 0).tolist():
+            look = {"color": HAND, "ls": ((0, (4, 3)), (0, (1, 1.5)), (0, (4, 2, 1, 2)))[j], "lw": 0.8}
+            axes[0].plot(times, factors[0][0] * q_s[:, j], label=f"hand, ${'xyz'[j]}$", **look)
+        axes[0].set_ylabel(f"displacement [{factors[0][1]}]")
+        if shown:
+            axes[1].set_ylabel(f"relative to hand [{factors[1][1]}]")
+        if angles:
+            _angles(axes[-1], times, q_s, d)
+        entries, labels = axes[0].get_legend_handles_labels()
+        figure.legend(
+            entries, labels, loc="outside upper center", ncols=min(4, max(2, -(-len(labels) // d))), handlelength=2.4,
+            columnspacing=1.4,
+        )  # fmt: skip
+        for ax in axes:
+            ax.axhline(0.0, color="#bbbbbb", lw=0.6, zorder=0)
+            ax.yaxis.set_major_locator(MaxNLocator(5, steps=STEPS))
+        axes[-1].set_xlabel("time [s]")
+        axes[-1].set_xlim(float(times[0]), float(times[-1]))
+        figure.align_ylabels(axes)
+        return save(figure, out_png)
+
+
+def _not_the_hand(outputs: Array, names: tuple[str, ...], axes_of: list[int], q_s: Array, d: int) -> list[int]:
+    """Displacements to draw: those of outputs that do not repeat a moving hand."""
+    groups: dict[str, list[int]] = {}
+    for i, axis in enumerate(axes_of):
+        if 0 <= axis < d:
+            groups.setdefault(names[i].rsplit("_", 1)[0], []).append(i)
+    moves = bool(np.abs(q_s[:, :d]).max(initial=0.0) > 0)
+    repeated = [moves and np.array_equal(outputs[:, g], q_s[:, [axes_of[i] for i in g]]) for g in groups.values()]
+    return [i for group, same in zip(groups.values(), repeated, strict=True) if not same for i in group]
+
+
+def _angles(ax: Any, times: Array, q_s: Array, d: int) -> None:
+    """The angles that the hand turns by; all if it turns by none."""
+    turned = np.abs(q_s[:, d:]).max(axis=0) > 0
+    for j, axis in enumerate(hand_axes(q_s.shape[1], d)[d:]):
+        if turned[j] or not turned.any():
+            ax.plot(times, q_s[:, d + j], color=CYCLE["xyz".index(axis[-1])], label=f"hand, {axis}")
+    ax.set_ylabel("hand angle [rad]")
+    ax.legend(loc="best", handlelength=2.0)

@@ -1,0 +1,1 @@
+"""`softgrasp study`: what accuracy costs in time."""

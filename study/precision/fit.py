@@ -1,0 +1,70 @@
+"""Pareto fronts and slopes of work-precision points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from softgrasp.study.precision.points import WorkPoint
+
+GAIN = 0.01  # of the error: what a slower point must gain to be on the front
+
+
+@dataclass(frozen=True)
+class Slope:
+    """error ~ factor * x^power, fitted by least squares in logarithms.
+
+    Attributes:
+        question, series: of the points.
+        against: what x is.
+        power: exponent.
+        count: points behind it.
+    """
+
+    question: str
+    series: str
+    against: str
+    power: float
+    count: int
+
+
+def usable(points: Sequence[WorkPoint]) -> list[WorkPoint]:
+    """Points that may be used and have a finite error and time. Not collective."""
+    return [p for p in points if p.ok and np.isfinite(p.error) and np.isfinite(p.seconds) and p.seconds > 0]
+
+
+def pareto(points: Sequence[WorkPoint]) -> list[WorkPoint]:
+    """Points that no other beats in time and error at once, by time; less than :data:`GAIN` counts as none.
+
+    Not collective.
+    """
+    front: list[WorkPoint] = []
+    for p in sorted(usable(points), key=lambda p: (p.seconds, p.error)):
+        if not front or p.error < (1 - GAIN) * front[-1].error:
+            front.append(p)
+    return front
+
+
+def power_law(x: Sequence[float], y: Sequence[float]) -> float | None:
+    """Exponent of y ~ x^power; None with fewer than two different x or values that are not positive. Not collective."""
+    a, b = np.array(x, dtype=float), np.array(y, dtype=float)
+    good = (a > 0) & (b > 0) & np.isfinite(a) & np.isfinite(b)
+    if len(set(a[good])) < 2:
+        return None
+    return float(np.polyfit(np.log(a[good]), np.log(b[good]), 1)[0])
+
+
+def interpolate(x: float, xs: Sequence[float], ys: Sequence[float], power: float | None = None) -> float:
+    """y(x), linear between logarithms; outside by the end's slope, or by ``power`` when it is given. Not collective."""
+    order = np.argsort(xs)
+    a, b = np.log(np.array(xs, dtype=float)[order]), np.log(np.maximum(np.array(ys, dtype=float)[order], 1e-300))
+    at = float(np.log(x))
+    if len(a) == 1:
+        return float(np.exp(b[0] + (power or 0.0) * (at - a[0])))
+    if a[0] <= at <= a[-1]:
+        return float(np.exp(np.interp(at, a, b)))
+    i, j = (0, 1) if at < a[0] else (-1, -2)
+    slope = power if power is not None else (b[i] - b[j]) / (a[i] - a[j])
+    return float(np.exp(b[i] + slope * (at - a[i])))

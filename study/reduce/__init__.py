@@ -1,0 +1,1 @@
+"""`softgrasp reduce`: bases, errors against N and time."""

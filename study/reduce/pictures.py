@@ -1,0 +1,265 @@
+"""Pictures of the body for ``softgrasp reduce``: first modes, and the full motion beside the reduced ones."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from PIL import Image
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.online import run
+from softgrasp.reduction.registry import PAPER_METHODS
+from softgrasp.study.pictures.animation import speed_up
+from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
+from softgrasp.reduction.replay import Reference, prepare
+from softgrasp.study.reduce.sweep import Swept, nearest
+from softgrasp.study.pictures.shapes import seen, shadow
+from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
+
+MODES = 4  # a method
+FRAMES = 30
+INSTANTS = 3  # at most, in the still picture
+ROOM = 0.25  # between two bodies there, over the size of the body
+STRETCH = 0.15  # largest displacement of a drawn mode over the size of the body
+GIF_DPI = 110
+FULL: dict[str, Any] = {"color": ORANGE, "linewidth": 1.1}
+MANY_VERTICES = 200_000  # above, no pictures of the body
+
+
+@dataclass(frozen=True)
+class View:
+    """One reduced model for the eye.
+
+    Attributes:
+        title: method and N.
+        stable: of the model.
+        error: of its deformation.
+        states: vertex displacements of its run at the frames, (k, n, d) [m].
+    """
+
+    title: str
+    stable: bool
+    error: float
+    states: Array
+
+
+@dataclass(frozen=True)
+class Views:
+    """What the pictures need, on rank 0.
+
+    Attributes:
+        picture: the body.
+        times: of the frames, (k,) [s].
+        table: the hand, columns time and q_s, (steps + 1, 1 + n_s) [s, m, rad].
+        full: vertex displacements of the full run at the frames, (k, n, d) [m].
+        reduced: models to compare.
+        modes: title and vertex displacements (k, n, d) of the first modes of some methods, largest entry 1.
+    """
+
+    picture: PictureMesh
+    times: Array
+    table: Array
+    full: Array
+    reduced: tuple[View, ...]
+    modes: tuple[tuple[str, Array], ...]
+
+
+def compared(swept: Sequence[Swept]) -> list[tuple[Swept, int]]:
+    """First of the paper's methods and best of all at the N compared."""
+    first = [s for s in swept if s.method.key in PAPER_METHODS and s.points][:1]
+    chosen = [(s, i) for s in first if (i := nearest(s.points, stable=False)) is not None]
+    stable = [(s, i) for s in swept if (i := nearest(s.points)) is not None]
+    stable.sort(key=_error)
+    return chosen + [f for f in stable[:1] if f[0] not in first]
+
+
+def _error(found: tuple[Swept, int]) -> float:
+    return found[0].points[found[1]].error
+
+
+def gather_views(model: Model, against: Reference, swept: Sequence[Swept]) -> Views | None:
+    """Bring to rank 0 what the pictures need; None on other ranks and for very large bodies. Collective."""
+    if model.space.mesh.mesh.geometry.index_map().size_global > MANY_VERTICES:
+        return None
+    picture = gather_picture(model)
+    snapshots, n = against.snapshots, model.system.layout.n_local
+    chosen = np.unique(np.linspace(0, len(snapshots.steps) - 1, FRAMES + 1).round().astype(int))
+    steps = snapshots.steps[chosen]
+    full = vertex_displacement(model, snapshots.Z[:n, chosen], snapshots.q_s[:, chosen])
+    views = []
+    for s, i in compared(swept):
+        point, reduced = s.points[i], s.models[i]
+        with np.errstate(all="ignore"):  # an unstable model may overflow
+            small = reduced.at()
+            step, drive = prepare(reduced, small, against, model.system)
+            found = run(step, allow_unstable=True, **drive)
+            z, _ = reduced.reconstruct(small, found.x[steps].T, found.v_s[steps].T)
+        states = vertex_displacement(model, np.nan_to_num(z), found.q_s[steps].T)
+        if states is not None:
+            views.append(View(f"{s.method.title}, $N$ = {point.N}", point.stable, point.error_deformation, states))
+    modes = [(s.method.title, _modes(model, s, i)) for s, i in modes_of(swept)]
+    if picture is None or full is None:
+        return None
+    table = np.column_stack([against.trajectory.times, against.trajectory.q_s])
+    shown = tuple((title, shapes) for title, shapes in modes if shapes is not None and len(shapes))
+    return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
+
+
+def modes_of(swept: Sequence[Swept]) -> list[tuple[Swept, int]]:
+    """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
+    found = [(s, i) for s in swept if s.method.fixed and (i := nearest(s.points)) is not None]
+    found.sort(key=_error)
+    old = [f for f in found if f[0].method.key in PAPER_METHODS][:1]
+    new = [f for f in found if f[0].method.key not in PAPER_METHODS]
+    new = ([f for f in new if not f[0].method.snapshots] or new)[:1]
+    return old + new
+
+
+def _modes(model: Model, s: Swept, i: int) -> Array | None:
+    """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
+    layout = model.system.layout
+    lift = s.models[i].lift
+    if lift is None:
+        return None
+    Q = lift.L_q[:, 2 * layout.n_s :]
+    largest = layout.comm.allreduce(np.abs(Q).max(axis=0, initial=0.0), np.maximum)
+    kept = np.flatnonzero(largest > 1e-12 * largest.max(initial=0.0))[:MODES]
+    shapes = vertex_displacement(model, Q[:, kept] / largest[kept], np.zeros((layout.n_s, len(kept))))
+    return None if shapes is None else np.asarray(shapes)
+
+
+def figure_modes(views: Views, out_png: Path) -> tuple[Path, Path]:
+    """First modes of the best methods drawn on the body, scaled to one largest displacement; PNG and PDF."""
+    picture = views.picture
+    size = float(np.ptp(picture.points, axis=0).max())
+    titles = [
+        f"{title.replace(', fixed solid modes', ', fixed')}, {k + 1}"
+        for title, shapes in views.modes
+        for k in range(len(shapes))
+    ]
+    shapes = np.concatenate([_scaled(shapes, STRETCH * size) for _, shapes in views.modes])
+    times = np.arange(len(shapes), dtype=float)
+    still = np.column_stack([times, np.zeros((len(shapes), picture.n_s))])
+    shot = make_shot(picture, shapes, times, still, None)
+    with paper_style():
+        figure, axes = make_axes(shot, len(shapes), captions=True, width=WIDTH, tallest=5.0)
+        for ax, shape, title, hand in zip(axes, shapes, titles, shot.hands, strict=True):
+            draw_scene(ax, shot, shape[None], None, hand[None])
+            ax.set_title(title, pad=3, fontsize=6.5)
+        return save(figure, out_png)
+
+
+def _scaled(shapes: Array, largest: float) -> Array:
+    """Displacements with the same largest length of a vector."""
+    lengths = np.linalg.norm(shapes, axis=2).max(axis=1)
+    return np.asarray(largest * shapes / lengths[:, None, None])
+
+
+def _outline(picture: PictureMesh, displacement: Array) -> Array | list[Array]:
+    """Lines around the body where it is seen."""
+    x = picture.points + displacement
+    if picture.dimension == 2:
+        return np.asarray(x[picture.facets])
+    return shadow(seen(x), picture.facets)
+
+
+def _hands(views: Views) -> Array:
+    return np.column_stack([np.interp(views.times, views.table[:, 0], q) for q in views.table[:, 1:].T])
+
+
+def _figure(views: Views, width: float, note: str = "") -> tuple[Any, list[Any], Shot]:
+    """Axes for every reduced model in the frame of the full one, so that one that grew does not shrink the picture."""
+    shot = make_shot(views.picture, views.full, views.times, views.table, None)
+    figure, axes = make_axes(shot, len(views.reduced), captions=True, width=width, tallest=3.6)
+    for ax, view in zip(axes, views.reduced, strict=True):
+        state = "" if view.stable else ", unstable"
+        ax.set_title(f"{view.title}{state}\ndeformation error {view.error:.1e}{note}", pad=3, fontsize=7)
+    entries: list[Any] = [Patch(color=HAND, label="hand"), Line2D([], [], label="outline of the full model", **FULL)]
+    top = max(ax.get_position().y1 for ax in axes) + 0.36 / figure.get_figheight()
+    figure.legend(handles=entries, loc="lower center", bbox_to_anchor=(0.5, top), ncols=2, borderaxespad=0.0)
+    colour_bar(figure, axes, shot)
+    return figure, axes, shot
+
+
+def _draw(ax: Any, shot: Shot, views: Views, view: View, k: int) -> None:
+    """One reduced model at one frame under the outline of the full one."""
+    q = _hands(views)[k]
+    draw_scene(ax, shot, view.states[k : k + 1], None, q[None])
+    lines = LineCollection(list(_outline(views.picture, views.full[k])), zorder=7, **FULL)
+    ax.add_collection(lines, autolim=False)
+
+
+def instants(views: Views) -> list[int]:
+    """Frames of large deformation and large error whose bodies do not cover each other, the most telling first."""
+    rigid = [views.picture.rigid(q) for q in _hands(views)]
+    deformation = np.array([np.abs(u - r).max() for u, r in zip(views.full, rigid, strict=True)])
+    error = np.max([np.abs(view.states - views.full).max(axis=(1, 2)) for view in views.reduced], axis=0)
+    score = sum(value / (value.max() or 1.0) for value in (deformation, np.minimum(error, deformation.max())))
+    x = views.picture.points + views.full
+    low, high = x.min(axis=1), x.max(axis=1)
+    room = ROOM * np.ptp(views.picture.points, axis=0)
+    chosen: list[int] = []
+    for k in np.argsort(-score, kind="stable").tolist():
+        if all((low[k] > high[i] + room).any() or (low[i] > high[k] + room).any() for i in chosen):
+            chosen.append(k)
+        if len(chosen) == INSTANTS:
+            break
+    return sorted(chosen)
+
+
+def figure_compare(views: Views, out_png: Path) -> tuple[Path, Path]:
+    """Full outline over reduced bodies at some instants; PNG and PDF."""
+    shown = instants(views)
+    note = f"; shown: $t$ = {', '.join(f'{views.times[k]:.2g}' for k in shown)} s"
+    with paper_style():
+        figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1, note)
+        for ax, view in zip(axes, views.reduced, strict=True):
+            for k in shown:
+                _draw(ax, shot, views, view, k)
+        return save(figure, out_png)
+
+
+def gif_compare(views: Views, out_gif: Path) -> Path:
+    """The same in motion."""
+    images = []
+    with paper_style():
+        figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1)
+        figure.set_dpi(GIF_DPI)
+        figure.canvas.draw()
+        frame = figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
+        for k in range(len(views.times)):
+            for ax, view in zip(axes, views.reduced, strict=True):
+                for artist in [*ax.collections, *ax.lines]:
+                    artist.remove()
+                _draw(ax, shot, views, view, k)
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format="png", dpi=GIF_DPI, bbox_inches=frame, pil_kwargs={"compress_level": 1})
+            images.append(Image.open(buffer).convert("RGB"))
+        plt.close(figure)
+    palette = _palette(images[len(images) // 2])
+    flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    span = float(views.times[-1] - views.times[0]) / speed_up(views.times)
+    wait = max(20, round(100 * span / max(1, len(flat) - 1)) * 10)  # [ms], GIF counts in hundredths of a second
+    durations = [wait] * (len(flat) - 1) + [wait + 1000]
+    flat[0].save(out_gif, format="GIF", save_all=True, append_images=flat[1:], duration=durations, loop=0)
+    return out_gif
+
+
+def _palette(image: Any) -> Any:
+    """The 256 colours of a picture, its paper pure white."""
+    found = image.quantize(256)
+    colours = np.reshape(found.getpalette(), (-1, 3))
+    colours[colours.sum(axis=1).argmax()] = 255
+    found.putpalette(colours.ravel().tolist())
+    return found

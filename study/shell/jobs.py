@@ -1,0 +1,65 @@
+"""Benchmark rows as programs of their own under mpiexec, so that none inherits memory or caches from another."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from softgrasp.study.shell.doctor import find_mpiexec
+
+
+def launch_worker(module: str, spec: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
+    """Run ``python -m module --worker SPEC`` on some ranks; its numbers, or ``error`` with the reason it gave.
+
+    Not collective.
+
+    Args:
+        module: whose command passes the specification to :func:`leave_result`.
+        spec: the job, fit for JSON.
+        ranks: MPI ranks.
+        limit: longest time [s].
+    """
+    mpiexec = find_mpiexec()
+    if mpiexec is None:
+        return {"error": "no mpiexec found; `softgrasp doctor` says what to do"}
+    root = str(Path(__file__).resolve().parent.parent)
+    path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "row.json"
+        text = json.dumps(spec | {"file": str(file)})
+        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", module, "--worker", text]
+        try:
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
+        except subprocess.TimeoutExpired:
+            return {"error": f"no result after {limit:g} s"}
+        if done.returncode == 0 and file.is_file():
+            return dict(json.loads(file.read_text()))
+    lines = (done.stderr + done.stdout).strip().splitlines() or ["no output"]
+    said = next((line for line in lines if "Error: " in line and not line.startswith(" ")), lines[-1])
+    return {"error": f"exit status {done.returncode}: {said}"}
+
+
+def leave_result(file: str, measure: Callable[[], dict[str, Any]]) -> None:
+    """Inside a worker: measure, and leave the numbers where the launcher looks. Collective."""
+    comm = MPI.COMM_WORLD
+    try:
+        result = measure()
+        if comm.rank == 0:
+            Path(file).write_text(json.dumps(result))
+    except Exception:
+        if comm.size == 1:
+            raise
+        # the other ranks may wait in a collective call
+        sys.stderr.write(traceback.format_exc())
+        sys.stderr.flush()
+        comm.Abort(1)

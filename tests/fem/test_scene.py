@@ -1,0 +1,365 @@
+"""Scenes: what loads, what is refused and with which sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.scene import materials
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.scene import check_dimension, scene_schema
+from softgrasp.fem.scene.file import load_scene, load_scene_collective, resolved_toml, scene_hash, shipped_scenes
+
+SCENES = shipped_scenes()
+PAPER = SCENES["paper_forward"]
+PILLOW = SCENES["pillow_3d"]
+BLOCK = SCENES["block_3d"]
+FRANKA = SCENES["franka_muscle"]
+
+REFUSED: list[tuple[Path, list[str], str]] = [
+    # unknown, missing, ill-typed
+    (PAPER, ["tissue.cels=[1, 2]"], "tissue.cels is not a key; did you mean tissue.cells?"),
+    (PAPER, ["tissu.order=1"], "tissu is not a key; did you mean tissue?"),
+    (PAPER, ["time.zzz=1"], "time.zzz is not a key; keys of time are steps, end, start, solver, rtol"),
+    (
+        PAPER,
+        ["tissue.material.yung=1"],
+        "tissue.material.yung is not a key; did you mean tissue.material.young?",
+    ),
+    (
+        PAPER,
+        ["effects.damping={kind='rayleigh', bta=1.0, beta=1.0}"],
+        "effects.damping.bta is not a key; did you mean",
+    ),
+    (PAPER, ["control.outputs.0.pont=[0.0, 0.0]"], "control.outputs.0.pont is not a key; did you mean"),
+    (SCENES["layers_2d"], ["tissue.layers.fat.bx=1"], "tissue.layers.fat.bx is not a key; did you mean"),
+    (PAPER, ["time={}"], "time.steps is missing; give number of equal time steps"),
+    (PAPER, ["effects.damping={beta=1.0}"], "damping.kind is missing; give damping law: 'kelvin-voigt', 'rayleigh'"),
+    (
+        PAPER,
+        ["tissue.material={mu=1.0, rho=1.0}"],
+        "tissue.material.lambda is missing; give first Lame constant",
+    ),
+    (PAPER, ["tissue.order=3"], "tissue.order is 3; it must be 1 or 2"),
+    (PAPER, ["tissue.repair=1"], "tissue.repair is 1; it must be true or false"),
+    (PAPER, ["hand.mass='heavy'"], 'hand.mass is "heavy"; it must be a number'),
+    (PAPER, ["time.steps=1.5"], "time.steps is 1.5; it must be an integer"),
+    (PAPER, ["control.Q=much"], 'control.Q is "much"; it must be a number or a list'),
+    (PAPER, ["effects.gravity=true"], "effects.gravity is true; it must be a table"),
+    (
+        PAPER,
+        ["hand.mas=1", "time.steps=0", "hand.mass=-1"],
+        "hand.mas is not a key; did you mean hand.mass?; and 2 more",
+    ),
+    # material
+    (
+        PAPER,
+        ["tissue.material=musle"],
+        "tissue.material 'musle' is not a material of the library; did you mean 'muscle'?",
+    ),
+    (PAPER, ["tissue.material.mu=0"], "tissue.material.mu is 0; it must be > 0"),
+    (PAPER, ["tissue.material.rho=-1"], "tissue.material.rho is -1; it must be > 0"),
+    (PAPER, ["tissue.material.lambda=-40"], "tissue.material.lambda is -40.0; it must be > -2 mu / 3"),
+    (PAPER, ["tissue.material.lambda=1e30"], "it gives nu = 0.5"),
+    (
+        PAPER,
+        ["tissue.material={young=1.0, poisson=0.5, rho=1.0}"],
+        "tissue.material.poisson is 0.5; it must lie",
+    ),
+    (
+        PAPER,
+        ["tissue.material={young=1.0, poisson=-1.0, rho=1.0}"],
+        "tissue.material.poisson is -1.0; it must lie",
+    ),
+    (
+        PAPER,
+        ["tissue.material={young=0.0, poisson=0.3, rho=1.0}"],
+        "tissue.material.young is 0.0; it must be > 0",
+    ),
+    (
+        PAPER,
+        ["tissue.material={young=nan, poisson=0.3, rho=1.0}"],
+        "tissue.material.young is nan; it must be finite",
+    ),
+    (
+        PAPER,
+        ["tissue.material={young='a', poisson=0.3, rho=1.0}"],
+        "tissue.material.young is 'a'; it must be a number",
+    ),
+    (PAPER, ["tissue.material={young=1.0, rho=1.0}"], "tissue.material.poisson is missing"),
+    (PAPER, ["tissue.material.young=1.0"], "young and poisson exclude lambda and mu"),
+    # numbers
+    (PAPER, ["hand.mass=nan"], "hand.mass is nan; it must be a finite number"),
+    (PAPER, ["motion.target=[inf, 0]"], "motion.target.0 is inf; it must be a finite number"),
+    (PAPER, ["hand.mass=0"], "hand.mass is 0; it must be > 0"),
+    (PAPER, ["motion.duration=0"], "motion.duration is 0; it must be > 0"),
+    (PAPER, ["time.steps=0"], "time.steps is 0; it must be >= 1"),
+    (PAPER, ["time.rtol=1"], "time.rtol is 1; it must be < 1"),
+    (PAPER, ["output.every=0"], "output.every is 0; it must be >= 1"),
+    (
+        PAPER,
+        ["effects.damping={kind='rayleigh', beta=-1.0}"],
+        "effects.damping.beta is -1.0; it must be >= 0",
+    ),
+    # geometry
+    (PAPER, ["tissue.mesh=a.msh"], "tissue.size and cells cannot go with tissue.mesh; drop them, or mesh (--set"),
+    (PILLOW, ["tissue.cells=[1, 1, 1]"], "tissue.cells cannot go with tissue.mesh"),
+    (PAPER, ["tissue.size=[1.0]"], "tissue.size is [1.0]; it must have at least 2 items"),
+    (PAPER, ["tissue.cells=[1, 2, 3]"], "tissue.cells is [1, 2, 3]; it must have 2 entries as size does"),
+    (
+        PAPER,
+        ["tissue={material='fat', size=[1.0, 1.0]}"],
+        "tissue.cells is missing; give size and cells, or mesh",
+    ),
+    (PAPER, ["tissue.scale=0.001"], "tissue.scale needs tissue.mesh"),
+    (PAPER, ["tissue.layers.a={material='fat'}"], "tissue.layers.a.box or tag must be given"),
+    (PAPER, ["tissue.layers.a={material='fat', tag=1}"], "tissue.layers.a.tag needs tissue.mesh"),
+    (
+        PAPER,
+        ["tissue.layers.a={material='fat', box=[[0.0, 0.0], [1.0, 1.0]], beta=1.0}"],
+        "layers.a.beta needs",
+    ),
+    (PAPER, ["contact={}"], "contact.sides, box or facet_tag must be given"),
+    (PAPER, ["contact.sides=[lft]"], "--set contact.sides=[lft]: '[lft]' is not a TOML value"),
+    (PAPER, ["contact.sides=['lft']"], "contact.sides.0 is \"lft\"; it must be 'x-', 'x+'"),
+    (PAPER, ["contact.sides=['front']"], "contact.sides has 'front'; a 2D tissue has no such side"),
+    (PAPER, ["contact.sides=['z+']"], "contact.sides has 'z+'; a 2D tissue has no such side"),
+    (PAPER, ["contact.facet_tag=1"], "contact.facet_tag needs tissue.mesh"),
+    (PAPER, ["contact.box=[[1.0, 0.0], [0.0, 1.0]]"], "its first corner must not exceed its second"),
+    (PAPER, ["contact.box=[[1.0, 0.0]]"], "contact.box is [[1.0, 0.0]]; it must have at least 2 items"),
+    (PAPER, ["contact.box=[[1.0], [2.0, 3.0]]"], "its two corners must have as many coordinates"),
+    (BLOCK, ["tissue.thickness=2"], "tissue.thickness is 2.0; in 3D it has no meaning"),
+    # dimension
+    (PAPER, ["tissue.origin=[0.0]"], "tissue.origin has a vector of 1 entries; it must have 2"),
+    (PAPER, ["motion.target=[1, 2, 3]"], "motion.target has a vector of 3 entries; it must have 2"),
+    (BLOCK, ["motion.target=[1, 2, 3]"], "motion.target has a vector of 3 entries; it must have 6"),
+    (PAPER, ["effects.gravity.g=[0, 0, -9]"], "effects.gravity.g has a vector of 3 entries; it must have 2"),
+    (PAPER, ["hand.reference=[0]"], "hand.reference has a vector of 1 entries"),
+    (PAPER, ["contact.box=[[0, 0, 0], [1, 1, 1]]"], "contact.box has a vector of 3 entries"),
+    (PAPER, ["control.outputs.0.point=[0, 0, 0]"], "control.outputs.0.point has a vector of 3 entries"),
+    (PAPER, ["control.R=[[1.0]]"], "control.R has 1 rows; it must have 2"),
+    (PAPER, ["hand.inertia=[1, 1, 1]"], "hand.inertia is a list; in 2D it must be one number"),
+    # effects, motion, control
+    (
+        PAPER,
+        ["effects.rotation=true", "motion.target=[1, 2, 0]"],
+        "hand.inertia is missing; effects.rotation needs it",
+    ),
+    (
+        PAPER,
+        ["effects.damping={kind='kelvin-voigt', beta=1.0, alpha=1.0}"],
+        "effects.damping.alpha is 1.0; Kelvin-Voigt",
+    ),
+    (PAPER, ["time.start=equilibrium"], "time.start is 'equilibrium' but effects.gravity is off"),
+    (FRANKA, ["effects.gravity=false"], "time.start is 'equilibrium' but effects.gravity is off"),
+    (PAPER, ["motion={}"], "motion.target is missing; the quintic profile needs it"),
+    (PAPER, ["motion.profile=hold"], "motion.target cannot go with profile = 'hold'"),
+    (PAPER, ["motion={profile='csv'}"], "motion.csv and profile = 'csv' go together"),
+    (PAPER, ["control.outputs=[]"], "control.outputs is []; it must have at least 1 item"),
+    (PAPER, ["control.outputs=[{kind='node'}]"], "control.outputs.0.point and kind = 'node' go together"),
+    (PAPER, ["control.outputs=[{kind='region'}]"], "control.outputs.0.box and kind = 'region' go together"),
+    (PAPER, ["control.R=0"], "control.R is 0.0; it must be > 0"),
+    (PAPER, ["control.Q=-1"], "control.Q is -1.0; it must be >= 0"),
+    (PAPER, ["control.Q=[[1.0, 2.0]]"], "control.Q is not square"),
+    (PAPER, ["control.Q=[[1.0, 2.0], [0.0, 1.0]]"], "control.Q is not symmetric"),
+    (PAPER, ["control.Q=[[1.0, 2.0], [2.0, 1.0]]"], "control.Q has the eigenvalue -1; all must be >= 0"),
+    (PAPER, ["control.R=[[1.0, 1.0], [1.0, 1.0]]"], "all must be > 0"),
+    # --set itself
+    (PAPER, ["hand.mass"], "--set hand.mass: it must read section.key=value"),
+    (PAPER, ["hand..mass=1"], "it must read section.key=value"),
+    (PAPER, ["hand.mass=1 2"], "'1 2' is not a TOML value"),
+    (PAPER, ["hand.mass=1\nb = 2"], "it must hold one value"),
+    (PAPER, ["hand.mass.kg=1"], "hand.mass is 20.0, no table; set hand.mass itself"),
+    (PAPER, ["control.outputs.1.name=a"], "'1' must be an index below 1"),
+]
+
+
+@pytest.mark.parametrize(
+    ("path", "overrides", "sentence"), REFUSED, ids=lambda v: "" if isinstance(v, Path) else str(v)[:50]
+)
+def test_refused_with_one_sentence(path: Path, overrides: list[str], sentence: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        load_scene(path, overrides)
+    message = str(caught.value)
+    assert sentence in message
+    assert "\n" not in message or "\n" in overrides[0]
+    assert message.startswith((f"{path}: ", "--set "))
+
+
+def test_semidefinite_output_weight_is_allowed() -> None:
+    assert load_scene(PAPER, ["control.Q=[[1.0, 1.0], [1.0, 1.0]]"]).control is not None
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_shipped_scene_loads_and_survives_its_resolved_text(name: str, tmp_path: Path) -> None:
+    scene = load_scene(SCENES[name])
+    assert scene.name == name
+    copy = tmp_path / "resolved.toml"
+    copy.write_text(resolved_toml(scene), encoding="utf-8")
+    again = load_scene(copy)
+    if scene.tissue.mesh is None:
+        assert again.model_dump() == scene.model_dump()
+    assert scene_hash(again) == scene_hash(scene)
+
+
+def test_scenes_that_checks_name_are_shipped() -> None:
+    wanted = {
+        "paper_forward",
+        "paper_lqr",
+        "paper_lqr_undamped",
+        "franka_muscle",
+        "block_3d",
+        "pillow_3d",
+        "layers_2d",
+    }
+    assert wanted <= SCENES.keys()
+    assert PILLOW.parent.joinpath("meshes", "pillow_small.LICENSE").is_file()
+
+
+def test_paper_scene_values_and_defaults() -> None:
+    scene = load_scene(PAPER)
+    assert (scene.tissue.size, scene.tissue.cells, scene.dimension) == ([1.0, 2.0], [15, 30], 2)
+    material = scene.tissue.material
+    assert (material.lam, material.mu, material.rho, material.nu) == (50.0, 50.0, 1.0, 0.25)
+    assert material.young == 125.0  # mu (3 lambda + 2 mu) / (lambda + mu), exact in binary
+    assert (scene.hand.mass, scene.motion.target, scene.time.steps, scene.time_end) == (
+        20.0,
+        [5.0, 3.0],
+        600,
+        3.0,
+    )
+    effects = scene.effects
+    assert (effects.gravity, effects.damping, effects.reaction, effects.rotation) == (
+        None,
+        None,
+        False,
+        False,
+    )
+    assert load_scene(SCENES["paper_lqr"]).time_end == 300.0
+    assert load_scene(SCENES["paper_lqr_undamped"]).effects.damping is None
+
+
+def test_no_motion_table_means_hold(tmp_path: Path) -> None:
+    text = resolved_toml(load_scene(PAPER))
+    start, rest = text.split("[motion]")
+    path = tmp_path / "still.toml"
+    path.write_text(start + "[time]" + rest.split("[time]")[1], encoding="utf-8")
+    assert load_scene(path).motion.profile == "hold"
+
+
+def test_set_takes_toml_values_bare_words_indices_and_false() -> None:
+    overrides = [
+        "tissue.cells=[4, 8]",
+        "tissue.material=fat",
+        "control.outputs.0.name='a b'",
+        "output.fields=vtx",
+    ]
+    scene = load_scene(PAPER, [*overrides, "effects.damping={kind='rayleigh', beta=0, alpha=2}"])
+    assert scene.tissue.cells == [4, 8]
+    assert scene.tissue.material.name == "fat"
+    assert scene.control is not None
+    assert scene.control.outputs[0].name == "a b"
+    assert scene.output.fields == "vtx"
+    assert scene.effects.damping is not None
+    assert scene.effects.damping.alpha == 2.0
+    assert load_scene(FRANKA, ["effects.damping=false"]).effects.damping is None
+    tissue = load_scene(PAPER, ["tissue.mesh=a.msh", "tissue.size=false", "tissue.cells=false"]).tissue
+    assert (tissue.size, tissue.cells, tissue.mesh) == (None, None, "a.msh")
+
+
+def test_sides_by_dimension() -> None:
+    contact = load_scene(PAPER, ["contact.sides=['left', 'x+', 'bottom', 'top']"]).contact
+    assert contact.axes(2) == [(0, -1), (0, 1), (1, -1), (1, 1)]
+    assert contact.axes(3) == [(0, -1), (0, 1), (2, -1), (2, 1)]
+    assert load_scene(BLOCK, ["contact.sides=['front', 'back']"]).contact.axes(3) == [(1, -1), (1, 1)]
+
+
+def test_dimension_of_a_mesh_scene_is_checked_later() -> None:
+    scene = load_scene(PILLOW)
+    assert scene.dimension is None
+    check_dimension(scene, 3)
+    with pytest.raises(SceneError, match=r"effects.gravity.g has a vector of 3 entries; it must have 2"):
+        check_dimension(scene, 2)
+
+
+def test_hash_sees_values_and_mesh_contents_but_not_names(tmp_path: Path) -> None:
+    base = scene_hash(load_scene(PAPER))
+    assert scene_hash(load_scene(PAPER, ["name=other", "description=x"])) == base
+    assert scene_hash(load_scene(PAPER, ["hand.mass=21"])) != base
+    (tmp_path / "a.msh").write_bytes(b"one")
+    scene = load_scene(PILLOW, [f"tissue.mesh='{tmp_path / 'a.msh'}'"])
+    before = scene_hash(scene)
+    (tmp_path / "a.msh").write_bytes(b"two")
+    assert scene_hash(scene) != before
+    (tmp_path / "a.msh").unlink()
+    with pytest.raises(SceneError, match=r"tissue.mesh = .* cannot be read"):
+        scene_hash(scene)
+
+
+def test_bad_files(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"no such scene file; did you mean demos/scenes/paper_lqr.toml"):
+        load_scene(tmp_path / "paper_lqr.tml")
+    with pytest.raises(SceneError, match="cannot be read"):
+        load_scene(tmp_path)
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[tissue\n", encoding="utf-8")
+    with pytest.raises(SceneError, match=r"bad.toml: the scene file is not valid TOML: .*line 1"):
+        load_scene(bad)
+    bad.write_bytes(b"name = '\xff'")
+    with pytest.raises(SceneError, match="not UTF-8"):
+        load_scene(bad)
+
+
+def test_scene_is_frozen() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        load_scene(PAPER).hand.mass = 1.0
+
+
+def test_collective_load_agrees_on_scene_and_error() -> None:
+    comm = MPI.COMM_WORLD
+    scene = load_scene_collective(comm, PAPER, ["hand.mass=3"])
+    assert comm.allgather(scene_hash(scene)) == [scene_hash(scene)] * comm.size
+    assert scene.directory == PAPER.parent
+    with pytest.raises(SceneError, match=r"hand\.mass is -3"):
+        load_scene_collective(comm, PAPER, ["hand.mass=-3"])
+
+
+def test_every_key_of_the_schema_states_its_unit() -> None:
+    schema = scene_schema()
+    json.dumps(schema)
+    objects = [schema, *schema["$defs"].values()]
+    for part in objects:
+        for key, field in part.get("properties", {}).items():
+            assert "[" in field.get("description", ""), f"{part.get('title')}.{key}"
+
+
+@pytest.mark.parametrize("name", materials.LIBRARY)
+def test_library_and_conversions(name: str) -> None:
+    entry = materials.LIBRARY[name]
+    lam, mu = materials.lame(entry.young, entry.poisson)
+    assert lam + 2 * mu / 3 == pytest.approx(entry.young / (3 * (1 - 2 * entry.poisson)), rel=1e-12)  # bulk, rounding
+    assert materials.young_poisson(lam, mu) == pytest.approx((entry.young, entry.poisson), rel=1e-12)  # rounding
+    assert entry.source
+    assert entry.rho > 0
+    assert math.isfinite(lam)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("tissue.layers.tissue={material='fat', box=[[0.0,0.0],[1.0,1.0]]}", "another name"),
+        ("reduction.mu_range=[500.0,20.0]", r"reduction\.mu_range"),
+        ("reduction.N=[0]", r"reduction\.N"),
+        ("reduction.engin='gram'", "engine"),
+        ("control.loop.limit=-1.0", r"control\.loop\.limit"),
+        ("control.method='newton'", "newton-adi"),
+        ("study.tolerance=2", r"study\.tolerance"),
+    ],
+)
+def test_later_sections_are_checked_too(change: str, words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        load_scene(PAPER.parent / "paper_lqr.toml", [change])

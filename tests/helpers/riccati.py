@@ -1,0 +1,75 @@
+"""Control problems for the tests of the Riccati solvers, and their distance to an oracle."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.design import make_problem
+from tests.helpers.models import CUBE, LAYERS, gather_rows, make_scene
+
+SCENE = Path(__file__).parents[2] / "demos" / "scenes" / "paper_lqr.toml"
+NODE = {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}
+KELVIN = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.003}}, "control": NODE}
+DRAG = {"effects": {"damping": {"kind": "rayleigh", "alpha": 0.05, "beta": 0.003, "drag": "space"}}}
+REGION = [{"kind": "region", "box": [[0.0, 0.0], [0.6, 0.6]]}, {"kind": "hand"}]
+CUBE_NODE = {"control": {"outputs": [{"kind": "node", "point": [0.9, 0.7, 0.1]}]}}
+CASES: dict[str, tuple[dict[str, Any], ...]] = {
+    "one_way": (KELVIN,),
+    "two_way": (KELVIN, {"effects": {"reaction": True}}),
+    "drag_in_space": (KELVIN, DRAG),
+    "two_way_drag_in_space": (KELVIN, DRAG, {"effects": {"reaction": True}}),
+    "layers": (KELVIN, {"tissue": {"layers": LAYERS}}),
+    "cube": (CUBE, KELVIN, CUBE_NODE),
+    "cube_two_way": (CUBE, KELVIN, CUBE_NODE, {"effects": {"reaction": True}}),
+    "region_hand_weights": (
+        KELVIN,
+        {"control": {"outputs": REGION, "Q": np.diag([9.0, 1.0, 4.0, 0.0]).tolist(), "R": [[2.0, 0.5], [0.5, 1.0]]}},
+    ),
+}
+
+
+@cache
+def problem_of(name: str) -> RiccatiProblem:
+    return make_problem(build(make_scene(*CASES[name]), MPI.COMM_WORLD))
+
+
+@cache
+def oracle(name: str) -> RiccatiSolution:
+    return DenseRiccati().solve(problem_of(name))
+
+
+@cache
+def paper(*changes: str) -> RiccatiProblem:
+    return make_problem(build(load_scene(SCENE, ["tissue.cells=[5,10]", *changes]), MPI.COMM_WORLD))
+
+
+def gain(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
+    """The gain in node order, (2n, m), on every rank."""
+    layout = problem.layout
+    return np.vstack([solution.K_s.T, gather_rows(layout, solution.K_z), gather_rows(layout, solution.K_v)])
+
+
+def gain_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSolution) -> float:
+    a, b = gain(problem, ours), gain(problem, theirs)
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+def factor(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
+    """Z in node order, on every rank."""
+    layout = problem.layout
+    return np.vstack([solution.Z_s, gather_rows(layout, solution.Z_z), gather_rows(layout, solution.Z_v)])
+
+
+def x_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSolution) -> float:
+    a, b = factor(problem, ours), factor(problem, theirs)
+    return float(np.linalg.norm(a @ a.T - b @ b.T, 2) / np.linalg.norm(b @ b.T, 2))

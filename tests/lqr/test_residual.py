@@ -1,0 +1,72 @@
+"""The public residual against dense algebra, on solutions and on anything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.dense.modal import DenseRiccati, dense_residual, relative_space
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.design import make_problem
+from tests.helpers.models import LAYERS, make_scene
+
+CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}], "Q": 7.0, "R": [[2.0, 0.5], [0.5, 1.0]]}}
+KELVIN = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.003}}}
+DRAG = {"effects": {"damping": {"kind": "rayleigh", "alpha": 0.3, "beta": 0.003, "drag": "space"}}}
+TWO_WAY = {"effects": {"reaction": True}}
+CASES = {
+    "one_way": (KELVIN,),
+    "two_way": (KELVIN, TWO_WAY),
+    "drag": (DRAG,),
+    "two_way_drag": (DRAG, TWO_WAY),
+    "layers": (KELVIN, {"tissue": {"layers": LAYERS}}),
+}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    Z_s: Array
+    Z_z: Array
+    Z_v: Array
+
+
+def spread(problem: RiccatiProblem, Z: Array) -> Candidate:
+    layout, s = problem.layout, 2 * problem.layout.n_s
+    own = slice(layout.start, layout.start + layout.n_local)
+    return Candidate(Z[:s], Z[s : s + layout.n_e][own], Z[s + layout.n_e :][own])
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_residual_of_any_z_is_the_dense_one(name: str) -> None:
+    """Also of a Z that is no solution: the number, not only its smallness."""
+    problem = make_problem(build(make_scene(CONTROL, *CASES[name], tissue={"cells": [3, 6]}), MPI.COMM_WORLD))
+    space = problem.layout.comm.bcast(relative_space(problem))
+    rng = np.random.default_rng(1)
+    for rank in (1, 5):
+        Z = rng.standard_normal((problem.layout.states, rank))
+        # the same products in another order: rounding of a number of 1e3 to 1e4
+        assert residual(problem, spread(problem, Z)) == pytest.approx(dense_residual(problem, space, Z), rel=1e-12)
+    nothing = np.zeros((problem.layout.states, 1))
+    assert residual(problem, spread(problem, nothing)) == pytest.approx(1.0, rel=1e-12)  # C'QC over itself
+
+
+def test_residual_sees_a_small_error() -> None:
+    problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), MPI.COMM_WORLD))
+    found = DenseRiccati().solve(problem)
+    assert residual(problem, found) < 1e-9  # rounding times |A||X|
+    worse = Candidate(found.Z_s * (1 + 1e-6), found.Z_z, found.Z_v)
+    assert residual(problem, worse) > 1e-7  # a hundred times the bound above
+
+
+def test_residual_leaves_its_input_alone() -> None:
+    problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), MPI.COMM_WORLD))
+    found = DenseRiccati().solve(problem)
+    copies = [x.copy() for x in (found.Z_s, found.Z_z, found.Z_v)]
+    residual(problem, found)
+    assert all(np.array_equal(a, b) for a, b in zip(copies, (found.Z_s, found.Z_z, found.Z_v), strict=True))

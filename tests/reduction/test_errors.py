@@ -1,0 +1,88 @@
+"""Errors of reduced runs against dense matrices, of one model and of a family that shares one factorisation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg
+from mpi4py import MPI
+
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.reduction.errors import Comparison, full_energy, trajectory_errors
+from softgrasp.reduction.model import ModelError
+from softgrasp.reduction.online import run
+from tests.helpers.models import Array, gather_matrix, gather_rows, gather_states
+from tests.helpers.reduced import FORCED, KINDS, force_of, leading, model_of, reduced, step_of, symplectic_basis, whole_basis
+
+DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
+norm = np.linalg.norm
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["alone", "of a family"])
+def test_errors_against_dense_matrices(comm: MPI.Intracomm, whole: bool) -> None:
+    """Errors of N = 6 (and the hand), computed from the model alone or from one of N = 10."""
+    model = model_of(comm, DAMPED, FORCED, {"output": {"every": 3}})
+    layout, system = model.system.layout, model.system
+    full, dt = simulate(model), step_of(model)
+    snapshots = full.snapshots
+    T, G = gather_rows(layout, system.T), gather_rows(layout, system.G)
+    M = gather_matrix(layout, system.M_ee)
+    z, v = np.split(gather_states(layout, snapshots.Z), 2)
+    energy = full_energy(system, snapshots)
+
+    def views(z: Array, v: Array, q_s: Array, v_s: Array) -> list[Array]:
+        absolute = np.concatenate([q_s, z + T @ q_s, v_s, v + T @ v_s])
+        canonical = np.concatenate([q_s, z + T @ q_s, system.M_hand @ v_s, M @ v + G @ v_s])
+        return [absolute, canonical, np.concatenate([z, v])]
+
+    exact = views(z, v, snapshots.q_s, snapshots.v_s)
+    for coordinates, frame, fixed in KINDS:
+        large = symplectic_basis(layout, 5, frame, fixed, coordinates)
+        rom = reduced(model, leading(large, 3))
+        small = rom.at()
+        largest = rom if whole else reduced(model, large)
+        comparison = Comparison(largest, largest.at(), system, snapshots, energy)
+        own = run(small, dt, force_of(model), allow_unstable=True)
+        errors = comparison.errors(rom, small, own)
+        q_s, v_s = own.q_s[::3].T, own.v_s[::3].T
+        z_r, v_r = (gather_rows(layout, part) for part in rom.reconstruct(small, own.x[::3].T, v_s))
+        found = (errors.error, errors.error_canonical, errors.error_deformation)
+        for mine, X, X_r in zip(found, exact, views(z_r, v_r, q_s, v_s), strict=True):
+            assert mine == pytest.approx(norm(X_r - X) / norm(X), rel=1e-10)  # sums in another order
+        peak = np.abs(small.energy(own.x[::3]) - energy).max() / energy.max()
+        assert errors.error_energy == pytest.approx(peak, rel=1e-12)  # the same products
+        # everything that the model can show
+        eye = np.eye(small.N)
+        shown = views(*(gather_rows(layout, part) for part in rom.reconstruct(small, eye)),
+                      small.operators.S_q, small.operators.S_v)  # fmt: skip
+        for view, mine, X, V in zip(("velocities", "momenta"), found, exact, shown, strict=False):
+            floor = norm(X - V @ scipy.linalg.lstsq(V, X)[0]) / norm(X)
+            assert comparison.floor(view, rom, small) == pytest.approx(floor, rel=1e-8)  # least squares, condition 1e4
+            assert mine > floor
+
+
+def test_a_model_outside_the_family_is_refused(comm: MPI.Intracomm) -> None:
+    model = model_of(comm)
+    snapshots = simulate(model).snapshots
+    basis = symplectic_basis(model.system.layout, 3, "relative", True)
+    rom, other = reduced(model, basis), reduced(model, replace(basis, V_q=basis.V_p, V_p=basis.V_q))
+    comparison = Comparison(rom, rom.at(), model.system, snapshots, full_energy(model.system, snapshots))
+    with pytest.raises(ModelError, match="shows more"):
+        comparison.floor("deformation", other, other.at())
+
+
+def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
+    model = model_of(comm, DAMPED)
+    snapshots: Any = simulate(model).snapshots
+    rom = reduced(model, whole_basis(model.system.layout, "qp", "absolute", True))
+    small = rom.at()
+    errors = trajectory_errors(rom, small, run(small, step_of(model), force_of(model)), model.system, snapshots)
+    # rounding of 30 steps in other coordinates
+    assert max(errors.error, errors.error_canonical, errors.error_deformation, errors.error_energy) < 1e-9
+    comparison = Comparison(rom, small, model.system, snapshots, full_energy(model.system, snapshots))
+    assert comparison.floor("velocities", rom, small) < 1e-13  # the whole space leaves rounding
+    with pytest.raises(ModelError, match="reach step 30"):
+        comparison.errors(rom, small, run(small, 0.1, np.zeros((5, 2))))

@@ -1,0 +1,50 @@
+"""The benchmark behind the size switches: its rows, its constants and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+from typer.testing import CliRunner
+
+import softgrasp.lqr.lowrank.modal_start
+import softgrasp.reduction.online
+from softgrasp.study.bench import switches as bench_switches
+from softgrasp.study.bench.switches import Row, app, start, table_of
+
+
+@pytest.mark.serial
+def test_rows_compare_two_methods_and_leave_the_constants_alone(comm: MPI.Intracomm) -> None:
+    before = softgrasp.lqr.lowrank.modal_start.FEW_MODES, softgrasp.reduction.online.TOGETHER
+    rows = list(start(comm, 1, False))
+    assert [row.setting for row in rows] == [f"2D, {k} modes" for k in (15, 16, 30, 60)]
+    assert all(row.first > 0 and row.second > 0 and row.ranks == 1 for row in rows)
+    assert rows[0].limit == f"FEW_MODES = {before[0]}"
+    assert before == (softgrasp.lqr.lowrank.modal_start.FEW_MODES, softgrasp.reduction.online.TOGETHER)
+    assert table_of(rows).row_count == 4
+
+
+@pytest.mark.serial
+def test_command_writes_what_the_workers_measured(
+    comm: MPI.Intracomm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Row("batch", "TOGETHER = 1 MB", "3 models", 1, 2.0, 3.0)
+    found = {1: {"rows": [vars(made)]}, 2: {"error": "exit status 1: no more"}}
+    monkeypatch.setattr(bench_switches, "launch_worker", lambda module, spec, ranks, limit: found[ranks])
+    for name in bench_switches.IN_MPI_JOB:
+        monkeypatch.delenv(name, raising=False)
+    runner = CliRunner()
+    good = runner.invoke(app, ["--switches", "batch", "--ranks", "1", "--out", str(tmp_path)])
+    assert good.exit_code == 0, good.output
+    assert "1.50" in good.output
+    assert json.loads((tmp_path / "bench_switches.json").read_text())["rows"] == [vars(made)]
+    assert (tmp_path / "bench_switches.csv").read_text().splitlines()[1].endswith("3 models,1,2.0,3.0")
+    bad = runner.invoke(app, ["--switches", "batch,shift", "--out", str(tmp_path)])
+    assert bad.exit_code == 1
+    assert "shift, 2 rank(s): exit status 1: no more" in bad.output
+    assert "batch, 2 rank(s)" not in bad.output  # on one rank only
+    wrong = runner.invoke(app, ["--switches", "btach", "--out", str(tmp_path)])
+    assert wrong.exit_code == 2
+    assert "'btach' is no switch" in wrong.output

@@ -1,0 +1,279 @@
+"""``softgrasp control`` on small scenes: numbers against identities and a plain loop, files, refusals, marks."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.helpers.models import make_scene
+from mpi4py import MPI
+from rich.console import Console
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.loop.controller import Controller, load_gain
+from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.study.shell.session import plain
+from softgrasp.study.control.run import run_control, with_control
+from softgrasp.study.control.plots import drawn, figure_reduced, unstable
+from softgrasp.study.control.sweep import SweptBasis
+from softgrasp.study.control.page import settled
+from softgrasp.study.control.solve import scene_words
+from tests.helpers.browser import look
+
+SCENES = Path(__file__).parents[3] / "demos" / "scenes"
+SMALL = ["tissue.cells=[4,8]", "control.N=[4,8,12]", "output.fields='none'", "reduction.lambda_range=[50.0,50.0]"]
+KEYS = {
+    "states", "rank", "newton_steps", "adi_steps", "residual", "optimal_cost", "gain_translation",
+    "gain_rigid_velocity", "closed_loop_abscissa", "reduced", "time",
+}  # fmt: skip
+POINT = {"N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are"}
+
+
+def common(folder: Path) -> Path:
+    return Path(MPI.COMM_WORLD.bcast(str(folder)))
+
+
+@cache
+def ran(folder: Path, method: str) -> tuple[dict[str, Any], str]:
+    text = io.StringIO()
+    console = Console(file=text, width=160, quiet=MPI.COMM_WORLD.rank != 0)
+    overrides = [*SMALL, f"control.method='{method}'"]
+    run_control(SCENES / "paper_lqr.toml", folder, overrides, console, quiet=True, pictures=False)
+    return json.loads((folder / "result.json").read_text()), text.getvalue()
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return common(tmp_path_factory.mktemp("control"))
+
+
+@pytest.fixture(scope="module")
+def result(out: Path) -> dict[str, Any]:
+    return ran(out, "newton-adi")[0]
+
+
+def test_result_holds_what_design_names(result: dict[str, Any], out: Path) -> None:
+    assert result.keys() >= KEYS
+    assert result["time"]["are"] > 0
+    assert result["states"] == 160
+    assert result["rank"] > 20
+    assert result["newton_steps"] >= 1
+    assert result["adi_steps"] >= 10
+    assert result["residual"] <= 1e-10  # the tolerance of the scene
+    assert result["reduced"].keys() == {
+        "pod", "weighted_pod", "pod_fixed_solid", "componentwise_pod", "pod_decomposed", "structured",
+    }  # fmt: skip
+    for points in result["reduced"].values():
+        assert [p["N"] for p in points] == [4, 8, 12]
+        assert all(p.keys() >= POINT for p in points)
+
+
+def test_gains_and_cost_agree_with_the_exact_identities(result: dict[str, Any]) -> None:
+    """K_T'K_T = Q = I for every mesh, and the cost of a rigid displacement d is d'K_T'K_V d."""
+    K_T, K_V = np.array(result["gain_translation"]), np.array(result["gain_rigid_velocity"])
+    assert np.abs(K_T.T @ K_T - np.eye(2)).max() < 1e-9  # the residual of the solution
+    d = np.array([5.0, 3.0])
+    assert result["optimal_cost"] == pytest.approx(d @ K_T.T @ K_V @ d, rel=1e-9)  # the residual of the solution
+    assert result["closed_loop_abscissa"] < 0
+
+
+def test_the_loop_costs_what_the_riccati_equation_says(result: dict[str, Any]) -> None:
+    loop = result["loop"]
+    assert loop["cost"] + loop["cost_to_come"] == pytest.approx(result["optimal_cost"], rel=1e-9)  # midpoint: exact
+    assert loop["distance_first"] == pytest.approx(np.hypot(5, 3))
+    assert loop["distance_final"] < 5 * np.exp(300 * result["closed_loop_abscissa"]) * loop["distance_first"]
+    assert 0 < loop["settled"] < 60
+    for run in loop["reduced"]:
+        assert not run["reason"]
+        assert run["distance_final"] < 0.05, run  # every gain marked stable reaches the target in T = 300
+        assert run["cost"] >= loop["cost"] * (1 - 1e-4)  # no gain beats the optimal one but for the cost to come
+
+
+class _StopError(Exception):
+    pass
+
+
+def test_an_interrupted_run_goes_on(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, result: dict[str, Any]
+) -> None:
+    """Stopped after 30 solves, the second call starts at 26 and ends with the gain of an undisturbed run."""
+    folder, solves = common(tmp_path_factory.mktemp("restart")), []
+
+    def bar(stop: float) -> Any:
+        def note(entry: dict[str, float]) -> None:
+            solves.append(entry["solve"])
+            if entry["solve"] == stop:
+                raise _StopError
+
+        return lambda *_: note
+
+    def run() -> str:
+        text = io.StringIO()
+        overrides = [*SMALL, "control.method='newton-adi'", "control.N=[4]"]
+        run_control(SCENES / "paper_lqr.toml", folder, overrides, Console(file=text, width=200), pictures=False)
+        return text.getvalue()
+
+    monkeypatch.setattr("softgrasp.study.control.run.RESTART_STATES", 0)
+    monkeypatch.setattr("softgrasp.study.control.run.solver_bar", bar(30))
+    with pytest.raises(_StopError):
+        run()
+    assert len(list(folder.glob("restart-*/newton-rank*.npz"))) == MPI.COMM_WORLD.size
+    solves.clear()
+    monkeypatch.setattr("softgrasp.study.control.run.solver_bar", bar(-1))
+    assert "going on from" in run()
+    assert solves[0] == 26
+    assert not list(folder.glob("restart-*"))
+    again = json.loads((folder / "result.json").read_text())
+    assert again["solves"] == result["solves"]
+    assert np.abs(np.array(again["gain_translation"]) - result["gain_translation"]).max() < 1e-12  # the same solves
+
+
+def test_marks_follow_the_spectrum(result: dict[str, Any]) -> None:
+    for points in result["reduced"].values():
+        for p in points:
+            assert p["stable"] == (not p["reason"] and p["certified"] and p["abscissa_full"] < 0), p
+            assert (p["cost_excess"] is not None) == p["stable"], p
+    best = result["reduced"]["structured"][-1]
+    assert best["stable"]
+    assert best["error_K"] < 1e-4  # measured 5e-6
+    assert best["time_are"] < 0.05  # s; below 1 ms on a quiet machine
+
+
+def test_re_tuning_covers_the_box(result: dict[str, Any]) -> None:
+    tuned = {r["method"]: r for r in result["retune"]}
+    assert "structured" in tuned
+    assert len(tuned) == 2
+    mu = {p["mu"] for p in tuned["structured"]["points"]}
+    assert [min(mu), max(mu)] == pytest.approx([20.0, 500.0])
+    assert all(p["stable"] and p["cost_excess"] < 1e-3 for p in tuned["structured"]["points"])  # measured 4e-6
+
+
+@pytest.mark.serial
+def test_page_in_a_browser(result: dict[str, Any], out: Path) -> None:
+    assert look(out / "report.html", figures=0) == []
+
+
+def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
+    names = {"result.json", "trajectory.csv", "reduced.csv", "retune.csv", "scene.toml", "report.html"}
+    assert names <= {p.name for p in out.iterdir()}
+    table = list(csv.reader((out / "trajectory.csv").open()))
+    assert len(table) == 602
+    assert float(table[-1][1]) == pytest.approx(5.0, abs=1e-5)  # of 5 m after T = 300, 3e-7 is left
+    assert len(list(csv.reader((out / "reduced.csv").open()))) == 19
+    load_scene(out / "scene.toml", [])
+    controller = Controller.load(out / "controller.npz", result["scene_hash"])
+    assert controller.plant.N == result["controller"]["N"] == 12
+    u = controller.step(np.zeros(2), np.zeros(2))
+    assert np.linalg.norm(u) == pytest.approx(np.hypot(5, 3), rel=1e-4)  # |K_T d| = |d|, at the error of this gain
+    model = build(load_scene(SCENES / "paper_lqr.toml", SMALL), MPI.COMM_WORLD)
+    gain, target = load_gain(out / "gain.npz", model.system.layout)
+    assert np.allclose(gain.K_s[:, :2], result["gain_translation"], rtol=0, atol=1e-14)  # the same numbers
+    assert target.q_s.tolist() == [5.0, 3.0]
+
+
+def test_other_methods_find_the_same(result: dict[str, Any], tmp_path: Path) -> None:
+    other = ran(common(tmp_path), "dense")[0]
+    assert other["method"].startswith("dense")
+    assert other["optimal_cost"] == pytest.approx(result["optimal_cost"], rel=1e-8)  # two solvers at their residuals
+    # gain and poles of two residuals of 1e-10
+    assert np.allclose(other["gain_rigid_velocity"], result["gain_rigid_velocity"], rtol=0, atol=1e-9)
+    assert other["closed_loop_abscissa"] == pytest.approx(result["closed_loop_abscissa"], rel=1e-9)
+
+
+def refused(name: str, out: Path, *overrides: str) -> str:
+    console = Console(file=io.StringIO(), quiet=MPI.COMM_WORLD.rank != 0)
+    with pytest.raises(SoftgraspError) as caught:
+        run_control(SCENES / f"{name}.toml", out, [*SMALL, *overrides], console, quiet=True, pictures=False)
+    assert not out.exists()  # nothing half-written
+    return str(caught.value)
+
+
+def test_no_damping_is_diagnosed_and_modal_feedback_offered(tmp_path: Path) -> None:
+    out = common(tmp_path) / "out"
+    sentence = refused("paper_lqr_undamped", out)
+    assert "no damping" in sentence
+    assert "control.method = 'modal'" in sentence
+    overrides = [*SMALL, "control.method='modal'"]
+    console = Console(file=io.StringIO(), quiet=MPI.COMM_WORLD.rank != 0)
+    found = run_control(SCENES / "paper_lqr_undamped.toml", out, overrides, console, quiet=True, pictures=False)
+    assert not found["stable"]
+    assert found["reduced"] == {}
+    assert "stay on the imaginary axis" in found["method"]
+    assert found["loop"]["distance_final"] < 0.1  # the body arrives; its swings are not damped by anything
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("control.Q=[[0.0,0.0],[0.0,1.0]]", "not detectable"),
+        ("motion={profile='hold'}", "motion.target"),
+        ("motion.target=[0.0,0.0]", "motion.target"),
+        ("control.R=0.0", "control.R"),
+        ("control.outputs=[{kind='node', point=[9.0,9.0]}]", "outside"),
+        ("control.loop.sampling='held'", "rate"),
+        ("control.Q=[[1.0]]", "control.Q"),
+    ],
+)
+def test_wrong_scenes_get_a_sentence(tmp_path: Path, change: str, words: str) -> None:
+    assert words in refused("paper_lqr", common(tmp_path) / "out", change)
+
+
+def test_a_scene_without_control_watches_tip_and_turning_hand() -> None:
+    effects = {"damping": {"kind": "kelvin-voigt", "beta": 0.02}}
+    for turning, kinds in ((False, ["node"]), (True, ["node", "hand"])):
+        scene = make_scene(effects={**effects, "rotation": turning}, motion={"target": [1.0, 0.5]})
+        model, note = with_control(build(scene, MPI.COMM_WORLD))
+        assert "no [control] table" in note
+        control = model.scene.control
+        assert control is not None
+        assert [o.kind for o in control.outputs] == kinds
+        assert (control.Q, control.R) == (1.0, 1.0)
+        same, nothing = with_control(model)
+        assert same is model
+        assert not nothing
+
+
+def points(name: str, *values: tuple[int, float, float]) -> SweptBasis:
+    return SweptBasis(name, None, tuple(GainReport(name, N, e, e, e, a, 1e-3) for N, e, a in values))
+
+
+def test_large_errors_break_the_line_and_unstable_gains_are_marked() -> None:
+    basis = points("pod", (4, 0.5, -1.0), (6, 3.0, -1.0), (8, 0.2, 0.1), (10, 5.0, 0.1))
+    N, values = drawn(basis, "error_P")
+    assert N == [4, 6, 8, 10]
+    assert np.isnan(values).tolist() == [False, True, False, True]
+    assert unstable(basis, "error_P")[0] == [8, 10]
+    best = basis.best()
+    assert best is not None
+    assert best.N == 4  # the least cost among the stable ones; N = 8 is nearer but unstable
+    assert basis.best(3) is None
+
+
+@pytest.mark.serial
+def test_figure_of_the_errors(tmp_path: Path) -> None:
+    swept = (points("pod", (4, 0.5, -1.0), (6, 30.0, 0.1)), points("structured", (4, 1e-3, -1.0), (6, 1e-5, -1.0)))
+    png, pdf = figure_reduced(swept, tmp_path / "errors.png")
+    assert png.stat().st_size > 10_000
+    assert pdf.stat().st_size > 5_000
+
+
+def test_small_helpers() -> None:
+    t = np.arange(5.0)
+    assert settled(t, np.array([1.0, 0.5, 0.005, 0.02, 0.001])) == 4.0
+    assert settled(t, np.array([1.0, 0.5, 0.005, 0.001, 0.02])) is None
+    assert plain({"a": [np.float64(np.nan), np.inf, 1.0, np.int64(2)], "b": True}) == {
+        "a": [None, None, 1.0, 2],
+        "b": True,
+    }
+    assert scene_words("use the method modal_lqr, which x") == "use control.method = 'modal', which x"
+    assert issubclass(ControlError, SoftgraspError)
+    assert issubclass(SceneError, SoftgraspError)

@@ -1,0 +1,382 @@
+"""effects judges scenes that are set wrong, counts what an effect adds, and proves that off is free."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.helpers.browser import find_chromium, look
+from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
+from mpi4py import MPI
+from rich.console import Console
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.effects import EFFECTS
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.study.effects import measure as effects_measure
+from softgrasp.study.effects.run import EffectsStudy, Finding, run_effects, show, study_effects
+from softgrasp.study.effects.judge import judge, prove_off
+from softgrasp.study.effects.measure import (
+    Case,
+    Stepper,
+    bare_output,
+    compare,
+    fingerprint,
+    holdings,
+    nothing_of,
+    objects_of,
+)
+from softgrasp.study.effects.objects import counting, difference, read_table
+from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
+
+QUICK = {"study": {"repeats": 1}, "time": {"steps": 20}}
+CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}}
+FORCE = {"motion": {"drive": "force"}}
+SCALES = Scales(2, 2.0, (0.5,), 4.0)
+ALL_ON = {
+    "gravity": {"g": [0.0, -1.0]},
+    "damping": {"kind": "kelvin-voigt", "beta": 0.01},
+    "reaction": True,
+    "rotation": True,
+}
+
+
+@pytest.fixture(autouse=True)
+def _short_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test looks at a time, so a few steps are enough."""
+    monkeypatch.setattr(effects_measure, "BURST_SECONDS", 1e-4)
+    monkeypatch.setattr(effects_measure, "BURSTS", 1)
+
+
+def found(comm: MPI.Intracomm, *changes: dict[str, Any], **tables: Any) -> tuple[EffectsStudy, dict[str, Finding]]:
+    study = study_effects(make_scene(QUICK, *changes, **tables), comm)
+    return study, {f.name: f for f in study.findings}
+
+
+def measured(model: Any) -> Case:
+    stepper = Stepper(model)
+    case = Case(model, {"step": [1.0]}, fingerprint(model, stepper.run), holdings(model, stepper.run), stepper.flops())
+    stepper.destroy()
+    case.objects, case.objects_in_steps = objects_of(model.system.layout.comm, model.scene)
+    return case
+
+
+# --- scenes that are set wrong
+
+
+def test_damping_without_effect_is_wasted(comm: MPI.Intracomm) -> None:
+    _, by = found(comm, effects={"damping": {"kind": "kelvin-voigt", "beta": 1e-9}})
+    damping = by["damping"]
+    assert damping.on
+    assert damping.change is not None
+    assert 0 < damping.change.outputs < 1e-6  # beta is 1e-9 of a second, periods are longer than 1e-2
+    assert damping.verdict == "wasted"
+    assert damping.advice.startswith("Switch it off")
+    assert not damping.gate.gate.matters
+
+
+def test_gravity_that_matters_but_is_off_is_needed(comm: MPI.Intracomm) -> None:
+    study, by = found(comm)
+    gravity = by["gravity"]
+    assert not gravity.on
+    assert gravity.verdict == "needed"
+    assert gravity.advice.startswith("Switch it on")
+    assert "gravity" in study.explanation.missing
+    # heavy only because it is soft: of steel it would not show
+    _, hard = found(comm, tissue={"material": {"young": 2e11, "poisson": 0.3, "rho": 7850.0}}, time={"steps": 5})
+    assert hard["gravity"].verdict == "optional"
+    assert hard["gravity"].advice.startswith("Rightly off")
+
+
+def test_p1_near_incompressibility_is_repeated_in_the_report(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    scene = make_scene(QUICK, tissue={"material": {"young": 125.0, "poisson": 0.499, "rho": 1.0}}, time={"steps": 5})
+    file = write_scene(comm, mpi_tmp_path, scene)
+    result = run_effects(file, mpi_tmp_path / "out", ["study.tolerance=1e-2"], Console(quiet=True), quiet=True)
+    (warning,) = [text for text in result["warnings"] if "P1 locks" in text]
+    if comm.rank == 0:
+        assert warning in (mpi_tmp_path / "out" / "report.html").read_text()
+    assert result["tolerance"] == 1e-2
+    measured = result["elements"]
+    assert measured["needed"]
+    assert measured["advice"] in result["warnings"]
+
+
+def test_locking_is_measured_and_not_only_suspected(comm: MPI.Intracomm) -> None:
+    """The sag of a held block: what P2 changes is what two runs with outputs at one node differ by."""
+    hold = {"motion": {"profile": "hold", "target": None}, "effects": {"gravity": {"g": [0.0, -1.0]}}}
+    start = {"time": {"start": "equilibrium", "steps": 3}}
+    soft = {"tissue": {"material": {"young": 125.0, "poisson": 0.499, "rho": 1.0}}}
+    assert study_effects(make_scene(QUICK, hold, start), comm).elements is None  # nu = 1/4
+    elements = study_effects(make_scene(QUICK, hold, start, soft), comm).elements
+    assert elements is not None
+    point = make_outputs(make_scene(), build(make_scene(), comm).system)[0].point
+    at = {"control": {"outputs": [{"kind": "node", "point": list(point)}]}}
+    a, b = (
+        simulate(build(make_scene(QUICK, hold, start, soft, at, {"tissue": {"order": n}}), comm)).outputs[0]
+        for n in (1, 2)
+    )
+    expected = np.linalg.norm(a - b) / max(np.linalg.norm(a), np.linalg.norm(b))
+    assert elements.change.outputs == pytest.approx(expected, rel=1e-6)  # three steps of rest
+    assert np.linalg.norm(a) < 0.6 * np.linalg.norm(b)  # P1 is far too stiff
+    assert elements.needed
+    assert elements.unknowns > 3  # nodes on every edge
+
+
+def test_reaction_is_felt_only_when_a_force_moves_the_hand(comm: MPI.Intracomm) -> None:
+    _, by = found(comm, time={"steps": 20})
+    assert by["reaction"].change is not None
+    assert by["reaction"].change.outputs == 0
+    assert by["reaction"].control is None
+    assert by["reaction"].verdict == "optional"  # nothing to gain, nothing to pay
+    _, by = found(comm, CONTROL)
+    assert by["reaction"].verdict == "optional"
+    assert by["reaction"].control is not None
+    assert by["reaction"].control == pytest.approx(0.1, rel=0.2)  # tissue over hand mass is 2 / 20
+    assert "for control alone" in by["reaction"].advice
+    _, by = found(comm, FORCE, CONTROL)
+    assert by["reaction"].verdict == "needed"
+    assert by["reaction"].cost is not None
+    assert "step.Y" in by["reaction"].cost.holds
+
+
+@pytest.mark.serial
+def test_damping_for_control_is_not_called_wasted(comm: MPI.Intracomm) -> None:
+    damped = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}, "study": {"tolerance": 0.5}}
+    assert found(comm, damped)[1]["damping"].verdict == "wasted"
+    finding = found(comm, damped, CONTROL)[1]["damping"]
+    assert finding.verdict == "optional"
+    assert "stabilises" in finding.advice
+
+
+# --- numbers against independent ones
+
+
+def test_change_is_what_two_runs_differ_by(comm: MPI.Intracomm) -> None:
+    _, by = found(comm, CONTROL, effects={"gravity": {"g": [0.0, -3.0]}})
+    with_, without = (
+        simulate(build(make_scene(QUICK, CONTROL, effects={"gravity": g}), comm)) for g in ({"g": [0.0, -3.0]}, False)
+    )
+    difference = np.linalg.norm(with_.outputs - without.outputs, axis=1).max()
+    scale = max(np.linalg.norm(run.outputs, axis=1).max() for run in (with_, without))
+    change = by["gravity"].change
+    assert change is not None
+    assert change.outputs == pytest.approx(difference / scale, rel=1e-9)  # parallel sums in another order
+    assert change.absolute == pytest.approx(difference, rel=1e-9)  # as above
+    assert change.deformation > change.outputs  # the rigid move hides it
+
+
+@pytest.mark.serial
+def test_strength_below_which_gravity_does_not_show(comm: MPI.Intracomm) -> None:
+    """The change is proportional to g: at the g that the advice names it is the tolerance."""
+    _, by = found(comm, CONTROL)
+    gravity = by["gravity"]
+    named = float(gravity.advice.split("below about ")[1].split(" m/s2")[0])
+    start = {"time": {"start": "equilibrium"}}
+    _, again = found(comm, CONTROL, start, effects={"gravity": {"g": [0.0, -named]}})
+    change = again["gravity"].change
+    assert change is not None
+    # two digits are printed; the scale of the outputs changes with g
+    assert change.outputs == pytest.approx(1e-3, rel=0.08)
+
+
+def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None:
+    outputs = {"control": {"outputs": [{"kind": "hand"}, {"kind": "node", "point": [0.5, 0.0]}]}}
+    plain = build(make_scene(outputs), comm)
+    turning = build(make_scene(outputs, effects={"rotation": True}, motion={"target": [5.0, 3.0, 0.3]}), comm)
+    a, b = simulate(plain), simulate(turning)
+    assert b.outputs.shape[1] == a.outputs.shape[1] + 1
+    node = np.linalg.norm(b.outputs[:, 3:] - a.outputs[:, 2:], axis=1).max()
+    assert node > 0.1  # [m]; the turn moves the tip
+    assert compare(plain, a, turning, b).absolute == pytest.approx(node, rel=1e-12)  # the same sums
+
+
+def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:
+    """A run taken back to its start gives the state of a fresh one."""
+    model = build(make_scene(effects=ALL_ON, motion={"drive": "force"}), comm)
+    stepper = Stepper(model)
+    stepper.seconds_per_step(2 * 60 + 17)
+    stepper.rewind()
+    stepper.run.advance_to(stepper.ts, 60)
+    layout = model.system.layout
+    end, fresh = gather_states(layout, stepper.run.state.array), gather_states(layout, simulate(model).final)
+    np.testing.assert_allclose(end, fresh, rtol=0, atol=1e-11 * np.abs(fresh).max())  # sixty steps of rounding
+    stepper.destroy()
+
+
+def test_memory_counts_what_each_effect_holds(comm: MPI.Intracomm) -> None:
+    bare = measured(build(make_scene(), comm))
+    n_e = bare.model.system.layout.n_e
+    for effects, tables, new in (
+        ({"damping": {"kind": "kelvin-voigt", "beta": 0.01}}, {}, {"step.k_old": 8 * n_e}),
+        ({"reaction": True}, FORCE, {"step.Y": 16 * n_e}),
+    ):
+        case = measured(build(make_scene(tables, effects=effects), comm))
+        # on ranks that all step the whole tissue, each holds it
+        assert [case.bytes[name] / size for name, size in new.items()] in ([1], [comm.size])
+        assert not set(new) & set(bare.bytes)
+    entries = bare.model.system.K_ee.getInfo()["nz_used"]
+    assert bare.bytes["K_ee"] >= 12 * entries
+    assert bare.bytes["G"] == 16 * n_e
+
+
+def test_judge() -> None:
+    assert judge(2e-3, False, False, 1e-3) == "needed"
+    assert judge(2e-3, True, True, 1e-3) == "needed"
+    assert judge(1e-3, False, True, 1e-3) == "wasted"
+    assert judge(0.0, True, True, 1e-3) == "optional"
+    assert judge(0.0, False, False, 1e-3) == "optional"
+
+
+# --- off is free, and the proof can fail
+
+
+def test_every_effect_that_is_off_is_shown_to_be_free(comm: MPI.Intracomm) -> None:
+    for tables in (CONTROL | FORCE, {"effects": {"damping": ALL_ON["damping"]}}):
+        _, by = found(comm, tables)
+        off = {name for name, effect in EFFECTS.items() if not effect.active(make_scene(tables))}
+        assert {name for name, f in by.items() if f.proof is not None} == off
+        for name in off:
+            proof = by[name].proof
+            assert proof is not None
+            counted = dataclasses.asdict(proof)
+            for key in ("same_operators", "absent", "same_objects", "same_allocations", "declared", "same_work"):
+                assert counted[key], (name, key)
+            assert proof.zero_strength in ({True} if name in ("gravity", "damping") else {None})
+
+
+def test_objects_are_counted_by_petsc_itself(comm: MPI.Intracomm) -> None:
+    """The log sees exactly what is made, and what an effect that is on makes more; steps make nothing."""
+    with counting(comm) as made:
+        vectors = [PETSc.Vec().createMPI(4, comm=comm) for _ in range(3)]
+        matrix = PETSc.Mat().createAIJ((4, 4), nnz=1, comm=comm)
+    for thing in (*vectors, matrix):
+        thing.destroy()
+    assert made["Matrix"] == (1 if comm.size == 1 else 3)  # its diagonal and its other block
+    assert made["Vector"] == 3
+    bare, in_steps = objects_of(comm, bare_output(make_scene()))
+    assert in_steps == {}
+    assert bare["Matrix"] >= 6  # three parts, M, K and S
+    damped, in_steps = objects_of(comm, bare_output(make_scene(effects={"damping": ALL_ON["damping"]})))
+    assert in_steps == {}
+    assert difference(damped, bare) == {"Vector": 1}  # K z of the last step
+    for effects in ({"gravity": {"g": [0.0, 0.0]}}, {"gravity": ALL_ON["gravity"]}, {"reaction": True}):
+        assert objects_of(comm, bare_output(make_scene(effects=effects)))[0] == bare, effects
+
+
+def test_table_of_petsc_is_read_over_all_stages() -> None:
+    text = (
+        "Object Type          Creations   Destructions.\n\n--- Event Stage 0: Main Stage\n\n"
+        "   Index Set    24             24\n      Vector    82             80\n"
+        "--- Event Stage 1: other\n\n      Vector     2              2\n      Viewer     1              0\n======\n"
+        "   Average    1      2\n"
+    )
+    assert read_table(text) == {"Index Set": 24, "Vector": 84}
+
+
+def test_proof_sees_every_effect_that_is_on(comm: MPI.Intracomm) -> None:
+    """Each part of the proof fails for a scene in which the effect is on after all."""
+    bare = measured(build(make_scene(FORCE), comm))
+    for name in ("gravity", "damping", "reaction", "rotation", "layers"):
+        tables: dict[str, Any] = {"effects": {name: ALL_ON[name]}} if name in ALL_ON else {"tissue": {"layers": {}}}
+        if name == "layers":
+            tables = {"tissue": {"layers": {"core": LAYERS["core"]}}}
+        on = measured(build(make_scene(FORCE, tables), comm))
+        assert nothing_of(name, bare)
+        assert not nothing_of(name, on), name
+        proof = prove_off(name, bare, on)
+        assert not proof.holds, name
+        assert not (proof.same_operators and proof.same_allocations and proof.same_work), name
+    slow = dataclasses.replace(bare, seconds={"step": [1.5]})
+    assert not prove_off("reaction", bare, slow).within_noise
+    assert prove_off("reaction", bare, bare).holds
+
+
+# --- scenes switched the other way
+
+
+def test_trial_values_are_those_that_are_stated(comm: MPI.Intracomm) -> None:
+    by = {s.name: s for s in switches(make_scene(), SCALES)}
+    assert not any(s.on for s in by.values())
+    assert by["gravity"].other.effects.gravity.g == [0.0, -9.81]
+    assert by["gravity"].other.time.start == "equilibrium"
+    assert by["damping"].other.effects.damping.beta * 4.0 / 2 == pytest.approx(TRIAL_ZETA)  # zeta = beta omega / 2
+    assert by["reaction"].other.effects.reaction
+    assert by["rotation"].other.hand.inertia == 3.0  # given, though rotation is off
+    assert by["rotation"].other.motion.target == [5.0, 3.0, 0.0]
+    assert by["layers"].other is None
+    unknown = make_scene(hand={"inertia": None})
+    (rotation,) = [s for s in switches(unknown, SCALES) if s.name == "rotation"]
+    assert rotation.other.hand.inertia == pytest.approx(20.0 * 0.5 / 2.0)
+    (damping,) = [s for s in switches(make_scene(), Scales(2, 2.0, (0.5,), None)) if s.name == "damping"]
+    assert damping.other is None
+    assert "frequency" in damping.reason
+
+
+def test_switched_off_leaves_a_valid_scene(comm: MPI.Intracomm) -> None:
+    R = np.diag([1.0, 2.0, 3.0]).tolist()
+    scene = make_scene(
+        CONTROL,
+        tissue={"layers": LAYERS},
+        effects=ALL_ON,
+        time={"start": "equilibrium"},
+        motion={"target": [5.0, 3.0, 0.2]},
+        control={"R": R},
+    )
+    by = {s.name: s for s in switches(scene, SCALES)}
+    assert all(s.on for s in by.values())
+    for name, s in by.items():
+        assert not EFFECTS[name].active(s.other)
+        others = [e for key, e in EFFECTS.items() if key != name]
+        assert all(e.active(s.other) for e in others)
+        assert neutral(s.other, name, 2) is None or EFFECTS[name].active(neutral(s.other, name, 2))
+    assert by["rotation"].other.control.R == [[1.0, 0.0], [0.0, 2.0]]
+    assert by["damping"].other.tissue.layers["low"].beta is None
+    again = changed(by["rotation"].other, lambda table: None)
+    assert again == by["rotation"].other
+
+
+# --- files
+
+
+def test_command_writes_every_file(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    scene = make_scene(QUICK, CONTROL, tissue={"layers": LAYERS}, effects={"damping": ALL_ON["damping"]})
+    file, out = write_scene(comm, mpi_tmp_path, scene), mpi_tmp_path / "out"
+    text = io.StringIO()
+    console = Console(file=text, width=78, quiet=comm.rank != 0)
+    result = run_effects(file, out, ["time.steps=20"], console, quiet=True)
+    assert set(result["effects"]) == set(EFFECTS)
+    assert result["ranks"] == comm.size
+    if comm.rank == 0:
+        assert json.loads((out / "result.json").read_text()) == json.loads(json.dumps(result))
+        rows = list(csv.DictReader((out / "effects.csv").open()))
+        assert [row["effect"] for row in rows] == list(EFFECTS)
+        assert [row["verdict"] for row in rows] == [e["verdict"] for e in result["effects"].values()]
+        assert float(rows[0]["change_outputs"]) == result["effects"]["gravity"]["change"]["outputs"]
+        page = (out / "report.html").read_text()
+        assert "data:image/png;base64" in page
+        if comm.size == 1 and find_chromium():
+            assert look(out / "report.html", figures=1) == []
+        assert "block.toml --set time.steps=20" in page.replace("&#39;", "'")
+        for name in ("effects.png", "effects.pdf"):
+            assert (out / name).stat().st_size > 5000
+        assert all(name in text.getvalue() for name in EFFECTS)
+        assert max(map(len, text.getvalue().split("files:")[0].splitlines())) <= 78
+
+
+def test_show_says_what_a_proof_misses(comm: MPI.Intracomm) -> None:
+    study, _ = found(comm, time={"steps": 3})
+    broken = tuple(
+        dataclasses.replace(f, proof=f.proof and dataclasses.replace(f.proof, same_work=False)) for f in study.findings
+    )
+    text = io.StringIO()
+    show(dataclasses.replace(study, findings=broken), Console(file=text, width=100))
+    assert "not shown: same work" in text.getvalue()
+    assert not dataclasses.replace(study, findings=broken).to_dict()["off_is_free"]

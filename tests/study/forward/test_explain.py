@@ -1,0 +1,235 @@
+"""explain tells exactly the terms of the scene, its sizes, and what deserves a look."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from rich.console import Console
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.run.midpoint import midpoint_matrix
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.solvers import choose_solver, make_solver
+from softgrasp.study.forward.cautions import gradients, inexact, run_warnings, slowest
+from softgrasp.study.report.equation import equation
+from softgrasp.study.forward.explain import Explanation, explain, factor_bytes, render, run_explain
+
+FORCE = {"target": [1.0, 0.0], "drive": "force"}
+RAYLEIGH = {"kind": "rayleigh", "alpha": 0.1, "beta": 0.01}
+
+
+def scene_of(order: int = 1, material: dict[str, float] | None = None, **parts: Any) -> Scene:
+    data: dict[str, Any] = {
+        "name": "told",
+        "tissue": {
+            "size": [1.0, 2.0],
+            "cells": [4, 8],
+            "order": order,
+            "material": material or {"lambda": 50.0, "mu": 50.0, "rho": 1.0},
+        },
+        "contact": {"sides": ["left", "right"], "box": [[0.0, 1.5], [1.0, 2.0]]},
+        "motion": {"target": [1.0, 0.0], "duration": 2.0},
+        "time": {"steps": 100},
+    }
+    return Scene.model_validate(data | parts)
+
+
+def stepped(scene: Scene) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
+    return {name: (left, right) for name, left, right in equation(scene).stepped}
+
+
+def blocks(scene: Scene) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
+    return {name: (left, right) for name, left, right in equation(scene).blocks}
+
+
+def test_bare_scene() -> None:
+    scene = scene_of()
+    rows = stepped(scene)
+    assert rows["tissue"] == (("M_ee z''", "K_ee z"), ("-G q_s''",))
+    assert rows["hand"][0] == ("q_s",)
+    assert blocks(scene) == {
+        "hand": (("M_ss q_s''",), ("u",)),
+        "tissue": (("M_es q_s''", "M_ee q_e''", "K_es q_s", "K_ee q_e"), ("0",)),
+    }
+    text = " ".join(equation(scene).where)
+    assert "one-way" in text
+    assert not any(word in text for word in ("D_ee", "f_e", "angles", "layers", "two-way"))
+
+
+def test_gravity_and_damping_add_their_terms_only() -> None:
+    gravity = scene_of(effects={"gravity": {"g": [0.0, -1.0]}})
+    assert stepped(gravity)["tissue"] == (("M_ee z''", "K_ee z"), ("-G (q_s'' - g)",))
+    assert blocks(gravity)["tissue"][1] == ("f_e",)
+    damped = scene_of(effects={"damping": RAYLEIGH})
+    assert stepped(damped)["tissue"] == (("M_ee z''", "D_ee z'", "K_ee z"), ("-G q_s''",))
+    dragged = scene_of(effects={"damping": RAYLEIGH | {"drag": "space"}})
+    assert stepped(dragged)["tissue"][1] == ("-G q_s''", "- alpha G q_s'")
+
+
+def test_force_and_two_way() -> None:
+    free = scene_of(motion=FORCE, effects={"gravity": {"g": [0.0, -1.0], "hand_weight": True}})
+    assert stepped(free)["hand"] == (("M_hand q_s''",), ("u(t)", "M_hand g"))
+    two_way = scene_of(motion=FORCE, effects={"reaction": True})
+    assert stepped(two_way)["hand"] == (("M_hand q_s''", "M_r q_s''", "G' z''"), ("u(t)",))
+    assert blocks(two_way)["hand"] == (("M_ss q_s''", "M_se q_e''", "K_ss q_s", "K_se q_e"), ("u",))
+    assert "two-way" in " ".join(equation(two_way).where)
+    dragged = scene_of(
+        motion=FORCE,
+        effects={"reaction": True, "gravity": {"g": [0.0, -1.0]}, "damping": RAYLEIGH | {"drag": "space"}},
+    )
+    assert stepped(dragged)["hand"][0] == (
+        "M_hand q_s''", "M_r (q_s'' - g)", "G' z''", "alpha M_r q_s'", "alpha G' z'",
+    )  # fmt: skip
+    held = stepped(scene_of(effects={"reaction": True}))
+    assert held["force it takes"][0] == ("u",), "a prescribed motion leaves the force to be told"
+
+
+def test_paper_sizes(comm: MPI.Intracomm) -> None:
+    data = scene_of().model_dump(by_alias=True)
+    tissue = {"size": [1.0, 2.0], "cells": [15, 30], "material": data["tissue"]["material"]}
+    scene = scene_of().model_validate(data | {"tissue": tissue})
+    result = explain(scene, comm)
+    assert (result.sizes.n_s, result.sizes.n_e, result.sizes.states) == (2, 956, 1916)
+    assert (result.sizes.cells, result.sizes.nodes) == (2 * 15 * 30, 16 * 31)
+    assert result.snapshot_bytes == 101 * 2 * 956 * 8
+    assert result.time.dt == 0.02
+    omega = np.array(result.time.omega)
+    np.testing.assert_array_equal(result.time.omega_dt, omega * 0.02)
+    np.testing.assert_array_equal(result.time.periods, 2 * np.pi / omega)
+    assert result.effects["reaction"].gate.number == pytest.approx(0.1, rel=1e-13)  # mass of 900 cells, summed
+
+
+@pytest.mark.parametrize(("order", "locks"), [(1, True), (2, False)])
+def test_locking(comm: MPI.Intracomm, order: int, locks: bool) -> None:
+    material = {"young": 100.0, "poisson": 0.499, "rho": 1.0}
+    result = explain(scene_of(order, material), comm)
+    assert result.poisson["tissue"] == pytest.approx(0.499, rel=1e-12)  # 1 - 2 nu loses three digits
+    assert any("P1 locks" in w and "tissue.order = 2" in w for w in result.warnings) == locks
+
+
+def test_no_locking_warning_at_049(comm: MPI.Intracomm) -> None:
+    result = explain(scene_of(1, {"young": 100.0, "poisson": 0.49, "rho": 1.0}), comm)
+    assert not any("locks" in w for w in result.warnings)
+
+
+def test_missing_idle_and_coarse(comm: MPI.Intracomm) -> None:
+    scene = scene_of(
+        hand={"mass": 1e6},
+        effects={"gravity": {"g": [0.0, -1e-6]}, "reaction": True},
+        control={"outputs": [{"kind": "hand"}]},
+        time={"steps": 2},
+    )
+    result = explain(scene, comm)
+    assert result.missing == ("damping",)
+    assert result.idle == ("gravity", "reaction")
+    assert any("steps" in w and "coarse" in w for w in result.warnings)
+
+
+def test_large_strain_and_angle(comm: MPI.Intracomm) -> None:
+    scene = scene_of(
+        hand={"inertia": 1.0},
+        effects={"gravity": {"g": [0.0, -20.0]}, "rotation": True},
+        motion={"target": [0.0, 0.0, -0.5]},
+    )
+    result = explain(scene, comm)
+    assert any("small strains" in w for w in result.warnings)
+    assert any("0.5 rad" in w and "12.5%" in w for w in result.warnings)
+
+
+def test_a_run_that_stores_nothing_warns_of_a_strain_seen_on_the_way(comm: MPI.Intracomm) -> None:
+    still = scene_of(motion={"target": [1e-3, 0.0]}, output={"snapshots": "none"})
+    model = build(still, comm)
+    run = simulate(model)
+    assert run.snapshots is None
+    assert run_warnings(model, run) == []
+    z = np.zeros(model.system.layout.n_local)
+    z[::2] = model.space.layout.nodes[:, 1] / 2  # sheared by a half
+    (found,) = run_warnings(model, run, (0.25, z))
+    assert "at t = 0.25 s, at most" in found
+
+
+def test_a_run_warns_of_what_explain_warns_of(comm: MPI.Intracomm) -> None:
+    few = scene_of(1, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, time={"steps": 6})
+    model = build(few, comm)
+    found = run_warnings(model, simulate(model))
+    told = explain(few, comm).warnings
+    assert told[0] in found  # locking, word by word
+    coarse, strained = (next(w for w in found if word in w) for word in ("coarse in time", "small strains"))
+    assert coarse.split(": use")[1] == next(w for w in told if "coarse" in w).split(": use")[1]  # as many steps
+    assert "of the body at t =" in strained
+    gentle = {"motion": {"target": [1e-3, 0.0], "duration": 2.0}, "time": {"steps": 400}}
+    model = build(scene_of(2, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, **gentle), comm)
+    assert run_warnings(model, simulate(model)) == []
+
+
+def test_slowest_period_and_gradient(comm: MPI.Intracomm) -> None:
+    model = build(scene_of(2, contact={"sides": ["top"]}), comm)
+    layout = model.system.layout
+    omega, Phi = lowest_modes(model.system, 3)
+    moving = Phi @ np.array([[1.0, 0.0, 0.0, -1.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]])
+    # three directions are left of four columns without their mean: all three modes; rounding in the eigenvalues
+    assert slowest(model.system, moving) == pytest.approx(omega[0], rel=1e-8)
+    assert slowest(model.system, np.repeat(Phi[:, :1], 4, axis=1)) == 0.0  # a deformation that does not move
+    z = 0.3 * (layout.nodes - [0.0, 2.0]) @ np.array([[0.0, 0.0], [1.0, 0.0]])  # shear, zero at the hand
+    most, share = gradients(model, z.ravel())
+    assert most == pytest.approx(0.3, rel=1e-12)  # linear, so exact but for rounding
+    assert share == 1.0
+    assert gradients(model, z.ravel() / 4)[1] == 0.0
+
+
+def test_digits_that_are_left() -> None:
+    assert inexact(1e-12, 1e-14, "cholesky", 0.3) == []
+    assert inexact(1e-5, 1e-14, "cg", 0.3) == []  # of cg the residual counts
+    assert "about 5 digits, because nu = 0.5 - 2.0e-11" in inexact(5.7e-6, 1e-14, "cholesky", 0.5 - 2e-11)[0]
+    assert "badly conditioned" in inexact(1e-12, 1e-7, "mumps", 0.3)[0]
+    assert "time.rtol" in inexact(1e-5, 1e-7, "cg", 0.3)[0]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("cells", [[15, 30], [60, 120], [4, 4, 8]])
+def test_factor_estimate(comm: MPI.Intracomm, cells: list[int]) -> None:
+    d = len(cells)
+    tissue = {"size": [1.0, 2.0, 2.0][:d], "cells": cells, "material": {"lambda": 50.0, "mu": 50.0, "rho": 1.0}}
+    scene = scene_of(tissue=tissue, contact={"sides": ["left"]}, motion={"profile": "hold"})
+    system = build(scene, comm).system
+    name, _ = choose_solver(system.layout)
+    solver = make_solver(midpoint_matrix(system, 0.01), name, system.layout, "softgrasp_test_")
+    factor = solver.ksp.getPC().getFactorMatrix()
+    entry = 8 + 4 / (factor.getBlockSize() ** 2 if name == "cholesky" else 1)
+    used = entry * factor.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
+    solver.destroy()
+    ratio = factor_bytes(name, system.layout.n_e, d, 1) / used
+    assert 1 / 2 < ratio < 2, f"{name}: estimate over truth is {ratio}"  # an estimate of the right size
+
+
+def text_of(result: Explanation, width: int) -> str:
+    console = Console(file=io.StringIO(), width=width, color_system=None)
+    render(result, console)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_text_and_json(comm: MPI.Intracomm) -> None:
+    result = explain(scene_of(effects={"gravity": {"g": [0.0, -1.0]}}), comm)
+    text = text_of(result, 200)
+    assert "tissue: M_ee z'' + K_ee z = -G (q_s'' - g)" in text
+    assert "rho g L / E = 0.016" in text  # 1 * 1 * 2 / 125
+    assert f"n_e = {result.sizes.n_e}" in text
+    assert max(map(len, text_of(result, 40).splitlines())) <= 40
+    data = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+    assert data["sizes"]["n_e"] == result.sizes.n_e
+    assert data["effects"]["gravity"]["on"] is True
+    assert data["effects"]["gravity"]["gate"]["matters"] is True
+
+
+def test_only_rank_zero_writes(comm: MPI.Intracomm) -> None:
+    file = io.StringIO()
+    run_explain(scene_of(), comm, Console(file=file, width=80))
+    assert bool(file.getvalue()) == (comm.rank == 0)

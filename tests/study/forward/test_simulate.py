@@ -1,0 +1,87 @@
+"""A run in legs leaves what the whole run leaves."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from rich.console import Console
+
+from softgrasp.fem.errors import CheckpointError, Interrupted
+from softgrasp.fem.scene.file import shipped_scenes
+from softgrasp.study.forward.run import run_simulate
+from tests.helpers.models import rough_save
+
+SMALL = ["tissue.cells=[3,6]", "time.steps=40", "output.frames=8", 'output.fields="xdmf"', "effects.reaction=true"]
+
+
+def run(out: Path, *changes: str, **how: Any) -> str:
+    """What the run says on this rank; also when it is stopped as asked. Collective."""
+    said = io.StringIO()
+    console = Console(file=said, width=400)
+    call = (shipped_scenes()["paper_forward"], out, [*SMALL, *changes], console)
+    if "until" in how:
+        with pytest.raises(Interrupted):
+            run_simulate(*call, quiet=True, **how)
+    else:
+        run_simulate(*call, quiet=True, **how)
+    return said.getvalue()
+
+
+def times(file: Path) -> list[float]:
+    """Instants of a field series."""
+    return sorted({float(t) for t in re.findall(r'Time Value="(.*?)"', file.read_text())})
+
+
+def test_three_legs_show_what_the_whole_run_shows(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("softgrasp.study.pictures.body.save", rough_save)
+    monkeypatch.setattr("softgrasp.study.pictures.traces.save", rough_save)
+    whole, legs = mpi_tmp_path / "whole", mpi_tmp_path / "legs"
+    run(whole)
+    run(legs, until=15)
+    run(legs, until=30, resume=True)
+    said = run(legs, resume=True)
+    if comm.rank > 0:
+        return
+    series = [legs / f"fields{leg}.xdmf" for leg in ("", "-from15", "-from30")]
+    assert [len(times(file)) for file in series] == [4, 3, 2]  # frames are five steps apart
+    assert [t for file in series for t in times(file)] == times(whole / "fields.xdmf")
+    assert "resumed from step 30 of 40\n" in said
+    assert all(f"{file}\n" in said for file in series)
+    assert "10 of 40, since the run was resumed," in said
+    assert json.loads((legs / "result.json").read_text())["time"]["steps_timed"] == 10
+    for name in ("move.gif", "move.png", "trajectory.csv"):
+        assert (legs / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_frames_that_nobody_kept_are_told(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    run(mpi_tmp_path, until=15, pictures=False)
+    said = run(mpi_tmp_path, until=20, resume=True)
+    if comm.rank == 0:
+        assert "resumed from step 15 of 40; 4 earlier frames are not kept" in said
+        (mpi_tmp_path / "checkpoint" / "frame20.npz").write_bytes(b"PK torn")
+    comm.Barrier()
+    with pytest.raises(CheckpointError, match=r"frame20\.npz cannot be read"):
+        run(mpi_tmp_path, resume=True)
+
+
+def test_the_force_that_the_motion_takes_is_written(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    turned = ("effects.rotation=true", "hand.inertia=3.0", "motion.target=[5.0,3.0,0.1]")
+    said = run(mpi_tmp_path, *turned, pictures=False)
+    if comm.rank > 0:
+        return
+    with (mpi_tmp_path / "trajectory.csv").open() as file:
+        assert file.readline().endswith("force_x [N],force_y [N],force_rz [N m]\n")
+        assert file.readline().endswith("nan,nan,nan\n")  # no step ends at the start
+        forces = np.loadtxt(file, delimiter=",")[:, -3:]
+    peak = json.loads((mpi_tmp_path / "result.json").read_text())["force_peak"]
+    assert peak == dict(zip(("x", "y", "rz"), np.abs(forces).max(axis=0).tolist(), strict=True))
+    assert f"rz {peak['rz']:.4g} N m" in said

@@ -1,0 +1,335 @@
+"""Accuracy against time: the tolerance holds under an independent finer run, and an interruption changes nothing."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from rich.console import Console
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.errors import Interrupted, SceneError
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.reduction.engines import ENGINES
+from softgrasp.study.precision import plots as work_plots, full as wp_full, reduced as wp_reduced
+from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
+from softgrasp.study.precision.page import rows_of
+from softgrasp.study.precision.answer import parse_budget, parse_tolerance
+from softgrasp.study.precision.fit import interpolate, pareto, power_law
+from softgrasp.study.precision.forward import forward_settings
+from softgrasp.study.precision.points import Asked, Setting, WorkPoint, least_steps, variant
+from softgrasp.study.precision.probe import Places, find_places, make_probe, run_probed
+from softgrasp.study.precision.reference import extrapolate, fitted, nested_meshes
+from tests.helpers.browser import look
+from tests.helpers.models import Array, make_scene, rough_save, write_scene
+
+TOLERANCE, BUDGET = 0.03, 1.0
+SMALL: dict[str, Any] = {
+    "name": "small",
+    "tissue": {"cells": [4, 8]},
+    "time": {"steps": 64},
+    "motion": {"target": [1.0, 0.5], "duration": 3.0},
+    "control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]},
+    "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [4, 8]},
+    "study": {"repeats": 1},
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_samples() -> Iterator[None]:
+    """No test looks at a time, or at more than the existence of a picture."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wp_full, "BUILD_SECONDS", 0.0)
+        patch.setattr(wp_reduced, "CALLS", 5)
+        patch.setattr(work_plots, "save", rough_save)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    comm = MPI.COMM_WORLD
+    return Path(comm.bcast(str(tmp_path_factory.mktemp("work")) if comm.rank == 0 else None))
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path) -> dict[str, Any]:
+    """The command on a small scene, once for all tests."""
+    file = write_scene(MPI.COMM_WORLD, folder, make_scene(SMALL))
+    quiet = Console(quiet=True)
+    return run_study(file, folder, [], quiet, tolerance=TOLERANCE, budget=BUDGET, quiet=True)
+
+
+def again(folder: Path) -> WorkStudy:
+    """The same study out of the cache."""
+    scene = make_scene(SMALL)
+    return study_scene(scene, MPI.COMM_WORLD, folder / "cache", Asked(TOLERANCE, BUDGET))
+
+
+def tip(comm: MPI.Intracomm, setting: Setting) -> Array:
+    """Outputs by the plain simulation; the point is a node of every mesh with an even number of cells across."""
+    run = simulate(build(variant(make_scene(SMALL), setting), comm))
+    return np.column_stack([run.times, run.outputs])
+
+
+# --- the promise
+
+
+def test_tolerance_holds_against_an_independent_finer_run(comm: MPI.Intracomm, result: dict[str, Any]) -> None:
+    answer = result["answers"][0]
+    assert answer["met"]
+    full = answer["full"]
+    assert full["predicted"]["error"] > 0
+    used = full["setting"]
+    found = tip(comm, Setting(tuple(used["cells"]), used["order"], used["steps"]))
+    # finer than every run of the study, and another time grid
+    truth = tip(comm, Setting((24, 48), 2, 8 * used["steps"]))[::8]
+    gap = np.linalg.norm(found[:, 1:] - truth[:, 1:], axis=1).max() / np.linalg.norm(truth[:, 1:], axis=1).max()
+    assert gap <= TOLERANCE
+    # the true error and the one told differ by the errors of both references
+    assert gap == pytest.approx(full["measured"]["error"], abs=2 * result["reference"]["error"])
+
+
+def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dict[str, Any]) -> None:
+    reduced = result["answers"][0]["reduced"]
+    assert reduced["measured"]["error"] + result["reference"]["error"] <= TOLERANCE
+    assert reduced["measured"]["seconds"] < result["answers"][0]["full"]["measured"]["seconds"]
+    # against its own full run alone it may be better by orders
+    assert reduced["setting"]["N"] in (4, 8)
+
+
+def test_what_nothing_meets_is_said_with_what_came_closest(
+    comm: MPI.Intracomm, result: dict[str, Any], folder: Path
+) -> None:
+    study = study_scene(make_scene(SMALL), comm, folder / "cache", Asked(1e-9))
+    answer = study.answers[0]
+    assert not answer.met
+    assert "Nothing tried meets 1e-09" in answer.sentences[0]
+    assert answer.closest is not None
+    errors = [p.error for points in study.points.values() for p in points if p.question != "bases" and p.ok]
+    assert answer.closest["measured"]["error"] == min(errors)
+
+
+def test_budget_takes_the_most_accurate_that_fits(result: dict[str, Any]) -> None:
+    answer = result["answers"][1]
+    rows = [r for r in result["points"]["forward"] if r["p99"] <= BUDGET]
+    assert answer["full"]["measured"]["error"] == min(r["error"] for r in rows)
+    m = answer["full"]["measured"]
+    assert 0 < m["p50"] <= m["p99"] <= m["max"]
+
+
+def test_a_budget_that_nothing_fits_is_said(comm: MPI.Intracomm, result: dict[str, Any], folder: Path) -> None:
+    answer = study_scene(make_scene(SMALL), comm, folder / "cache", Asked(None, 1e-9)).answers[0]
+    assert not answer.met
+    assert answer.closest is not None
+    assert answer.sentences[0].startswith("No full run fits")
+
+
+# --- cache
+
+
+def test_study_out_of_the_cache_is_the_same_table(result: dict[str, Any], folder: Path) -> None:
+    study = again(folder)
+    assert study.measured == 0
+    assert {k: rows_of(v) for k, v in study.points.items()} == result["points"]
+
+
+def test_interrupted_study_goes_on_to_the_same_errors(
+    comm: MPI.Intracomm, result: dict[str, Any], mpi_tmp_path: Path
+) -> None:
+    scene = make_scene(SMALL)
+    seen: list[str] = []
+    before = signal.getsignal(signal.SIGINT)  # ignored where the tests run in the background
+
+    def stop_later(label: str, share: float) -> None:
+        seen.append(label)
+        if len(seen) == 13 and comm.rank == comm.size - 1:
+            signal.raise_signal(signal.SIGINT)  # Ctrl-C that reaches one rank
+
+    with pytest.raises(Interrupted, match=r"^stopped before '.*' with \d+ % done; the same command goes on"):
+        study_scene(scene, comm, mpi_tmp_path, progress=stop_later)
+    assert len(seen) == 13
+    assert signal.getsignal(signal.SIGINT) is before
+    comm.Barrier()
+    kept = {f.name: f.read_text() for f in mpi_tmp_path.glob("*.json")}
+    assert len(kept) >= 8  # points before the stop; some settings come twice
+    study = study_scene(scene, comm, mpi_tmp_path)
+    assert study.cached >= len(kept)
+    assert {name: (mpi_tmp_path / name).read_text() for name in kept} == kept
+    for name in ("forward", "reduced"):
+        old = {r["label"]: r for r in result["points"][name]}
+        for row in rows_of(study.points[name]):
+            # the same numbers but for the order of sums in parallel
+            assert row["error"] == pytest.approx(old[row["label"]]["error"], rel=1e-6)
+        assert len(old) == len({p.label for p in study.points[name]})
+
+
+@pytest.mark.serial
+def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: dict[str, Any], tmp_path: Path) -> None:
+    """The real command is killed in the middle, without a chance to clean up."""
+    file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
+    command = [sys.executable, "-m", "softgrasp.study.cli", "study", str(file), "--out", str(tmp_path), "--question", "forward"]
+    with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL) as process:
+        while len(list(cache.glob("run-*.json"))) < 8 and process.poll() is None:
+            time.sleep(0.01)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL  # before its end
+    kept = {f.name: f.read_text() for f in cache.glob("*.json")}
+    study = study_scene(make_scene(SMALL), comm, cache, Asked(names=("forward",)))
+    assert study.cached >= len(kept) >= 8
+    assert study.measured > 0
+    assert {name: (cache / name).read_text() for name in kept} == kept
+    table = [(r["label"], r["error"], r["ok"]) for r in rows_of(study.points["forward"])]
+    assert table == [(r["label"], r["error"], r["ok"]) for r in result["points"]["forward"]]
+
+
+def test_another_scene_uses_none_of_the_cached_points(
+    comm: MPI.Intracomm, result: dict[str, Any], folder: Path
+) -> None:
+    stopped: list[str] = []
+
+    def stop(label: str, share: float) -> None:
+        stopped.append(label)
+        raise Interrupted("at once")
+
+    before = len(list((folder / "cache").glob("run-*.json")))
+    softer = make_scene(SMALL, {"tissue": {"material": {"lambda": 40.0, "mu": 50.0, "rho": 1.0}}})
+    with pytest.raises(Interrupted):
+        study_scene(softer, comm, folder / "cache", progress=stop)
+    assert len(list((folder / "cache").glob("run-*.json"))) == before
+
+
+def test_an_undamped_scene_is_diagnosed_and_keeps_its_other_questions(result: dict[str, Any], folder: Path) -> None:
+    assert set(result["skipped"]) == {"riccati", "reduced_riccati", "loop"}
+    assert all(reason.startswith("no damping: ") for reason in result["skipped"].values())
+    assert result["points"]["forward"]
+    assert (folder / "report.html").read_text().count("no damping: ") == 1
+
+
+def test_steps_too_long_for_the_move_are_not_tried() -> None:
+    scene = make_scene(SMALL, {"time": {"steps": 64, "end": 48.0}})
+    assert least_steps(scene) == 32  # two over the three seconds of the move
+    assert {s.steps for s in forward_settings(scene, 2) if s.steps < 64} == {32}
+    assert least_steps(make_scene(SMALL)) == 4
+
+
+# --- files
+
+
+def test_files_hold_every_point(result: dict[str, Any], folder: Path) -> None:
+    saved = json.loads((folder / "result.json").read_text())
+    assert saved["points"] == result["points"]
+    with (folder / "points.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == sum(len(v) for v in result["points"].values()) + len(result["measured_for_the_answers"])
+    assert {r["question"] for r in rows} == {"forward", "reduced", "bases"}
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png") == 4
+    assert "--tolerance 0.03" in page
+
+
+@pytest.mark.serial
+def test_page_in_a_browser(result: dict[str, Any], folder: Path) -> None:
+    assert look(folder / "report.html", figures=4) == []
+
+
+def test_slopes_show_the_order_of_the_midpoint_rule(result: dict[str, Any]) -> None:
+    powers = [s["power"] for s in result["slopes"] if s["against"] == "change in time against steps"]
+    assert len(powers) >= 3
+    # e(s) - e(2 steps) of order 2 at s = steps, steps / 2, steps / 4 has about the slope -2.2
+    assert -2.4 < np.median(powers) < -1.7
+
+
+def test_every_question_has_slopes(result: dict[str, Any]) -> None:
+    assert {s["question"] for s in result["slopes"]} == set(result["points"])
+    bases = [s for s in result["slopes"] if s["question"] == "bases" and s["against"].startswith("left")]
+    assert {s["series"] for s in bases} == set(ENGINES)
+    # every engine keeps the vectors that the tolerance asks for: what is left falls with them
+    assert all(s["power"] < -1 for s in bases)
+
+
+# --- parts
+
+
+def test_places_are_the_nodes_of_the_plain_run_where_there_are_any(comm: MPI.Intracomm) -> None:
+    setting = Setting((4, 8), 2, 24)
+    model = build(variant(make_scene(SMALL), setting), comm)
+    found = run_probed(model, make_probe(model, find_places(make_scene(SMALL), model)))
+    # sums of a few shape functions: rounding
+    np.testing.assert_allclose(found.y, tip(comm, setting)[:, 1:], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_probe_is_exact_for_polynomials_of_its_order(comm: MPI.Intracomm, order: int) -> None:
+    model = build(variant(make_scene(SMALL), Setting((3, 7), order, 4)), comm)
+    point = np.array([0.437, 0.519])  # no node, far from the contact zone
+    probe = make_probe(model, Places(("p",), (point[None, :],)))
+    x, y = model.system.layout.nodes.T
+
+    def f(x: Any, y: Any) -> Any:
+        linear = 0.3 + 1.7 * x - 0.6 * y
+        return linear if order == 1 else linear + 2.1 * x * y - 0.9 * y**2 + x**2
+
+    field = np.column_stack([f(x, y), -f(x, y)]).ravel()
+    value = probe.of_rows(comm, field[:, None])[:, 0]
+    # rounding of a dozen terms
+    np.testing.assert_allclose(value, [f(*point), -f(*point)], rtol=0, atol=1e-12)
+
+
+def test_nested_meshes_meet_the_ends_of_the_contact_zone() -> None:
+    meshes = nested_meshes(make_scene(SMALL, {"tissue": {"cells": [15, 30]}}))
+    assert len(meshes) >= 4
+    for coarse, fine in itertools.pairwise(meshes):
+        assert fine == tuple(2 * n for n in coarse)
+    assert all(n % 4 == 0 for _, n in meshes)  # 1.5 of 2.0
+    assert fitted(7.5, [0.75]) == 8
+    assert fitted(2.0, [0.333]) is None
+
+
+def test_extrapolation_finds_limit_and_order() -> None:
+    limit = np.array([[1.0, -2.0, 0.5, 0.25]])
+    values = [limit + h**1.5 * np.array([[1.0, 0.3, 1.0, 0.3]]) for h in (0.4, 0.2, 0.1)]
+    found, p = extrapolate(values, 2)
+    assert p == pytest.approx(1.5, abs=1e-9)  # made with this order: rounding
+    np.testing.assert_allclose(found, limit, rtol=0, atol=1e-12)  # rounding
+
+
+def test_pareto_and_power_law() -> None:
+    points = [
+        WorkPoint("forward", "a", str(k), s, e, ok)
+        for k, (s, e, ok) in enumerate(
+            [(1, 1, True), (2, 0.5, True), (3, 0.6, True), (0.5, 0.1, False), (4, 0.1, True)]
+        )
+    ]
+    assert [p.label for p in pareto(points)] == ["0", "1", "4"]
+    assert power_law([1, 2, 4], [1, 0.25, 0.0625]) == pytest.approx(-2)
+    assert power_law([1, 1], [1, 2]) is None
+    assert interpolate(8, [1, 2, 4], [1, 0.25, 0.0625]) == pytest.approx(1 / 64)
+    assert interpolate(8, [4], [1.0], -2.0) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("1ms", 1e-3), ("500us", 5e-4), ("0.01 s", 0.01), ("2e-3s", 2e-3)])
+def test_budget_is_read_with_its_unit(text: str, seconds: float) -> None:
+    assert parse_budget(text) == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("text", ["1", "ms", "-1ms", "1 parsec", "0s", "1.2.3ms", ""])
+def test_budget_without_sense_is_refused_in_one_sentence(text: str) -> None:
+    with pytest.raises(SceneError, match=r"^--budget .*such as 1ms, 500us or 0\.01s$"):
+        parse_budget(text)
+
+
+@pytest.mark.parametrize("text", ["0", "1", "-1e-3", "nan", "small"])
+def test_tolerance_without_sense_is_refused_in_one_sentence(text: str) -> None:
+    with pytest.raises(SceneError, match=r"^--tolerance .*such as 1e-3$"):
+        parse_tolerance(text)

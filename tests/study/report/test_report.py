@@ -1,0 +1,136 @@
+"""The page of a run: set equations, nothing loaded from outside, and what a real browser makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.helpers.browser import DESK, PHONE, Browser, faults, find_chromium
+from rich.console import Console
+
+from softgrasp.fem.scene.file import load_scene, resolved_toml, shipped_scenes
+from softgrasp.study.report.equation import equation
+from softgrasp.study.report.equation_control import control_text
+from softgrasp.study.report.page import Section, equation_text, of_scene, outside, versions, write_report
+from softgrasp.study.forward.run import run_simulate
+from softgrasp.study.report.typeset import equation_html, formula, terms
+
+pytestmark = pytest.mark.serial
+
+
+# --- equations
+
+
+def test_symbols_are_set_and_words_are_not() -> None:
+    assert formula("M_ee z''") == "<i>M</i><sub><i>ee</i></sub> <i>z</i>″"
+    assert formula("q_s'' - g") == "<i>q</i>″<sub><i>s</i></sub> − <i>g</i>"
+    assert formula("R' M R") == "<i>R</i><sup>⊤</sup> <i>M</i> <i>R</i>"  # of a matrix: transposed
+    assert formula("-alpha M_hand x^3") == "−<i>α</i> <i>M</i><sub>hand</sub> <i>x</i><sup>3</sup>"
+    text = "a rigid move is free: the hand's row only tells"
+    assert formula(text) == text
+    assert formula("<u, R u> & z") == "⟨<i>u</i>, <i>R</i> <i>u</i>⟩ &amp; <i>z</i>"
+    assert formula("A^T P - R^-1") == "<i>A</i><sup>⊤</sup> <i>P</i> − <i>R</i><sup>−1</sup>"
+    assert formula("min(t / duration, 1)") == "min(<i>t</i> / duration, 1)"
+
+
+def test_lines_break_before_operators_outside_brackets() -> None:
+    pieces = [str(piece) for piece in terms("K z + D z' = -G (a - g) - u")]
+    assert [piece[:1] for piece in pieces] == ["<", "+", "=", "−"]
+    assert "<i>g</i>)" in pieces[2]
+
+
+@pytest.mark.parametrize("name", sorted(shipped_scenes()))
+def test_every_symbol_of_every_scene_is_set(name: str) -> None:
+    """Nothing of the notation of text is left in the page: no underscore, prime or power."""
+    html = str(equation_html(equation_text(equation(load_scene(shipped_scenes()[name])))))
+    text = html.replace("hand's", "")
+    assert not any(mark in text for mark in ("_", "'", "^"))
+    assert html.count("<i>") == html.count("</i>")
+    assert "tissue" in html
+
+
+@pytest.mark.parametrize("name", sorted(shipped_scenes()))
+def test_control_has_its_cost_and_riccati_equation(name: str) -> None:
+    text = control_text(load_scene(shipped_scenes()[name]))
+    html = str(equation_html(text)).replace("hand's", "")
+    assert not any(mark in html for mark in ("_", "'", "^", "int "))
+    assert "prescribed" not in text  # a force moves the hand, whatever moves it in `simulate`
+    assert "hand:   M_hand q_s''" in text
+    assert text.index("Riccati") < text.index("with:")
+
+
+# --- nothing from outside
+
+
+@pytest.mark.parametrize(
+    "mark",
+    [
+        '<script src="https://x.org/a.js">', "<script>1</script>", '<link rel="stylesheet" href="a.css">',
+        '<img src="a.png">', "<img src=//x.org/a>", '<img alt="" srcset="a.png 2x">', '<a href="https://x.org">',
+        "<style>@import 'a.css';</style>", "<style>p{background:url(a.png)}</style>", '<iframe title="x">',
+    ],
+)  # fmt: skip
+def test_a_page_that_loads_something_is_seen(mark: str) -> None:
+    assert outside(f"<p>before</p>{mark}")
+
+
+def test_text_about_addresses_is_no_address(tmp_path: Path) -> None:
+    assert outside('<p>src=a.png href="x" url(a) @import</p><img src="data:image/png;base64,AA">') == []
+    path = write_report(tmp_path / "r.html", title="t", sections=[Section("", "<script src='a.js'></script>")])
+    assert "&lt;script" in path.read_text()
+
+
+def test_versions_name_what_the_numbers_come_from() -> None:
+    found = dict(versions())
+    assert {"softgrasp", "DOLFINx", "NumPy", "SciPy", "PETSc", "SLEPc", "MPI", "Python"} == set(found)
+    assert all(any(letter.isdigit() for letter in text) for name, text in found.items() if name != "softgrasp")
+
+
+def test_the_equation_comes_from_the_scene(tmp_path: Path) -> None:
+    scene = resolved_toml(load_scene(shipped_scenes()["paper_forward"]))
+    page = write_report(tmp_path / "r.html", title="t", scene=scene, reproduce="softgrasp").read_text()
+    assert str(equation_html(of_scene(scene).code)) in page
+    assert "<h2>Versions</h2>" in page
+
+
+# --- a real browser
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a small run of the command."""
+    out = tmp_path_factory.mktemp("page")
+    changes = ["tissue.cells=[3,6]", "time.steps=30", "output.frames=4", "effects={gravity={g=[0.0,-1.0]}}"]
+    run_simulate(shipped_scenes()["paper_forward"], out, changes, Console(quiet=True), quiet=True)
+    return out / "report.html"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    program = find_chromium()
+    if program is None:
+        pytest.skip("no Chromium here")
+    with Browser(program) as found:
+        yield found
+
+
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_browser_shows_the_page_without_complaint(browser: Browser, page: Path, width: int) -> None:
+    assert faults(browser, page, width, figures=3) == []
+    assert browser.ask("document.querySelectorAll('.term').length") > 5
+
+
+def test_browser_prints_the_page(browser: Browser, page: Path, tmp_path: Path) -> None:
+    browser.open(page, DESK)
+    browser.pdf(tmp_path / "page.pdf")
+    assert (tmp_path / "page.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "page.pdf").stat().st_size > 20_000  # with its figures
+
+
+def test_the_checks_can_fail(browser: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "bad.html"
+    wide = "<meta name=viewport content='width=device-width'><p style='width:900px'>x</p>"
+    file.write_text(f"{wide}<img src='no.png'><script>console.error('e'); f()</script>")
+    said = " ".join(faults(browser, file, PHONE, figures=2))
+    assert all(word in said for word in ("console", "exception", "failed", "cut off", "1 figures", "px wide of 0"))

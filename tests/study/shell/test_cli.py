@@ -1,0 +1,138 @@
+"""The command as a new user meets it: run, two ranks, and what happens on wrong input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.browser import look
+
+ROOT = Path(__file__).parents[3]
+FORWARD = ROOT / "demos" / "scenes" / "paper_forward.toml"
+# A PETSc that was initialised before, with its own handler of signals, as a cluster may have it.
+HANDLING = "from softgrasp.fem import _stack; import os; os.environ['PETSC_OPTIONS'] = ''; import petsc4py.PETSc; "
+pytestmark = pytest.mark.serial
+
+
+def softgrasp(*args: str, ranks: int = 1) -> subprocess.CompletedProcess[str]:
+    launcher = Path(sys.executable).with_name("mpiexec")
+    if ranks > 1 and not launcher.exists():
+        launcher = Path(shutil.which("mpiexec") or pytest.skip("no mpiexec"))
+    start = [str(launcher), "-n", str(ranks)] if ranks > 1 else []
+    return subprocess.run(
+        [*start, sys.executable, "-m", "softgrasp.study.cli", *args], cwd=ROOT, capture_output=True, text=True, timeout=240
+    )
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> None:
+    out = tmp_path / "out"
+    run = softgrasp("simulate", str(FORWARD), "--out", str(out), ranks=ranks)
+    assert run.returncode == 0, run.stderr
+    result = json.loads((out / "result.json").read_text())
+    assert (result["n_s"], result["n_e"], result["states"], result["steps"]) == (2, 956, 1916, 600)
+    assert result["hand_final"] == pytest.approx([5.0, 3.0], abs=1e-12)  # the motion is prescribed: rounding only
+    assert result["energy_drift"] < 1e-12  # momentum-form midpoint conserves to rounding
+    assert result["ranks"] == ranks
+    assert {"assembly", "factor", "steps", "per_step"} <= result["time"].keys()
+    assert result["memory_peak_mb"] > 50  # MiB; Python with PETSc alone needs more
+    for name in ("trajectory.csv", "scene.toml", "move.png", "move.pdf", "move.gif", "traces.png", "report.html"):
+        assert (out / name).stat().st_size > 500, name
+    page = (out / "report.html").read_text()
+    assert "data:image/png;base64" in page
+    assert ["small strains" in text for text in result["warnings"]] == [True]  # of the paper's move
+    assert result["warnings"][0] in page
+    assert run.stdout.count("warning:") == 1
+
+
+def test_set_changes_the_mesh(tmp_path: Path) -> None:
+    run = softgrasp("simulate", str(FORWARD), "--out", str(tmp_path), "--set", "tissue.cells=[10,20]", "--no-pictures")
+    assert run.returncode == 0, run.stderr
+    assert json.loads((tmp_path / "result.json").read_text())["states"] == 880
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (("--set", "tissue.cels=[4,8]"), ("tissue.cels", "tissue.cells")),
+        (("--set", "tissue.material.mu=-1.0"), ("tissue.material.mu", "> 0")),
+        (("--set", "time.steps=0"), ("time.steps",)),
+        (("--set", "motion.target=[1.0,2.0,3.0]"), ("motion.target",)),
+        (("--set", "contact.box=[[0.4,0.4],[0.5,0.5]]"), ("contact",)),
+        (("--set", "control.outputs=[{kind='node', point=[9.0,9.0]}]"), ("control.outputs[0].point", "outside")),
+        (("--resume",), ("checkpoint.json", "--resume")),
+    ],
+)
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_wrong_input_is_one_sentence(tmp_path: Path, args: tuple[str, ...], words: tuple[str, ...], ranks: int) -> None:
+    run = softgrasp("simulate", str(FORWARD), "--out", str(tmp_path / "out"), *args, ranks=ranks)
+    assert run.returncode != 0
+    assert "Traceback" not in run.stderr
+    assert "resumed" not in run.stdout
+    message = run.stderr[run.stderr.index("error:") :]
+    assert message.count("error:") == 1  # one rank speaks
+    for word in words:
+        assert word in message, message
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+def test_a_resumed_run_says_from_where_and_what_it_timed(tmp_path: Path) -> None:
+    small = ("simulate", str(FORWARD), "--out", str(tmp_path), "--set", "tissue.cells=[4,8]", "--set", "time.steps=40")
+    assert softgrasp(*small, "--until", "20", "--no-pictures").returncode != 0  # stopped, as asked
+    run = softgrasp(*small, "--resume", "--no-pictures")
+    assert run.returncode == 0, run.stderr
+    assert "resumed from step 20 of 40" in run.stdout
+    assert "20 of 40, since the run was resumed," in run.stdout
+    assert any(tmp_path.glob("fields-from20*"))
+    assert json.loads((tmp_path / "result.json").read_text())["time"]["steps_timed"] == 20
+    assert json.loads((tmp_path / "result.json").read_text())["output_final"][0] > 5  # the tissue came along
+
+
+@pytest.mark.parametrize("first", ["", HANDLING])
+def test_a_reader_that_leaves_ends_no_run(tmp_path: Path, first: str) -> None:
+    out = tmp_path / "out"
+    code = f"{first}from softgrasp.study.cli import main; main()"
+    small = ["--set", "tissue.cells=[4,8]", "--set", "time.steps=40", "--no-pictures"]
+    command = [sys.executable, "-c", code, "simulate", str(FORWARD), "--out", str(out), *small]
+    reader, writer = os.pipe()
+    os.close(reader)
+    run = subprocess.run(command, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60)
+    os.close(writer)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert json.loads((out / "result.json").read_text())["states"] > 0
+    assert (out / "report.html").exists()
+
+
+def test_missing_scene_and_mesh(tmp_path: Path) -> None:
+    run = softgrasp("simulate", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out"))
+    assert run.returncode == 1
+    assert "none.toml" in run.stderr
+    scene = tmp_path / "lost.toml"
+    text = (ROOT / "demos" / "scenes" / "pillow_3d.toml").read_text()
+    scene.write_text(text.replace("meshes/pillow_small.msh", "no_such.msh"))
+    run = softgrasp("simulate", str(scene), "--out", str(tmp_path / "out"))
+    assert run.returncode == 1
+    assert "no_such.msh" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_scenes_schema_explain_and_help(tmp_path: Path) -> None:
+    listing = softgrasp("scenes")
+    assert listing.returncode == 0
+    for name in ("paper_forward", "paper_lqr", "paper_lqr_undamped", "franka_muscle", "block_3d", "pillow_3d"):
+        assert name in listing.stdout
+    assert "tissue" in json.loads(softgrasp("schema").stdout)["properties"]
+    muscle = str(ROOT / "demos" / "scenes" / "franka_muscle.toml")
+    assert "rho g L / E" in softgrasp("explain", muscle, "--out", str(tmp_path / "why")).stdout
+    result = json.loads((tmp_path / "why" / "result.json").read_text())
+    page = (tmp_path / "why" / "report.html").read_text()
+    assert all(name in page for name in result["effects"])
+    assert f"2n = {result['sizes']['states']}" in page
+    assert look(tmp_path / "why" / "report.html", figures=0) == []
+    assert "simulate" in softgrasp("--help").stdout

@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import io
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from softgrasp.study.shell import doctor
+
+
+def script(path: Path, text: str) -> str:
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No sign of an MPI job around us."""
+    for name in doctor.IN_MPI_JOB:
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_this_environment_passes_every_look_but_memory() -> None:
+    for name, look in doctor.CHECKS:
+        if name not in ("memory", "two ranks"):
+            check = look()
+            assert check.ok, check
+            assert check.name == name
+            assert check.cure == ""
+
+
+@pytest.mark.serial
+@pytest.mark.usefixtures("alone")
+def test_two_ranks_are_really_launched() -> None:
+    assert doctor.check_launch() == doctor.Check("two ranks", True, "launched, found each other")
+
+
+def test_no_launch_inside_a_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PMI_RANK", "0")
+    monkeypatch.setattr(doctor, "find_mpiexec", lambda: "/nonexistent/mpiexec")
+    assert "already an MPI job" in doctor.check_launch().value
+
+
+@pytest.mark.usefixtures("alone")
+def test_singletons_of_another_mpi_are_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    text = 'case "$1" in --version) echo "mpiexec (OpenRTE) 4.1.4";; *) shift 2; "$@"; "$@";; esac'
+    launcher = script(tmp_path / "mpiexec", text)
+    monkeypatch.setattr(doctor, "find_mpiexec", lambda: launcher)
+    monkeypatch.setattr(doctor, "SAY_SIZE", "import sys; sys.stdout.write('1\\n')")
+    check = doctor.check_launch()
+    assert not check.ok
+    assert "another MPI" in check.cure
+    check = doctor.check_launcher()
+    assert not check.ok
+    assert "Open MPI" in check.cure
+
+
+@pytest.mark.usefixtures("alone")
+def test_a_launcher_that_refuses_is_quoted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    launcher = script(tmp_path / "mpiexec", "echo will not run as root; exit 3")
+    monkeypatch.setattr(doctor, "find_mpiexec", lambda: launcher)
+    check = doctor.check_launch()
+    assert not check.ok
+    assert check.value == "exit status 3: will not run as root"
+
+
+@pytest.mark.usefixtures("alone")
+def test_a_launcher_that_hangs_is_ended_with_its_children(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    launcher = script(tmp_path / "mpiexec", "sleep 60 & wait")
+    monkeypatch.setattr(doctor, "find_mpiexec", lambda: launcher)
+    monkeypatch.setattr(doctor, "LAUNCH_LIMIT", 0.2)
+    start = time.monotonic()
+    assert not doctor.check_launch().ok
+    assert time.monotonic() - start < 30  # half of the sleep: the child held the pipe and was ended too
+
+
+def test_the_launcher_beside_python_comes_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folders = [tmp_path / "env", tmp_path / "system"]
+    for folder in folders:
+        folder.mkdir()
+        script(folder / "mpiexec", "true")
+    monkeypatch.setattr(sys, "executable", str(folders[0] / "python"))
+    monkeypatch.setenv("PATH", str(folders[1]))
+    assert doctor.find_mpiexec() == str(folders[0] / "mpiexec")
+    (folders[0] / "mpiexec").unlink()
+    assert doctor.find_mpiexec() == str(folders[1] / "mpiexec")
+    (folders[1] / "mpiexec").unlink()
+    assert doctor.find_mpiexec() is None
+    assert "PATH" in doctor.check_launcher().cure
+
+
+@pytest.mark.parametrize("value", ["2", None])
+def test_threads(monkeypatch: pytest.MonkeyPatch, value: str | None) -> None:
+    if value is None:
+        monkeypatch.delenv("OMP_NUM_THREADS")
+    else:
+        monkeypatch.setenv("OMP_NUM_THREADS", value)
+    assert "OMP_NUM_THREADS=1" in doctor.check_threads().cure
+
+
+def test_compiler_missing_or_without_headers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert "no-such-compiler" in doctor.check_compiler().cure
+    monkeypatch.setenv("CC", script(tmp_path / "cc", "exit 1"))
+    assert "headers" in doctor.check_compiler().cure
+
+
+def test_cache_that_cannot_be_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import dolfinx.jit
+
+    (tmp_path / "file").touch()  # a folder below a file: refused to root as well
+    options = {"cache_dir": tmp_path / "file" / "cache"}
+    monkeypatch.setattr(dolfinx.jit, "get_options", lambda: options)
+    assert "XDG_CACHE_HOME" in doctor.check_cache().cure
+
+
+def test_complex_petsc_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    from petsc4py import PETSc
+
+    monkeypatch.setattr(PETSc, "ScalarType", complex)
+    check = doctor.check_petsc()
+    assert not check.ok
+    assert "complex128" in check.value
+
+
+def test_missing_stack_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "dolfinx", None)  # import raises ModuleNotFoundError
+    monkeypatch.setattr(doctor, "CHECKS", (("DOLFINx", doctor.check_dolfinx),))
+    (check,) = doctor.checks()
+    assert not check.ok
+    assert "softgrasp[solver]" in check.cure
+
+
+@pytest.mark.parametrize("ok", [True, False])
+def test_show_tells_the_cure_and_whether_all_is_well(monkeypatch: pytest.MonkeyPatch, ok: bool) -> None:
+    check = doctor.Check("thing", ok, "value [1]", "" if ok else "Do 'softgrasp[solver]'.")
+    monkeypatch.setattr(doctor, "CHECKS", (("thing", lambda: check),))
+    out = io.StringIO()
+    assert doctor.show(Console(file=out, width=100)) is ok
+    assert "value [1]" in out.getvalue()
+    assert ("softgrasp[solver]" in out.getvalue()) is not ok
+    assert os.linesep in out.getvalue()

@@ -1,0 +1,100 @@
+"""The page that compares with the paper, from results as the commands return them."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softgrasp.study.paper import at, number, write_page
+
+POINT = {"N": 14, "error": 1e-3, "error_qv": 1e-2, "time_online": 2e-4, "stable": True}
+REDUCED = {"N": 8, "time_are": 4e-4, "error_P": None, "error_K": 0.1, "stable": False, "reason": ""}
+ROOT = Path(__file__).parents[2]
+
+
+def about(title: str, preserving: bool) -> dict[str, Any]:
+    return {"title": title, "structure_preserving": preserving, "N_energy": 5}
+
+
+@pytest.fixture
+def results() -> dict[str, dict[str, Any]]:
+    """As the three commands return them, cut to what the page reads."""
+    methods = {
+        "global_pod": [POINT | {"error": 0.5, "time_online": 3e-4, "stable": False}],
+        "psd": [POINT, POINT | {"N": 40, "error": 1e-5, "stable": False}],
+        "psd_fixed": [POINT | {"error": 2e-3}],
+    }
+    titles = {"global_pod": about("global POD", False), "psd": about("PSD", True), "psd_fixed": about("PSD, f", True)}
+    run = {"method": "pod", "N": 16, "distance_final": 2e-4, "cost": 11.0, "reason": ""}
+    return {
+        "forward": {"states": 1916, "time": {"factor": 0.002, "steps": 0.04}},
+        "reduce": {
+            "methods": methods,
+            "about": titles,
+            "speed": [{"method": "psd", "speedup": 200.0, "speedup_whole": 100.0}],
+        },
+        "control": {
+            "states": 880,
+            "time": {"are": 0.2},
+            "loop": {"distance_final": 1e-4, "cost": 10.0, "reduced": [run, run | {"reason": "not stable"}]},
+            "reduced": {"pod": [REDUCED], "pod_decomposed": [REDUCED | {"error_P": 0.25, "stable": True}]},
+        },
+    }
+
+
+@pytest.mark.serial
+def test_page_has_every_row(tmp_path: Path, results: dict[str, dict[str, Any]]) -> None:
+    page, data = write_page(tmp_path, results)
+    found = json.loads(data.read_text())
+    forward = {row["quantity"]: row["here"] for row in found["forward"]}
+    assert forward["stable at every N tried"] == "PSD, f"
+    assert forward["reduced runs, all six methods and N"] == "0.0002 to 0.0003 s"
+    assert forward["errors of methods that preserve structure, N = 14"] == (
+        "preserving: 0.001, 0.002; not preserving: 0.5 unstable"
+    )
+    assert forward["best PSD"].startswith("without fixed solid modes: 0.001 without, 0.002 with")
+    assert forward["PSD beyond N = 25"] == "0.001 at N = 14, 1e-05 at N = 40"
+    control = {row["quantity"]: row["here"] for row in found["control"]}
+    assert "not finite" in control["POD of P, N = 8"]
+    assert "not stable" in control["POD of P, N = 8"]
+    assert control["speed-up, POD of P, N = 8"] == "500"
+    assert control["target reached, POD of P, N = 16"] in ("0.0002 m off, excess cost 0.1", "not stable")
+    assert control["smallest error of P at N = 8"] == "inf without, 0.25 with"
+    text = page.read_text()
+    # every number that the paper states on its results
+    for words in (
+        "16.22 s",
+        "84.53 s",
+        "167",
+        "1600",
+        "0.097 to 0.101 s",
+        "0.051 to 0.057 s",
+        "0.053 s",
+        "1916",
+        "880",
+    ):
+        assert words in text
+    assert "Versions" in text
+
+
+@pytest.mark.serial
+def test_every_reference_is_cited_and_every_citation_is_listed() -> None:
+    listed = set(re.findall(r"^- \*\*\[?(\w+)\]?\*\*", (ROOT / "REFERENCES.md").read_text(), re.MULTILINE))
+    places = [
+        path for package in ("fem", "reduction", "lqr", "study", "tests") for path in (ROOT / package).rglob("*.py")
+    ]
+    places += [*(ROOT / "demos").rglob("*.py"), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    text = "\n".join(path.read_text() for path in places if path != Path(__file__))
+    cited = set(re.findall(r"\[([A-Z][A-Za-z]*\d{2,4}[a-z]?)\]", text))
+    assert cited <= listed
+    assert [key for key in listed if key not in text] == []
+
+
+def test_nearest_point_and_numbers() -> None:
+    assert at([{"N": 4}, {"N": 10}, {"N": 12}], 8)["N"] == 10
+    assert number(None) == "not finite"
+    assert number(0.12345, " s") == "0.123 s"
