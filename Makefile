@@ -33,7 +33,7 @@ test: lint ## lint, then the tests on 1, 2 and 3 ranks
 	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q
 
 bench: $(STAMP) ## print the table of costs of the forward run
-	$(BIN)/python -m softgrasp.study.bench.forward
+	$(BIN)/python -m softgrasp.study.bench forward
 
 paper: $(STAMP) ## every figure and table of the paper, and a page that compares
 	$(BIN)/python -m softgrasp.study.paper --out out/paper

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args, get_origin
 from mpi4py import MPI
 from pydantic import BaseModel, ValidationError
 
+from softgrasp import PACKAGE
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
 
@@ -34,7 +35,7 @@ _EXPECTED = {
 
 def shipped_scenes() -> dict[str, Path]:
     """Name and path of the scenes that ship with the project. Not collective."""
-    folder = Path(__file__).resolve().parent.parent / "demos" / "scenes"
+    folder = (PACKAGE / "scenes").resolve()
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 

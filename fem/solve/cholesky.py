@@ -1,10 +1,10 @@
 """Cholesky of a matrix that one rank holds, in blocks of d x d, and its solves for distributed vectors.
 
-PETSc's solves with blocks take less time than those with single entries (``python -m softgrasp.study.bench.forward`` prints
-both): one index serves d^2 numbers, and d unknowns at a time. But PETSc takes such a matrix in the order in which it
-comes, so the rows are put in order first (:mod:`fem.solve.order`); and it multiplies by inverses of the blocks on the
-diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured, and a factor of
-single entries is made where blocks would lose digits.
+PETSc's solves with blocks take less time than those with single entries (``python -m softgrasp.study.bench forward``
+prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc takes such a matrix in the order in
+which it comes, so the rows are put in order first (:mod:`fem.solve.order`); and it multiplies by inverses of the blocks
+on the diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured, and a factor
+of single entries is made where blocks would lose digits.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.solve.order import NodeOrder
 from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.solve.order import NodeOrder
 
 # Stable factors leave below 1e-15, in whatever units and however ill-conditioned; blocks may leave 1e-14 and more, as
 # in the hard cases with layers or nu near 0.5. Ten rounding units tell them apart.

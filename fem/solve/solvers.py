@@ -7,17 +7,17 @@ from typing import Literal
 
 import numpy as np
 
-from softgrasp.fem.solve.cholesky import OrderedFactor, factor_blocks
 from softgrasp.fem.errors import SolverError, agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.solve.order import dissect
 from softgrasp.fem.petsc import PETSc, petsc_options, whole_copy
+from softgrasp.fem.solve.cholesky import OrderedFactor, factor_blocks
+from softgrasp.fem.solve.order import dissect
 
 SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
 # Where each road ends on two ranks and 24 GiB: PETSc Cholesky in blocks is fastest per solve, but its factorisation is
-# the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (softgrasp.study.bench.switches), but
+# the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (study.bench.switches), but
 # not the few solves of an equilibrium or of modes, nor when single entries must do. Beyond the last limits the factor
 # itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
@@ -25,7 +25,7 @@ FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
 # every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
-# (softgrasp.study.bench.switches), and each rank needs the memory of the whole factor.
+# (study.bench.switches), and each rank needs the memory of the whole factor.
 REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,

@@ -13,9 +13,9 @@ import numpy as np
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
+from softgrasp.lqr.loop.small_plant import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
-from softgrasp.lqr.loop.small_plant import SmallPlant
 
 FORMAT = 1
 
@@ -89,7 +89,7 @@ class Controller:
         one = np.eye(N)
         if not (np.array_equal(self.plant.S_q, one[:n_s]) and np.array_equal(self.plant.S_v, one[n_s : 2 * n_s])):
             raise ControlError(
-                "the plant of a controller must begin with q_s and v_s; make it with softgrasp.lqr.loop.small_plant.project"
+                "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small_plant.project"
             )
         if not self.period > 0:
             raise ControlError(f"period = {self.period} s of the controller must be positive")

@@ -13,9 +13,10 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex
 from softgrasp.lqr.lowrank.adjoint import Right, closed_adjoint, mass_right
 from softgrasp.lqr.lowrank.compress import compress, gram
-from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import WINDOW, ShiftQueue
+from softgrasp.lqr.plant.block import Block
 from softgrasp.reduction.engines import on_root
 
 Progress = Callable[[dict[str, float]], None]

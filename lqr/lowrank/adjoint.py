@@ -10,8 +10,9 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex, total
-from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
+from softgrasp.lqr.plant.block import Block
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.lowrank.compress import triangular
-from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.block import Block
 
 SHORTEST = 1e-2
 

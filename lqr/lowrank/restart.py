@@ -13,7 +13,8 @@ from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.lowrank.adi import SHARE, Columns, Sweep
 from softgrasp.lqr.lowrank.adjoint import Right
-from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.plant.block import Block
 
 FORMAT = 2
 

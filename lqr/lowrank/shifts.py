@@ -10,7 +10,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
 from softgrasp.lqr.lowrank.adjoint import Right
-from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.plant.block import Block
 from softgrasp.reduction.engines import on_root
 
 WINDOW = 10  # blocks of Z whose Ritz values give the next shifts

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop
-from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import costates_to_absolute, factor_of, gain_of, gain_to_absolute
 from softgrasp.lqr.plant.operators import descriptor, descriptor_adjoint, dynamics, inputs_adjoint, outputs
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop
 from softgrasp.reduction.engines import on_root
 
 
@@ -161,8 +161,8 @@ class GainJudge:
     def quality(self, gain: Block) -> LoopQuality:
         """Abscissa and cost excess of any gain. Collective.
 
-        Large scenes take the abscissa from :func:`lqr.spectrum.certificate.certified_abscissa` and the cost from the lowest modes;
-        where the certificate fails, all modes are taken as long as a dense spectrum is affordable.
+        Large scenes take the abscissa from :func:`lqr.spectrum.certificate.certified_abscissa` and the cost from the
+        lowest modes; where the certificate fails, all modes are taken as long as a dense spectrum is affordable.
         """
         if self.loop.complete:
             return self.loop.quality(gain, self.K, self.start, self.optimal)

@@ -10,10 +10,10 @@ from slepc4py import SLEPc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import PETSc, combine, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
-from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.dense.modal import some_modes
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.plant.operators import damp, descriptor
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
 
@@ -64,8 +64,8 @@ class Abscissa:
 def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
     """Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it. Collective.
 
-    :class:`lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle |s - sigma| <= d with
-    d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely many eigenvalues
+    :class:`lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle |s - sigma| <= d
+    with d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely many eigenvalues
     accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them outside. One solve
     with sigma^2 M_ee + sigma D_ee + K_ee a step, factored once; the few inputs enter by Sherman-Morrison-Woodbury.
 
@@ -82,7 +82,9 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
     """
     n_s = problem.layout.n_s
     if n_s == 0:
-        raise ControlError("the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop")
+        raise ControlError(
+            "the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop"
+        )
     K_q = K.hand[:n_s].T
     if not np.linalg.svd(K_q, compute_uv=False)[-1] > 100 * EPS * np.linalg.norm(K.hand):
         reason = "the gain on a rigid displacement is singular: the hand is not held"

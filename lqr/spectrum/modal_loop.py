@@ -10,8 +10,8 @@ import scipy.linalg
 from softgrasp.fem.petsc import Array, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import damp, reach
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.reduction.engines import on_root
 
@@ -27,7 +27,8 @@ class LoopQuality:
     Attributes:
         abscissa: largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``.
         cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
-        certified: its sign is certain: from the whole spectrum, or from :func:`lqr.spectrum.certificate.certified_abscissa`.
+        certified: its sign is certain: from the whole spectrum, or from
+            :func:`lqr.spectrum.certificate.certified_abscissa`.
         exact: the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth.
     """
 

@@ -1,4 +1,4 @@
-"""What the engines of a reduced basis cost and how far they are right: ``python -m softgrasp.study.bench.bases``."""
+"""What the engines of a reduced basis cost and how far they are right: ``python -m softgrasp.study.bench bases``."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from rich.table import Table
 from softgrasp.fem.petsc import Array, total
 from softgrasp.reduction.engines import factor, small_svd
 from softgrasp.study.bench.forward import parse_ranks
-from softgrasp.study.bench.forward_rows import interleave, medians, timed
-from softgrasp.study.shell.doctor import IN_MPI_JOB
 from softgrasp.study.shell.jobs import launch_worker, leave_result
+from softgrasp.study.shell.processes import IN_MPI_JOB
+from softgrasp.study.shell.timing import interleave, medians, timed
 
 SIZES = "10000x600,100000x600"
 KEPT = 60  # basis vectors that are made
@@ -54,7 +54,6 @@ matrix stands beside them on one rank.
 Keep the machine quiet while it runs. A fast look: --sizes 2000x100 --ranks 1 --repeats 3."""
 
 Row = dict[str, Any]
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 def parse_shapes(text: str) -> list[tuple[int, int]]:
@@ -175,7 +174,7 @@ def measure(comm: MPI.Intracomm, n: int, m: int, repeats: int) -> Row:
 def launch(n: int, m: int, ranks: int, repeats: int) -> Row:
     """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
     spec = {"n": n, "m": m, "repeats": repeats}
-    return {"rows": n, "columns": m, "ranks": ranks} | launch_worker("softgrasp.study.bench.bases", spec, ranks, WORKER_LIMIT)
+    return {"rows": n, "columns": m, "ranks": ranks} | launch_worker("bases", spec, ranks, WORKER_LIMIT)
 
 
 def table_of(results: Sequence[Row]) -> Table:
@@ -234,7 +233,6 @@ def run_worker(spec: dict[str, Any]) -> None:
     leave_result(spec["file"], lambda: measure(MPI.COMM_WORLD, spec["n"], spec["m"], spec["repeats"]))
 
 
-@app.command(help=HELP)
 def main(
     sizes: Annotated[str, typer.Option(help="rows x columns")] = SIZES,
     ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
@@ -272,7 +270,3 @@ def main(
         console.print(f"  {file}")
     if late or any("error" in row for row in results):
         raise typer.Exit(1)
-
-
-if __name__ == "__main__":
-    app()

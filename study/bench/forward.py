@@ -1,4 +1,4 @@
-"""What the forward run costs, as one table, JSON, CSV and figure: ``python -m softgrasp.study.bench.forward``."""
+"""What the forward run costs, as one table, JSON, CSV and figure: ``python -m softgrasp.study.bench forward``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from softgrasp.study.shell.doctor import IN_MPI_JOB
 from softgrasp.study.shell.jobs import launch_worker
+from softgrasp.study.shell.processes import IN_MPI_JOB
 
 SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"
 LARGE = (("2d", 1_000_000), ("3d", 200_000))
@@ -50,7 +50,6 @@ Keep the machine quiet while it runs. A fast look: --sizes 2d:1000 --ranks 1 --r
 --large adds 2D with 1e6 and 3D with 2e5 unknowns, {LARGE_STEPS} steps each on {LARGE_RANKS} ranks: minutes, GiB."""
 
 Row = dict[str, Any]
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def parse_ranks(text: str) -> list[int]:
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
     """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
-    return {"ranks": ranks} | launch_worker("softgrasp.study.bench.forward", spec, ranks, WORKER_LIMIT)
+    return {"ranks": ranks} | launch_worker("forward", spec, ranks, WORKER_LIMIT)
 
 
 def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
@@ -302,7 +301,6 @@ def collect(console: Console, sizes: list[tuple[str, int]], ranks: list[int], re
     return rows
 
 
-@app.command(help=HELP)
 def main(
     sizes: Annotated[str, typer.Option(help="tissue unknowns; 2d:1000 is the paper's scene exactly")] = SIZES,
     ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
@@ -334,7 +332,3 @@ def main(
         console.print(f"  {file}")
     if any("error" in row for row in rows):
         raise typer.Exit(1)
-
-
-if __name__ == "__main__":
-    app()

@@ -7,25 +7,34 @@ import gc
 import resource
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.run.midpoint import midpoint_matrix
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, whole_copy
+from softgrasp.fem.run.drive import TableDrive
+from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
-from softgrasp.fem.solve.solvers import make_solver
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.study.bench.peers import BareSolve, PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, has_pymor, to_scipy
+from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.solvers import make_solver
+from softgrasp.study.bench.peers import (
+    BareSolve,
+    PlainCholesky,
+    PymorLoop,
+    ScipyLoop,
+    TextbookLoop,
+    has_pymor,
+    to_scipy,
+)
 from softgrasp.study.shell.jobs import leave_result
+from softgrasp.study.shell.timing import interleave, medians, timed, warm
 
 DT = 0.005  # [s], that of the paper: 600 steps in 3 s
 PAPER_STEPS = 600
@@ -72,39 +81,6 @@ def peak_mb(comm: MPI.Intracomm) -> float:
     except (OSError, StopIteration):
         mine = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return float(comm.allreduce(mine))
-
-
-def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
-    """Seconds of a call on the slowest rank. Collective."""
-    gc.collect()
-    comm.Barrier()
-    begin = time.perf_counter()
-    call()
-    return float(comm.allreduce(time.perf_counter() - begin, MPI.MAX))
-
-
-def warm(count: int) -> int:
-    """Steps before the timed ones: the method before left the caches full of its own factor. Not collective."""
-    return max(1, count // 20)
-
-
-def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
-    """Call every method once a repeat, in rotated order, and keep what each returns. Collective if the methods are.
-
-    Noise of the machine then hits all methods alike, and none is always the first.
-    """
-    names = list(methods)
-    samples: dict[str, list[float]] = {name: [] for name in names}
-    for i in range(repeats):
-        shift = i % len(names)
-        for name in names[shift:] + names[:shift]:
-            samples[name].append(methods[name]())
-    return samples
-
-
-def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:
-    """Median of each list. Not collective."""
-    return {name: float(statistics.median(values)) for name, values in samples.items()}
 
 
 def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dict[str, list[float]], float, float]:

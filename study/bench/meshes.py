@@ -1,4 +1,4 @@
-"""Reduced online time stays flat while the full model grows: ``python -m softgrasp.study.bench.meshes``."""
+"""Reduced online time stays flat while the full model grows: ``python -m softgrasp.study.bench meshes``."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.forward.result import package_version
+from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.registry import METHODS, find_method
-from softgrasp.study.shell.session import list_files, machine, write_json
 from softgrasp.reduction.replay import reference
 from softgrasp.study.reduce.sweep import Point, sweep
+from softgrasp.study.report.files import write_json
+from softgrasp.study.report.origin import machine, package_version
+from softgrasp.study.shell.session import list_files
 
 SIZES = "1e3,1e4,1e5,1e6"
 KEPT = 60  # snapshots of a run, the same on every mesh: those of all steps would not fit in memory at n_e = 1e6
@@ -34,8 +35,6 @@ Prints for every mesh the full run, the offline time (basis and projection, from
 of the reduced model, then the exponents with which they grow and the mesh from which a reduced run is faster than a
 full one. LONG: the full run at n_e = 1e6 takes many minutes and several GB; a fast look: --sizes 1e3,3e3,1e4. Keep the
 machine quiet."""
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @dataclass(frozen=True)
@@ -249,7 +248,6 @@ def parse_sizes(text: str) -> list[int]:
     return result
 
 
-@app.command(help=HELP)
 def main(
     sizes: Annotated[str, typer.Option(help="tissue unknowns")] = SIZES,
     steps: Annotated[int, typer.Option(help="time steps of a run", min=2)] = 600,
@@ -267,7 +265,3 @@ def main(
         if comm.rank == 0:
             Console(stderr=True, highlight=False).print(f"error: {error}", soft_wrap=True, markup=False)
         raise typer.Exit(1) from None
-
-
-if __name__ == "__main__":
-    app()

@@ -1,4 +1,4 @@
-"""What the large Riccati equation costs, as one table, JSON, CSV and figure: ``python -m softgrasp.study.bench.riccati``."""
+"""What the large Riccati equation costs, as table, JSON, CSV, figure: ``python -m softgrasp.study.bench riccati``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from softgrasp.study.bench.forward import Goal, growth, parse_ranks
-from softgrasp.study.shell.doctor import IN_MPI_JOB
 from softgrasp.study.shell.jobs import launch_worker
+from softgrasp.study.shell.processes import IN_MPI_JOB
 
 SIZES = "10,20,40,80,160"
 LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
@@ -41,7 +41,6 @@ Keep the machine quiet while it runs. A fast look: --sizes 10 --ranks 1 --no-pee
 --large adds nx = {LARGEST} (2n > 1e6) on {LARGEST_RANKS} ranks by Newton-ADI and Galerkin: up to half an hour."""
 
 Row = dict[str, Any]
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 def parse_meshes(text: str) -> list[int]:
@@ -64,7 +63,7 @@ def launch(spec: dict[str, Any], ranks: int) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         partial = Path(folder) / "partial.json"
         extra = {"partial": str(partial)} if "methods" in spec else {}
-        row = {"ranks": ranks} | launch_worker("softgrasp.study.bench.riccati", spec | extra, ranks, WORKER_LIMIT)
+        row = {"ranks": ranks} | launch_worker("riccati", spec | extra, ranks, WORKER_LIMIT)
         if "error" in row and partial.is_file():
             reason = row.pop("error")
             row |= json.loads(partial.read_text())
@@ -301,7 +300,6 @@ def collect_peers(console: Console, meshes: list[int], record: Record) -> list[R
     return record.peers
 
 
-@app.command(help=HELP)
 def main(
     sizes: Annotated[str, typer.Option(help="meshes nx; 10 is the paper's")] = SIZES,
     ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
@@ -336,7 +334,3 @@ def main(
         console.print(f"  {file}")
     if any("error" in entry for entry in [*rows, *flat(rows)]):
         raise typer.Exit(1)
-
-
-if __name__ == "__main__":
-    app()

@@ -1,4 +1,4 @@
-"""What stands behind the sizes at which softgrasp changes its method: ``python -m softgrasp.study.bench.switches``."""
+"""What stands behind the sizes at which softgrasp changes its method: ``python -m softgrasp.study.bench switches``."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ import softgrasp.lqr.lowrank.shifted
 import softgrasp.lqr.riccati
 import softgrasp.reduction.online
 from softgrasp.fem.model.build import build
-from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.solve.solvers import SolverName
 from softgrasp.lqr.dense.modal import DenseRiccati
@@ -40,10 +40,11 @@ from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.registry import make_basis
 from softgrasp.reduction.states import States
 from softgrasp.study.bench.forward import parse_ranks
+from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
 from softgrasp.study.bench.riccati_rows import problem_for
-from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for, interleave, timed
-from softgrasp.study.shell.doctor import IN_MPI_JOB
 from softgrasp.study.shell.jobs import launch_worker, leave_result
+from softgrasp.study.shell.processes import IN_MPI_JOB
+from softgrasp.study.shell.timing import interleave, timed
 
 BATCH = 100  # models of a batch
 STEPS = 600
@@ -54,16 +55,18 @@ HELP = """Measure two methods at sizes near those at which softgrasp changes fro
 Each row compares a first and a second method at one size, medians of runs in turn (set-ups and the largest sizes are
 timed once); 'second / first' above 1 means that the first is the faster one. The switches:
 
-batch: many reduced models step together (first) or one after the other (second), up to softgrasp.reduction.online.TOGETHER byte.
-start: the modal Riccati equation from few modes (first) or from one Schur form (second), softgrasp.lqr.lowrank.modal_start.FEW_MODES.
-dense: the dense Riccati solver (first, used up to softgrasp.lqr.riccati.DENSE_STATES states) or Newton-ADI (second).
+batch: many reduced models step together (first) or one after the other (second), up to reduction.online.TOGETHER byte.
+start: the modal Riccati equation from few modes (first) or from one Schur form (second), lqr.lowrank.modal_start.
+FEW_MODES.
+dense: the dense Riccati solver (first, used up to lqr.riccati.DENSE_STATES states) or Newton-ADI (second).
 shift: a shifted factor and solve for each rank, SuperLU on whole matrices (first) or MUMPS (second), GATHER_LIMIT of
-softgrasp.lqr.lowrank.shifted.
-set-up, step: of the forward run with PETSc Cholesky (first) or MUMPS (second), softgrasp.fem.solve.solvers.CHOLESKY_LIMIT.
-whole: the same with MUMPS' whole factor on every rank (first) or a spread one (second), softgrasp.fem.solve.solvers.REPEATED_LIMIT.
+lqr.lowrank.shifted.
+set-up, step: of the forward run with PETSc Cholesky (first) or MUMPS (second), fem.solve.solvers.
+CHOLESKY_LIMIT.
+whole: the same with MUMPS' whole factor on every rank (first) or a spread one (second), fem.solve.solvers.
+REPEATED_LIMIT.
 
 Keep the machine quiet. A fast look: --switches batch,start --repeats 3."""
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @dataclass(frozen=True)
@@ -270,7 +273,6 @@ def table_of(rows: list[Row]) -> Table:
     return table
 
 
-@app.command(help=HELP)
 def main(
     switches: Annotated[str, typer.Option(help="which, with commas")] = ",".join(SWITCHES),
     ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
@@ -298,7 +300,7 @@ def main(
         for k in [k for k in counts if k == 1 or name not in SERIAL]:
             with console.status(f"{name}, {k} rank(s)"):
                 spec = {"switch": name, "repeats": repeats, "large": large}
-                found = launch_worker("softgrasp.study.bench.switches", spec, k, WORKER_LIMIT)
+                found = launch_worker("switches", spec, k, WORKER_LIMIT)
             if "error" in found:
                 failed = True
                 console.print(f"{name}, {k} rank(s): {found['error']}", markup=False)
@@ -315,7 +317,3 @@ def main(
         console.print(f"  {path}")
     if failed:
         raise typer.Exit(1)
-
-
-if __name__ == "__main__":
-    app()

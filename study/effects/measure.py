@@ -16,16 +16,16 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import Array, PETSc, whole_copy
 from softgrasp.fem.run.drive import Force
 from softgrasp.fem.run.motion import motion_table
-from softgrasp.fem.solve.order import dissect
-from softgrasp.fem.petsc import Array, PETSc, whole_copy
 from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.study.bench.forward_rows import interleave, medians
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.order import dissect
 from softgrasp.study.effects.objects import STEPS, counting
 from softgrasp.study.effects.switch import changed
+from softgrasp.study.shell.timing import interleave, medians
 
 BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
 BURST_SECONDS = 0.02  # of the steps of one; long against the timer

@@ -5,33 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import platform
-import resource
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import hand_axes, unit
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import Trajectory
 from softgrasp.fem.scene.file import resolved_toml, scene_hash
-
-
-def package_version() -> str:
-    """Version of the installed distribution, or "source" in a bare checkout."""
-    try:
-        return version("softgrasp")
-    except PackageNotFoundError:
-        return "source"
-
-
-def peak_memory_mb(comm: MPI.Intracomm) -> float:
-    """Largest resident memory so far, summed over the ranks [MiB]. Collective."""
-    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+from softgrasp.study.report.origin import package_version, peak_memory_mb
 
 
 def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.study.shell.session import write_json, write_scene
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.reduce.tables import (
     BOX_HEADER,
     ERROR_HEADER,
@@ -22,11 +21,13 @@ from softgrasp.study.reduce.tables import (
     time_rows,
     write_csv,
 )
-from softgrasp.study.report.page import Section, command_line, made_with, write_report
+from softgrasp.study.report.files import write_json, write_scene
+from softgrasp.study.report.origin import command_line, made_with
+from softgrasp.study.report.page import Section, write_report
 
 if TYPE_CHECKING:
-    from softgrasp.study.reduce.run import Reduced
     from softgrasp.study.reduce.pictures import Views
+    from softgrasp.study.reduce.run import Reduced
 
 CAPTIONS = {
     "errors.png": "Relative errors of the paper's six methods against N. First the state that the basis is built "

@@ -219,7 +219,8 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
             f"none, the reduced run ({named}) is faster on every mesh (by its time per unknown from n_e = {mesh:.0f})"
         )
     notes.append(
-        f"Break-even mesh: {found}. The reduced time does not grow with the mesh, see python -m softgrasp.study.bench.meshes."
+        f"Break-even mesh: {found}. The reduced time does not grow with the mesh, see "
+        "python -m softgrasp.study.bench meshes."
     )
     notes.append(
         f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "

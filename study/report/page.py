@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import base64
-import platform
 import re
-import shlex
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
-from mpi4py import MPI
 from PIL import Image
-from slepc4py import SLEPc
 
-from softgrasp.fem.petsc import PETSc
-from softgrasp.study.forward.result import package_version
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.equation import Equation, equation
+from softgrasp.study.report.origin import versions
 from softgrasp.study.report.typeset import equation_html
 
 TEMPLATE = """<!doctype html>
@@ -101,7 +95,6 @@ pre{background:none;border:1px solid #bbb;font-size:8pt} .motion{display:none}}
 KINDS = {".png": "image/png", ".gif": "image/gif", ".svg": "image/svg+xml", ".jpg": "image/jpeg"}
 PIXELS_PER_INCH = 135  # width of a figure on the screen against its width in print
 EQUATION = "Equation"  # first word of the heading of a section whose code is an equation
-PACKAGES = {"DOLFINx": ("fenics-dolfinx", "dolfinx-solver-real"), "NumPy": ("numpy",), "SciPy": ("scipy",)}
 HOW = (
     "In a checkout, after `make env`, with OMP_NUM_THREADS=1. All numbers of this page are in {numbers} beside it. "
     "Sizes, counts and errors come out again up to rounding, which the number of ranks changes; times depend on the "
@@ -157,54 +150,6 @@ def of_scene(scene: str) -> Section:
         pydantic.ValidationError: the text is no scene.
     """
     return Section(EQUATION, code=equation_text(equation(Scene.model_validate(tomllib.loads(scene)))))
-
-
-def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int, options: str = "") -> str:
-    """How a page about a scene is made again: the command as it is typed. Not collective."""
-    launch = f"mpiexec -n {ranks} " if ranks > 1 else ""
-    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
-    return f"{launch}softgrasp {command} {shlex.quote(str(path))}{sets}{options}"
-
-
-def made_with(result: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Rows on where the numbers of a result come from, see :func:`study.shell.session.origin`. Not collective."""
-    names = {"version": "softgrasp", "machine": "machine", "ranks": "ranks", "scene_hash": "scene hash"}
-    return [(name, result[key]) for key, name in names.items()]
-
-
-def versions() -> list[tuple[str, str]]:
-    """Versions of this program and of what its numbers come from. Not collective."""
-    commit = _commit(Path(__file__).parents[1] / ".git")
-    rows = [("softgrasp", package_version() + (f", commit {commit}" if commit else ""))]
-    for name, distributions in PACKAGES.items():
-        found = [text for distribution in distributions if (text := _version(distribution))]
-        rows += [(name, found[0])] if found else []
-    rows += [(name, ".".join(map(str, sys.getVersion()))) for name, sys in (("PETSc", PETSc.Sys), ("SLEPc", SLEPc.Sys))]
-    library = MPI.Get_library_version().splitlines()[0].split(",")[0]
-    rows.append(("MPI", " ".join(library.replace("Version:", " ").split())))
-    return [*rows, ("Python", f"{platform.python_version()}, {platform.system()} on {platform.machine()}")]
-
-
-def _version(distribution: str) -> str:
-    try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return ""
-
-
-def _commit(git: Path) -> str:
-    """Ten digits of the commit of a checkout, read from its files; empty where there is none."""
-    try:
-        head = (git / "HEAD").read_text().strip()
-        if not head.startswith("ref: "):
-            return head[:10]
-        name = head.removeprefix("ref: ")
-        if (git / name).exists():
-            return (git / name).read_text()[:10]
-        packed = (git / "packed-refs").read_text().splitlines()
-        return next((line[:10] for line in packed if line.endswith(f" {name}")), "")
-    except OSError:
-        return ""
 
 
 def outside(page: str) -> list[str]:

@@ -9,8 +9,6 @@ import importlib
 import os
 import shlex
 import shutil
-import signal
-import subprocess
 import sys
 import sysconfig
 import tempfile
@@ -22,9 +20,10 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
+from softgrasp.study.shell.processes import IN_MPI_JOB, find_mpiexec, run_limited
+
 LAUNCH_LIMIT = 30.0  # [s] for two ranks that only say how many they are
-SAY_SIZE = "import fem, sys; from mpi4py import MPI; sys.stdout.write(f'{MPI.COMM_WORLD.size}\\n')"
+SAY_SIZE = "import sys, softgrasp.fem._stack; from mpi4py import MPI; sys.stdout.write(f'{MPI.COMM_WORLD.size}\\n')"
 MPI_FAMILIES = {
     "MPICH": ("hydra", "mpich"),
     "Open MPI": ("open mpi", "openrte", "open-mpi"),
@@ -65,7 +64,7 @@ def check_dolfinx() -> Check:
 
 def check_petsc() -> Check:
     """PETSc with real double scalars. Not collective."""
-    importlib.import_module("fem")  # MPI before petsc4py
+    importlib.import_module("softgrasp.fem._stack")  # MPI before petsc4py
     petsc = importlib.import_module("petsc4py.PETSc")
     np = importlib.import_module("numpy")
     scalar, integer = np.dtype(petsc.ScalarType), np.dtype(petsc.IntType)
@@ -77,38 +76,15 @@ def check_petsc() -> Check:
 
 def check_slepc() -> Check:
     """SLEPc. Not collective."""
-    importlib.import_module("fem")
+    importlib.import_module("softgrasp.fem._stack")
     version = importlib.import_module("slepc4py.SLEPc").Sys.getVersion()
     return Check("SLEPc", True, ".".join(str(part) for part in version))
-
-
-def find_mpiexec() -> str | None:
-    """The launcher beside this Python, else the first on PATH. Not collective."""
-    beside = Path(sys.executable).parent / "mpiexec"
-    return str(beside) if os.access(beside, os.X_OK) else shutil.which("mpiexec")
 
 
 def family(text: str) -> str:
     """Name the MPI family that a version text belongs to, or "unknown". Not collective."""
     low = text.lower()
     return next((name for name, words in MPI_FAMILIES.items() if any(word in low for word in words)), "unknown")
-
-
-def run_limited(command: list[str], limit: float) -> tuple[int | None, str]:
-    """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough.
-
-    Not collective.
-    """
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    ) as process:
-        try:
-            output, _ = process.communicate(timeout=limit)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            output, _ = process.communicate()
-            return None, output
-    return process.returncode, output
 
 
 def check_launcher() -> Check:
@@ -181,7 +157,7 @@ def check_compiler() -> Check:
 
 def check_cache() -> Check:
     """The folder of compiled forms can be written. Not collective."""
-    importlib.import_module("fem")
+    importlib.import_module("softgrasp.fem._stack")
     folder = Path(importlib.import_module("dolfinx.jit").get_options()["cache_dir"])
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -194,7 +170,7 @@ def check_cache() -> Check:
 
 def check_adios2() -> Check:
     """ADIOS2 inside DOLFINx, for VTX series. Not collective."""
-    importlib.import_module("fem")
+    importlib.import_module("softgrasp.fem._stack")
     ok = hasattr(importlib.import_module("dolfinx.io"), "VTXWriter")
     cure = "" if ok else "Use a DOLFINx built with ADIOS2, or ask for XDMF output."
     return Check("ADIOS2", ok, "VTX output" if ok else "missing", cure)

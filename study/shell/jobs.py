@@ -14,16 +14,17 @@ from typing import Any
 
 from mpi4py import MPI
 
-from softgrasp.study.shell.doctor import find_mpiexec
+from softgrasp import PACKAGE
+from softgrasp.study.shell.processes import find_mpiexec
 
 
-def launch_worker(module: str, spec: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
-    """Run ``python -m module --worker SPEC`` on some ranks; its numbers, or ``error`` with the reason it gave.
+def launch_worker(name: str, spec: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
+    """Run ``python -m softgrasp.study.bench NAME --worker SPEC`` on some ranks; its numbers, or ``error``.
 
     Not collective.
 
     Args:
-        module: whose command passes the specification to :func:`leave_result`.
+        name: of the benchmark, whose command passes the specification to :func:`leave_result`.
         spec: the job, fit for JSON.
         ranks: MPI ranks.
         limit: longest time [s].
@@ -31,13 +32,13 @@ def launch_worker(module: str, spec: dict[str, Any], ranks: int, limit: float) -
     mpiexec = find_mpiexec()
     if mpiexec is None:
         return {"error": "no mpiexec found; `softgrasp doctor` says what to do"}
-    root = str(Path(__file__).resolve().parent.parent)
+    root = str(PACKAGE.parent)
     path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "row.json"
         text = json.dumps(spec | {"file": str(file)})
-        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", module, "--worker", text]
+        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "softgrasp.study.bench", name, "--worker", text]
         try:
             done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
         except subprocess.TimeoutExpired:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import platform
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.study.forward.result import package_version
+from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.scene.file import load_scene_collective, resolved_toml, scene_hash
 
 
 def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
@@ -61,45 +56,3 @@ def list_files(console: Console, files: Sequence[Path]) -> None:
     console.print("files:")
     for file in files:
         console.print(f"  {file}", soft_wrap=True, markup=False)
-
-
-def machine() -> str:
-    """Processor, system and Python, as results name them. Not collective."""
-    return f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}"
-
-
-def origin(scene: Scene, ranks: int) -> dict[str, Any]:
-    """Where the numbers of a result come from: the first keys of its ``result.json``. Not collective."""
-    return {
-        "scene": scene.name,
-        "scene_hash": scene_hash(scene),
-        "version": package_version(),
-        "ranks": ranks,
-        "machine": machine(),
-    }
-
-
-def plain(value: Any) -> Any:
-    """A value that JSON can hold: what is not finite becomes None. Not collective."""
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [plain(v) for v in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
-
-
-def write_scene(out: Path, scene: Scene) -> Path:
-    """Write the resolved scene beside a result. Not collective: call on one rank."""
-    path = out / "scene.toml"
-    path.write_text(resolved_toml(scene))
-    return path
-
-
-def write_json(path: Path, result: dict[str, Any]) -> Path:
-    """Write a result; what is not finite becomes null. Not collective: call on one rank."""
-    path.write_text(json.dumps(plain(result), indent=2, allow_nan=False) + "\n")
-    return path

@@ -16,6 +16,7 @@ from softgrasp.reduction.states import BasisError
 from softgrasp.reduction.svd_like import balanced, form, svd_like_pairs
 from softgrasp.reduction.truncation import Columns, Part, Truncation, allocate, counts_of, needed
 from softgrasp.study.bench import bases as bench_bases
+from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.bases import known_matrix, parse_shapes, reach, spectrum_of
 from tests.helpers.models import Array, close, same_everywhere
 
@@ -372,7 +373,7 @@ def test_benchmark_prints_one_table_and_fails_with_its_workers(
     for variable in bench_bases.IN_MPI_JOB:
         monkeypatch.delenv(variable, raising=False)
     folder = mpi_tmp_path / str(MPI.COMM_WORLD.rank)
-    done = CliRunner().invoke(bench_bases.app, ["--sizes", "40x8", "--ranks", "1", "--out", str(folder)])
+    done = CliRunner().invoke(app, ["bases", "--sizes", "40x8", "--ranks", "1", "--out", str(folder)])
     assert done.exit_code == 1
     assert "40 x 8, 1 rank(s): no" in done.stdout
     assert (folder / "bench_bases.json").is_file()

@@ -15,7 +15,9 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.study.bench import forward as bench_forward, forward_rows as bench_worker
+from softgrasp.study.bench import forward as bench_forward
+from softgrasp.study.bench import forward_rows as bench_worker
+from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, to_scipy
 
 TINY: dict[str, Any] = {"size": 150, "repeats": 3, "repeat_seconds": 0.005}
@@ -147,8 +149,8 @@ def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypat
     monkeypatch.setattr(bench_forward, "launch", launch)
     for name in bench_forward.IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
-    arguments = ["--sizes", "2d:2000,40000,3d:300", "--out", str(tmp_path)]
-    done = CliRunner().invoke(bench_forward.app, arguments)
+    arguments = ["forward", "--sizes", "2d:2000,40000,3d:300", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 1  # a row failed, and the rest is there
     assert "3D 3e2, 1 rank(s) failed: exit status 1: broken" in done.output
     assert "<= 1.15 missed" in done.output

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 import softgrasp.lqr.lowrank.modal_start
 import softgrasp.reduction.online
 from softgrasp.study.bench import switches as bench_switches
-from softgrasp.study.bench.switches import Row, app, start, table_of
+from softgrasp.study.bench.__main__ import app
+from softgrasp.study.bench.switches import Row, start, table_of
 
 
 @pytest.mark.serial
@@ -32,19 +33,19 @@ def test_command_writes_what_the_workers_measured(
 ) -> None:
     made = Row("batch", "TOGETHER = 1 MB", "3 models", 1, 2.0, 3.0)
     found = {1: {"rows": [vars(made)]}, 2: {"error": "exit status 1: no more"}}
-    monkeypatch.setattr(bench_switches, "launch_worker", lambda module, spec, ranks, limit: found[ranks])
+    monkeypatch.setattr(bench_switches, "launch_worker", lambda name, spec, ranks, limit: found[ranks])
     for name in bench_switches.IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     runner = CliRunner()
-    good = runner.invoke(app, ["--switches", "batch", "--ranks", "1", "--out", str(tmp_path)])
+    good = runner.invoke(app, ["switches", "--switches", "batch", "--ranks", "1", "--out", str(tmp_path)])
     assert good.exit_code == 0, good.output
     assert "1.50" in good.output
     assert json.loads((tmp_path / "bench_switches.json").read_text())["rows"] == [vars(made)]
     assert (tmp_path / "bench_switches.csv").read_text().splitlines()[1].endswith("3 models,1,2.0,3.0")
-    bad = runner.invoke(app, ["--switches", "batch,shift", "--out", str(tmp_path)])
+    bad = runner.invoke(app, ["switches", "--switches", "batch,shift", "--out", str(tmp_path)])
     assert bad.exit_code == 1
     assert "shift, 2 rank(s): exit status 1: no more" in bad.output
     assert "batch, 2 rank(s)" not in bad.output  # on one rank only
-    wrong = runner.invoke(app, ["--switches", "btach", "--out", str(tmp_path)])
+    wrong = runner.invoke(app, ["switches", "--switches", "btach", "--out", str(tmp_path)])
     assert wrong.exit_code == 2
     assert "'btach' is no switch" in wrong.output

@@ -1,0 +1,99 @@
+"""Where the numbers of a result come from: scene, version, machine, memory, command line."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import shlex
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+from slepc4py import SLEPc
+
+from softgrasp import PACKAGE
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.scene.file import scene_hash
+from softgrasp.fem.scene.scene import Scene
+
+
+def package_version() -> str:
+    """Version of the installed distribution, or "source" in a bare checkout."""
+    try:
+        return version("softgrasp")
+    except PackageNotFoundError:
+        return "source"
+
+
+def peak_memory_mb(comm: MPI.Intracomm) -> float:
+    """Largest resident memory so far, summed over the ranks [MiB]. Collective."""
+    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+
+
+def machine() -> str:
+    """Processor, system and Python, as results name them. Not collective."""
+    return f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}"
+
+
+def origin(scene: Scene, ranks: int) -> dict[str, Any]:
+    """Where the numbers of a result come from: the first keys of its ``result.json``. Not collective."""
+    return {
+        "scene": scene.name,
+        "scene_hash": scene_hash(scene),
+        "version": package_version(),
+        "ranks": ranks,
+        "machine": machine(),
+    }
+
+
+PACKAGES = {"DOLFINx": ("fenics-dolfinx", "dolfinx-solver-real"), "NumPy": ("numpy",), "SciPy": ("scipy",)}
+
+
+def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int, options: str = "") -> str:
+    """How a page about a scene is made again: the command as it is typed. Not collective."""
+    launch = f"mpiexec -n {ranks} " if ranks > 1 else ""
+    sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
+    return f"{launch}softgrasp {command} {shlex.quote(str(path))}{sets}{options}"
+
+
+def made_with(result: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Rows on where the numbers of a result come from, see :func:`study.report.origin.origin`. Not collective."""
+    names = {"version": "softgrasp", "machine": "machine", "ranks": "ranks", "scene_hash": "scene hash"}
+    return [(name, result[key]) for key, name in names.items()]
+
+
+def versions() -> list[tuple[str, str]]:
+    """Versions of this program and of what its numbers come from. Not collective."""
+    commit = _commit(PACKAGE.parent / ".git")
+    rows = [("softgrasp", package_version() + (f", commit {commit}" if commit else ""))]
+    for name, distributions in PACKAGES.items():
+        found = [text for distribution in distributions if (text := _version(distribution))]
+        rows += [(name, found[0])] if found else []
+    rows += [(name, ".".join(map(str, sys.getVersion()))) for name, sys in (("PETSc", PETSc.Sys), ("SLEPc", SLEPc.Sys))]
+    library = MPI.Get_library_version().splitlines()[0].split(",")[0]
+    rows.append(("MPI", " ".join(library.replace("Version:", " ").split())))
+    return [*rows, ("Python", f"{platform.python_version()}, {platform.system()} on {platform.machine()}")]
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return ""
+
+
+def _commit(git: Path) -> str:
+    """Ten digits of the commit of a checkout, read from its files; empty where there is none."""
+    try:
+        head = (git / "HEAD").read_text().strip()
+        if not head.startswith("ref: "):
+            return head[:10]
+        name = head.removeprefix("ref: ")
+        if (git / name).exists():
+            return (git / name).read_text()[:10]
+        packed = (git / "packed-refs").read_text().splitlines()
+        return next((line[:10] for line in packed if line.endswith(f" {name}")), "")
+    except OSError:
+        return ""

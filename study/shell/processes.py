@@ -1,0 +1,35 @@
+"""Other programs: the launcher of ranks, and a run that may take only so long. Loads neither MPI nor DOLFINx."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
+
+
+def find_mpiexec() -> str | None:
+    """The launcher beside this Python, else the first on PATH. Not collective."""
+    beside = Path(sys.executable).parent / "mpiexec"
+    return str(beside) if os.access(beside, os.X_OK) else shutil.which("mpiexec")
+
+
+def run_limited(command: list[str], limit: float) -> tuple[int | None, str]:
+    """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough.
+
+    Not collective.
+    """
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    ) as process:
+        try:
+            output, _ = process.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            output, _ = process.communicate()
+            return None, output
+    return process.returncode, output

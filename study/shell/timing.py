@@ -1,0 +1,44 @@
+"""Seconds of calls on the slowest rank, in turn, and their medians."""
+
+from __future__ import annotations
+
+import gc
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from mpi4py import MPI
+
+
+def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
+    """Seconds of a call on the slowest rank. Collective."""
+    gc.collect()
+    comm.Barrier()
+    begin = time.perf_counter()
+    call()
+    return float(comm.allreduce(time.perf_counter() - begin, MPI.MAX))
+
+
+def warm(count: int) -> int:
+    """Steps before the timed ones: the method before left the caches full of its own factor. Not collective."""
+    return max(1, count // 20)
+
+
+def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
+    """Call every method once a repeat, in rotated order, and keep what each returns. Collective if the methods are.
+
+    Noise of the machine then hits all methods alike, and none is always the first.
+    """
+    names = list(methods)
+    samples: dict[str, list[float]] = {name: [] for name in names}
+    for i in range(repeats):
+        shift = i % len(names)
+        for name in names[shift:] + names[:shift]:
+            samples[name].append(methods[name]())
+    return samples
+
+
+def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:
+    """Median of each list. Not collective."""
+    return {name: float(statistics.median(values)) for name, values in samples.items()}
