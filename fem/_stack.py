@@ -1,7 +1,7 @@
 """Load the solver stack in the one order that works.
 
-Threads are fixed before numpy is imported (two ranks with two BLAS threads each are 10 to 200 times slower on two
-cores), and MPI is initialised before any compiled module. The PyPI wheel does the latter in ``dolfinx_solver``; a
+The package itself fixes the threads before numpy is imported (two ranks with two BLAS threads each are 10 to 200 times
+slower on two cores). MPI is initialised before any compiled module: the PyPI wheel does so in ``dolfinx_solver``; a
 cluster's own DOLFINx has no such module and needs ``mpi4py.MPI`` only. PETSc leaves signals to Python.
 """
 
@@ -10,9 +10,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")
 
 # PETSc's handler aborts the program, and with it the run, when the reader of a pipe has gone; an option keeps it off,
 # which PETSc reads when it is initialised, unless that has happened before (see `study.shell.streams`).

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from mpi4py import MPI
+if TYPE_CHECKING:  # scenes are read without MPI
+    from mpi4py import MPI
 
 
 class SoftgraspError(Exception):

@@ -3,24 +3,18 @@
 # ruff: noqa: E402  (the other imports take a second, in which Ctrl-C shall not end in a traceback)
 from __future__ import annotations
 
-from softgrasp.study.shell.streams import outlive_readers, quiet_imports
+from softgrasp.study.shell.streams import quiet_imports
 
 quiet_imports()
 
 import json
-import sys
-import time
-import traceback
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from mpi4py import MPI
-from rich.console import Console
-from rich.text import Text
 
-from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
-from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.errors import SceneError
+from softgrasp.study.shell.ending import console, rank, run_command
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -38,9 +32,21 @@ NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fie
 SceneFile = Annotated[Path, typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship")]
 
 
-def console() -> Console:
-    """A console that writes on rank 0 only."""
-    return Console(quiet=MPI.COMM_WORLD.rank != 0, highlight=False)
+def _show_version(asked: bool) -> None:
+    if asked:
+        from softgrasp import package_version
+
+        typer.echo(f"softgrasp {package_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="print the version and leave")
+    ] = False,
+) -> None:
+    """Options of the program itself."""
 
 
 @app.command()
@@ -75,7 +81,7 @@ def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
     from softgrasp.fem.scene.scene import scene_schema
 
-    if MPI.COMM_WORLD.rank == 0:
+    if rank() == 0:
         typer.echo(json.dumps(scene_schema(), indent=2))
 
 
@@ -86,14 +92,17 @@ def explain(
     set_: Overrides = None,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
+    from mpi4py import MPI
+
     from softgrasp.fem.scene.file import load_scene_collective
     from softgrasp.study.forward.explain import run_explain
     from softgrasp.study.forward.explain_page import write_explanation
     from softgrasp.study.shell.session import list_files
 
-    made = load_scene_collective(MPI.COMM_WORLD, scene, set_ or [])
-    found = run_explain(made, MPI.COMM_WORLD, console())
-    if out is not None and MPI.COMM_WORLD.rank == 0:
+    comm = MPI.COMM_WORLD
+    made = load_scene_collective(comm, scene, set_ or [])
+    found = run_explain(made, comm, console())
+    if out is not None and comm.rank == 0:
         list_files(console(), write_explanation(out, found, made, scene, set_ or []))
 
 
@@ -200,35 +209,9 @@ def hardcases(
     raise typer.Exit(0 if result["ok"] else 1)
 
 
-def _end_all(comm: MPI.Intracomm) -> None:
-    """End the other ranks, which may wait for this one. Not collective."""
-    sys.stderr.flush()
-    if comm.size > 1:
-        time.sleep(0.5)  # the launcher must have passed the text on before it ends
-        comm.Abort(1)
-
-
 def main() -> None:
-    """Entry point: one sentence and status 1 for a user's error; a bug on one rank ends all ranks."""
-    comm = MPI.COMM_WORLD
-    outlive_readers()
-    try:
-        app()
-    except SoftgraspError as error:
-        if comm.rank == 0:
-            Console(stderr=True, highlight=False).print(Text(f"error: {error}"), soft_wrap=True)
-        sys.exit(1)
-    except (SystemExit, KeyboardInterrupt):
-        raise
-    except OSError as error:  # a folder that cannot be made, a full disk: of one rank, so it must end all
-        name = f"{error.filename}: " if error.filename else ""
-        sys.stderr.write(f"error: {name}{error.strerror or error}; check --out, its permissions and the free disk\n")
-        _end_all(comm)
-        sys.exit(1)
-    except BaseException:
-        traceback.print_exc()
-        _end_all(comm)
-        sys.exit(2)
+    """Entry point. Collective, but for the commands that load no MPI: doctor, scenes, schema, --help, --version."""
+    run_command(app)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
 import re
 import shutil
 import subprocess
@@ -14,6 +16,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fem", "reduction", "lqr", "study")
+SCENES = ROOT / "demos" / "scenes"
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MODULE_LINES, FUNCTION_LINES = 400, 60  # what a reader holds in mind
 
@@ -57,22 +60,67 @@ def test_no_path_of_a_machine_in_the_tree() -> None:
     assert [line for line in found if "re.compile" not in line] == []
 
 
-@pytest.mark.serial
-def test_wheel_holds_every_module_and_does_not_ask_for_a_solver(tmp_path: Path) -> None:
-    """A cluster's own DOLFINx must not be shadowed: the wheel depends on no solver stack unless asked."""
-    source = tmp_path / "source"  # building leaves files behind
-    for package in PACKAGES:
-        shutil.copytree(ROOT / package, source / package)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this tree, built from a copy: building leaves files behind."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    for name in (*PACKAGES, "softgrasp", "demos"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(source)]
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(source)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-    (wheel,) = tmp_path.glob("*.whl")
+    (file,) = folder.glob("*.whl")
+    return file
+
+
+@pytest.mark.serial
+def test_wheel_is_one_package_and_does_not_ask_for_a_solver(wheel: Path) -> None:
+    """A cluster's own DOLFINx must not be shadowed, nor a user's own modules: one name, and no solver stack."""
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         metadata = archive.read(next(n for n in names if n.endswith("METADATA"))).decode()
-    assert {str(p.relative_to(ROOT)) for p in SOURCES} <= names
+    assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"softgrasp"}
+    scenes = {f"softgrasp/scenes/{p.relative_to(SCENES)}" for p in SCENES.rglob("*") if p.is_file()}
+    modules = {f"softgrasp/{p.relative_to(ROOT)}" for p in SOURCES}
+    assert modules | scenes | {"softgrasp/__init__.py", "softgrasp/py.typed"} <= names
     needed = re.findall(r"^Requires-Dist: ([\w.-]+)[^;\n]*$", metadata, re.MULTILINE)
     assert "numpy" in needed
     assert not {"dolfinx-solver-real", "mpich", "fenics-dolfinx", "petsc4py"} & set(needed)
+
+
+@pytest.mark.serial
+def test_wheel_runs_a_scene_beside_modules_of_the_same_names(wheel: Path, tmp_path: Path) -> None:
+    site, here = tmp_path / "site", tmp_path / "here"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    (here / "fem").mkdir(parents=True)
+    for name in ("study.py", "lqr.py", "fem/__init__.py"):
+        (here / name).write_text("raise ImportError('a module of the user')\n")
+    changes = ["--set", "tissue.cells=[2,4]", "--set", "time.steps=4"]
+    command = [sys.executable, "-m", "softgrasp.study.cli", "simulate", "paper_forward", "--no-pictures", *changes]
+    done = subprocess.run(
+        command, cwd=here, env=os.environ | {"PYTHONPATH": str(site)}, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads((here / "out" / "result.json").read_text())["steps"] == 4
+
+
+LIGHT = """
+import sys
+from typer.testing import CliRunner
+from softgrasp.study.cli import app
+for line in (["--help"], ["--version"], ["scenes"], ["schema"]):
+    assert CliRunner().invoke(app, line).exit_code == 0, line
+import softgrasp.study.shell.doctor
+loaded = {"mpi4py.MPI", "dolfinx", "petsc4py", "scipy", "matplotlib"} & set(sys.modules)
+sys.exit(", ".join(loaded) or 0)
+"""
+
+
+@pytest.mark.serial
+def test_commands_that_compute_nothing_load_neither_mpi_nor_dolfinx() -> None:
+    done = subprocess.run([sys.executable, "-c", LIGHT], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

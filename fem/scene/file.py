@@ -9,14 +9,16 @@ import re
 import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
-from mpi4py import MPI
 from pydantic import BaseModel, ValidationError
 
 from softgrasp import PACKAGE
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
+
+if TYPE_CHECKING:  # scenes are listed and explained without MPI
+    from mpi4py import MPI
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _FILES = (("tissue", "mesh"), ("motion", "csv"))
@@ -39,6 +41,12 @@ def shipped_scenes() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
+def find_scene(path: str | Path) -> Path:
+    """The scene that ships under a bare name, else the file of that path. Not collective."""
+    file = Path(path)
+    return shipped_scenes().get(file.name, file) if len(file.parts) == 1 and not file.exists() else file
+
+
 def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     """Read and validate a scene file.
 
@@ -50,7 +58,7 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     Raises:
         SceneError: the file is missing, no TOML, or a key is unknown, missing, ill-typed or meaningless.
     """
-    file = Path(path)
+    file = find_scene(path)
     data = _read(file)
     for override in overrides:
         _apply(data, override)

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from softgrasp import package_version
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
@@ -24,7 +25,7 @@ from softgrasp.reduction.registry import METHODS, find_method
 from softgrasp.reduction.replay import reference
 from softgrasp.study.reduce.sweep import Point, sweep
 from softgrasp.study.report.files import write_json
-from softgrasp.study.report.origin import machine, package_version
+from softgrasp.study.report.origin import machine
 from softgrasp.study.shell.session import list_files
 
 SIZES = "1e3,1e4,1e5,1e6"

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp import package_version
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import hand_axes, unit
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import Trajectory
 from softgrasp.fem.scene.file import resolved_toml, scene_hash
-from softgrasp.study.report.origin import package_version, peak_memory_mb
+from softgrasp.study.report.origin import peak_memory_mb
 
 
 def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
+from softgrasp import package_version
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.hardcases import carex as hard_carex
 from softgrasp.study.hardcases import motion as hard_motion
@@ -26,7 +27,7 @@ from softgrasp.study.hardcases import statics as hard_forward
 from softgrasp.study.hardcases.cases import Family, Outcome, Row
 from softgrasp.study.hardcases.plots import figure_family
 from softgrasp.study.report.files import plain, write_json
-from softgrasp.study.report.origin import machine, package_version
+from softgrasp.study.report.origin import machine
 from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.shell.session import list_files, progress_bar
 

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp import package_version
 from softgrasp.fem.errors import Interrupted, SceneError, agree
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import scene_hash
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.switch import changed
 from softgrasp.study.report.files import plain
-from softgrasp.study.report.origin import package_version
 
 FORMAT = 1  # of the cached files
 LEAST_STEPS = 4  # of a run

@@ -13,18 +13,10 @@ from typing import Any
 from mpi4py import MPI
 from slepc4py import SLEPc
 
-from softgrasp import PACKAGE
+from softgrasp import PACKAGE, package_version
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.scene.file import scene_hash
 from softgrasp.fem.scene.scene import Scene
-
-
-def package_version() -> str:
-    """Version of the installed distribution, or "source" in a bare checkout."""
-    try:
-        return version("softgrasp")
-    except PackageNotFoundError:
-        return "source"
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:

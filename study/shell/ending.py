@@ -1,0 +1,65 @@
+"""How a command ends: one sentence and status 1 for a user's error; what only one rank meets ends all ranks."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+
+from rich.console import Console
+from rich.text import Text
+
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.study.shell.streams import outlive_readers
+
+RANK = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")  # set by launchers, known before MPI is loaded
+
+
+def rank() -> int:
+    """Rank of this process, without loading MPI. Not collective."""
+    if "mpi4py.MPI" in sys.modules:
+        from mpi4py import MPI
+
+        return int(MPI.COMM_WORLD.rank)
+    return next((int(os.environ[name]) for name in RANK if os.environ.get(name, "").isdigit()), 0)
+
+
+def console() -> Console:
+    """A console that writes on rank 0 only. Not collective."""
+    return Console(quiet=rank() != 0, highlight=False)
+
+
+def end_all() -> None:
+    """End the other ranks, which may wait for this one. Not collective."""
+    sys.stderr.flush()
+    if "mpi4py.MPI" not in sys.modules:
+        return
+    from mpi4py import MPI
+
+    if MPI.COMM_WORLD.size > 1:
+        time.sleep(0.5)  # the launcher must have passed the text on before it ends
+        MPI.COMM_WORLD.Abort(1)
+
+
+def run_command(command: Callable[[], object]) -> None:
+    """Run a command line to its end. Collective."""
+    outlive_readers()
+    try:
+        command()
+    except SoftgraspError as error:
+        if rank() == 0:
+            Console(stderr=True, highlight=False).print(Text(f"error: {error}"), soft_wrap=True)
+        sys.exit(1)
+    except (SystemExit, KeyboardInterrupt):
+        raise
+    except OSError as error:  # a folder that cannot be made, a full disk: of one rank, so it must end all
+        name = f"{error.filename}: " if error.filename else ""
+        sys.stderr.write(f"error: {name}{error.strerror or error}; check --out, its permissions and the free disk\n")
+        end_all()
+        sys.exit(1)
+    except BaseException:
+        traceback.print_exc()
+        end_all()
+        sys.exit(2)
