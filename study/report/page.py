@@ -230,7 +230,7 @@ def _prepared(section: Section) -> dict[str, Any]:
         "code": section.code,
         "equation": equation_html(section.code) if section.title.startswith(EQUATION) and section.code else "",
         "header": section.header,
-        "rows": [[_shown(cell) for cell in row] for row in section.rows],
+        "rows": [[shown(cell) for cell in row] for row in section.rows],
         "align": [Markup(f' class="{kind}"') if kind else "" for kind in kinds],
         "kind": "wider" if section.header else "pairs",
         "figures": figures,
@@ -239,13 +239,13 @@ def _prepared(section: Section) -> dict[str, Any]:
 
 def _column(cells: Sequence[Any]) -> str:
     """Class of a column: "n" for numbers, "t" for text long enough to be broken into lines."""
-    texts = [_shown(cell) for cell in cells]
+    texts = [shown(cell) for cell in cells]
     if all(not t or (isinstance(c, NUMBERS) and not isinstance(c, bool)) for c, t in zip(cells, texts, strict=True)):
         return "n"
     return "t" if max(map(len, texts)) > LONG else ""
 
 
-def _shown(cell: Any) -> str:
+def shown(cell: Any) -> str:
     """Text of a cell: numbers with four digits, counts in full, nothing for None."""
     if cell is None:
         return ""

@@ -1,42 +1,139 @@
-"""What the commands do alike: the scene and its size at the start, progress, result.json, the files at the end."""
+"""One command in progress: the scene and its size at the start, progress, result.json, tables and page at the end."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
+from softgrasp.fem.errors import agree
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.scene.file import load_scene_collective
+from softgrasp.fem.scene.file import load_scene_collective, resolved_toml
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.report.files import write_json, write_scene
+from softgrasp.study.report.origin import command_line
+from softgrasp.study.report.page import Section, write_report
+from softgrasp.study.report.tables import Table
 
 
-def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
-    """Load a scene file and print its name and description. Collective.
+@dataclass(frozen=True)
+class Page:
+    """What a command writes beside result.json.
 
-    Raises:
-        SceneError: the file or a key is wrong.
+    Attributes:
+        title: first line of the page.
+        sections: parts of the page.
+        tables: CSV file name -> table.
+        files: what is written already, pictures and fields.
+        options: of the command line, for the page's last line: " --tolerance 1e-2".
     """
-    scene = load_scene_collective(MPI.COMM_WORLD, path, overrides)
-    described = f": {escape(scene.description)}" if scene.description else ""
-    console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
-    return scene
+
+    title: str
+    sections: Sequence[Section]
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    files: Sequence[Path] = ()
+    options: str = ""
 
 
-def open_model(scene: Scene, console: Console) -> Model:
-    """Build a scene and print its size. Collective.
+@dataclass(frozen=True)
+class Session:
+    """What a command was called with.
 
-    Raises:
-        SoftgraspError: the scene cannot be built.
+    Attributes:
+        command: its name.
+        path: scene file.
+        overrides: arguments of ``--set``.
+        out: folder of the results.
+        console: writes on rank 0 only.
+        quiet: no progress bars.
+        pictures: draw figures.
+        begin: clock at the start [s].
     """
-    model = build(scene, MPI.COMM_WORLD)
-    layout = model.system.layout
-    console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
-    return model
+
+    command: str
+    path: Path
+    overrides: Sequence[str]
+    out: Path
+    console: Console
+    quiet: bool = False
+    pictures: bool = True
+    begin: float = field(default_factory=time.perf_counter)
+
+    @property
+    def comm(self) -> MPI.Intracomm:
+        """Ranks that run the command."""
+        return MPI.COMM_WORLD
+
+    def scene(self) -> Scene:
+        """Load the scene file and print its name and description. Collective.
+
+        Raises:
+            SceneError: the file or a key is wrong.
+        """
+        scene = load_scene_collective(self.comm, self.path, self.overrides)
+        described = f": {escape(scene.description)}" if scene.description else ""
+        self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
+        return scene
+
+    def model(self, scene: Scene) -> Model:
+        """Build a scene and print its size. Collective.
+
+        Raises:
+            SoftgraspError: the scene cannot be built.
+        """
+        model = build(scene, self.comm)
+        layout = model.system.layout
+        sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
+        self.console.print(sizes)
+        return model
+
+    def progress(self, count: ProgressColumn) -> Progress:
+        """Bars with the time left, in a terminal only. Not collective."""
+        return progress_bar(self.console, count, quiet=self.quiet)
+
+    def write(self, scene: Scene, result: dict[str, Any], page: Callable[[], Page]) -> list[Path]:
+        """Write result.json, scene.toml, tables and report.html on rank 0. Collective.
+
+        Args:
+            scene: as it was run.
+            result: what result.json holds, equal on all ranks; takes ``time.pictures`` and ``time.total`` on rank 0.
+            page: draws and composes the rest; called on rank 0 only, so it must not communicate.
+
+        Returns:
+            The files, on rank 0.
+
+        Raises:
+            OSError: the folder cannot be written; on all ranks.
+        """
+        files: list[Path] = []
+        with agree(self.comm):
+            if self.comm.rank == 0:
+                self.out.mkdir(parents=True, exist_ok=True)
+                drawing = time.perf_counter()
+                made = page()
+                now = time.perf_counter()
+                result.setdefault("time", {}).update(pictures=now - drawing, total=now - self.begin)
+                files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
+                files += [table.write_csv(self.out / name) for name, table in made.tables.items()]
+                files += made.files
+                files.append(
+                    write_report(
+                        self.out / "report.html",
+                        title=made.title,
+                        subtitle=scene.description,
+                        sections=made.sections,
+                        scene=resolved_toml(scene),
+                        reproduce=command_line(self.command, self.path, self.overrides, self.comm.size, made.options),
+                    )
+                )
+        return files
 
 
 def progress_bar(console: Console, count: ProgressColumn, *, quiet: bool = False) -> Progress:
@@ -56,3 +153,13 @@ def list_files(console: Console, files: Sequence[Path]) -> None:
     console.print("files:")
     for file in files:
         console.print(f"  {file}", soft_wrap=True, markup=False)
+
+
+def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
+    """See :meth:`Session.scene`; for commands that are not one yet. Collective."""
+    return Session("", path, overrides, Path(), console).scene()
+
+
+def open_model(scene: Scene, console: Console) -> Model:
+    """See :meth:`Session.model`; for commands that are not one yet. Collective."""
+    return Session("", Path(), (), Path(), console).model(scene)

@@ -1,0 +1,92 @@
+"""A table once, for the terminal, the page, CSV and Markdown."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rich.box
+import rich.table
+from rich.markup import escape
+
+from softgrasp.study.report.page import NUMBERS, Section, shown
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns with their rows.
+
+    Attributes:
+        header: names of the columns, units in brackets: "step [s]".
+        rows: cells, as many in each row as there are columns; None is an empty cell. Numbers are shown with four
+            digits and written in full.
+        title: heading.
+    """
+
+    header: tuple[str, ...]
+    rows: Sequence[Sequence[Any]]
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.header):
+                raise ValueError(f"the table {self.title!r} has {len(self.header)} columns, but a row has {len(row)}")
+
+    def write_csv(self, path: Path) -> Path:
+        """One line a row, numbers in full, nothing for None. Not collective: call on one rank."""
+        with path.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(self.header)
+            writer.writerows(["" if cell is None else cell for cell in row] for row in self.rows)
+        return path
+
+    def section(self, text: str = "", title: str | None = None) -> Section:
+        """The table as a part of a page."""
+        return Section(self.title if title is None else title, text, header=self.header, rows=self.rows)
+
+    def markdown(self) -> str:
+        """The table as a README shows it."""
+        lines = [self.header, ["---"] * len(self.header), *([shown(cell) for cell in row] for row in self.rows)]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+    def terminal(self, *, wrap: Sequence[int] = ()) -> rich.table.Table:
+        """The table for a terminal: numbers to the right.
+
+        Args:
+            wrap: columns that a narrow terminal may break into lines.
+        """
+        table = rich.table.Table(box=None, pad_edge=False, title=self.title or None, title_justify="left")
+        for i, name in enumerate(self.header):
+            right = bool(self.rows) and all(number(row[i]) for row in self.rows)
+            free = i in wrap
+            table.add_column(
+                escape(name),
+                justify="right" if right else "left",
+                no_wrap=not free,
+                overflow="fold" if free else "ellipsis",
+            )
+        for row in self.rows:
+            table.add_row(*(escape(shown(cell)) for cell in row))
+        return table
+
+
+def pairs(rows: Sequence[Sequence[str]]) -> rich.table.Table:
+    """Labels and texts for a terminal."""
+    table = rich.table.Table(box=None, show_header=False, pad_edge=False)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
+
+
+def number(cell: Any) -> bool:
+    """A number, the text of one, or an empty cell."""
+    if cell is None or cell in ("", "-") or (isinstance(cell, NUMBERS) and not isinstance(cell, bool)):
+        return True
+    try:
+        float(str(cell).split(" ")[0].rstrip("%"))
+    except ValueError:
+        return False
+    return True
