@@ -13,7 +13,6 @@ import pytest
 import scipy.linalg
 import skfem
 from skfem.helpers import ddot, div, sym_grad
-from test_fem_mesh import COMM, WIDE, area, grid, volume, zone
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.cells import check_straight, cut_cells, shape_of, simplices
@@ -24,6 +23,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.model.contact import cells_in, check_parts, contact_facets, held_check
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.tissue import Contact, Layer
+from tests.fem.test_mesh import COMM, WIDE, area, grid, volume, zone
 from tests.helpers.models import gather_matrix, node_order
 
 Blocks = list[tuple[str, np.ndarray]]
