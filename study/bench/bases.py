@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,14 +12,12 @@ import numpy as np
 import typer
 from mpi4py import MPI
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from softgrasp.fem.petsc import Array, total
 from softgrasp.reduction.engines import factor, small_svd
-from softgrasp.study.bench.forward import parse_ranks
+from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, write_bench
+from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker, leave_result
-from softgrasp.study.shell.processes import IN_MPI_JOB
 from softgrasp.study.shell.timing import interleave, medians, timed
 
 SIZES = "10000x600,100000x600"
@@ -177,25 +173,21 @@ def launch(n: int, m: int, ranks: int, repeats: int) -> Row:
     return {"rows": n, "columns": m, "ranks": ranks} | launch_worker("bases", spec, ranks, WORKER_LIMIT)
 
 
+HEADER = ("engine", "rows", "columns", "ranks", "s", "/ default", f"right to {RIGHT:g}", f"to {ROUGH:g}", "|U'U - I|")
+
+
 def table_of(results: Sequence[Row]) -> Table:
     """The one table, accuracy against time. Not collective."""
-    table = Table(box=None, pad_edge=False, title=f"factoring snapshots: {KEPT} vectors, median seconds")
-    table.add_column("engine", no_wrap=True)
-    for head in ("rows", "columns", "ranks", "s", "/ default", f"right to {RIGHT:g}", f"to {ROUGH:g}", "|U'U - I|"):
-        table.add_column(head, justify="right", no_wrap=True)
+    cells: list[tuple[Any, ...]] = []
     for row in results:
-        size = [str(row["rows"]), str(row["columns"]), str(row["ranks"])]
+        size = (row["rows"], row["columns"], row["ranks"])
         if "error" in row:
-            table.add_row("failed", *size)
-            continue
-        for name, title in TITLES.items():
-            if name not in row["engines"]:
-                continue
-            found = row["engines"][name]
+            cells.append(("failed", *size, *["-"] * 5))
+        for name, engine in row.get("engines", {}).items():
             default = row["engines"]["psd_tsqr" if name.startswith("psd") else "tsqr"]["seconds"]
-            numbers = [f"{found['seconds']:.3g}", f"{found['seconds'] / default:.2f}"]
-            table.add_row(title, *size, *numbers, *(f"{found[key]:.0e}" for key in ("right", "rough", "off")))
-    return table
+            seconds = f"{engine['seconds']:.3g}", f"{engine['seconds'] / default:.2f}"
+            cells.append((TITLES[name], *size, *seconds, *(f"{engine[key]:.0e}" for key in ("right", "rough", "off"))))
+    return Table(HEADER, cells, f"factoring snapshots: {KEPT} vectors, median seconds")
 
 
 def missed(results: Sequence[Row]) -> list[str]:
@@ -217,15 +209,21 @@ def missed(results: Sequence[Row]) -> list[str]:
     ]
 
 
-def write_csv(path: Path, results: Sequence[Row]) -> None:
+def csv_table(results: Sequence[Row]) -> Table:
     """One line an engine, numbers in full. Not collective."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["engine", "rows", "columns", "ranks", "seconds", "right", "rough", "orthonormality"])
-        for row in results:
-            for name, found in row.get("engines", {}).items():
-                values = [found[key] for key in ("seconds", "right", "rough", "off")]
-                writer.writerow([name, row["rows"], row["columns"], row["ranks"], *values])
+    cells = [
+        (
+            name,
+            row["rows"],
+            row["columns"],
+            row["ranks"],
+            *(engine[key] for key in ("seconds", "right", "rough", "off")),
+        )
+        for row in results
+        for name, engine in row.get("engines", {}).items()
+    ]
+    header = ("engine", "rows", "columns", "ranks", "seconds", "right", "rough", "orthonormality")
+    return Table(header, cells)
 
 
 def run_worker(spec: dict[str, Any]) -> None:
@@ -245,16 +243,13 @@ def main(
         run_worker(json.loads(worker))
         return
     wanted, counts = parse_shapes(sizes), parse_ranks(ranks)
-    if any(variable in os.environ for variable in IN_MPI_JOB):
-        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
-    terminal = Console(highlight=False)
-    console = Console(highlight=False, width=max(terminal.width, 130), soft_wrap=True)
+    console = open_console(130)
     results = []
     for n, m in wanted:
         for k in counts:
             with console.status(f"{n} x {m}, {k} rank(s)"):
                 results.append(launch(n, m, k, repeats))
-    console.print(table_of(results))
+    console.print(table_of(results).terminal())
     for row in results:
         if "error" in row:
             console.print(f"{row['rows']} x {row['columns']}, {row['ranks']} rank(s): {row['error']}", markup=False)
@@ -263,10 +258,5 @@ def main(
         console.print(f"goal [red]missed[/red]: {sentence}")
     if not late and not any("error" in row for row in results):
         console.print(f"goal [green]ok[/green]: the defaults are right to {RIGHT:g} down to sigma / sigma_1 = {GOAL:g}")
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "bench_bases.json").write_text(json.dumps({"command": "bench_bases", "results": results}, indent=2) + "\n")
-    write_csv(out / "bench_bases.csv", results)
-    for file in (out / "bench_bases.json", out / "bench_bases.csv"):
-        console.print(f"  {file}")
-    if late or any("error" in row for row in results):
-        raise typer.Exit(1)
+    files = write_bench(out, "bench_bases", {"command": "bench_bases", "results": results}, csv_table(results))
+    list_bench(console, files, bool(late) or any("error" in row for row in results))

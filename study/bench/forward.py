@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
+from softgrasp.study.bench.driver import (
+    Goal,
+    goal_rows,
+    growth,
+    list_bench,
+    number,
+    open_console,
+    parse_ranks,
+    show_goals,
+    write_bench,
+)
+from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker
-from softgrasp.study.shell.processes import IN_MPI_JOB
 
 SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"
 LARGE = (("2d", 1_000_000), ("3d", 200_000))
@@ -52,20 +58,6 @@ Keep the machine quiet while it runs. A fast look: --sizes 2d:1000 --ranks 1 --r
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Goal:
-    """A number to reach: ``value <= limit``."""
-
-    text: str
-    value: float
-    limit: float
-
-    @property
-    def ok(self) -> bool:
-        """Whether it is reached."""
-        return self.value <= self.limit
-
-
 def parse_sizes(text: str) -> list[tuple[str, int]]:
     """``2d:1000,3d:50000`` as pairs; a bare number is 2D. Not collective.
 
@@ -81,33 +73,9 @@ def parse_sizes(text: str) -> list[tuple[str, int]]:
     return result
 
 
-def parse_ranks(text: str) -> list[int]:
-    """``1,2`` as numbers. Not collective.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdigit() and int(part) > 0 for part in parts):
-        raise typer.BadParameter(f"'{text}' is no list of rank counts; write 1,2")
-    return [int(part) for part in parts]
-
-
 def launch(spec: dict[str, Any], ranks: int) -> Row:
     """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
     return {"ranks": ranks} | launch_worker("forward", spec, ranks, WORKER_LIMIT)
-
-
-def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
-    """Exponent p of cost ~ n^p by least squares on logarithms; None for fewer than two positive points.
-
-    Not collective.
-    """
-    points = [(a, b) for a, b in zip(n, cost, strict=True) if a > 0 and b > 0]
-    if len({a for a, _ in points}) < 2:
-        return None
-    x, y = np.log(np.array(points)).T
-    return float(np.polyfit(x, y, 1)[0])
 
 
 def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
@@ -155,48 +123,43 @@ def goals(rows: Sequence[Row]) -> list[Goal]:
     return result
 
 
-def _number(value: float | None, digits: int = 3) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
+HEADER = (
+    "problem", "n_e", "ranks", "solver", "assembly [s]", "factor [s]", "TS step [µs]", "bare solve [µs]", "TS / solve",
+    "own solve [µs]", "TS / own", "SciPy step [µs]", "pyMOR step [µs]", "drift", "memory [MiB]",
+)  # fmt: skip
 
 
 def table_of(rows: Sequence[Row]) -> Table:
-    """The one table. Not collective."""
-    heads = ["problem", "n_e", "ranks", "solver", "assembly s", "factor s", "TS us", "solve us", "TS/solve", "goal"]
-    heads += ["own us", "TS/own", "loop us", "SciPy us", "pyMOR us", "drift", "MiB"]
-    table = Table(box=None, pad_edge=False, title="cost of a forward run, medians; us are per time step")
-    for head in heads:
-        table.add_column(head, justify="left" if head in ("problem", "solver", "goal") else "right", no_wrap=True)
+    """The table of the terminal and the README. Not collective."""
+    cells = []
     for row in rows:
         if "error" in row:
-            table.add_row(row["problem"], "-", str(row["ranks"]), "failed")
+            cells.append((row["problem"], "-", row["ranks"], "failed", *["-"] * (len(HEADER) - 4)))
             continue
-        step, goal = row["step_us"], ratio_goal(row)
-        verdict = "" if goal is None else f"<= {goal.limit:g} {'ok' if goal.ok else 'missed'}"
-        table.add_row(
-            row["problem"],
-            str(row["n_e"]),
-            str(row["ranks"]),
-            row["solver"],
-            _number(row["seconds"]["assembly"]),
-            _number(row["seconds"]["factor"]),
-            _number(step["ts"]),
-            _number(step.get("solve")),
-            _number(row.get("ratio")),
-            verdict,
-            _number(step.get("own")),
-            _number(row.get("ratio_own")),
-            *(_number(step.get(name)) for name in ("loop", "scipy", "pymor")),
-            f"{row['drift']:.0e}",
-            _number(row["memory_mb"]),
-        )
-    return table
+        step, seconds = row["step_us"], row["seconds"]
+        values = [seconds["assembly"], seconds["factor"], step["ts"], step.get("solve"), row.get("ratio")]
+        values += [step.get("own"), row.get("ratio_own"), step.get("scipy"), step.get("pymor")]
+        last = f"{row['drift']:.0e}", number(row["memory_mb"])
+        cells.append((row["problem"], row["n_e"], row["ranks"], row["solver"], *map(number, values), *last))
+    return Table(HEADER, cells, "cost of a forward run, medians; µs are per time step")
+
+
+def csv_table(rows: Sequence[Row]) -> Table:
+    """One line a row, numbers in full. Not collective."""
+    names = ["problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats"]
+    stages = ["mesh", "assembly", "factor"]
+    last = ["ratio", "ratio_own", "drift", "residual", "memory_mb", "memory_base_mb", "error"]
+    cells = []
+    for row in rows:
+        seconds, step = row.get("seconds", {}), row.get("step_us", {})
+        values = [row.get(n) for n in names] + [seconds.get(s) for s in stages]
+        cells.append(values + [step.get(m) for m in METHODS] + [row.get(n) for n in last])
+    return Table((*names, *(f"{s}_s" for s in stages), *(f"{m}_us" for m in METHODS), *last), cells)
 
 
 def show(console: Console, rows: Sequence[Row]) -> None:
     """Table, whole runs, exponents and goals."""
-    console.print(table_of(rows))
+    console.print(table_of(rows).terminal())
     for row in rows:
         if "error" in row:
             console.print(f"{row['problem']}, {row['ranks']} rank(s) failed: {row['error']}", markup=False)
@@ -204,7 +167,7 @@ def show(console: Console, rows: Sequence[Row]) -> None:
         factors = {"here": row["seconds"]["factor"], **row.get("factor_peer_s", {})}
         if len(factors) > 1:
             names = {"here": "here", "petsc": "PETSc's Cholesky", "scipy": "SciPy (SuperLU)"}
-            parts = [f"{names[name]} {_number(value)} s" for name, value in factors.items()]
+            parts = [f"{names[name]} {number(value)} s" for name, value in factors.items()]
             console.print(f"set-up of the factor, {row['problem']}, {row['ranks']} rank(s): {', '.join(parts)}")
         if row["whole"]:
             seconds = row["whole"]["seconds"]
@@ -218,39 +181,7 @@ def show(console: Console, rows: Sequence[Row]) -> None:
         parts = [f"{name} {power:.2f}" for name, power in powers.items() if power is not None]
         if parts:
             console.print(f"growth exponents in n_e over the 2D sizes, {ranks} rank(s): {', '.join(parts)}")
-    for goal in goals(rows):
-        verdict = "[green]ok[/green]" if goal.ok else "[red]missed[/red]"
-        console.print(f"goal {verdict}: {goal.text} {_number(goal.value)} <= {goal.limit:g}")
-
-
-def write_markdown(path: Path, rows: Sequence[Row]) -> None:
-    """The table as the README shows it. Not collective."""
-    heads = ["problem", "n_e", "ranks", "solver", "assembly [s]", "factor [s]", "TS step [µs]", "bare solve [µs]"]
-    heads += ["TS / solve", "own solve [µs]", "TS / own", "SciPy step [µs]", "pyMOR step [µs]", "memory [MiB]"]
-    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
-    for row in rows:
-        if "error" in row:
-            continue
-        step, seconds = row["step_us"], row["seconds"]
-        cells = [row["problem"], str(row["n_e"]), str(row["ranks"]), row["solver"]]
-        numbers = [seconds["assembly"], seconds["factor"], step["ts"], step.get("solve"), row.get("ratio")]
-        numbers += [step.get("own"), row.get("ratio_own"), step.get("scipy"), step.get("pymor"), row["memory_mb"]]
-        lines.append("| " + " | ".join(cells + [_number(value) for value in numbers]) + " |")
-    path.write_text("\n".join(lines) + "\n")
-
-
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """One line a row, numbers in full. Not collective."""
-    names = ["problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats"]
-    stages = ["mesh", "assembly", "factor"]
-    last = ["ratio", "ratio_own", "drift", "residual", "memory_mb", "memory_base_mb", "error"]
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(names + [f"{s}_s" for s in stages] + [f"{m}_us" for m in METHODS] + last)
-        for row in rows:
-            seconds, step = row.get("seconds", {}), row.get("step_us", {})
-            values = [row.get(n) for n in names] + [seconds.get(s) for s in stages]
-            writer.writerow(values + [step.get(m) for m in METHODS] + [row.get(n) for n in last])
+    show_goals(console, goals(rows))
 
 
 def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
@@ -316,19 +247,11 @@ def main(
         run_worker(json.loads(worker))
         return
     wanted, counts = parse_sizes(sizes), parse_ranks(ranks)
-    if any(variable in os.environ for variable in IN_MPI_JOB):
-        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
-    terminal = Console(highlight=False)
-    console = Console(highlight=False, width=max(terminal.width, 175), soft_wrap=True)
+    console = open_console(175)
     rows = collect(console, wanted, counts, repeats, large)
     show(console, rows)
-    out.mkdir(parents=True, exist_ok=True)
-    reached = [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals(rows)]
-    report = {"command": "bench_forward", "rows": rows, "exponents": exponents(rows), "goals": reached}
-    (out / "bench.json").write_text(json.dumps(report, indent=2) + "\n")
-    write_csv(out / "bench.csv", rows)
-    write_markdown(out / "bench.md", rows)
-    for file in (out / "bench.json", out / "bench.csv", out / "bench.md", *draw(out / "bench.png", rows)):
-        console.print(f"  {file}")
-    if any("error" in row for row in rows):
-        raise typer.Exit(1)
+    content = {"command": "bench_forward", "rows": rows, "exponents": exponents(rows), "goals": goal_rows(goals(rows))}
+    files = write_bench(
+        out, "bench", content, csv_table(rows), table_of([row for row in rows if "error" not in row]).markdown()
+    )
+    list_bench(console, [*files, *draw(out / "bench.png", rows)], any("error" in row for row in rows))

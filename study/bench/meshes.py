@@ -12,8 +12,6 @@ import numpy as np
 import typer
 from mpi4py import MPI
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from softgrasp import package_version
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
@@ -26,6 +24,7 @@ from softgrasp.reduction.replay import reference
 from softgrasp.study.reduce.sweep import Point, sweep
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
+from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import list_files
 
 SIZES = "1e3,1e4,1e5,1e6"
@@ -148,16 +147,15 @@ def show(console: Console, rows: Sequence[MeshRow], found: dict[str, Any], title
     """Print table and exponents."""
     header = ("n_e", "factor", "full", "offline", "online", "speed-up", "error", "deform.")
     console.print(f"{title}; seconds, online in milliseconds")
-    table = Table(box=None, pad_edge=False)
-    for name in header:
-        table.add_column(escape(name), no_wrap=True)
-    for row in rows:
-        table.add_row(
-            str(row.n_e), f"{row.time_factor:.3g}", f"{row.time_full:.3g}", f"{row.time_offline:.3g}",
-            f"{1e3 * row.time_online:.3g}", f"{row.time_full / row.time_online:.0f}", f"{row.error:.1e}",
+    cells = [
+        (
+            row.n_e, row.time_factor, row.time_full, row.time_offline, 1e3 * row.time_online,
+            f"{row.time_full / row.time_online:.0f}", f"{row.error:.1e}",
             f"{row.error_deformation:.1e}" + ("" if row.stable else " !"),
-        )  # fmt: skip
-    console.print(table)
+        )
+        for row in rows
+    ]  # fmt: skip
+    console.print(Table(header, cells).terminal())
     if found["exponent_offline"] is None:
         return
     console.print(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,11 +11,19 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from softgrasp.study.bench.forward import Goal, growth, parse_ranks
+from softgrasp.study.bench.driver import (
+    Goal,
+    goal_rows,
+    growth,
+    list_bench,
+    number,
+    open_console,
+    parse_ranks,
+    show_goals,
+)
+from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker
-from softgrasp.study.shell.processes import IN_MPI_JOB
 
 SIZES = "10,20,40,80,160"
 LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
@@ -100,9 +106,8 @@ class Record:
         if self.file is None:
             return
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        reached = [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals(self.rows)]
         report = {"command": "bench_riccati", "beta": self.beta, "rows": self.rows, "peers": self.peers}
-        report |= {"exponents": exponents(self.rows), "goals": reached}
+        report |= {"exponents": exponents(self.rows), "goals": goal_rows(goals(self.rows))}
         self.file.write_text(json.dumps(report, indent=2) + "\n")
 
 
@@ -152,12 +157,6 @@ def goals(rows: Sequence[Row]) -> list[Goal]:
     return result
 
 
-def _number(value: float | None, digits: int = 3) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
-
-
 HEADS = ["nx", "2n", "ranks", "method", "solves", "rank", "total s", *(f"{name} s" for name in SPLIT)]
 HEADS += ["true residual", "gain diff.", "MiB"]
 
@@ -167,11 +166,11 @@ def cells_of(entry: Row) -> list[str]:
     first = [str(entry["nx"]), str(entry["states"]), str(entry["ranks"]), entry["method"]]
     if "error" in entry:
         return [*first, "failed", *[""] * (len(HEADS) - 5)]
-    split = [_number(entry["split"][name]) for name in SPLIT]
-    middle = [str(entry["solves"]), str(entry["rank"]), _number(entry["seconds"]), *split]
+    split = [number(entry["split"][name]) for name in SPLIT]
+    middle = [str(entry["solves"]), str(entry["rank"]), number(entry["seconds"]), *split]
     difference = entry.get("gain_difference")
     last = [f"{entry['residual']:.1e}", "-" if difference is None else f"{difference:.1e}"]
-    return [*first, *middle, *last, _number(entry["memory_mb"])]
+    return [*first, *middle, *last, number(entry["memory_mb"])]
 
 
 def peer_line(peer: Row) -> str:
@@ -184,19 +183,15 @@ def peer_line(peer: Row) -> str:
     if "error" in peer:
         return f"{label}: failed, {peer['error']}"
     return (
-        f"{label}: {_number(peer['seconds'])} s, rank {peer['rank']}, true residual {peer['residual']:.1e}, "
+        f"{label}: {number(peer['seconds'])} s, rank {peer['rank']}, true residual {peer['residual']:.1e}, "
         f"gain difference {peer['gain_difference']:.1e}"
     )
 
 
 def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
     """Table, failures, peers, exponents and goals. Not collective."""
-    table = Table(box=None, pad_edge=False, title="large Riccati equation, paper scene; seconds are medians")
-    for head in HEADS:
-        table.add_column(head, justify="left" if head == "method" else "right", no_wrap=True)
-    for entry in flat(rows):
-        table.add_row(*cells_of(entry))
-    console.print(table)
+    title = "large Riccati equation, paper scene; seconds are medians"
+    console.print(Table(tuple(HEADS), [cells_of(entry) for entry in flat(rows)], title).terminal())
     for row in [*rows, *flat(rows)]:
         if "error" in row:
             label = f"nx = {row['nx']}, {row.get('ranks', '?')} rank(s) {row.get('method', '')}"
@@ -206,27 +201,24 @@ def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
     for label, power in exponents(rows).items():
         if power is not None:
             console.print(f"growth exponent of the time in 2n from nx = 20 on, {label}: {power:.2f}")
-    for goal in goals(rows):
-        verdict = "[green]ok[/green]" if goal.ok else "[red]missed[/red]"
-        console.print(f"goal {verdict}: {goal.text} {_number(goal.value)} <= {goal.limit:g}")
+    show_goals(console, goals(rows))
 
 
-def write_tables(folder: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, Path]:
-    """bench_riccati.csv and .md. Not collective."""
-    lines = ["| " + " | ".join(HEADS) + " |", "|" + " --- |" * len(HEADS)]
-    lines += ["| " + " | ".join(cells_of(entry)) + " |" for entry in flat(rows)]
-    lines += ["", *(f"- {peer_line(peer)}" for peer in peers)]
-    markdown, table = folder / "bench_riccati.md", folder / "bench_riccati.csv"
-    markdown.write_text("\n".join(lines) + "\n")
+def csv_table(rows: Sequence[Row]) -> Table:
+    """One line a mesh, rank count and method, numbers in full. Not collective."""
     names = ["nx", "states", "ranks", "method", "solves", "newton_steps", "rank", "seconds", "residual"]
     names += ["gain_difference", "memory_mb", "memory_base_mb", "error"]
-    with table.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(names + [f"{name}_s" for name in SPLIT])
-        for entry in flat(rows):
-            split = entry.get("split", {})
-            writer.writerow([entry.get(name) for name in names] + [split.get(name) for name in SPLIT])
-    return markdown, table
+    cells = [
+        [*(entry.get(name) for name in names), *(entry.get("split", {}).get(name) for name in SPLIT)]
+        for entry in flat(rows)
+    ]
+    return Table((*names, *(f"{name}_s" for name in SPLIT)), cells)
+
+
+def markdown(rows: Sequence[Row], peers: Sequence[Row]) -> str:
+    """The table as the README shows it, and a line a peer. Not collective."""
+    table = Table(tuple(HEADS), [cells_of(entry) for entry in flat(rows)]).markdown()
+    return table + "".join(f"\n- {peer_line(peer)}" for peer in peers) + "\n"
 
 
 def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, Path]:
@@ -275,7 +267,7 @@ def collect(
             row = launch({"nx": nx, "beta": record.beta, "methods": methods, "repeats": count}, k) | {"nx": nx}
         record.rows.append(row)
         record.save()
-        times = [f"{e['method']} {'failed' if 'error' in e else _number(e['seconds']) + ' s'}" for e in flat([row])]
+        times = [f"{e['method']} {'failed' if 'error' in e else number(e['seconds']) + ' s'}" for e in flat([row])]
         console.print(f"row {i + 1} of {len(jobs)}, nx = {nx}, {k} rank(s): {', '.join(times) or 'failed'}")
     return record.rows
 
@@ -318,10 +310,7 @@ def main(
         run_worker(json.loads(worker))
         return
     meshes, counts = parse_meshes(sizes), parse_ranks(ranks)
-    if any(variable in os.environ for variable in IN_MPI_JOB):
-        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
-    terminal = Console(highlight=False)
-    console = Console(highlight=False, width=max(terminal.width, 160), soft_wrap=True)
+    console = open_console(160)
     record = Record(out / "bench_riccati.json", beta)
     if resume:
         record.resume()
@@ -329,8 +318,7 @@ def main(
     others = collect_peers(console, meshes, record) if peers else record.peers
     record.save()
     show(console, rows, others)
-    files = [*write_tables(out, rows, others), *draw(out / "bench_riccati.png", rows, others)]
-    for file in (out / "bench_riccati.json", *files):
-        console.print(f"  {file}")
-    if any("error" in entry for entry in [*rows, *flat(rows)]):
-        raise typer.Exit(1)
+    (out / "bench_riccati.md").write_text(markdown(rows, others))
+    files = [out / "bench_riccati.json", out / "bench_riccati.md", csv_table(rows).write_csv(out / "bench_riccati.csv")]
+    files += draw(out / "bench_riccati.png", rows, others)
+    list_bench(console, files, any("error" in entry for entry in [*rows, *flat(rows)]))

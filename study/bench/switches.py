@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -16,8 +14,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from mpi4py import MPI
-from rich.console import Console
-from rich.table import Table
 
 import softgrasp.fem.solve.solvers
 import softgrasp.lqr.lowrank.modal_start
@@ -39,11 +35,11 @@ from softgrasp.reduction.projection import project as project_model
 from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.registry import make_basis
 from softgrasp.reduction.states import States
-from softgrasp.study.bench.forward import parse_ranks
+from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, write_bench
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
 from softgrasp.study.bench.riccati_rows import problem_for
+from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker, leave_result
-from softgrasp.study.shell.processes import IN_MPI_JOB
 from softgrasp.study.shell.timing import interleave, timed
 
 BATCH = 100  # models of a batch
@@ -260,17 +256,16 @@ def run_worker(spec: dict[str, Any]) -> None:
     leave_result(spec["file"], measure)
 
 
+HEADER = ("switch", "constant", "size", "ranks", "first s", "second s", "second / first")
+
+
 def table_of(rows: list[Row]) -> Table:
     """The one table. Not collective."""
-    table = Table(box=None, pad_edge=False, title="two methods around the sizes of a switch, median seconds")
-    for head in ("switch", "constant", "size"):
-        table.add_column(head, no_wrap=True)
-    for head in ("ranks", "first s", "second s", "second / first"):
-        table.add_column(head, justify="right", no_wrap=True)
-    for row in rows:
-        numbers = (f"{row.first:.3g}", f"{row.second:.3g}", f"{row.second / row.first:.2f}")
-        table.add_row(row.switch, row.limit, row.setting, str(row.ranks), *numbers)
-    return table
+    cells = [
+        (r.switch, r.limit, r.setting, r.ranks, f"{r.first:.3g}", f"{r.second:.3g}", f"{r.second / r.first:.2f}")
+        for r in rows
+    ]
+    return Table(HEADER, cells, "two methods around the sizes of a switch, median seconds")
 
 
 def main(
@@ -291,9 +286,7 @@ def main(
             raise typer.BadParameter(f"'{name}' is no switch; choose from {', '.join(SWITCHES)}")
         if name == "whole" and max(counts) == 1 and len(wanted) == 1:
             raise typer.BadParameter("whole and spread factors are the same on one rank; add --ranks 2")
-    if any(variable in os.environ for variable in IN_MPI_JOB):
-        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
-    console = Console(highlight=False, width=max(Console().width, 130), soft_wrap=True)
+    console = open_console(130)
     rows: list[Row] = []
     failed = False
     for name in wanted:
@@ -305,15 +298,7 @@ def main(
                 failed = True
                 console.print(f"{name}, {k} rank(s): {found['error']}", markup=False)
             rows += [Row(**row) for row in found.get("rows", [])]
-    console.print(table_of(rows))
-    out.mkdir(parents=True, exist_ok=True)
+    console.print(table_of(rows).terminal())
     content = {"command": "bench_switches", "rows": [asdict(row) for row in rows]}
-    (out / "bench_switches.json").write_text(json.dumps(content, indent=2) + "\n")
-    with (out / "bench_switches.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(list(Row.__dataclass_fields__))
-        writer.writerows(asdict(row).values() for row in rows)
-    for path in (out / "bench_switches.json", out / "bench_switches.csv"):
-        console.print(f"  {path}")
-    if failed:
-        raise typer.Exit(1)
+    table = Table(tuple(Row.__dataclass_fields__), [tuple(asdict(row).values()) for row in rows])
+    list_bench(console, write_bench(out, "bench_switches", content, table), failed)

@@ -19,6 +19,7 @@ from softgrasp.study.bench import forward as bench_forward
 from softgrasp.study.bench import forward_rows as bench_worker
 from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, to_scipy
+from softgrasp.study.shell.processes import IN_MPI_JOB
 
 TINY: dict[str, Any] = {"size": 150, "repeats": 3, "repeat_seconds": 0.005}
 
@@ -147,13 +148,13 @@ def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypat
         return made_up(spec["size"], ranks=ranks)
 
     monkeypatch.setattr(bench_forward, "launch", launch)
-    for name in bench_forward.IN_MPI_JOB:
+    for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     arguments = ["forward", "--sizes", "2d:2000,40000,3d:300", "--out", str(tmp_path)]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 1  # a row failed, and the rest is there
     assert "3D 3e2, 1 rank(s) failed: exit status 1: broken" in done.output
-    assert "<= 1.15 missed" in done.output
+    assert "goal missed: 2D" in done.output
     report = json.loads((tmp_path / "bench.json").read_text())
     assert len(report["rows"]) == 6
     assert set(report["exponents"]) == {"1", "2"}
@@ -167,7 +168,7 @@ def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypat
 
 @pytest.mark.serial
 def test_driver_gets_numbers_from_two_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in bench_forward.IN_MPI_JOB:
+    for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     spec = {"dimension": 2, "large": False} | TINY
     row = bench_forward.launch(spec, 2)

@@ -14,6 +14,7 @@ import softgrasp.reduction.online
 from softgrasp.study.bench import switches as bench_switches
 from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.switches import Row, start, table_of
+from softgrasp.study.shell.processes import IN_MPI_JOB
 
 
 @pytest.mark.serial
@@ -24,7 +25,7 @@ def test_rows_compare_two_methods_and_leave_the_constants_alone(comm: MPI.Intrac
     assert all(row.first > 0 and row.second > 0 and row.ranks == 1 for row in rows)
     assert rows[0].limit == f"FEW_MODES = {before[0]}"
     assert before == (softgrasp.lqr.lowrank.modal_start.FEW_MODES, softgrasp.reduction.online.TOGETHER)
-    assert table_of(rows).row_count == 4
+    assert len(table_of(rows).rows) == 4
 
 
 @pytest.mark.serial
@@ -34,7 +35,7 @@ def test_command_writes_what_the_workers_measured(
     made = Row("batch", "TOGETHER = 1 MB", "3 models", 1, 2.0, 3.0)
     found = {1: {"rows": [vars(made)]}, 2: {"error": "exit status 1: no more"}}
     monkeypatch.setattr(bench_switches, "launch_worker", lambda name, spec, ranks, limit: found[ranks])
-    for name in bench_switches.IN_MPI_JOB:
+    for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     runner = CliRunner()
     good = runner.invoke(app, ["switches", "--switches", "batch", "--ranks", "1", "--out", str(tmp_path)])

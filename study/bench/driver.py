@@ -1,0 +1,107 @@
+"""What every benchmark does alike: ranks, goals, its console, and the files at the end."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from softgrasp.study.report.files import write_json
+from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.processes import IN_MPI_JOB
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A number to reach: ``value <= limit``."""
+
+    text: str
+    value: float
+    limit: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether it is reached."""
+        return self.value <= self.limit
+
+
+def parse_ranks(text: str) -> list[int]:
+    """``1,2`` as numbers. Not collective.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdigit() and int(part) > 0 for part in parts):
+        raise typer.BadParameter(f"'{text}' is no list of rank counts; write 1,2")
+    return [int(part) for part in parts]
+
+
+def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
+    """Exponent p of cost ~ n^p by least squares on logarithms; None for fewer than two positive points.
+
+    Not collective.
+    """
+    points = [(a, b) for a, b in zip(n, cost, strict=True) if a > 0 and b > 0]
+    if len({a for a, _ in points}) < 2:
+        return None
+    x, y = np.log(np.array(points)).T
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Three digits, or all before the point; a dash for None. Not collective."""
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
+
+
+def open_console(width: int) -> Console:
+    """A terminal wide enough for the table. Not collective.
+
+    Raises:
+        typer.BadParameter: the benchmark was started under mpiexec.
+    """
+    if any(variable in os.environ for variable in IN_MPI_JOB):
+        raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
+    return Console(highlight=False, width=max(Console().width, width), soft_wrap=True)
+
+
+def show_goals(console: Console, goals: Sequence[Goal]) -> None:
+    """Print what was to be reached, and whether it is. Not collective."""
+    for goal in goals:
+        verdict = "[green]ok[/green]" if goal.ok else "[red]missed[/red]"
+        console.print(f"goal {verdict}: {goal.text} {number(goal.value)} <= {goal.limit:g}")
+
+
+def goal_rows(goals: Sequence[Goal]) -> list[dict[str, Any]]:
+    """Goals as the JSON file has them. Not collective."""
+    return [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals]
+
+
+def write_bench(out: Path, name: str, content: dict[str, Any], table: Table, markdown: str = "") -> list[Path]:
+    """NAME.json, NAME.csv and NAME.md; returns what was written. Not collective."""
+    out.mkdir(parents=True, exist_ok=True)
+    files = [write_json(out / f"{name}.json", content), table.write_csv(out / f"{name}.csv")]
+    if markdown:
+        files.append(out / f"{name}.md")
+        files[-1].write_text(markdown)
+    return files
+
+
+def list_bench(console: Console, files: Sequence[Path], failed: bool) -> None:
+    """Print the files and leave with status 1 where a row failed. Not collective.
+
+    Raises:
+        typer.Exit: a row failed.
+    """
+    for file in files:
+        console.print(f"  {file}")
+    if failed:
+        raise typer.Exit(1)
