@@ -13,8 +13,8 @@ import meshio
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import agree
+from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 

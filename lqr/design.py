@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.plant.problem import RiccatiProblem

@@ -8,15 +8,15 @@ from typing import Literal
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.lqr.dense.care import care
-from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.dense.modal import some_modes
-from softgrasp.lqr.plant.operators import reach
 from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
+from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.operators import reach
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.reduced.riccati import project
 from softgrasp.lqr.reduced.bases import modal_basis
+from softgrasp.lqr.reduced.riccati import project
+from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.engines import on_root
 
 MODES = 60

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from softgrasp.fem.petsc import total
-from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.lqr.dense.care import care
-from softgrasp.lqr.plant.checks import ControlError, check_weights
 from softgrasp.lqr.dense.modal import factor_psd, some_modes
-from softgrasp.lqr.plant.operators import reach
 from softgrasp.lqr.dense.poles import closed_loop_rates
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.reduced.riccati import lift_gain, project
-from softgrasp.lqr.reduced.bases import modal_basis
 from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.plant.checks import ControlError, check_weights
+from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.reduced.bases import modal_basis
+from softgrasp.lqr.reduced.riccati import lift_gain, project
+from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.engines import on_root
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Trajectory
 from softgrasp.fem.run.snapshots import Snapshots

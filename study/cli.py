@@ -87,9 +87,9 @@ def explain(
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
     from softgrasp.fem.scene.file import load_scene_collective
-    from softgrasp.study.shell.session import list_files
     from softgrasp.study.forward.explain import run_explain
     from softgrasp.study.forward.explain_page import write_explanation
+    from softgrasp.study.shell.session import list_files
 
     made = load_scene_collective(MPI.COMM_WORLD, scene, set_ or [])
     found = run_explain(made, MPI.COMM_WORLD, console())
@@ -170,8 +170,8 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
-    from softgrasp.study.precision.run import run_study
     from softgrasp.study.precision.answer import parse_budget, parse_tolerance
+    from softgrasp.study.precision.run import run_study
 
     limit = None if budget is None else parse_budget(budget)
     wanted = None if tolerance is None else parse_tolerance(tolerance)

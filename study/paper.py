@@ -16,9 +16,9 @@ from softgrasp.fem import _stack as _stack
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.control.run import run_control
 from softgrasp.study.control.sweep import TITLES
+from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.report.page import Section, write_report
-from softgrasp.study.forward.run import run_simulate
 
 Row = tuple[str, str, str, str]
 HEADER = ("quantity", "paper", "here", "why different")

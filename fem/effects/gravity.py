@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softgrasp.fem.effects.gate import Gate, Problem
-from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.materials import young_poisson
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene

@@ -9,10 +9,10 @@ import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
 
-from softgrasp.fem.model.assembly import cells_of_layers
-from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.mesh.make import cell_nodes
+from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.petsc import Array, rows_on_root
 
 if TYPE_CHECKING:

@@ -18,9 +18,17 @@ from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, agree
-from softgrasp.fem.mesh.make import TissueMesh
-from softgrasp.fem.mesh.cells import check_interfaces, check_straight, corners, cut_cells, dimension_of, shape_of, simplices
+from softgrasp.fem.mesh.cells import (
+    check_interfaces,
+    check_straight,
+    corners,
+    cut_cells,
+    dimension_of,
+    shape_of,
+    simplices,
+)
 from softgrasp.fem.mesh.check import check_cells
+from softgrasp.fem.mesh.make import TissueMesh
 from softgrasp.fem.mesh.parts import Parts, find_parts
 
 Floats = npt.NDArray[np.float64]

@@ -12,10 +12,10 @@ import scipy.sparse
 import ufl
 from mpi4py import MPI
 
-from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.errors import MeshError, SceneError
-from softgrasp.fem.mesh.make import TissueMesh
 from softgrasp.fem.layout import BlockLayout, bounding_box
+from softgrasp.fem.mesh.make import TissueMesh
+from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.system import Component, LayerBlocks
 

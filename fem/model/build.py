@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise
-from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise
+from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.system import (
     BlockSystem,
     LayerBlocks,

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softgrasp.fem.model.assembly import cells_of_layers
-from softgrasp.fem.model.contact import bounding_box
 from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import Problem
 from softgrasp.fem.mesh.make import cell_nodes
+from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.contact import bounding_box
 from softgrasp.fem.petsc import Array, times_columns, total
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from typing import Protocol
 import numpy as np
 
 from softgrasp.fem.errors import SceneError, SolverError
-from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.run.motion import HandTable
 from softgrasp.fem.model.outputs import hand_axes
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.run.motion import HandTable
 from softgrasp.fem.system import BlockSystem
 
 Force = Callable[[int, float, Array, Array], Array]

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.run.checkpoint import read_checkpoint, write_checkpoint
-from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
 from softgrasp.fem.errors import Interrupted, SceneError, SolverError, agree
-from softgrasp.fem.run.midpoint import TissueMidpoint
-from softgrasp.fem.run.motion import driven_table, force_values, motion_table
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.scene.scene import Scene, Time
+from softgrasp.fem.run.checkpoint import read_checkpoint, write_checkpoint
+from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
+from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.run.motion import driven_table, force_values, motion_table
 from softgrasp.fem.run.snapshots import Snapshots, make_store
-from softgrasp.fem.solve.solvers import SolverName, choose_solver, make_solver
 from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.fem.scene.scene import Scene, Time
+from softgrasp.fem.solve.solvers import SolverName, choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem
 
 Observer = Callable[["Run"], None]

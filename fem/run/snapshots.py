@@ -12,8 +12,8 @@ import psutil
 
 from softgrasp.fem.errors import CheckpointError, ResourceError, agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.system import BlockSystem
 
 BUFFER_BYTES = 64 * 2**20  # per rank; large enough that HDF5 writes whole chunks

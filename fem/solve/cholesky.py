@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.solve.order import NodeOrder
 from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.solve.order import NodeOrder
 
 # Stable factors leave below 1e-15, in whatever units and however ill-conditioned; blocks may leave 1e-14 and more, as
 # in the hard cases with layers or nu near 0.5. Ten rounding units tell them apart.

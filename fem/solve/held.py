@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.solve.order import Dissection, NodeOrder, dissect
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
+from softgrasp.fem.solve.order import Dissection, NodeOrder, dissect
 from softgrasp.fem.system import BlockSystem
 
 

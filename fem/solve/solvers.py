@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from softgrasp.fem.solve.cholesky import OrderedFactor, factor_blocks
 from softgrasp.fem.errors import SolverError, agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.solve.order import dissect
 from softgrasp.fem.petsc import PETSc, petsc_options, whole_copy
+from softgrasp.fem.solve.cholesky import OrderedFactor, factor_blocks
+from softgrasp.fem.solve.order import dissect
 
 SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool

@@ -10,12 +10,12 @@ import scipy.linalg
 
 from softgrasp.fem.errors import ResourceError, SolverError, agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
 from softgrasp.lqr.dense.care import care as care
-from softgrasp.lqr.plant.checks import EPS, check_finite, check_weights, square_root
 from softgrasp.lqr.dense.poles import check_poles, closed_loop_rates
+from softgrasp.lqr.plant.checks import EPS, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 DENSE_MODES = 600  # a tenth of a second; SLEPc on several ranks is slower there

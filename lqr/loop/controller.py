@@ -13,9 +13,9 @@ import numpy as np
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
+from softgrasp.lqr.loop.small_plant import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
-from softgrasp.lqr.loop.small_plant import SmallPlant
 
 FORMAT = 1
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.lowrank.compress import gram
+from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.coordinates import factor_of
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.operators import descriptor
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 

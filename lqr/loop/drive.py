@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.plant.gain import Gain

@@ -10,8 +10,8 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.loop.small_plant import SmallPlant
+from softgrasp.lqr.plant.checks import ControlError
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,15 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
-from softgrasp.fem.solve.solvers import Reproducible, choose_solver
 from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.fem.solve.solvers import Reproducible, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.loop.cost import accumulated_cost
 from softgrasp.lqr.loop.drive import Drive, HeldDrive, ImplicitDrive, PlantStep
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import Target, rest

@@ -10,9 +10,9 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.loop.cost import accumulated_cost
 from softgrasp.lqr.loop.small_plant import SmallPlant
+from softgrasp.lqr.plant.checks import ControlError
 
 
 @dataclass(frozen=True)

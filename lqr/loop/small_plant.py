@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 
 from softgrasp.fem.petsc import Array, PETSc, times_columns, total
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.dense.modal import assemble_space
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.operators import damp
 from softgrasp.lqr.plant.problem import RiccatiProblem

@@ -7,8 +7,8 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.reduction.engines import on_root
 
 COLUMNS = 64  # columns whose products are held at a time

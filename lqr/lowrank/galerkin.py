@@ -12,12 +12,20 @@ import scipy.linalg
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, total
 from softgrasp.lqr.lowrank.adi import Progress
-from softgrasp.lqr.lowrank.solution import Outcome, make_solution
-from softgrasp.lqr.lowrank.modal_start import MODES, SmallPlant, SmallSolution, check_damped, plant_modes, project, solve_small
+from softgrasp.lqr.lowrank.modal_start import (
+    MODES,
+    SmallPlant,
+    SmallSolution,
+    check_damped,
+    plant_modes,
+    project,
+    solve_small,
+)
 from softgrasp.lqr.lowrank.plant import Block, Plant
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import shift_range
+from softgrasp.lqr.lowrank.solution import Outcome, make_solution
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.reduction.engines import on_root
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve

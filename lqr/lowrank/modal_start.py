@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.care import care, lyapunov, riccati_residual
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.dense.modal import StateSpace, assemble_space
-from softgrasp.lqr.lowrank.plant import Block, Plant
 from softgrasp.lqr.dense.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
+from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.reduction.engines import on_root
 
 MODES = 30

@@ -12,13 +12,13 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.lqr.lowrank.adi import Progress, Sweep, adi_step, start_sweep, sweep_norms
 from softgrasp.lqr.lowrank.adjoint import Right, make_right
 from softgrasp.lqr.lowrank.line_search import best_step, mixed_residual
-from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
 from softgrasp.lqr.lowrank.modal_start import modal_start
-from softgrasp.lqr.lowrank.restart import Iteration, load_state, save_state
 from softgrasp.lqr.lowrank.plant import Block, Plant
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.lowrank.restart import Iteration, load_state, save_state
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
+from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 LINE_SEARCH = 0.5  # of the residual before: a Newton step that leaves more is shortened
 

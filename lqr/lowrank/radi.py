@@ -13,12 +13,12 @@ from softgrasp.fem.petsc import Array
 from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, Columns, Progress
 from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, make_right, mass_right
 from softgrasp.lqr.lowrank.compress import gram
-from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Block, Plant
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
+from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.reduction.engines import on_root
 
 

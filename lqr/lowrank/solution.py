@@ -10,8 +10,8 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.plant import Block, Plant
-from softgrasp.lqr.plant.problem import RiccatiSolution
 from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.plant.problem import RiccatiSolution
 
 STOP = 0.8  # share of the tolerance at which a recursion stops
 DROP = 0.1  # share that the last compression may add

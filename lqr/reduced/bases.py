@@ -13,15 +13,15 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array, times_columns, total
-from softgrasp.lqr.spectrum.modal_loop import modal_damping
-from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.lowrank.compress import gram, triangular
-from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
 from softgrasp.lqr.dense.modal import some_modes
-from softgrasp.lqr.plant.operators import reach
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.dense.poles import closed_loop_rates
+from softgrasp.lqr.lowrank.compress import gram, triangular
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
+from softgrasp.lqr.plant.operators import reach
 from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.engines import EPS, factor, on_root, small_svd
 from softgrasp.reduction.inner import solve_columns
 

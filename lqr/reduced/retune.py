@@ -10,15 +10,15 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
+from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.operators import descriptor_adjoint
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.reduced.riccati import GainJudge, gain_error, project
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
+from softgrasp.lqr.reduced.riccati import GainJudge, gain_error, project
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.reduction.engines import on_root
 
 Materials = tuple[LayerMaterial, ...]

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop
-from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import costates_to_absolute, factor_of, gain_of, gain_to_absolute
 from softgrasp.lqr.plant.operators import descriptor, descriptor_adjoint, dynamics, inputs_adjoint, outputs
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop
 from softgrasp.reduction.engines import on_root
 
 

@@ -10,10 +10,10 @@ from slepc4py import SLEPc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import PETSc, combine, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
-from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.dense.modal import some_modes
-from softgrasp.lqr.plant.operators import damp, descriptor
 from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.checks import EPS, ControlError
+from softgrasp.lqr.plant.operators import damp, descriptor
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
 
@@ -82,7 +82,9 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
     """
     n_s = problem.layout.n_s
     if n_s == 0:
-        raise ControlError("the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop")
+        raise ControlError(
+            "the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop"
+        )
     K_q = K.hand[:n_s].T
     if not np.linalg.svd(K_q, compute_uv=False)[-1] > 100 * EPS * np.linalg.norm(K.hand):
         reason = "the gain on a rigid displacement is singular: the hand is not held"

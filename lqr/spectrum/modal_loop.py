@@ -10,8 +10,8 @@ import scipy.linalg
 from softgrasp.fem.petsc import Array, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
-from softgrasp.lqr.plant.operators import damp, reach
 from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.operators import damp, reach
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.reduction.engines import on_root
 

@@ -7,8 +7,8 @@ import numpy as np
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.lowrank.modal_start import plant_modes
-from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.reduction.inner import solve_columns
 

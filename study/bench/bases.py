@@ -175,7 +175,9 @@ def measure(comm: MPI.Intracomm, n: int, m: int, repeats: int) -> Row:
 def launch(n: int, m: int, ranks: int, repeats: int) -> Row:
     """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
     spec = {"n": n, "m": m, "repeats": repeats}
-    return {"rows": n, "columns": m, "ranks": ranks} | launch_worker("softgrasp.study.bench.bases", spec, ranks, WORKER_LIMIT)
+    return {"rows": n, "columns": m, "ranks": ranks} | launch_worker(
+        "softgrasp.study.bench.bases", spec, ranks, WORKER_LIMIT
+    )
 
 
 def table_of(results: Sequence[Row]) -> Table:

@@ -14,17 +14,25 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.run.midpoint import midpoint_matrix
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, whole_copy
+from softgrasp.fem.run.drive import TableDrive
+from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
-from softgrasp.fem.solve.solvers import make_solver
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.study.bench.peers import BareSolve, PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, has_pymor, to_scipy
+from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.solvers import make_solver
+from softgrasp.study.bench.peers import (
+    BareSolve,
+    PlainCholesky,
+    PymorLoop,
+    ScipyLoop,
+    TextbookLoop,
+    has_pymor,
+    to_scipy,
+)
 from softgrasp.study.shell.jobs import leave_result
 
 DT = 0.005  # [s], that of the paper: 600 steps in 3 s

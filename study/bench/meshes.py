@@ -16,15 +16,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.forward.result import package_version
+from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.registry import METHODS, find_method
-from softgrasp.study.shell.session import list_files, machine, write_json
 from softgrasp.reduction.replay import reference
+from softgrasp.study.forward.result import package_version
 from softgrasp.study.reduce.sweep import Point, sweep
+from softgrasp.study.shell.session import list_files, machine, write_json
 
 SIZES = "1e3,1e4,1e5,1e6"
 KEPT = 60  # snapshots of a run, the same on every mesh: those of all steps would not fit in memory at n_e = 1e6

@@ -16,20 +16,20 @@ import scipy.linalg
 import scipy.sparse
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
-from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_of, gain_to_relative
+from softgrasp.lqr.design import make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.plant import Block
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
-from softgrasp.study.bench.peers import to_scipy
+from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_of, gain_to_relative
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.study.bench.forward_rows import peak_mb
-from softgrasp.lqr.design import make_problem
+from softgrasp.study.bench.peers import to_scipy
 from softgrasp.study.shell.jobs import leave_result
 
 METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}

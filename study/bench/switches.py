@@ -25,8 +25,8 @@ import softgrasp.lqr.lowrank.shifted
 import softgrasp.lqr.riccati
 import softgrasp.reduction.online
 from softgrasp.fem.model.build import build
-from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.solve.solvers import SolverName
 from softgrasp.lqr.dense.modal import DenseRiccati
@@ -40,8 +40,8 @@ from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.registry import make_basis
 from softgrasp.reduction.states import States
 from softgrasp.study.bench.forward import parse_ranks
-from softgrasp.study.bench.riccati_rows import problem_for
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for, interleave, timed
+from softgrasp.study.bench.riccati_rows import problem_for
 from softgrasp.study.shell.doctor import IN_MPI_JOB
 from softgrasp.study.shell.jobs import launch_worker, leave_result
 

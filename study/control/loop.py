@@ -10,25 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import scene_hash
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
 from softgrasp.lqr.loop.controller import Controller, layout_hash, save_gain
-from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.loop.cost import predicted_cost
-from softgrasp.lqr.plant.gain import Gain
-from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
 from softgrasp.lqr.loop.small import ReducedLoop, ReducedTrajectory
 from softgrasp.lqr.loop.small_plant import m_orthonormal, project
-from softgrasp.study.control.sweep import MANY_STATES, SweptBasis, fast_order
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.coordinates import gain_of
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.study.control.solve import Design, actuation
+from softgrasp.study.control.sweep import MANY_STATES, SweptBasis, fast_order
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.loop import move_steps
-from softgrasp.fem.model.outputs_named import farthest
 
 SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
 LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle

@@ -12,17 +12,17 @@ import numpy as np
 
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import hand_axes
-from softgrasp.study.forward.result import peak_memory_mb, trajectory_header
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
-from softgrasp.study.pictures.animation import speed_up
-from softgrasp.study.shell.session import origin, write_json, write_scene
 from softgrasp.study.control.loop import LoopRuns, MadeController, distance
-from softgrasp.study.control.sweep import TITLES, Retuned, SweptBasis, report_dict
 from softgrasp.study.control.solve import Design, scene_words
+from softgrasp.study.control.sweep import TITLES, Retuned, SweptBasis, report_dict
+from softgrasp.study.forward.result import peak_memory_mb, trajectory_header
+from softgrasp.study.pictures.animation import speed_up
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.page import Section, command_line, made_with, write_report
+from softgrasp.study.shell.session import origin, write_json, write_scene
 
 Row = tuple[Any, ...]
 REDUCED_HEADER = ("basis", "N", "error of P", "error of K", "excess cost", "abscissa [1/s]", "reduced ARE [ms]", "gain")

@@ -12,17 +12,29 @@ from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.lqr.plant.coordinates import gain_of
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.study.control.sweep import TITLES, SweptBasis, fast_order
 from softgrasp.study.pictures.loop import figure_decay, figure_histories, figure_loop_move
-from softgrasp.study.pictures.style import BLUE, COLUMN, GREEN, HAND, ORANGE, PURPLE, SKY, UNSTABLE, WIDTH, paper_style, save
+from softgrasp.study.pictures.style import (
+    BLUE,
+    COLUMN,
+    GREEN,
+    HAND,
+    ORANGE,
+    PURPLE,
+    SKY,
+    UNSTABLE,
+    WIDTH,
+    paper_style,
+    save,
+)
 
 if TYPE_CHECKING:
     from softgrasp.fem.petsc import Array
     from softgrasp.study.control.loop import LoopRuns
-    from softgrasp.study.control.sweep import Retuned
     from softgrasp.study.control.solve import Design
+    from softgrasp.study.control.sweep import Retuned
     from softgrasp.study.pictures.frames import Frames
     from softgrasp.study.pictures.loop import Poles
 

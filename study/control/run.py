@@ -20,12 +20,12 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.scene.control import Control, ControlOutput
 from softgrasp.fem.scene.file import scene_hash
-from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
 from softgrasp.study.control.loop import make_controller, plan, run_loops, save_controllers
-from softgrasp.study.control.sweep import Retuned, SweptBasis, orders, retune, sweep
 from softgrasp.study.control.page import Found, control_result, summary_rows, write_all
 from softgrasp.study.control.solve import design
+from softgrasp.study.control.sweep import Retuned, SweptBasis, orders, retune, sweep
 from softgrasp.study.pictures.frames import Frames
+from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
 
 GOAL = 1e-10  # of the solver when the scene names none: the right end of its progress bar
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files

@@ -8,23 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.errors import SceneError, SolverError
-from softgrasp.fem.run.motion import motion_table
+from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, LoopQuality, ModalLoop
+from softgrasp.fem.run.motion import motion_table
+from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.loop.actuation import Actuation
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import gain_of
-from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.plant.gain import PlantState
-from softgrasp.lqr.modal_feedback import modal_lqr
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainJudge
 from softgrasp.lqr.riccati import Method, choose, solve
-from softgrasp.lqr.plant.target import Target, hand_target, rest
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, LoopQuality, ModalLoop
 
 Progress = Callable[[dict[str, float]], None]
 NAMES: dict[str, Method] = {

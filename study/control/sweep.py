@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.errors import SolverError
-from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality
+from softgrasp.fem.model.build import Model
+from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import factor_of
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.reduced.riccati import GainReport, ReducedRiccati, factor_error, gain_error, reduce_riccati
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.retune import BoxPoint, Materials, Retuner, over_box
+from softgrasp.lqr.reduced.riccati import GainReport, ReducedRiccati, factor_error, gain_error, reduce_riccati
 from softgrasp.lqr.riccati import solve
+from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality
 from softgrasp.reduction.engines import on_root
 from softgrasp.study.control.solve import WHOLE_SPECTRUM, Design, every_mode, worth
 from softgrasp.study.reduce.box import box_materials, outside

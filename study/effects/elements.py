@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import RunOptions, Trajectory, simulate
+from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.forward.cautions import LOCKING
 from softgrasp.study.effects.measure import Change, compare
 from softgrasp.study.effects.switch import changed
+from softgrasp.study.forward.cautions import LOCKING
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.effects import EFFECTS
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.study.effects.measure import Case, fingerprint, nothing_of, objects_of

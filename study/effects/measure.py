@@ -16,13 +16,13 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import Array, PETSc, whole_copy
 from softgrasp.fem.run.drive import Force
 from softgrasp.fem.run.motion import motion_table
-from softgrasp.fem.solve.order import dissect
-from softgrasp.fem.petsc import Array, PETSc, whole_copy
 from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.order import dissect
 from softgrasp.study.bench.forward_rows import interleave, medians
 from softgrasp.study.effects.objects import STEPS, counting
 from softgrasp.study.effects.switch import changed

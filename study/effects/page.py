@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from softgrasp.fem.errors import agree
-from softgrasp.study.forward.result import peak_memory_mb
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.study.shell.session import origin, write_json, write_scene
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.objects import in_words
 from softgrasp.study.effects.plots import Mark, figure_effects
+from softgrasp.study.forward.result import peak_memory_mb
 from softgrasp.study.report.page import Section, command_line, made_with, write_report
+from softgrasp.study.shell.session import origin, write_json, write_scene
 
 if TYPE_CHECKING:
     from softgrasp.study.effects.run import EffectsStudy, Finding

@@ -17,11 +17,10 @@ from rich.padding import Padding
 from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
+from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.scales import rigid_inertia
-from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.shell.session import list_files, open_scene, progress_bar
 from softgrasp.study.effects.elements import Elements, judge_elements
 from softgrasp.study.effects.judge import TIMER, Cost, OffProof, cost_of, judge, prove_off, quartiles
 from softgrasp.study.effects.measure import (
@@ -38,6 +37,7 @@ from softgrasp.study.effects.measure import (
 from softgrasp.study.effects.page import write_effects
 from softgrasp.study.effects.switch import Switch, scales_of, switches
 from softgrasp.study.forward.explain import EffectReport, Explanation, explain_model
+from softgrasp.study.shell.session import list_files, open_scene, progress_bar
 
 SCENE, AGAIN = "scene", "scene again"
 

@@ -11,8 +11,8 @@ from rich.text import Text
 
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.mesh.make import cell_nodes
-from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.scene.materials import young_poisson
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model

@@ -10,15 +10,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.effects import EFFECTS, Gate
+from softgrasp.fem.model.build import build
 from softgrasp.fem.model.scales import measure
-from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
 from softgrasp.study.forward.cautions import SMALL_STRAIN, coarse, locking, poisson_ratios, turned
-from softgrasp.study.shell.session import plain
 from softgrasp.study.report.equation import Equation, equation
+from softgrasp.study.shell.session import plain
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from softgrasp.fem.effects import Gate
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.study.shell.session import origin, write_json
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.explain import Explanation, remarks, size_text, verdict
 from softgrasp.study.report.page import EQUATION, Section, command_line, equation_text, write_report
+from softgrasp.study.shell.session import origin, write_json
 
 
 def write_explanation(

@@ -16,15 +16,15 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.model.outputs import unit
-from softgrasp.study.forward.result import force_unit, simulate_result, write_results
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import resolved_toml
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.cautions import run_warnings, show_warnings
-from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
-from softgrasp.study.report.equation import equation
+from softgrasp.study.forward.result import force_unit, simulate_result, write_results
 from softgrasp.study.pictures.frames import Frames
+from softgrasp.study.report.equation import equation
 from softgrasp.study.report.page import Section, command_line, equation_text, made_with, write_report
+from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
 
 Rows = list[tuple[str, str]]
 

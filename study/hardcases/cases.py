@@ -13,8 +13,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 

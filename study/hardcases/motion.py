@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.errors import Interrupted
-from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
-from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
 from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem, Damping
-from softgrasp.study.hardcases.textbook import leapfrog, staggered_hand, textbook_midpoint
 from softgrasp.study.hardcases.cases import EPS, Family, Row, make, ours, plain, scaled_condition, sparse, thin
+from softgrasp.study.hardcases.textbook import leapfrog, staggered_hand, textbook_midpoint
 
 SMALL = ("tissue.cells=[3, 6]", "control=false")
 REST = "motion={profile='hold'}"

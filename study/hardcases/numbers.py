@@ -12,13 +12,13 @@ import numpy as np
 from mpi4py import MPI
 from pydantic import TypeAdapter, ValidationError
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.fem.scene.file import load_scene
-from softgrasp.study.hardcases.textbook import textbook_midpoint
+from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.hardcases.cases import Family, Outcome, Row, make, ours, plain, sparse
+from softgrasp.study.hardcases.textbook import textbook_midpoint
 
 BAD = ("nan", "inf", "-inf")
 SCENE = """

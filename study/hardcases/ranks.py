@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from softgrasp.study.shell.doctor import IN_MPI_JOB, find_mpiexec, run_limited
 from softgrasp.study.hardcases.cases import LENGTH, Family, Outcome, Row, plain
+from softgrasp.study.shell.doctor import IN_MPI_JOB, find_mpiexec, run_limited
 
 # what happens, what must be said, and the same in a bare script
 FAULTS: dict[str, tuple[str, str, str]] = {

@@ -13,9 +13,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.run.simulate import Trajectory, simulate
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.reduction.engines import factor

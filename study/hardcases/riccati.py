@@ -11,11 +11,11 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.modal import DenseRiccati, gather_tissue, relative_space
-from softgrasp.lqr.diagnosis import diagnose
-from softgrasp.lqr.plant.identities import translation_defect, velocity_defect
-from softgrasp.lqr.lowrank.newton import NewtonADI
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.diagnosis import diagnose
+from softgrasp.lqr.lowrank.newton import NewtonADI
+from softgrasp.lqr.plant.identities import translation_defect, velocity_defect
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.study.hardcases.cases import Family, Outcome, Row, make, ours, plain, thin
 
 TOLERANCE = 1e-8  # of both solvers on the residual, relative to |C'QC|

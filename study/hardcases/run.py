@@ -17,11 +17,17 @@ from rich.table import Table
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.forward.result import package_version
-from softgrasp.study.hardcases import carex as hard_carex, statics as hard_forward, motion as hard_motion, numbers as hard_numbers, ranks as hard_rank, reduction as hard_reduction, riccati as hard_riccati
-from softgrasp.study.shell.session import list_files, machine, plain, progress_bar, write_json
+from softgrasp.study.hardcases import carex as hard_carex
+from softgrasp.study.hardcases import motion as hard_motion
+from softgrasp.study.hardcases import numbers as hard_numbers
+from softgrasp.study.hardcases import ranks as hard_rank
+from softgrasp.study.hardcases import reduction as hard_reduction
+from softgrasp.study.hardcases import riccati as hard_riccati
+from softgrasp.study.hardcases import statics as hard_forward
 from softgrasp.study.hardcases.cases import Family, Outcome, Row
 from softgrasp.study.hardcases.plots import figure_family
 from softgrasp.study.report.page import Section, write_report
+from softgrasp.study.shell.session import list_files, machine, plain, progress_bar, write_json
 
 MODULES: Any = (hard_forward, hard_motion, hard_reduction, hard_carex, hard_riccati, hard_numbers, hard_rank)
 FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for family in module.FAMILIES}

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse.linalg
 
-from softgrasp.fem.scene import materials
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import equilibrium
+from softgrasp.fem.scene import materials
 from softgrasp.fem.solve.solvers import choose_solver
-from softgrasp.study.hardcases.textbook import conjugate_gradients, linear_triangles
 from softgrasp.study.hardcases.cases import EPS, Family, Outcome, Row, make, ours, plain, scaled_condition, sparse, thin
+from softgrasp.study.hardcases.textbook import conjugate_gradients, linear_triangles
 
 CELLS = 4  # over the height 1 of the beam
 REFUSED = 1e-6  # estimated error at which a static solve is refused

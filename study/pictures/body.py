@@ -33,7 +33,18 @@ from softgrasp.study.pictures.shapes import (
     subdivision,
     view_direction,
 )
-from softgrasp.study.pictures.style import COLUMN, HAND, OUTLINE, STEPS, TARGET, WIDTH, colour_map, length_unit, paper_style, save
+from softgrasp.study.pictures.style import (
+    COLUMN,
+    HAND,
+    OUTLINE,
+    STEPS,
+    TARGET,
+    WIDTH,
+    colour_map,
+    length_unit,
+    paper_style,
+    save,
+)
 
 if TYPE_CHECKING:
     from softgrasp.fem.fields.picture import PictureMesh

@@ -8,10 +8,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.errors import CheckpointError, agree
-from softgrasp.fem.fields.series import SeriesWriter
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
+from softgrasp.fem.fields.series import SeriesWriter
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Run, Trajectory, frame_steps
 from softgrasp.study.pictures.shapes import pick_instants, way_done

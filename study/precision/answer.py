@@ -9,13 +9,13 @@ from typing import Any
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.shell.session import plain
 from softgrasp.study.precision.fit import usable
 from softgrasp.study.precision.forward import SAFETY, Prediction, Predictor, setting_of, to_point
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.points import Row, Setting, WorkPoint
 from softgrasp.study.precision.reduced import ReducedRuns
 from softgrasp.study.precision.reference import Reference
+from softgrasp.study.shell.session import plain
 
 TRIES = 4  # settings that are run to check a prediction
 MARGIN = 0.75  # of the tolerance that the full run behind a reduced model may use

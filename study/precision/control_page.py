@@ -8,7 +8,6 @@ from typing import Any
 
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.control.sweep import TITLES as BASIS_TITLES
-from softgrasp.study.report.page import Section
 from softgrasp.study.precision.control_plots import (
     PAPER_ARE,
     PAPER_N,
@@ -20,6 +19,7 @@ from softgrasp.study.precision.control_plots import (
 from softgrasp.study.precision.fit import pareto
 from softgrasp.study.precision.points import CONTROL, TITLES, Row, WorkPoint
 from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
+from softgrasp.study.report.page import Section
 
 Rows = list[tuple[Any, ...]]
 PAPER_SCENE = "paper_lqr"

@@ -15,22 +15,22 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
-from softgrasp.lqr.plant.coordinates import factor_of
 from softgrasp.lqr.loop.cost import predicted_cost
-from softgrasp.lqr.plant.gain import Gain
-from softgrasp.lqr.lowrank.plant import Block
-from softgrasp.lqr.reduced.riccati import reduce_riccati
-from softgrasp.lqr.reduced.bases import BasisFamily, make_family
+from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
 from softgrasp.lqr.loop.small import ReducedLoop, ReducedTrajectory
 from softgrasp.lqr.loop.small_plant import SmallPlant, project
+from softgrasp.lqr.lowrank.plant import Block
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.coordinates import factor_of
+from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.reduced.bases import BasisFamily, make_family
+from softgrasp.lqr.reduced.riccati import reduce_riccati
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.reduction.engines import on_root
 from softgrasp.study.control.sweep import TITLES, fast_order, judged, orders
-from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.points import LEAST_STEPS, Row, WorkPoint, number
 from softgrasp.study.precision.riccati import SECOND, ControlRuns

@@ -15,24 +15,24 @@ from rich.markup import escape
 from rich.table import Table
 
 from softgrasp.fem.errors import agree
-from softgrasp.study.forward.result import peak_memory_mb
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.reduction.registry import METHODS
-from softgrasp.study.shell.session import list_files, origin, plain, write_json, write_scene
 from softgrasp.study.control.sweep import TITLES as BASIS_TITLES
-from softgrasp.study.report.equation_control import control_text
-from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
-from softgrasp.study.report.page import EQUATION, Section, command_line, made_with, write_report
-from softgrasp.study.precision.control_page import HEADERS, control_sections, draw_control, notes, rows_of_control
-from softgrasp.study.precision.plots import figure_budget, figure_forward, figure_reduced, figure_series
+from softgrasp.study.forward.result import peak_memory_mb
 from softgrasp.study.precision.answer import seconds_text
+from softgrasp.study.precision.control_page import HEADERS, control_sections, draw_control, notes, rows_of_control
 from softgrasp.study.precision.fit import Slope, pareto
+from softgrasp.study.precision.plots import figure_budget, figure_forward, figure_reduced, figure_series
 from softgrasp.study.precision.points import CONTROL, TITLES, Asked, Row, WorkPoint
 from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
+from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.report.equation_control import control_text
+from softgrasp.study.report.page import EQUATION, Section, command_line, made_with, write_report
+from softgrasp.study.shell.session import list_files, origin, plain, write_json, write_scene
 
 if TYPE_CHECKING:
-    from softgrasp.study.precision.run import WorkStudy
     from softgrasp.study.precision.reference import Reference
+    from softgrasp.study.precision.run import WorkStudy
 
 PAPER_SCENE = "paper_forward"
 FIRST = ("question", "series", "label", "seconds", "error", "ok", "pareto")

@@ -12,11 +12,11 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import Formatter, LogLocator
 
 from softgrasp.reduction.registry import METHODS
-from softgrasp.study.reduce.plots import LOOKS, SPARE
-from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, WIDTH, paper_style, save
 from softgrasp.study.precision.fit import Slope, pareto, usable
 from softgrasp.study.precision.points import WorkPoint
+from softgrasp.study.reduce.plots import LOOKS, SPARE
+from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
 
 PAPER_ERROR = 1e-3  # about, of PSD at N = 14: the paper, section 4.1
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s")}

@@ -18,11 +18,11 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import Interrupted, SceneError, agree
 from softgrasp.fem.petsc import Array
-from softgrasp.study.forward.result import package_version
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import scene_hash
-from softgrasp.study.shell.session import plain
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.switch import changed
+from softgrasp.study.forward.result import package_version
+from softgrasp.study.shell.session import plain
 
 FORMAT = 1  # of the cached files
 LEAST_STEPS = 4  # of a run

@@ -18,8 +18,8 @@ from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.scene.scene import Scene
 
 REGION_POINTS = 4  # along each axis of the box of a region output
 

@@ -14,23 +14,23 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import scene_hash
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.engines import ENGINES, factor, small_svd
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper, prepared, run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.registry import METHODS
-from softgrasp.reduction.states import States
 from softgrasp.reduction.replay import Reference as FullRun
 from softgrasp.reduction.replay import prepare, reference
-from softgrasp.study.reduce.sweep import Point, bases_of, chosen_methods, comparison_of, measure, sizes_for
+from softgrasp.reduction.states import States
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import Row, Setting, WorkPoint, number, scene_setting
 from softgrasp.study.precision.probe import Probe, make_probe
 from softgrasp.study.precision.reference import Reference
+from softgrasp.study.reduce.sweep import Point, bases_of, chosen_methods, comparison_of, measure, sizes_for
 
 CALLS = 2_000  # single steps of a reduced model that are timed
 ENGINE_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
+from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution

@@ -12,25 +12,56 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import TaskProgressColumn
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import ResourceError, SolverError
+from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.reduction.engines import ENGINES
-from softgrasp.study.shell.session import open_scene, progress_bar
-from softgrasp.study.reduce.sweep import chosen_methods
 from softgrasp.study.precision.answer import Answer, Asker
 from softgrasp.study.precision.fit import Slope
 from softgrasp.study.precision.forward import forward_settings, forward_slopes, sweep_forward
 from softgrasp.study.precision.full import FullRuns
-from softgrasp.study.precision.loop import CONTROLLERS, Controller, Feedback, LoopRuns, controller_work, loop_slopes, sweep_loop
-from softgrasp.study.precision.points import CONTROL, QUESTIONS, Asked, Cache, Guard, Row, WorkPoint, interruptible, number, variant
+from softgrasp.study.precision.loop import (
+    CONTROLLERS,
+    Controller,
+    Feedback,
+    LoopRuns,
+    controller_work,
+    loop_slopes,
+    sweep_loop,
+)
+from softgrasp.study.precision.points import (
+    CONTROL,
+    QUESTIONS,
+    Asked,
+    Cache,
+    Guard,
+    Row,
+    WorkPoint,
+    interruptible,
+    number,
+    variant,
+)
 from softgrasp.study.precision.probe import find_places
-from softgrasp.study.precision.reduced import bases_slopes, engine_work, own_setting, reduced_slopes, sweep_bases, sweep_reduced
+from softgrasp.study.precision.reduced import (
+    bases_slopes,
+    engine_work,
+    own_setting,
+    reduced_slopes,
+    sweep_bases,
+    sweep_reduced,
+)
 from softgrasp.study.precision.reference import Reference, make_reference, nested_meshes
 from softgrasp.study.precision.riccati import SECOND, ControlRuns, riccati_slopes, riccati_work, sweep_riccati
-from softgrasp.study.precision.riccati_reduced import basis_work, reduced_riccati_slopes, reference_note, sweep_riccati_reduced
+from softgrasp.study.precision.riccati_reduced import (
+    basis_work,
+    reduced_riccati_slopes,
+    reference_note,
+    sweep_riccati_reduced,
+)
+from softgrasp.study.reduce.sweep import chosen_methods
+from softgrasp.study.shell.session import open_scene, progress_bar
 
 REDUCED_WORK = 5e5  # expected of a basis, in unknowns times steps
 FULL_SNAPSHOTS = 3e8  # entries; beyond them the scene's own run is too large for reduced models in memory

@@ -19,10 +19,10 @@ from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import Method
-from softgrasp.reduction.states import States
-from softgrasp.study.shell.session import plain
 from softgrasp.reduction.replay import Reference, prepare, reference
+from softgrasp.reduction.states import States
 from softgrasp.study.reduce.sweep import COMPARED, LARGER, Point, Swept, bases_of, nearest
+from softgrasp.study.shell.session import plain
 
 GRID = 3  # test values of each constant, from corner to corner of the box
 METHODS_TESTED = 4

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.study.shell.session import write_json, write_scene
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.reduce.tables import (
     BOX_HEADER,
     ERROR_HEADER,
@@ -23,10 +22,11 @@ from softgrasp.study.reduce.tables import (
     write_csv,
 )
 from softgrasp.study.report.page import Section, command_line, made_with, write_report
+from softgrasp.study.shell.session import write_json, write_scene
 
 if TYPE_CHECKING:
-    from softgrasp.study.reduce.run import Reduced
     from softgrasp.study.reduce.pictures import Views
+    from softgrasp.study.reduce.run import Reduced
 
 CAPTIONS = {
     "errors.png": "Relative errors of the paper's six methods against N. First the state that the basis is built "

@@ -15,17 +15,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from PIL import Image
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.online import run
 from softgrasp.reduction.registry import PAPER_METHODS
+from softgrasp.reduction.replay import Reference, prepare
 from softgrasp.study.pictures.animation import speed_up
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
-from softgrasp.reduction.replay import Reference, prepare
-from softgrasp.study.reduce.sweep import Swept, nearest
 from softgrasp.study.pictures.shapes import seen, shadow
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
+from softgrasp.study.reduce.sweep import Swept, nearest
 
 MODES = 4  # a method
 FRAMES = 30

@@ -12,8 +12,20 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from softgrasp.reduction.registry import PAPER_METHODS
+from softgrasp.study.pictures.style import (
+    BLUE,
+    GREEN,
+    HAND,
+    ORANGE,
+    PURPLE,
+    SKY,
+    STEPS,
+    UNSTABLE,
+    WIDTH,
+    paper_style,
+    save,
+)
 from softgrasp.study.reduce.sweep import Point, Swept, nearest
-from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, SKY, STEPS, UNSTABLE, WIDTH, paper_style, save
 
 TOP = 1.0  # errors above are drawn at the upper edge
 NARROW = 16.0  # largest over least time below which an axis has numbers between the powers of ten

@@ -15,15 +15,14 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
-from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.errors import SceneError
-from softgrasp.study.forward.result import peak_memory_mb, simulate_result
+from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save_model
-from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
-from softgrasp.study.reduce.box import Box, box_result, measure_box
 from softgrasp.reduction.replay import Reference, reference
+from softgrasp.study.forward.result import peak_memory_mb, simulate_result
+from softgrasp.study.reduce.box import Box, box_result, measure_box
 from softgrasp.study.reduce.page import draw_all, write_all
 from softgrasp.study.reduce.sweep import COMPARED, Swept, best, chosen_methods, sweep
 from softgrasp.study.reduce.tables import (
@@ -44,6 +43,7 @@ from softgrasp.study.reduce.tables import (
     speed_of,
     time_rows,
 )
+from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
 
 FULL_REPEATS = 3  # behind the median of the full run
 PATIENCE = 2.0  # seconds of a full run above which one is enough

@@ -20,10 +20,10 @@ from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import METHODS, PAPER_METHODS, Method, find_method, make_bases
+from softgrasp.reduction.replay import Reference, prepare
 from softgrasp.reduction.states import BasisError, States
 from softgrasp.reduction.truncation import Truncation
 from softgrasp.study.shell.session import plain
-from softgrasp.reduction.replay import Reference, prepare
 
 BEYOND = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
 REPEATS, SETUPS = 15, 3  # behind each median of the online time and of the set-up

@@ -21,8 +21,8 @@ from PIL import Image
 from slepc4py import SLEPc
 
 from softgrasp.fem.petsc import PETSc
-from softgrasp.study.forward.result import package_version
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.forward.result import package_version
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.typeset import equation_html
 

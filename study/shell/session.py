@@ -15,9 +15,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.study.forward.result import package_version
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import load_scene_collective, resolved_toml, scene_hash
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.forward.result import package_version
 
 
 def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:

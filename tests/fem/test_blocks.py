@@ -7,6 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import build
+from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from tests.helpers.models import (
     CUBE,
     LAYERS,
@@ -19,10 +23,6 @@ from tests.helpers.models import (
     reference,
     same_everywhere,
 )  # fmt: skip
-from mpi4py import MPI
-
-from softgrasp.fem.model.build import build
-from softgrasp.fem.scene.file import load_scene, shipped_scenes
 
 SCENES: dict[str, tuple[list[dict[str, Any]], Any]] = {
     "2d-p1": ([], held_by_paper),

@@ -9,16 +9,16 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.effects import EFFECTS, Problem
 from softgrasp.fem.effects.damping import operator, ratios
 from softgrasp.fem.effects.gravity import acceleration
-from softgrasp.fem.model.scales import damping_ratios, measure, rigid_inertia
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.model.build import build
+from softgrasp.fem.model.scales import damping_ratios, measure, rigid_inertia
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import LayerMaterial
 
 EPS = np.finfo(float).eps

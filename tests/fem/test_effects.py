@@ -7,6 +7,12 @@ from typing import Any
 import dolfinx.fem
 import numpy as np
 import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.study.effects.objects import counting, difference
 from tests.helpers.models import (
     LAYERS,
     absolute,
@@ -20,12 +26,6 @@ from tests.helpers.models import (
     run_from,
     wave,
 )
-from mpi4py import MPI
-
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import PETSc
-from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.effects.objects import counting, difference
 
 BARE_FORMS = ["K_mu", "K_lambda", "M_1"]
 BARE_OPERATORS = ["K_mu[tissue]", "K_lambda[tissue]", "M_1[tissue]", "M_ee", "K_ee", "T", "G"]

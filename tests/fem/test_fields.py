@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.errors import ResourceError
-from softgrasp.fem.fields.series import FullField, SeriesWriter
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
+from softgrasp.fem.fields.series import FullField, SeriesWriter
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.scene import Scene
 
 EXACT = 1e-14  # coordinates of order 1 times rounding

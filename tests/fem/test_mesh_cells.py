@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import scipy.linalg
 import skfem
-from tests.helpers.models import gather_matrix, node_order
 from skfem.helpers import ddot, div, sym_grad
 from test_fem_mesh import COMM, WIDE, area, grid, volume, zone
 
-from softgrasp.fem.model.build import build
-from softgrasp.fem.model.contact import cells_in, check_parts, contact_facets, held_check
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.cells import check_straight, cut_cells, shape_of, simplices
 from softgrasp.fem.mesh.check import signed_volumes
 from softgrasp.fem.mesh.file import load_arrays, read_mesh
 from softgrasp.fem.mesh.parts import find_parts
+from softgrasp.fem.model.build import build
+from softgrasp.fem.model.contact import cells_in, check_parts, contact_facets, held_check
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.tissue import Contact, Layer
+from tests.helpers.models import gather_matrix, node_order
 
 Blocks = list[tuple[str, np.ndarray]]
 

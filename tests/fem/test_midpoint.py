@@ -8,6 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import PETSc, total
+from softgrasp.fem.run.drive import force_taken
+from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
+from softgrasp.fem.run.motion import force_values, motion_table
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.stepping import make_ts
 from tests.helpers.models import (
     CUBE,
     LAYERS,
@@ -28,16 +38,6 @@ from tests.helpers.models import (
     same_everywhere,
     wave,
 )
-from mpi4py import MPI
-from numpy.typing import NDArray
-
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.run.drive import force_taken
-from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
-from softgrasp.fem.run.motion import force_values, motion_table
-from softgrasp.fem.petsc import PETSc, total
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.run.stepping import make_ts
 
 Array = NDArray[np.float64]
 # 60 solves with a matrix of condition 1e4, each good to 1e-12: the two runs may part by 1e-10

@@ -7,6 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.solve.solvers import factor_on_every_rank
 from tests.helpers.models import (
     CUBE,
     LAYERS,
@@ -21,12 +27,6 @@ from tests.helpers.models import (
     same_everywhere,
     wave,
 )
-from mpi4py import MPI
-
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.solve.solvers import factor_on_every_rank
-from softgrasp.fem.run.stepping import make_ts
 
 # relative; both runs carry the rounding of 60 solves with a matrix of condition 1e4
 SAME = 1e-10

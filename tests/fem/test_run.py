@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.solve.solvers import TissueSolver
-from softgrasp.fem.run.stepping import make_ts
 
 SCENES = Path(__file__).parents[2] / "demos" / "scenes"
 
@@ -52,7 +52,9 @@ def test_restart_leaves_the_same_streamed_snapshots(
     comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     extra = ('output.snapshots="hdf5"', "output.every=3")
-    monkeypatch.setattr("softgrasp.fem.run.snapshots.BUFFER_BYTES", 20_000)  # a few columns: the buffer is filled several times
+    monkeypatch.setattr(
+        "softgrasp.fem.run.snapshots.BUFFER_BYTES", 20_000
+    )  # a few columns: the buffer is filled several times
     simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path / "whole"))
     with pytest.raises(Interrupted):
         simulate(small(comm, *extra), RunOptions(directory=mpi_tmp_path / "parts", until=17))

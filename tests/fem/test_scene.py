@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.scene import materials
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.scene.scene import check_dimension, scene_schema
+from softgrasp.fem.scene import materials
 from softgrasp.fem.scene.file import load_scene, load_scene_collective, resolved_toml, scene_hash, shipped_scenes
+from softgrasp.fem.scene.scene import check_dimension, scene_schema
 
 SCENES = shipped_scenes()
 PAPER = SCENES["paper_forward"]

@@ -12,18 +12,18 @@ import scipy.sparse
 import scipy.sparse.linalg
 import skfem
 import ufl
-from tests.helpers.models import dof_order, gather_matrix, gather_rows, local_rows, make_scene
 from mpi4py import MPI
 from numpy.typing import NDArray
 from skfem.helpers import ddot, div, sym_grad
 
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.mesh.make import TissueMesh, structured_mesh
 from softgrasp.fem.model.assembly import Inventory, _bilinear, assemble, discretise
 from softgrasp.fem.model.build import build
-from softgrasp.fem.mesh.make import TissueMesh, structured_mesh
-from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import LayerMaterial, tissue_matrices
+from tests.helpers.models import dof_order, gather_matrix, gather_rows, local_rows, make_scene
 
 Array = NDArray[np.float64]
 SIDES = {2: ["left", "right", "bottom", "top"], 3: ["x-", "x+", "y-", "y+", "z-", "z+"]}

@@ -15,13 +15,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from skfem.helpers import ddot, div, dot, sym_grad
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.scene.file import resolved_toml
+from softgrasp.fem.scene.scene import Scene
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.run.motion import force_values
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import total
+from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.run.simulate import Trajectory, simulate
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.basis import Basis

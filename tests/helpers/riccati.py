@@ -13,8 +13,8 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from tests.helpers.models import CUBE, LAYERS, gather_rows, make_scene
 
 SCENE = Path(__file__).parents[2] / "demos" / "scenes" / "paper_lqr.toml"

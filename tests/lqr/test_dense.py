@@ -10,12 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
-from tests.helpers.models import Array, close, first_order, gather_rows, held_by_paper, held_on_top, make_scene, reference
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.care import care, riccati_schur
+from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
+from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import (
     costates_to_relative,
@@ -26,11 +28,18 @@ from softgrasp.lqr.plant.coordinates import (
     states_to_relative,
     to_absolute,
 )
-from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
 from softgrasp.lqr.plant.identities import translation_defect, velocity_defect
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.design import make_problem
+from tests.helpers.models import (
+    Array,
+    close,
+    first_order,
+    gather_rows,
+    held_by_paper,
+    held_on_top,
+    make_scene,
+    reference,
+)
 
 EPS = np.finfo(float).eps
 Example = tuple[Array, Array, Array, Array, Array, Array]  # A, B, C, Q, R, X

@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
-from tests.helpers.models import close, gather_matrix, gather_rows, make_scene, same_everywhere
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.diagnosis import Diagnosis, diagnose
+from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.coordinates import gain_of
-from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.plant.identities import translation_defect
-from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from tests.helpers.models import close, gather_matrix, gather_rows, make_scene, same_everywhere
 
 SMALL = {"tissue": {"cells": [3, 6]}}
 

@@ -13,18 +13,18 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.scene.file import scene_hash
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.loop.full import ClosedLoop
 from softgrasp.lqr.loop.controller import Controller, layout_hash, load_gain, save_gain
 from softgrasp.lqr.loop.export import to_pymor, to_python_control
-from softgrasp.lqr.plant.gain import PlantState
-from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.loop.full import ClosedLoop
 from softgrasp.lqr.loop.small import ReducedLoop
 from softgrasp.lqr.loop.small_plant import Shapes, SmallPlant, project
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.gain import PlantState
+from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import hand_target, rest
 from tests.helpers.models import close, gather_rows, make_scene, same_everywhere
 

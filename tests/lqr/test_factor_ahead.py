@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.model.build import build
 from softgrasp.lqr.lowrank import shifted_gathered
 from softgrasp.lqr.lowrank.factor_ahead import FactorsAhead
 from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue

@@ -12,16 +12,16 @@ import pytest
 from mpi4py import MPI
 
 import softgrasp.lqr.lowrank.adi
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import CheckpointError, ResourceError, SolverError
-from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.design import make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.shifted import factor_bytes, make_shifted
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.riccati import choose, solve
-from softgrasp.lqr.design import make_problem
 from tests.helpers.models import make_scene
 from tests.helpers.riccati import CASES, NODE, gain, gain_error, oracle, paper, problem_of, x_error
 

@@ -12,15 +12,15 @@ import scipy.linalg
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
-from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
 from softgrasp.lqr.loop.cost import predicted_cost
-from softgrasp.lqr.plant.gain import Gain, PlantState
+from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
 from softgrasp.lqr.loop.small import ReducedLoop
 from softgrasp.lqr.loop.small_plant import m_orthonormal, project
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.target import hand_target, output_target, rest
-from tests.helpers.models import close, gather_rows, gather_states, local_rows, same_everywhere
 from tests.helpers.loop import CASES, Setup, aim, enumerate_input, plain_loop, setup
+from tests.helpers.models import close, gather_rows, gather_states, local_rows, same_everywhere
 
 Array = np.ndarray
 STEPS, END = 40, 4.0

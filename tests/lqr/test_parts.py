@@ -11,17 +11,17 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.system import BlockSystem
+from softgrasp.lqr.dense.modal import relative_space
 from softgrasp.lqr.lowrank.adjoint import closed_adjoint, make_right
 from softgrasp.lqr.lowrank.compress import compress
-from softgrasp.lqr.dense.modal import relative_space
 from softgrasp.lqr.lowrank.galerkin import frequencies
 from softgrasp.lqr.lowrank.line_search import best_step, mixed_residual
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Block, Plant
-from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.lowrank.shifted import make_shifted
 from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue
 from softgrasp.lqr.lowrank.shifts import ShiftRange, choose_shifts, energy_products, ritz_pairs
+from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import gather_matrix, gather_rows, local_rows
 from tests.helpers.riccati import SCENE, problem_of
 

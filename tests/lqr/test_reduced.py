@@ -8,23 +8,32 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy.linalg
-from tests.helpers.models import Array, FirstOrder, close, first_order, gather_rows, make_scene, reference, same_everywhere
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.dense.small_care import closed_loop, fast_solution, solve_reduced
+from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import factor_of, gain_of, gain_to_absolute, to_absolute
-from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.plant.identities import optimal_cost
-from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.reduced.riccati import GainJudge, hand_start, project, reduce_riccati
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, energy_scaled, make_family
 from softgrasp.lqr.reduced.retune import Retuner, over_box
-from softgrasp.lqr.dense.small_care import closed_loop, fast_solution, solve_reduced
+from softgrasp.lqr.reduced.riccati import GainJudge, hand_start, project, reduce_riccati
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
+from tests.helpers.models import (
+    Array,
+    FirstOrder,
+    close,
+    first_order,
+    gather_rows,
+    make_scene,
+    reference,
+    same_everywhere,
+)
 
 PAPER = [name for name in BASES if name != "structured"]
 DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.002}}, "tissue": {"cells": [3, 6]}}

@@ -11,9 +11,9 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.modal import DenseRiccati, dense_residual, relative_space
-from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import LAYERS, make_scene
 
 CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}], "Q": 7.0, "R": [[2.0, 0.5], [0.5, 1.0]]}}

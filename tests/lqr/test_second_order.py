@@ -16,13 +16,13 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.system import Damping
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.diagnosis import diagnose
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.lowrank.radi import RADI
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.second_order import second_order
 from softgrasp.lqr.riccati import solve
 

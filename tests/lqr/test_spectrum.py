@@ -11,16 +11,16 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
-from softgrasp.lqr.plant.coordinates import gain_of
+from softgrasp.lqr.design import make_problem
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Block, Plant
+from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 from softgrasp.lqr.spectrum.tail import Tail
 from softgrasp.study.control.run import with_control
-from softgrasp.lqr.design import make_problem
 from tests.helpers.models import LAYERS, make_scene
 
 SCENES = Path(__file__).parents[2] / "demos" / "scenes"

@@ -15,7 +15,17 @@ from softgrasp.reduction.errors import Comparison, full_energy, trajectory_error
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import run
 from tests.helpers.models import Array, gather_matrix, gather_rows, gather_states
-from tests.helpers.reduced import FORCED, KINDS, force_of, leading, model_of, reduced, step_of, symplectic_basis, whole_basis
+from tests.helpers.reduced import (
+    FORCED,
+    KINDS,
+    force_of,
+    leading,
+    model_of,
+    reduced,
+    step_of,
+    symplectic_basis,
+    whole_basis,
+)
 
 DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
 norm = np.linalg.norm

@@ -11,15 +11,25 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
-from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.basis import Basis
 from softgrasp.reduction.model import ModelError, ReducedModel, SmallModel, UnstableModelError
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.spectrum import GROWTH_TOLERANCE
-from tests.helpers.models import CUBE, LAYERS, Array, close, first_order, gather_rows, make_scene, reference, same_everywhere
+from tests.helpers.models import (
+    CUBE,
+    LAYERS,
+    Array,
+    close,
+    first_order,
+    gather_rows,
+    make_scene,
+    reference,
+    same_everywhere,
+)
 from tests.helpers.reduced import (
     DAMPED,
     FORCED,

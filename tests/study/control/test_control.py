@@ -11,23 +11,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.helpers.models import make_scene
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.loop.controller import Controller, load_gain
+from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
-from softgrasp.study.shell.session import plain
-from softgrasp.study.control.run import run_control, with_control
-from softgrasp.study.control.plots import drawn, figure_reduced, unstable
-from softgrasp.study.control.sweep import SweptBasis
 from softgrasp.study.control.page import settled
+from softgrasp.study.control.plots import drawn, figure_reduced, unstable
+from softgrasp.study.control.run import run_control, with_control
 from softgrasp.study.control.solve import scene_words
+from softgrasp.study.control.sweep import SweptBasis
+from softgrasp.study.shell.session import plain
 from tests.helpers.browser import look
+from tests.helpers.models import make_scene
 
 SCENES = Path(__file__).parents[3] / "demos" / "scenes"
 SMALL = ["tissue.cells=[4,8]", "control.N=[4,8,12]", "output.fields='none'", "reduction.lambda_range=[50.0,50.0]"]

@@ -11,18 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.helpers.browser import find_chromium, look
-from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.effects import EFFECTS
+from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.effects import measure as effects_measure
-from softgrasp.study.effects.run import EffectsStudy, Finding, run_effects, show, study_effects
 from softgrasp.study.effects.judge import judge, prove_off
 from softgrasp.study.effects.measure import (
     Case,
@@ -35,7 +32,10 @@ from softgrasp.study.effects.measure import (
     objects_of,
 )
 from softgrasp.study.effects.objects import counting, difference, read_table
+from softgrasp.study.effects.run import EffectsStudy, Finding, run_effects, show, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
+from tests.helpers.browser import find_chromium, look
+from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
 
 QUICK = {"study": {"repeats": 1}, "time": {"steps": 20}}
 CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}}

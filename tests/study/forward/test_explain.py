@@ -12,15 +12,15 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.model.build import build
-from softgrasp.fem.run.midpoint import midpoint_matrix
-from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.study.forward.cautions import gradients, inexact, run_warnings, slowest
-from softgrasp.study.report.equation import equation
 from softgrasp.study.forward.explain import Explanation, explain, factor_bytes, render, run_explain
+from softgrasp.study.report.equation import equation
 
 FORCE = {"target": [1.0, 0.0], "drive": "force"}
 RAYLEIGH = {"kind": "rayleigh", "alpha": 0.1, "beta": 0.01}

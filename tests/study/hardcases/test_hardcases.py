@@ -17,10 +17,11 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.hardcases import carex as hard_carex, numbers as hard_numbers
-from softgrasp.study.hardcases.textbook import leapfrog, textbook_midpoint
+from softgrasp.study.hardcases import carex as hard_carex
+from softgrasp.study.hardcases import numbers as hard_numbers
 from softgrasp.study.hardcases.cases import Family, Outcome, Row, ours, plain
 from softgrasp.study.hardcases.run import FAMILIES, choose, run_hardcases
+from softgrasp.study.hardcases.textbook import leapfrog, textbook_midpoint
 from tests.helpers.browser import look
 
 pytestmark = pytest.mark.serial

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.study.pictures import loop as loop_plots
 from softgrasp.study.pictures.loop import figure_decay, figure_histories, move_steps, still_to_come
-from softgrasp.fem.model.outputs_named import farthest
 
 pytestmark = pytest.mark.serial
 

@@ -15,9 +15,9 @@ from PIL import Image, ImageChops
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.animation import gif_move, speed_up
 from softgrasp.study.pictures.body import figure_move
-from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.pictures.shapes import hand_polygons, overlap, pick_instants, seen, shadow, view_direction
 from softgrasp.study.pictures.traces import figure_traces
+from softgrasp.study.report.page import Section, write_report
 
 pytestmark = pytest.mark.serial  # no communication here
 

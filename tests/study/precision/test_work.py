@@ -18,19 +18,21 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import Interrupted, SceneError
+from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.engines import ENGINES
-from softgrasp.study.precision import plots as work_plots, full as wp_full, reduced as wp_reduced
-from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
-from softgrasp.study.precision.page import rows_of
+from softgrasp.study.precision import full as wp_full
+from softgrasp.study.precision import plots as work_plots
+from softgrasp.study.precision import reduced as wp_reduced
 from softgrasp.study.precision.answer import parse_budget, parse_tolerance
 from softgrasp.study.precision.fit import interpolate, pareto, power_law
 from softgrasp.study.precision.forward import forward_settings
+from softgrasp.study.precision.page import rows_of
 from softgrasp.study.precision.points import Asked, Setting, WorkPoint, least_steps, variant
 from softgrasp.study.precision.probe import Places, find_places, make_probe, run_probed
 from softgrasp.study.precision.reference import extrapolate, fitted, nested_meshes
+from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
 from tests.helpers.browser import look
 from tests.helpers.models import Array, make_scene, rough_save, write_scene
 
@@ -178,7 +180,17 @@ def test_interrupted_study_goes_on_to_the_same_errors(
 def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: dict[str, Any], tmp_path: Path) -> None:
     """The real command is killed in the middle, without a chance to clean up."""
     file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
-    command = [sys.executable, "-m", "softgrasp.study.cli", "study", str(file), "--out", str(tmp_path), "--question", "forward"]
+    command = [
+        sys.executable,
+        "-m",
+        "softgrasp.study.cli",
+        "study",
+        str(file),
+        "--out",
+        str(tmp_path),
+        "--question",
+        "forward",
+    ]
     with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL) as process:
         while len(list(cache.glob("run-*.json"))) < 8 and process.poll() is None:
             time.sleep(0.01)

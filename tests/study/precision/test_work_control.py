@@ -14,19 +14,21 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import Interrupted, SceneError
+from softgrasp.fem.model.build import build
+from softgrasp.lqr.design import make_problem
 from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.lqr.riccati import solve
-from softgrasp.study.precision import control_plots as work_control_plots, loop as wp_loop, riccati as wp_riccati
-from softgrasp.lqr.design import make_problem
+from softgrasp.study.precision import control_plots as work_control_plots
+from softgrasp.study.precision import loop as wp_loop
+from softgrasp.study.precision import riccati as wp_riccati
 from softgrasp.study.precision.control_page import notes, rows_of_control
-from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
-from softgrasp.study.precision.page import rows_of
 from softgrasp.study.precision.loop import step_counts
+from softgrasp.study.precision.page import rows_of
 from softgrasp.study.precision.points import CONTROL, Asked, Cache, Guard, WorkPoint
+from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene, rough_save, write_scene
 

@@ -11,13 +11,15 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
-from softgrasp.study.precision import forward as wp_forward, full as wp_full, reduced as wp_reduced
-from softgrasp.study.precision.run import WorkStudy, study_scene
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.precision import forward as wp_forward
+from softgrasp.study.precision import full as wp_full
+from softgrasp.study.precision import reduced as wp_reduced
 from softgrasp.study.precision.points import Asked, Setting, variant
 from softgrasp.study.precision.probe import find_places, make_probe, run_probed
 from softgrasp.study.precision.reduced import own_setting
+from softgrasp.study.precision.run import WorkStudy, study_scene
 from tests.helpers.models import Array
 
 FORWARD = ("forward", "reduced")

@@ -13,8 +13,8 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.model.build import build
 from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
@@ -22,11 +22,11 @@ from softgrasp.reduction.archive import load_model
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import METHODS, make_bases
+from softgrasp.reduction.replay import Reference, prepare, reference
 from softgrasp.reduction.states import BasisError, States
-from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.reduce.box import cases_of, measure_box, summary, training_of, training_states
 from softgrasp.study.reduce.pictures import gather_views, instants
-from softgrasp.reduction.replay import Reference, prepare, reference
+from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.reduce.sweep import sweep, uncounted
 from softgrasp.study.reduce.tables import FullTimes, speed_of
 from tests.helpers.browser import find_chromium, look

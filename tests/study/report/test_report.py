@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.helpers.browser import DESK, PHONE, Browser, faults, find_chromium
 from rich.console import Console
 
 from softgrasp.fem.scene.file import load_scene, resolved_toml, shipped_scenes
+from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.page import Section, equation_text, of_scene, outside, versions, write_report
-from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.report.typeset import equation_html, formula, terms
+from tests.helpers.browser import DESK, PHONE, Browser, faults, find_chromium
 
 pytestmark = pytest.mark.serial
 

@@ -26,7 +26,11 @@ def softgrasp(*args: str, ranks: int = 1) -> subprocess.CompletedProcess[str]:
         launcher = Path(shutil.which("mpiexec") or pytest.skip("no mpiexec"))
     start = [str(launcher), "-n", str(ranks)] if ranks > 1 else []
     return subprocess.run(
-        [*start, sys.executable, "-m", "softgrasp.study.cli", *args], cwd=ROOT, capture_output=True, text=True, timeout=240
+        [*start, sys.executable, "-m", "softgrasp.study.cli", *args],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=240,
     )
 
 
