@@ -36,8 +36,9 @@ class ReducedTrajectory:
     output_names: tuple[str, ...]
 
 
-def _check_stable(model: SmallModel, allow_unstable: bool) -> None:
-    if not (allow_unstable or model.stable):
+def _check_stable(step: Propagator, allow_unstable: bool) -> None:
+    if not (allow_unstable or step.stable):
+        model = step.model
         raise UnstableModelError(
             f"{model.name} with N = {model.N} is unstable (spectral abscissa {model.spectral_abscissa:.2e} 1/s); "
             "choose another N or a structure-preserving basis, or run with allow_unstable"
@@ -69,8 +70,8 @@ def run(
     if (force is None) == (hand is None):
         raise ModelError("give either the force on the hand or the motion of the hand")
     step = prepared(model, dt, hand is not None)
+    _check_stable(step, allow_unstable)
     model = step.model
-    _check_stable(model, allow_unstable)
     inputs = force_inputs(model, force) if hand is None else hand_inputs(model, hand, step.dt)
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
     x = march(step, inputs, step.X_inverse @ start[model.N - step.size :]) @ step.X.T
@@ -145,8 +146,8 @@ class Stepper:
         allow_unstable: bool = False,
     ) -> None:
         self.step = prepared(model, dt, False)
+        _check_stable(self.step, allow_unstable)
         model = self.step.model
-        _check_stable(model, allow_unstable)
         k, op = self.step.size, model.operators
         C = model.outputs.C_z + model.outputs.C_s @ op.S_q
         # new state, and outputs of the new state, in one product
@@ -204,7 +205,7 @@ def run_batch(
             "model or one for each run, all with one N"
         )
     for s in steps:
-        _check_stable(s.model, allow_unstable)
+        _check_stable(s, allow_unstable)
     result = []
     for i, w in enumerate(_states(steps, u)):
         s = steps[i if len(steps) > 1 else 0]

@@ -179,7 +179,7 @@ def make_bases(
     whole = Basis(
         method.key, states.layout, *(np.zeros((0, 0)),) * 4, method.coordinates, method.frame, method.structure,
         method.fixed, metric, parts[0].rate, method.pairs,
-        tuple(part.scale * part.sigma for part in parts if len(part.sigma)), seconds,
+        tuple(part.scale * part.sigma for part in parts if len(part.sigma)), (), seconds,
     )  # fmt: skip
     return tuple(_cut(whole, columns, c) for c in counts)
 
@@ -214,5 +214,6 @@ def _cut(whole: Basis, columns: Sequence[tuple[Columns, ...]], counts: tuple[int
         V_sv=joined([c.s_p for c in sets]),
         V_q=joined([c.e_q for c in sets]),
         V_p=joined([c.e_p for c in sets]),
+        split=tuple((2 if whole.pairs else 1) * k for k in counts),
         seconds=dict(whole.seconds),
     )

@@ -177,7 +177,7 @@ def cases_of(against: Reference, swept: Sequence[Swept], states: States | None) 
         cases += [Case(s.method, point.N, False, model) for point, model in points]
         if states is None or not s.method.snapshots:
             continue
-        sizes = [point.columns for point, _ in points]
+        sizes = [point.N for point, _ in points]
         bases, _ = bases_of(s.method.key, states, sizes, full.scene.reduction, {})
         for basis, (point, _) in zip(bases, points, strict=False):
             cases.append(Case(s.method, point.N, True, project(basis, full.system, outputs)))

@@ -15,10 +15,11 @@ import reduction.online
 from fem.build import build
 from fem.run import simulate
 from reduction.archive import load_model, save_model
+from reduction.modal import rotation
 from reduction.model import ModelError, SmallModel
 from reduction.online import Stepper, run, run_batch
 from reduction.project import project
-from reduction.propagator import propagator, rotation
+from reduction.propagator import propagator
 from reduction.registry import make_basis
 from reduction.states import states_of
 from tests.helpers import Array, close, gather_rows, make_scene
