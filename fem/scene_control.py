@@ -33,11 +33,14 @@ class Reduction(Model):
     engine: Literal["tsqr", "svd", "gram"] = Field(
         "tsqr", description="factorisation of the snapshots [no unit]; gram is fast and loses small singular values"
     )
-    lambda_range: Range = Field(
-        default_factory=lambda: [30.0, 500.0], description="range of lambda for tests at other parameters [Pa]"
+    lambda_range: Range | None = Field(
+        None,
+        description="range of lambda for tests at other parameters [Pa]; by default 0.6 to 10 times that of the first "
+        "layer",
     )
-    mu_range: Range = Field(
-        default_factory=lambda: [20.0, 500.0], description="range of mu for tests at other parameters [Pa]"
+    mu_range: Range | None = Field(
+        None,
+        description="range of mu for tests at other parameters [Pa]; by default 0.4 to 10 times that of the first layer",
     )
 
     train: Literal["corners"] | list[Range] = Field(
@@ -49,7 +52,7 @@ class Reduction(Model):
     @model_validator(mode="after")
     def _check(self) -> Reduction:
         for key in ("lambda_range", "mu_range"):
-            low, high = getattr(self, key)
+            low, high = getattr(self, key) or (0.0, 0.0)
             if low > high:
                 raise ValueError(f"{key} is [{low}, {high}]; the first must not exceed the second")
         return self

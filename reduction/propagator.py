@@ -188,7 +188,7 @@ def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator
     loads = np.hstack([inputs, f[:, None]])
     step = Propagator(model, dt, at, E, A, loads, driven, modal_of(at, E, A, loads, dt))
     if step.modal is None:
-        _ = step.matrix  # which may be refused
+        _ = step.block  # needed by every run, and its matrix may be refused
     return step
 
 
