@@ -40,7 +40,8 @@ class Reduction(Model):
     )
     mu_range: Range | None = Field(
         None,
-        description="range of mu for tests at other parameters [Pa]; by default 0.4 to 10 times that of the first layer",
+        description="range of mu for tests at other parameters [Pa]; by default 0.4 to 10 times that of the first "
+        "layer",
     )
 
     train: Literal["corners"] | list[Range] = Field(

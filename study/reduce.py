@@ -247,7 +247,8 @@ def show(console: Console, found: Reduced, result: dict[str, Any]) -> None:
     """Print the tables."""
     share = f"{100 * result['reduction']['energy']:g} %"
     _print(console, (ERROR_HEADER[0], share, *ERROR_HEADER[2:]), error_rows(found.swept))
-    console.print(f"{error_note(share)} fixed: with fixed solid modes. {N_NOTE} {inner_note(found.swept)}", style="dim")
+    note = f"{error_note(share)} fixed: with fixed solid modes. {N_NOTE} {inner_note(found.swept)}"
+    console.print(note, style="dim", markup=False)
     for sentence in result["findings"]:
         console.print(sentence, markup=False)
     for sizes, titles, reason in refused_rows(found.swept):

@@ -26,7 +26,7 @@ from study.command import plain
 from study.reduce_reference import Reference, prepare
 
 BEYOND = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
-REPEATS, SETUPS = 15, 3  # behind each median of the online time and of the set-up
+REPEATS, SETUPS = 15, 7  # behind each median of the online time and of the set-up
 COMPARED = 14  # N at which methods are compared: the paper's
 LARGER = 30  # N of the second model that is tested at other parameters
 
