@@ -112,10 +112,9 @@ def _structure(swept: Sequence[Swept]) -> Iterator[str]:
         "not."
     )
     (kept, p), (lost, q) = (min(g, key=lambda b: b[1].error_deformation) for g in groups.values())
-    ratio = p.error_deformation / max(q.error_deformation, np.finfo(float).tiny)
-    verdict = (
-        f"structure costs a factor of {ratio:.1f}" if ratio > 1 else f"structure gains a factor of {1 / ratio:.1f}"
-    )
+    tiny = np.finfo(float).tiny
+    ratio = max(p.error_deformation, tiny) / max(q.error_deformation, tiny)
+    verdict = f"structure {'costs' if ratio > 1 else 'gains'} a factor of {max(ratio, 1 / ratio):.1f}"
     yield (
         f"Least error of the deformation at N = {N}: {p.error_deformation:.1e} with structure ({title_of(kept)}), "
         f"{q.error_deformation:.1e} without ({title_of(lost)}, stable at this N), so {verdict} here."

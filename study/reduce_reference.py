@@ -75,7 +75,7 @@ def at_rest(snapshots: Snapshots) -> bool:
         layout.comm.allreduce(max(float(np.abs(x).max(initial=0.0)) for x in parts), MPI.MAX)
         for parts in ((z - z[:, :1], snapshots.q_s - snapshots.q_s[:, :1]), (z, snapshots.q_s))
     )
-    return change <= REST * size
+    return bool(change <= REST * size)
 
 
 def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots) -> Array:
