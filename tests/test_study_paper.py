@@ -11,7 +11,7 @@ import pytest
 
 from study.paper import at, number, write_page
 
-POINT = {"N": 14, "error": 1e-3, "error_qv": 1e-2, "time_online": 2e-4, "stable": True}
+POINT = {"N": 14, "error": 1e-3, "error_canonical": 1e-2, "error_deformation": 0.1, "time_online": 2e-4, "stable": True}
 REDUCED = {"N": 8, "time_are": 4e-4, "error_P": None, "error_K": 0.1, "stable": False, "reason": ""}
 ROOT = Path(__file__).parents[1]
 
@@ -35,7 +35,7 @@ def results() -> dict[str, dict[str, Any]]:
         "reduce": {
             "methods": methods,
             "about": titles,
-            "speed": [{"method": "psd", "speedup": 200.0, "speedup_whole": 100.0}],
+            "speed": [{"method": "psd", "speedup_same_model": 200.0, "speedup_new_parameter": 100.0}],
         },
         "control": {
             "states": 880,

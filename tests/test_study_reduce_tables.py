@@ -26,7 +26,7 @@ def test_scene_chooses_methods() -> None:
 
 
 def point(N: int, error: float, stable: bool = True, online: float = 1e-3) -> Point:
-    return Point(N, N, error, error, error, error, error, error, 2.0, 1e-3, online, 0.0 if stable else 1.0, stable)
+    return Point(N, N, (N,), error, *(5 * [2 * error]), 2.0, 1e-3, online, 0.0 if stable else 1.0, stable)
 
 
 def test_choice_of_points() -> None:

@@ -41,7 +41,7 @@ SMALL: dict[str, Any] = {
     "time": {"steps": 64},
     "motion": {"target": [1.0, 0.5], "duration": 3.0},
     "control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]},
-    "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [4, 8]},
+    "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [8, 12]},
     "study": {"repeats": 1},
 }
 
@@ -105,7 +105,7 @@ def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dic
     assert reduced["measured"]["error"] + result["reference"]["error"] <= TOLERANCE
     assert reduced["measured"]["seconds"] < result["answers"][0]["full"]["measured"]["seconds"]
     # against its own full run alone it may be better by orders
-    assert reduced["setting"]["N"] in (4, 8)
+    assert reduced["setting"]["N"] in (8, 12)
 
 
 def test_what_nothing_meets_is_said_with_what_came_closest(

@@ -21,7 +21,7 @@ from study.wp_reduced import own_setting
 from tests.helpers import Array
 
 FORWARD = ("forward", "reduced")
-QUICK = ["study.repeats=1", "reduction.methods=['craig_bampton']", "reduction.N=[14, 20]"]
+QUICK = ["study.repeats=1", "reduction.methods=['craig_bampton']", "reduction.N=[18, 24]"]
 
 
 @dataclass(frozen=True)
