@@ -110,7 +110,7 @@ def test_batch_of_prescribed_hands_is_its_runs(comm: MPI.Intracomm, damped: bool
 
 @pytest.mark.serial
 def test_new_parameter_is_fast(comm: MPI.Intracomm) -> None:
-    """N = 14, 600 steps, small matrices to outputs: 0.4 ms; no more than a few runs of the same model again."""
+    """N = 14, 600 steps, small matrices to outputs, 0.36 ms: no more than a few runs of the same model again."""
     scene = make_scene(TINY, {"output": {"snapshots": "memory"}, "time": {"steps": 600}})
     model = build(scene, comm)
     full, dt = simulate(model), step_of(model)
@@ -126,5 +126,5 @@ def test_new_parameter_is_fast(comm: MPI.Intracomm) -> None:
         run(again, hand=hand)
         new.append(middle - begin)
         old.append(perf_counter() - middle)
-    # the ratio does not depend on the machine: 3 to 4 mode by mode, 9 with the matrices of the steps
-    assert min(new) < 6 * min(old)
+    # both on one machine under one load: 3.1 mode by mode, 7.6 with the matrices of eight steps
+    assert min(new) < 5 * min(old)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from reduction.registry import PAPER_METHODS
+from reduction.registry import METHODS, PAPER_METHODS
 from study.mesh_study import MeshRow, break_even, exponent, run_mesh_study
-from study.reduce_sweep import BEYOND, Point, best, chosen_methods, nearest, noted
-from study.reduce_tables import least_size, stability
+from study.reduce_findings import findings
+from study.reduce_sweep import BEYOND, Point, Swept, best, chosen_methods, nearest, noted
+from study.reduce_tables import ERROR_HEADER, error_rows, least_size, stability
 from tests.helpers import make_scene
 
 PAPER = Path(__file__).parent.parent / "demos" / "scenes" / "paper_forward.toml"
@@ -39,6 +41,46 @@ def test_choice_of_points() -> None:
     assert least_size(points, 1e-6) is None  # an unstable model does not count
     assert stability(points) == "not 14"
     assert nearest([]) is None
+
+
+def swept_of(key: str, *points: Point) -> Swept:
+    return Swept(METHODS[key], points, {}, ())
+
+
+def test_findings_name_the_best_of_every_measure_and_the_unstable() -> None:
+    """Errors of the state are twice those of the deformation here, so that both measures agree."""
+    swept = [
+        swept_of("componentwise_pod", point(6, 4e-2), point(14, 1e-2), point(30, 1e-1, stable=False)),
+        swept_of("psd", point(6, 2e-2), point(14, 4e-2), point(30, 3e-2)),
+        swept_of("psd_fixed", point(6, 5e-2), point(14, 3e-2), point(30, 4e-2)),
+    ]
+    first, second, third, kept, lost, energy, cost, paper, fixed = findings(swept)
+    assert first == (
+        "Least error of the deformation among stable models: PSD complex SVD at N = 6 (2.0e-02); componentwise POD at "
+        "N = 14 (1.0e-02); PSD complex SVD at N = 30 (3.0e-02)."
+    )
+    assert "the same methods lead as in the deformation" in second
+    assert "the same methods lead as in the deformation" in third
+    assert kept == "Unstable models among the 6 that keep the structure: none."
+    assert lost == "Unstable models among the 3 that do not: 1 (componentwise POD at N = 30)."
+    assert "6.0e-02 to 8.0e-02 in models that keep the structure, 2.0e-02 to 2.0e-02" in energy
+    assert "structure costs a factor of 3.0 here" in cost  # 3e-2 of psd_fixed against 1e-2
+    assert "this holds but for N = 14" in paper
+    assert "6.0e-02 preserving (PSD complex SVD, fixed), 2.0e-02 others (componentwise POD)" in paper
+    assert "this holds but for N = 14; at N = 14: 8.0e-02 without (PSD complex SVD), 6.0e-02 with" in fixed
+    alone = findings([swept_of("craig_bampton", point(8, 1e-2), point(10, 2e-2))])
+    assert len(alone) == 4  # no other to compare structure with, and none of the paper's
+    assert "Craig-Bampton at N = 8 to 10 (2.0e-02 at N = 10)" in alone[0]
+    assert findings([]) == []
+
+
+def test_table_shows_the_deformation_first_and_the_split() -> None:
+    split = replace(point(14, 1e-2), N_tissue=10, split=(5, 5))
+    (row,) = error_rows([swept_of("componentwise_pod_fixed", point(6, 0.2), split, point(30, 1e-3, stable=False))])
+    assert dict(zip(ERROR_HEADER, row, strict=True)) == {
+        "method": "componentwise POD, fixed solid modes", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": "1.0e-02",
+        "state": "2.0e-02", "energy": "2.0e-02", "1e-1": "14", "1e-2": "14", "1e-3": "-", "stable N": "not 30",
+    }  # fmt: skip
 
 
 def test_mesh_study_of_small_meshes(mpi_tmp_path: Path, comm: MPI.Intracomm) -> None:
