@@ -20,7 +20,7 @@ class Reduction(Model):
     )
     N: list[Annotated[int, Field(ge=1)]] = Field(
         default_factory=lambda: [4, 6, 8, 10, 12, 14, 18, 22, 26, 30, 40, 60],
-        description="reduced dimensions to try [1]",
+        description="numbers of basis vectors to try, the hand's own included [1]",
     )
     energy: Annotated[float, Field(gt=0, lt=1)] = Field(
         0.999, description="share of the snapshot energy that picks N [1], the paper's 99.9 %"
