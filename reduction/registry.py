@@ -105,6 +105,9 @@ METHODS: dict[str, Method] = _methods()
 PAPER_METHODS = ("global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed")
 """The six of the paper, in its order."""
 
+PAPER_PLAIN = ("global_pod", "componentwise_pod")
+"""Those of the six that the paper counts as not structure-preserving; fixed solid modes keep its block structure."""
+
 
 def find_method(name: str) -> Method:
     """Look a basis up.

@@ -53,10 +53,12 @@ def test_page_has_every_row(tmp_path: Path, results: dict[str, dict[str, Any]]) 
     forward = {row["quantity"]: row["here"] for row in found["forward"]}
     assert forward["stable at every N tried"] == "PSD, f"
     assert forward["reduced runs, all six methods and N"] == "0.0002 to 0.0003 s"
-    assert forward["errors of methods that preserve structure, N = 14"] == (
+    assert forward["errors of methods that the paper calls structure-preserving, N = 14"] == (
         "preserving: 0.001, 0.002; not preserving: 0.5 unstable"
     )
-    assert forward["best PSD"].startswith("without fixed solid modes: 0.001 without, 0.002 with")
+    assert forward["best of the six methods, stable, N = 14"] == (
+        "PSD: 0.001; PSD: 0.001 without fixed solid modes, 0.002 with"
+    )
     assert forward["PSD beyond N = 25"] == "0.001 at N = 14, 1e-05 at N = 40"
     control = {row["quantity"]: row["here"] for row in found["control"]}
     assert "not finite" in control["POD of P, N = 8"]

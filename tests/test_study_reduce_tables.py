@@ -66,8 +66,8 @@ def test_findings_name_the_best_of_every_measure_and_the_unstable() -> None:
     assert "6.0e-02 to 8.0e-02 in models that keep the structure, 2.0e-02 to 2.0e-02" in energy
     assert "structure costs a factor of 3.0 here" in cost  # 3e-2 of psd_fixed against 1e-2
     assert "this holds but for N = 14" in paper
-    assert "6.0e-02 preserving (PSD complex SVD, fixed), 2.0e-02 others (componentwise POD)" in paper
-    assert "this holds but for N = 14; at N = 14: 8.0e-02 without (PSD complex SVD), 6.0e-02 with" in fixed
+    assert "6.0e-02 for the former (PSD complex SVD, fixed), 2.0e-02 for the latter (componentwise POD)" in paper
+    assert "this holds but for N = 14; at N = 14: 8.0e-02 for it (PSD complex SVD), 2.0e-02 for the best" in fixed
     alone = findings([swept_of("craig_bampton", point(8, 1e-2), point(10, 2e-2))])
     assert len(alone) == 4  # no other to compare structure with, and none of the paper's
     assert "Craig-Bampton at N = 8 to 10 (2.0e-02 at N = 10)" in alone[0]
