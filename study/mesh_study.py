@@ -258,7 +258,7 @@ def parse_sizes(text: str) -> list[int]:
 def main(
     sizes: Annotated[str, typer.Option(help="tissue unknowns")] = SIZES,
     steps: Annotated[int, typer.Option(help="time steps of a run", min=2)] = 600,
-    method: Annotated[str, typer.Option(help="basis by key")] = "psd_fixed",
+    method: Annotated[str, typer.Option(help="basis by key")] = "psd_fixed_relative",
     dimension: Annotated[int, typer.Option("--N", help="dimension of the reduced model", min=2)] = 14,
     out: Annotated[Path, typer.Option(help="folder for mesh_study.json, .png and .pdf")] = Path("out"),
 ) -> None:

@@ -222,7 +222,7 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
         "the full run that gives the snapshots is one more."
     ]
     stable = [s for s in speeds if s.stable]
-    chosen = next((s for s in stable if s.method == "psd_fixed"), None) or next(iter(stable), None)
+    chosen = next((s for s in stable if s.method == "psd"), None) or next(iter(stable), None)
     if chosen is None:
         return notes
     mesh, named = break_even_mesh(n_e, full, chosen.time_online), f"{chosen.title}, N = {chosen.N}"

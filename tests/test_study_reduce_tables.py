@@ -85,9 +85,9 @@ def test_table_shows_the_deformation_first_and_the_split() -> None:
 
 def test_mesh_study_of_small_meshes(mpi_tmp_path: Path, comm: MPI.Intracomm) -> None:
     console = Console(file=io.StringIO(), quiet=comm.rank != 0)
-    result = run_mesh_study([300, 1200], 60, "psd_fixed", 10, mpi_tmp_path, console, comm)
-    assert [row["N"] for row in result["rows"]] == [10, 10]
-    assert all(row["stable"] and row["error"] < 0.02 for row in result["rows"])  # N = 10 of a coarse run
+    result = run_mesh_study([300, 1200], 60, "psd_fixed_relative", 14, mpi_tmp_path, console, comm)
+    assert [row["N"] for row in result["rows"]] == [14, 14]
+    assert all(row["stable"] and row["error"] < 0.02 for row in result["rows"])  # 10 tissue columns, a coarse run
     if comm.rank == 0:
         assert json.loads((mpi_tmp_path / "mesh_study.json").read_text())["rows"] == result["rows"]
         assert (mpi_tmp_path / "mesh_study.png").stat().st_size > 5000
