@@ -26,7 +26,7 @@ HEALTHY_LIMIT = 600.0  # [s] for the run without a fault
 # Times of a run without a fault on the same machine, measured just before, so that no bound judges the machine. A job
 # that ends early needs less than one; the rest is for other work that comes in between. One that hangs never ends.
 PATIENCE = 20.0
-BARE_PATIENCE = 2.0  # the bare script only starts: a share of the time of the run
+BARE_PATIENCE = 1.0  # the bare script only starts, which is a part of the run
 BARE = """
 import os, signal
 from mpi4py import MPI
