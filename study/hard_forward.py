@@ -183,8 +183,8 @@ def by_hand(path: Path) -> Outcome:
         bottom, edge = (float(u[np.abs(y - level) < 1e-9].mean()) for level in (0.0, 0.5))
         return max(abs(edge / (-(4 - 0.25) / 200) - 1), abs((bottom - edge) / (-0.25 / 200) - 1))
 
-    found = solve_twice(K[free][:, free], -f[free], error)
-    return replace(found, text=f"P1 by hand; {found.text}")
+    outcome = solve_twice(K[free][:, free], -f[free], error)
+    return replace(outcome, text=f"P1 by hand; {outcome.text}")
 
 
 def _sliver(mesh: str) -> Model:

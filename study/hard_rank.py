@@ -135,9 +135,9 @@ def rank_rows(quick: bool) -> list[Row]:
     for i, fault in enumerate(["disk"] if quick else list(FAULTS)):
         text, sentence, same = FAULTS[fault]
         with tempfile.TemporaryDirectory() as folder:
-            found = judge(["-c", WORKER.format(path=sys.path), fault, folder], PATIENCE, healthy, sentence)
+            outcome = judge(["-c", WORKER.format(path=sys.path), fault, folder], PATIENCE, healthy, sentence)
         bare = plain(judge, ["-c", BARE.format(fault=same)], BARE_PATIENCE, healthy, "")
-        rows.append(Row(text, i + 1, found, bare, PATIENCE, reason))
+        rows.append(Row(text, i + 1, outcome, bare, PATIENCE, reason))
     return rows
 
 

@@ -116,8 +116,8 @@ def gain_row(name: str, x: float, problem: RiccatiProblem, bound: float, textboo
              note: str = "", group: str = "") -> Row:  # fmt: skip
     """Error of one solver's gain against the exact one; ``note`` says why it may be refused. Not collective."""
     solver = low_rank if bound == LOW_RANK else dense
-    mine = ours(lambda: gain_error(solver(problem), exact, problem.layout.n_s))
-    return Row(name, x, mine, textbook_, bound, REASONS[bound] + note, may_refuse=bool(note), group=group)
+    error = ours(lambda: gain_error(solver(problem), exact, problem.layout.n_s))
+    return Row(name, x, error, textbook_, bound, REASONS[bound] + note, may_refuse=bool(note), group=group)
 
 
 # --- weights
@@ -186,8 +186,8 @@ def lqr_damping_rows(quick: bool) -> list[Row]:
     if not quick:
         undamped.append(("paper_lqr_undamped, 880 states", make_problem(make("paper_lqr_undamped"))))
     for name, case in undamped:
-        mine = ours(_some, low_rank, case)
-        rows.append(Row(name, 0.0, mine, plain(textbook, case, None), None, reason, group="low rank"))
+        answer = ours(_some, low_rank, case)
+        rows.append(Row(name, 0.0, answer, plain(textbook, case, None), None, reason, group="low rank"))
     return rows
 
 

@@ -47,17 +47,17 @@ def test_exact_gain_against_eigenvectors_in_256_bits(beta: float, r: float) -> N
     problem = replace(problem, R=r * problem.R)
     precision, ctx.prec = ctx.prec, 256
     try:
-        found = gain_by_eigenvectors(problem)
+        K = gain_by_eigenvectors(problem)
     finally:
         ctx.prec = precision
     # both are rounded to doubles at their very end
-    assert gain_error(exact_gain(problem), found, problem.layout.n_s) <= np.finfo(float).eps
+    assert gain_error(exact_gain(problem), K, problem.layout.n_s) <= np.finfo(float).eps
 
 
 def without_tissue(solve: Callable[..., RiccatiSolution]) -> Callable[..., RiccatiSolution]:
     def bare(self: Any, problem: RiccatiProblem) -> RiccatiSolution:
-        found = solve(self, problem)
-        return replace(found, K_z=np.zeros_like(found.K_z), K_v=np.zeros_like(found.K_v))
+        answer = solve(self, problem)
+        return replace(answer, K_z=np.zeros_like(answer.K_z), K_v=np.zeros_like(answer.K_v))
 
     return bare
 

@@ -196,11 +196,11 @@ def test_jacobi_cg_stands_bad_scales() -> None:
     """Springs of 1, 1e6 and 1e12: three steps with the diagonal as preconditioner, ten times as many are not enough
     without it."""
     K = scipy.sparse.diags_array([1.0, 1e6, 1e12]).tocsr()
-    found = solve_twice(K, np.ones(3), lambda z: float(np.abs(K @ z - 1).max()))
-    assert found.value is not None
-    assert found.value < 1e-15
-    assert found.text.startswith("Jacobi-CG")
-    assert "stops" not in found.text
+    outcome = solve_twice(K, np.ones(3), lambda z: float(np.abs(K @ z - 1).max()))
+    assert outcome.value is not None
+    assert outcome.value < 1e-15
+    assert outcome.text.startswith("Jacobi-CG")
+    assert "stops" not in outcome.text
 
 
 def test_hand_and_tissue_in_turn() -> None:
