@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from skfem.helpers import ddot, div, dot, sym_grad
 
 from fem.build import Model
+from fem.geometry import cell_nodes
 from fem.layout import BlockLayout
 from fem.petsc import PETSc
 from fem.run import Run, RunOptions
@@ -130,7 +131,7 @@ def gather_mesh(mesh: Any) -> tuple[Array, NDArray[np.int64]]:
     comm, d = mesh.comm, mesh.geometry.dim
     to_global = mesh.geometry.index_map().local_to_global(np.arange(len(mesh.geometry.x), dtype=np.int32))
     owned = mesh.topology.index_map(mesh.topology.dim).size_local
-    cells = np.concatenate(comm.allgather(to_global[mesh.geometry.dofmaps[0][:owned]]))
+    cells = np.concatenate(comm.allgather(to_global[cell_nodes(mesh)[:owned]]))
     points = np.empty((mesh.geometry.index_map().size_global, d))
     for index, x in comm.allgather((to_global, mesh.geometry.x[:, :d])):
         points[index] = x
