@@ -18,7 +18,7 @@ from study.wp_reference import ADVICE, Reference
 
 TRIES = 4  # settings that are run to check a prediction
 MARGIN = 0.75  # of the tolerance that the full run behind a reduced model may use
-SNAPSHOTS = 1e8  # entries of the snapshots behind a reduced model
+SNAPSHOTS = 1.5e8  # entries of the snapshots behind a reduced model
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 MORE = 3  # reduced dimensions tried beyond the predicted one
 
@@ -90,6 +90,24 @@ def seconds_text(value: float | None) -> str:
         if value >= 0.9995 * factor:
             return f"{value / factor:.3g} {unit}"
     return f"{value / 1e-6:.3g} us"
+
+
+def advice(shares: Row, details: Row) -> str:
+    """What to refine first: that which carries the largest share of an error. Not collective.
+
+    Args:
+        shares: of space, time and maybe reduction.
+        details: cells and order of the mesh.
+    """
+    largest = max(shares, key=lambda name: float(shares[name]))
+    better = {
+        "space": ("a finer mesh, tissue.cells" if details["cells"] else "a finer mesh file")
+        + (", or tissue.order = 2" if details["order"] == 1 else ""),
+        "time": "more time.steps",
+        "reduction": "a larger N, reduction.N",
+    }[largest]
+    parts = ", ".join(f"{name} {value:.1e}" for name, value in shares.items())
+    return f"Of its error, {largest} carries the largest share ({parts}): {better} would help first."
 
 
 class Asker:
@@ -240,7 +258,7 @@ class Asker:
             f"Nothing tried meets {tolerance:g}; closest is {best.label} with the error {best.error:.1e}, give or take "
             f"{self.truth.error:.1e}, in {seconds_text(best.seconds)}."
         ]
-        words.append(self._advice(best))
+        words.append(advice(self.shares(best), best.details))
         if self.truth.error >= tolerance:
             part = self.truth.largest_part
             words.append(
@@ -263,19 +281,6 @@ class Asker:
         predict = self.predictor
         found = {"space": predict.space_error((cells, d["order"])), "time": predict.time_error(d["steps"])}
         return found | ({"reduction": d["error_outputs_full"]} if point.question == "reduced" else {})
-
-    def _advice(self, point: WorkPoint) -> str:
-        """What to refine first: that which carries the largest share of the error."""
-        shares = self.shares(point)
-        largest = max(shares, key=lambda name: shares[name])
-        mesh = "a finer mesh, tissue.cells" if point.details["cells"] else "a finer mesh file"
-        better = {
-            "space": mesh + (", or tissue.order = 2" if point.details["order"] == 1 else ""),
-            "time": "more time.steps",
-            "reduction": "a larger N, reduction.N",
-        }[largest]
-        parts = ", ".join(f"{name} {value:.1e}" for name, value in shares.items())
-        return f"Of its error, {largest} carries the largest share ({parts}): {better} would help first."
 
     def row(self, point: WorkPoint, error: float | None = None, seconds: float | None = None) -> Row:
         """A setting with its predicted and measured numbers, and the ``--set`` that repeat it. Not collective."""
