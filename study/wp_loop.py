@@ -113,9 +113,6 @@ class LoopRuns:
 
     Args:
         runs: the control problem.
-
-    Raises:
-        ControlError: no output moves against the hand.
     """
 
     def __init__(self, runs: ControlRuns) -> None:
@@ -126,8 +123,6 @@ class LoopRuns:
         self._families: dict[str, BasisFamily] = {}
         self._gains: dict[Feedback, Gain] = {}
         self._ending: Row = {}
-        if not runs.layout.comm.allreduce(bool(np.any(runs.problem.C_z)), MPI.LOR):
-            raise ControlError("no output moves against the hand, so that there is no deformation whose error counts")
 
     def gain(self, what: Feedback) -> Gain:
         """The gain as blocks."""
@@ -159,7 +154,12 @@ class LoopRuns:
         """Error estimate of the reference, cost and what is to come at the end, from the cache when they are there.
 
         Keys: error, modes, complete, optimal, to_come.
+
+        Raises:
+            ControlError: no output moves against the hand.
         """
+        if not self.layout.comm.allreduce(bool(np.any(self.runs.problem.C_z)), MPI.LOR):
+            raise ControlError("no output moves against the hand, so that there is no deformation whose error counts")
 
         def measure() -> Row:
             design, most, best = self.runs.design, self.counts[0], Feedback()
