@@ -14,7 +14,7 @@ from study.wp_forward import SAFETY, Prediction, Predictor, setting_of, to_point
 from study.wp_full import FullRuns
 from study.wp_points import Row, Setting, WorkPoint
 from study.wp_reduced import ReducedRuns
-from study.wp_reference import ADVICE, Reference
+from study.wp_reference import Reference
 
 TRIES = 4  # settings that are run to check a prediction
 MARGIN = 0.75  # of the tolerance that the full run behind a reduced model may use
@@ -263,7 +263,7 @@ class Asker:
             part = self.truth.largest_part
             words.append(
                 "The reference itself is not known that well, so that nothing can be shown to meet it: most of its "
-                f"own error is the {part} part, and would need {ADVICE[part]}."
+                f"own error is the {part} part, and would need {self.truth.need}."
             )
         else:
             large = self.beyond(tolerance)
@@ -275,11 +275,15 @@ class Asker:
         return self.row(best), words
 
     def shares(self, point: WorkPoint) -> Row:
-        """About how much of a point's error space, the time step and the reduced model carry. Not collective."""
+        """About how much of a point's error space, the time step and the reduced model carry. Not collective.
+
+        What the reference does not know about space counts with space.
+        """
         d = point.details
         cells = None if d["cells"] is None else tuple(d["cells"])
         predict = self.predictor
-        found = {"space": predict.space_error((cells, d["order"])), "time": predict.time_error(d["steps"])}
+        space = predict.space_error((cells, d["order"])) + self.truth.space[0]
+        found = {"space": space, "time": predict.time_error(d["steps"])}
         return found | ({"reduction": d["error_outputs_full"]} if point.question == "reduced" else {})
 
     def row(self, point: WorkPoint, error: float | None = None, seconds: float | None = None) -> Row:

@@ -216,7 +216,7 @@ class Predictor:
         if self.scene.tissue.cells is not None:
             coarse = smallest_mesh(self.scene)
             widest = max((c[0] for c, _ in groups if c is not None), default=coarse[0])
-            for k in (*range(1, 17), *range(18, 32, 2), *range(32, 64, 4), *range(64, 257, 16)):
+            for k in (*range(1, 17), *range(18, 32, 2), *range(32, 64, 4), *range(64, 257, 16), 384, 512, 768, 1024):
                 cells = tuple(n * k for n in coarse)
                 groups += [(cells, order) for order in (1, 2) if (cells, order) not in self.space]
                 if cells[0] > 16 * widest:

@@ -98,6 +98,12 @@ class Reference:
         parts = {"space": self.space[0], "time": self.time[0], "mixed": self.mixed[0]}
         return max(parts, key=lambda name: parts[name])
 
+    @property
+    def need(self) -> str:
+        """What would make that part smaller."""
+        part = self.largest_part
+        return "a finer mesh" if part == "space" and self.limit.expected is None else ADVICE[part]
+
 
 def space_limit(sizes: list[float], values: list[Array], expected: float, d: int) -> Limit:
     """Limit of values on two meshes or more with cells of size h, coarse to fine. Not collective."""
@@ -230,7 +236,7 @@ def _note(scene: Scene, plan: Plan, made: Reference) -> str:
     )
     if made.error > ROUGH:
         part = made.largest_part
-        words += f" That is too much to judge by: most of it is the {part} part, and would need {ADVICE[part]}."
+        words += f" That is too much to judge by: most of it is the {part} part, and would need {made.need}."
     if not all(fits(n, shares) for n, shares in zip(scene.tissue.cells or (), edges(scene), strict=False)):
         words += " The scene's own mesh has no lines at the ends of its contact zone or layers, which adds error."
     return words
