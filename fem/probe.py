@@ -95,9 +95,9 @@ def locate(space: Discretisation, points: Array) -> tuple[np.ndarray, Array, Arr
     # the first rank of those as near as rounding tells: a point between two parts belongs to both
     distances = np.array(comm.allgather(distance))
     roots = np.argmax(distances <= distances.min(axis=0) + (1e-12 * space.layout.extent) ** 2, axis=0)
-    mine = {k: _shapes(space, cells[k], padded[k]) for k in range(len(points)) if roots[k] == comm.rank}
-    found = {k: value for part in comm.allgather(mine) for k, value in part.items()}
-    nodes, values, where = (np.array([found[k][i] for k in range(len(points))]) for i in range(3))
+    local = {k: _shapes(space, cells[k], padded[k]) for k in range(len(points)) if roots[k] == comm.rank}
+    shapes = {k: value for part in comm.allgather(local) for k, value in part.items()}
+    nodes, values, where = (np.array([shapes[k][i] for k in range(len(points))]) for i in range(3))
     return nodes, values, where
 
 

@@ -111,9 +111,9 @@ def write_study(
 def _answer(answer: Answer, path: Path, overrides: list[str], ranks: int) -> Row:
     """An answer for JSON, each of its settings with the command that runs it again. Not collective."""
     row = answer.to_dict()
-    for found in (row.get("full"), row.get("reduced"), row["closest"]):
-        if found is not None:
-            found["command"] = command_line(found["command"], path, [*overrides, *found["set"]], ranks)
+    for part in (row.get("full"), row.get("reduced"), row["closest"]):
+        if part is not None:
+            part["command"] = command_line(part["command"], path, [*overrides, *part["set"]], ranks)
     return row
 
 

@@ -283,8 +283,8 @@ class Asker:
         cells = None if d["cells"] is None else tuple(d["cells"])
         predict = self.predictor
         space = predict.space_error((cells, d["order"])) + self.truth.space[0]
-        found = {"space": space, "time": predict.time_error(d["steps"])}
-        return found | ({"reduction": d["error_outputs_full"]} if point.question == "reduced" else {})
+        parts = {"space": space, "time": predict.time_error(d["steps"])}
+        return parts | ({"reduction": d["error_outputs_full"]} if point.question == "reduced" else {})
 
     def row(self, point: WorkPoint, error: float | None = None, seconds: float | None = None) -> Row:
         """A setting with its predicted and measured numbers, and the ``--set`` that repeat it. Not collective."""
@@ -297,7 +297,7 @@ class Asker:
             sets.append(f"hand.reference={self.runs.reference}")  # the default moves a little with the mesh
         if point.question == "reduced":
             sets += [f"reduction.methods=['{d['method']}']", f"reduction.N=[{d['N']}]"]
-        found: Row = plain(
+        row: Row = plain(
             {
                 "label": point.label,
                 "command": "reduce" if point.question == "reduced" else "simulate",
@@ -308,7 +308,7 @@ class Asker:
                 "shares": self.shares(point),
             }
         )
-        return found
+        return row
 
     def _against_own_mesh(self, tolerance: float) -> list[str]:
         """The paper's question: the fastest reduced model of the scene's own mesh against its own full run."""

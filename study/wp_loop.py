@@ -300,11 +300,11 @@ def largest(values: Array, names: Sequence[str]) -> float:
     return float(farthest(values, np.zeros(values.shape[1]), names).max())
 
 
-def errors_of(found: Array, true: Array, names: Sequence[str]) -> tuple[float, float]:
+def errors_of(values: Array, true: Array, names: Sequence[str]) -> tuple[float, float]:
     """Largest error over the largest value, of each half of the columns (m, 2 p). Not collective."""
     p = true.shape[1] // 2
     halves = (slice(0, p), slice(p, 2 * p))
-    return tuple(largest(found[:, h] - true[:, h], names) / largest(true[:, h], names) for h in halves)  # type: ignore[return-value]
+    return tuple(largest(values[:, h] - true[:, h], names) / largest(true[:, h], names) for h in halves)  # type: ignore[return-value]
 
 
 def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -> Array:

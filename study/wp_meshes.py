@@ -22,11 +22,11 @@ def edges(scene: Scene) -> list[list[float]]:
     """Coordinates that mesh lines should meet, as shares of each edge of the body: ends of contact and layers."""
     size, origin = scene.tissue.size or [], scene.tissue.origin or [0.0] * len(scene.tissue.size or [])
     boxes = [layer.box for layer in scene.tissue.layers.values()] + [scene.contact.box]
-    found = []
+    lines = []
     for a, (length, low) in enumerate(zip(size, origin, strict=True)):
         shares = {round((corner[a] - low) / length, 12) for box in boxes if box is not None for corner in box}
-        found.append(sorted(s for s in shares if 0 < s < 1))
-    return found
+        lines.append(sorted(s for s in shares if 0 < s < 1))
+    return lines
 
 
 def fits(cells: int, shares: list[float]) -> bool:
@@ -64,13 +64,13 @@ def nested_meshes(scene: Scene) -> tuple[tuple[int, ...], ...]:
     if scene.tissue.cells is None:
         return ()
     unit, steps, d = smallest_mesh(scene), few_steps(scene), len(scene.tissue.cells)
-    found: list[tuple[int, ...]] = []
+    meshes: list[tuple[int, ...]] = []
     for k in MULTIPLES:
         cells = tuple(k * n for n in unit)
         unknowns = Setting(cells, 2, steps).unknowns(d)
-        if not found or (unknowns <= UNKNOWNS[d] and unknowns * steps <= WORK[d]):
-            found.append(cells)
-    return tuple(found)
+        if not meshes or (unknowns <= UNKNOWNS[d] and unknowns * steps <= WORK[d]):
+            meshes.append(cells)
+    return tuple(meshes)
 
 
 def halved_meshes(scene: Scene, most: int) -> tuple[tuple[int, ...], ...]:

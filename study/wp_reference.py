@@ -115,8 +115,8 @@ def space_limit(sizes: list[float], values: list[Array], expected: float, d: int
     if shown is None or abs(shown - expected) > NEAR:
         return Limit(values[-1], plain - values[-1], shown, expected, False)
     weights = limit_weights(sizes[-3:], [expected, expected + 1])
-    found = sum(w * v for w, v in zip(weights, values[-3:], strict=True))
-    return Limit(np.asarray(found), found - plain, shown, expected, True)
+    limit = sum(w * v for w, v in zip(weights, values[-3:], strict=True))
+    return Limit(np.asarray(limit), limit - plain, shown, expected, True)
 
 
 @dataclass(frozen=True)
@@ -172,30 +172,30 @@ def make_reference(scene: Scene, runs: FullRuns) -> Reference:
         SceneError: the outputs move with the hand, so that there is no deformation to measure.
     """
     plan = make_plan(scene)
-    found = {s: runs.series(runs.run(s, 1)) for s in plan.settings}
-    d = found[plan.middle].dimension
-    values = [found[s].values for s in plan.space]
+    series = {s: runs.series(runs.run(s, 1)) for s in plan.settings}
+    d = series[plan.middle].dimension
+    values = [series[s].values for s in plan.space]
     if plan.space[0].order == 1:
         limit = Limit(values[-1], values[-1] - values[0], None, None, False)
     else:
         sizes = [1.0 / s.cells[0] for s in plan.space if s.cells]
         limit = space_limit(sizes, values, singular_order(scene), d)
-    return combine(scene, plan, found, limit)
+    return combine(scene, plan, series, limit)
 
 
-def combine(scene: Scene, plan: Plan, found: dict[Setting, Series], limit: Limit) -> Reference:
+def combine(scene: Scene, plan: Plan, series: dict[Setting, Series], limit: Limit) -> Reference:
     """y* and its error estimate from the runs. Not collective.
 
     Raises:
         SceneError: the outputs move with the hand.
     """
-    middle, below = found[plan.middle], found[plan.below]
-    fine, half = found[plan.at(plan.middle, 4)], found[plan.at(plan.middle, 2)]
+    middle, below = series[plan.middle], series[plan.below]
+    fine, half = series[plan.at(plan.middle, 4)], series[plan.at(plan.middle, 2)]
     d, t, few = middle.dimension, fine.times, middle.times
     time_part = (fine.values - half.at(t)) / 3
     total = fine.values + time_part + Series(few, limit.values - middle.values, d).at(t)
     change = fine.at(few) - middle.values
-    lower = found[plan.at(plan.below, 4)].at(few) - below.values
+    lower = series[plan.at(plan.below, 4)].at(few) - below.values
     scale = largest(total, d)
     if not scale[0] > STILL * max(scale[1], 1e-300):
         raise SceneError(
@@ -206,16 +206,16 @@ def combine(scene: Scene, plan: Plan, found: dict[Setting, Series], limit: Limit
     def relative(values: Array) -> tuple[float, float]:
         return tuple(g / s if s > 0 else 0.0 for g, s in zip(largest(values, d), scale, strict=True))  # type: ignore[return-value]
 
-    made = Reference(
+    reference = Reference(
         Series(t, total, d), relative(limit.gap), relative(time_part), relative(change - lower), limit,
-        tuple(found), "",
+        tuple(series), "",
     )  # fmt: skip
-    return replace(made, note=_note(scene, plan, made))
+    return replace(reference, note=_note(scene, plan, reference))
 
 
-def _note(scene: Scene, plan: Plan, made: Reference) -> str:
-    """What the reference is made of, how good it is, and what is wrong with it."""
-    limit, meshes = made.limit, [s.mesh for s in plan.space]
+def _note(scene: Scene, plan: Plan, reference: Reference) -> str:
+    """What the reference is built from, how good it is, and what is wrong with it."""
+    limit, meshes = reference.limit, [s.mesh for s in plan.space]
     seen = "no order" if limit.order is None else f"the order {limit.order:.2f}"
     if limit.expected is None:
         how = f"from {' to '.join(meshes)}, whose difference is all that is known in space, since the mesh is given"
@@ -231,12 +231,12 @@ def _note(scene: Scene, plan: Plan, made: Reference) -> str:
         )
     words = (
         f"Reference: {how}; in time with {4 * plan.base} steps on {plan.middle.mesh}. Its own relative error of the "
-        f"deformation is estimated as {made.error:.1e} (displacement {made.error_displacement:.1e}); the measured "
-        "errors may be wrong by as much either way."
+        f"deformation is estimated as {reference.error:.1e} (displacement {reference.error_displacement:.1e}); the "
+        "measured errors may be wrong by as much either way."
     )
-    if made.error > ROUGH:
-        part = made.largest_part
-        words += f" That is too much to judge by: most of it is the {part} part, and would need {made.need}."
+    if reference.error > ROUGH:
+        part = reference.largest_part
+        words += f" That is too much to judge by: most of it is the {part} part, and would need {reference.need}."
     if not all(fits(n, shares) for n, shares in zip(scene.tissue.cells or (), edges(scene), strict=False)):
         words += " The scene's own mesh has no lines at the ends of its contact zone or layers, which adds error."
     return words

@@ -415,7 +415,7 @@ def graded_model(scene: Scene, comm: MPI.Intracomm) -> Model:
 
 def _crowded(s: Array, ends: list[float]) -> Array:
     """A monotone map of [0, 1] onto itself that keeps the ends and takes the steps near them to the third power."""
-    cuts, found = sorted({0.0, 1.0, *ends}), s.copy()
+    cuts, moved = sorted({0.0, 1.0, *ends}), s.copy()
     for a, b in itertools.pairwise(cuts):
         inside = (s >= a - 1e-12) & (s <= b + 1e-12)
         t = np.clip((s[inside] - a) / (b - a), 0.0, 1.0)
@@ -423,5 +423,5 @@ def _crowded(s: Array, ends: list[float]) -> Array:
             t = np.where(t <= 0.5, (2 * t) ** 3 / 2, 1 - (2 - 2 * t) ** 3 / 2)
         elif a in ends or b in ends:
             t = t**3 if a in ends else 1 - (1 - t) ** 3
-        found[inside] = a + (b - a) * t
-    return found
+        moved[inside] = a + (b - a) * t
+    return moved

@@ -57,9 +57,9 @@ def test_products_with_columns_equal_scipy(comm: MPI.Intracomm, columns: int, mo
     X = np.random.default_rng(1).standard_normal((layout.n_e, columns))
     rows, indices, values = system.K_ee.getValuesCSR()
     whole = scipy.sparse.csr_matrix((values, indices, rows), shape=(layout.n_local, layout.n_e)) @ X
-    found = times_columns(system.K_ee, np.asfortranarray(X[start : start + layout.n_local]))
-    assert found.flags.f_contiguous
-    np.testing.assert_allclose(found, whole, rtol=0, atol=EXACT * np.abs(whole).max())
+    product = times_columns(system.K_ee, np.asfortranarray(X[start : start + layout.n_local]))
+    assert product.flags.f_contiguous
+    np.testing.assert_allclose(product, whole, rtol=0, atol=EXACT * np.abs(whole).max())
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -98,9 +98,9 @@ def truth() -> Array:
     return tip(comm, FINE, graded_model(variant(make_scene(SMALL), FINE), comm))
 
 
-def apart(found: Array, true: Array) -> float:
-    every = (len(true) - 1) // (len(found) - 1)
-    return float(np.linalg.norm(found - true[::every], axis=1).max() / np.linalg.norm(true, axis=1).max())
+def apart(values: Array, true: Array) -> float:
+    every = (len(true) - 1) // (len(values) - 1)
+    return float(np.linalg.norm(values - true[::every], axis=1).max() / np.linalg.norm(true, axis=1).max())
 
 
 # --- the promise
@@ -150,21 +150,21 @@ def test_answers_carry_a_command_that_repeats_them(
     comm: MPI.Intracomm, result: dict[str, Any], mpi_tmp_path: Path
 ) -> None:
     for kind in ("full", "reduced"):
-        found = result["answers"][0][kind]
-        words = shlex.split(found["command"])
+        part = result["answers"][0][kind]
+        words = shlex.split(part["command"])
         words = words[words.index("softgrasp") + 1 :]
         sets = [value for flag, value in itertools.pairwise(words) if flag == "--set"]
         assert words[0] == {"full": "simulate", "reduced": "reduce"}[kind]
         scene = load_scene_collective(comm, Path(words[1]), sets)
         assert [scene.tissue.cells, scene.tissue.order, scene.time.steps] == [
-            found["setting"][key] for key in ("cells", "order", "steps")
+            part["setting"][key] for key in ("cells", "order", "steps")
         ]
         if kind == "reduced":
             again = run_reduce(Path(words[1]), mpi_tmp_path, sets, Console(quiet=True), quiet=True, pictures=False)
             (points,) = again["methods"].values()
-            assert [p["N"] for p in points] == [found["setting"]["N"]]
-            # the same computation, made again
-            assert points[0]["error"] == pytest.approx(found["measured"]["error_full"], rel=1e-6)
+            assert [p["N"] for p in points] == [part["setting"]["N"]]
+            # the same computation, once more
+            assert points[0]["error"] == pytest.approx(part["measured"]["error_full"], rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -349,9 +349,9 @@ def test_every_question_has_slopes(result: dict[str, Any]) -> None:
 def test_places_are_the_nodes_of_the_plain_run_where_there_are_any(comm: MPI.Intracomm) -> None:
     setting, scene = Setting((4, 8), 2, 24), make_scene(SMALL)
     model = build(variant(scene, setting), comm)
-    found = run_probed(model, make_probe(model.space, find_places(scene, model).points, False))
+    run = run_probed(model, make_probe(model.space, find_places(scene, model).points, False))
     # sums of a few shape functions: rounding
-    np.testing.assert_allclose(found.own, tip(comm, setting), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run.own, tip(comm, setting), rtol=0, atol=1e-12)
 
 
 def test_a_scene_that_sees_its_hand_only_is_measured_at_the_farthest_node(comm: MPI.Intracomm) -> None:
@@ -390,21 +390,21 @@ def test_limit_of_values_with_two_powers() -> None:
     exact = np.array([[1.0, -2.0, 0.5, 0.25]])
     shape = np.array([[1.0, 0.3, 1.0, 0.3]])
     sizes = [1 / 8, 1 / 12, 1 / 16]
-    found = space_limit(sizes, [exact + (h + h**2) * shape for h in sizes], 1.0, 2)
-    assert found.extrapolated
-    np.testing.assert_allclose(found.values, exact, rtol=0, atol=1e-12)  # rounding
+    limit = space_limit(sizes, [exact + (h + h**2) * shape for h in sizes], 1.0, 2)
+    assert limit.extrapolated
+    np.testing.assert_allclose(limit.values, exact, rtol=0, atol=1e-12)  # rounding
     # the next power, and not less
-    assert largest(found.gap, 2)[0] >= 0.5 * sizes[-1] ** 2
+    assert largest(limit.gap, 2)[0] >= 0.5 * sizes[-1] ** 2
 
 
 def test_an_order_that_no_theory_explains_is_not_extrapolated() -> None:
     exact, sizes = np.array([[1.0, -2.0, 0.5, 0.25]]), [0.5, 0.25, 0.125]
     values = [exact + h**3 * np.array([[1.0, 0.3, 1.0, 0.3]]) for h in sizes]
-    found = space_limit(sizes, values, 1.0, 2)
-    assert found.order == pytest.approx(3.0, abs=1e-9)  # made with this order: rounding
-    assert not found.extrapolated
-    np.testing.assert_array_equal(found.values, values[-1])
-    assert largest(found.gap, 2)[0] >= largest(values[-1] - exact, 2)[0]
+    limit = space_limit(sizes, values, 1.0, 2)
+    assert limit.order == pytest.approx(3.0, abs=1e-9)  # of this order: rounding
+    assert not limit.extrapolated
+    np.testing.assert_array_equal(limit.values, values[-1])
+    assert largest(limit.gap, 2)[0] >= largest(values[-1] - exact, 2)[0]
 
 
 def test_pareto_and_power_law() -> None:

@@ -99,14 +99,14 @@ def check(comm: MPI.Intracomm, case: Case, folder: Path) -> dict[str, float]:
     assert truth is not None
     used, measured = _setting(answer.found["full"]["setting"]), answer.found["full"]["measured"]
     multiple = max(s.steps for s in truth.settings) // used.steps + 1
-    found = outputs(comm, scene, used)
+    values = outputs(comm, scene, used)
     exact = outputs(comm, scene, Setting(case.cells, 2, multiple * used.steps), graded=True)[::multiple]
     d = truth.series.dimension
 
     def length(y: Array) -> float:
         return float(np.linalg.norm(y.reshape(len(y), -1, d), axis=2).max())
 
-    error = length(found - exact) / length(exact)
+    error = length(values - exact) / length(exact)
     assert error <= case.tolerance
     low, high = measured["error_range"]
     assert low - case.off <= error <= high + case.off
