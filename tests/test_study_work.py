@@ -41,6 +41,7 @@ from tests.browser import look
 from tests.helpers import Array, graded_model, make_scene, rough_save, write_scene
 
 TOLERANCE, BUDGET = 0.1, 1.0
+UNKNOWNS, MESHES = {2: 5_000, 3: 5_000}, 3  # of the finest mesh of the reference; in the diagram
 FINE, TRUTH = Setting((16, 32), 2, 512), 0.004  # a graded mesh, and what the run on it may be off
 SMALL: dict[str, Any] = {
     "name": "small",
@@ -58,8 +59,8 @@ def _few_samples() -> Iterator[None]:
     """No test looks at a time, or at more than the existence of a picture."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wp_full, "BUILD_SECONDS", 0.0)
-        patch.setattr(wp_meshes, "UNKNOWNS", {2: 5_000, 3: 5_000})  # of the finest mesh of the reference
-        patch.setattr(wp_forward, "MESHES", 3)
+        patch.setattr(wp_meshes, "UNKNOWNS", UNKNOWNS)
+        patch.setattr(wp_forward, "MESHES", MESHES)
         patch.setattr(wp_reduced, "CALLS", 5)
         patch.setattr(work_plots, "save", rough_save)
         yield
@@ -261,9 +262,11 @@ def test_interrupted_study_goes_on_to_the_same_errors(
 
 @pytest.mark.serial
 def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: dict[str, Any], tmp_path: Path) -> None:
-    """The real command is killed in the middle, without a chance to clean up."""
+    """The real command, with the limits of these tests, is killed in the middle, without a chance to clean up."""
     file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
-    command = [sys.executable, "-m", "study.cli", "study", str(file), "--out", str(tmp_path), "--question", "forward"]
+    limits = f"wp_meshes.UNKNOWNS, wp_forward.MESHES = {UNKNOWNS}, {MESHES}"
+    code = f"from study import wp_forward, wp_meshes; {limits}; from study.cli import main; main()"
+    command = [sys.executable, "-c", code, "study", str(file), "--out", str(tmp_path), "--question", "forward"]
     with subprocess.Popen(command, cwd=Path(__file__).parents[1], stdout=subprocess.DEVNULL) as process:
         while len(list(cache.glob("run-*.json"))) < 8 and process.poll() is None:
             time.sleep(0.01)
