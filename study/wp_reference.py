@@ -12,7 +12,7 @@ p, else L is y(M3, s) itself. The error estimate adds up
 
     space: |L - L'|, L' the limit of y + a h^p through the two finest (|y(M3, s) - L'| where L is not extrapolated)
     time:  the time part itself
-    mixed: how much the time part changes from mesh m to the next one of half its cells.
+    mixed: how much the time part changes from mesh m to one of half its cells, or of P1 where there is none.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fem.errors import SceneError
 from fem.petsc import Array
 from fem.scene import Scene
 from study.wp_full import FullRuns, Series, largest
-from study.wp_meshes import edges, few_steps, fits, limit_weights, nested_meshes, observed_order, singular_order
+from study.wp_meshes import WORK, edges, few_steps, fits, limit_weights, nested_meshes, observed_order, singular_order
 from study.wp_points import Setting
 
 ROUGH = 0.05  # error of a reference that is worth a warning
@@ -159,8 +159,11 @@ def make_plan(scene: Scene) -> Plan:
 
     fine = meshes[-1][0]
     space = tuple(dict.fromkeys((*(coarser(share * fine) for share in APART), coarser(fine))))
-    middle = coarser(fine / 4)
-    below = coarser((middle.cells or meshes[0])[0] / 2)
+    middle, d = coarser(max(fine / 4, meshes[1][0])), len(meshes[0])
+    if middle.unknowns(d) * 4 * scene.time.steps > WORK[d]:
+        middle = coarser(fine / 4)
+    cells = middle.cells or meshes[0]
+    below = Setting(cells, 1, few) if cells == meshes[0] else coarser(cells[0] / 2)
     return Plan(space, middle, below, scene.time.steps)
 
 
