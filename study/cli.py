@@ -156,7 +156,8 @@ def study(
     out: Out = Path("out"),
     set_: Overrides = None,
     tolerance: Annotated[
-        str | None, typer.Option(help="find the cheapest setting with at most this relative error, e.g. 1e-3")
+        str | None,
+        typer.Option(help="find the cheapest setting with at most this error of the deformation, e.g. 1e-2"),
     ] = None,
     budget: Annotated[
         str | None, typer.Option(help="find the most accurate setting within this time per step, e.g. 1ms")

@@ -28,7 +28,7 @@ from study.wp_loop import CONTROLLERS, Controller, Feedback, LoopRuns, controlle
 from study.wp_points import CONTROL, QUESTIONS, Asked, Cache, Guard, Row, WorkPoint, interruptible, number, variant
 from study.wp_probe import find_places
 from study.wp_reduced import bases_slopes, engine_work, own_setting, reduced_slopes, sweep_bases, sweep_reduced
-from study.wp_reference import Reference, make_reference, nested_meshes
+from study.wp_reference import Reference, make_plan, make_reference
 from study.wp_riccati import SECOND, ControlRuns, riccati_slopes, riccati_work, sweep_riccati
 from study.wp_riccati_reduced import basis_work, reduced_riccati_slopes, reference_note, sweep_riccati_reduced
 
@@ -86,7 +86,7 @@ def run_study(
         out: folder of the results.
         overrides: arguments of ``--set``.
         console: for the tables.
-        tolerance: relative error of the outputs to answer for; None asks nothing.
+        tolerance: relative error of the deformation to answer for; None asks nothing.
         budget: seconds of a step to answer for; None asks nothing.
         questions: arguments of ``--question``, see :class:`study.wp_points.Asked`; None asks all.
         quiet: no progress bar.
@@ -255,8 +255,5 @@ def control_work(control: ControlRuns, wanted: Sequence[str]) -> float:
 
 def _expected(scene: Scene, runs: FullRuns, methods: int, d: int) -> float:
     """Expected work of the forward questions, for the time left. Not collective."""
-    meshes: tuple[tuple[int, ...] | None, ...] = nested_meshes(scene) or (None,)
-    own = own_setting(scene)
-    space = [runs.work(type(own)(cells, 2, own.steps)) for cells in meshes]
-    points = sum(runs.work(s) for s in forward_settings(scene, d))
-    return float(2 * sum(space) + points + REDUCED_WORK * (methods + 1))
+    settings = [*make_plan(scene).settings, *forward_settings(scene, d)]
+    return float(sum(runs.work(s) for s in settings) + REDUCED_WORK * (methods + 1))

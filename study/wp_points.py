@@ -24,7 +24,7 @@ from fem.scene_file import scene_hash
 from study.command import plain
 from study.effects_switch import changed
 
-FORMAT = 1  # of the cached files
+FORMAT = 2  # of the cached files
 LEAST_STEPS = 4  # of a run
 QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati", "loop")
 CONTROL = ("riccati", "reduced_riccati", "loop")  # of these, the ones about feedback
@@ -74,10 +74,8 @@ class Setting:
     def overrides(self) -> list[str]:
         """Arguments of ``--set`` that give this setting."""
         found = [] if self.cells is None else [f"tissue.cells={list(self.cells)}"]
-        found += [f"tissue.order={self.order}", f"time.steps={self.steps}"]
-        if self.solver != "auto":
-            found += [f"time.solver={self.solver}", f"time.rtol={self.rtol:g}"]
-        return found
+        found += [f"tissue.order={self.order}", f"time.steps={self.steps}", f"time.solver={self.solver}"]
+        return found + ([f"time.rtol={self.rtol:g}"] if self.solver == "cg" else [])
 
     def unknowns(self, d: int) -> int:
         """About how many tissue unknowns a structured mesh has. Not collective."""
@@ -266,7 +264,7 @@ class Asked:
     """What is asked of a study.
 
     Attributes:
-        tolerance: relative error of the outputs to answer for, or None.
+        tolerance: relative error of the deformation to answer for, or None.
         budget: seconds of a step to answer for, or None.
         names: arguments of ``--question``, each one or several with commas; empty asks all questions.
     """
