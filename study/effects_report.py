@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 CAPTION = (
     "Each effect switched on against off, the rest of the scene as it is. Left: largest change of the outputs over the "
     "run, relative to their largest displacement; under a force, the same with the hand driven by the force that would "
-    "carry it along the motion without tissue, for effects that the run itself does not show; with a partner, the change "
-    "by an effect that shows only when another one is switched too. Right: what the effect "
-    "adds to the time of a step (median and quartiles of paired samples) and to the memory that the run holds. "
+    "carry it along the motion without tissue, for effects that the run itself does not show; with a partner, the "
+    "change by an effect that shows only when another one is switched too. Right: what the effect adds to "
+    "the time of a step (median and quartiles of paired samples) and to the memory that the run holds. "
     "Grey: quartiles of the scene's step time against itself. Open marks: the effect is off in the scene and was tried."
 )
 
@@ -101,8 +101,8 @@ def write_csv(study: EffectsStudy, path: Path) -> Path:
     """One row an effect; empty where nothing was tried. Rank 0 only."""
     header = [
         "effect", "on", "value", "verdict", "gate", "gate_threshold", "gate_matters", "change_outputs",
-        "change_deformation", "change_absolute [m]", "change_under_force", "change_advised", "change_advised_under_force",
-        "partners", "assembly [s]", "setup [s]", "step [s]",
+        "change_deformation", "change_absolute [m]", "change_under_force", "change_advised",
+        "change_advised_under_force", "partners", "assembly [s]", "setup [s]", "step [s]",
         "step_relative", "step_low", "step_high", "flops", "memory [byte]", "memory_relative", "off_is_free",
     ]  # fmt: skip
     with path.open("w", newline="") as file:

@@ -13,10 +13,12 @@ from rich.padding import Padding
 from fem.build import build
 from fem.effects import EFFECTS, Gate
 from fem.effects.measure import measure
+from fem.effects.sag import Sag
 from fem.modes import lowest_modes
 from fem.petsc import PETSc
 from fem.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
-from study.cautions import SMALL_STRAIN, coarse, locking, poisson_ratios, turned
+from fem.strain import SMALL_SHARE, SMALL_STRAIN
+from study.cautions import coarse, locking, poisson_ratios, turned
 from study.command import plain
 from study.equation import Equation, equation
 
@@ -88,6 +90,7 @@ class Explanation:
         poisson: Poisson's ratio of each material by layer name [1].
         missing: effects that are off and would matter.
         idle: effects that are on and do not matter.
+        sag: the tissue at rest under its weight.
         warnings: one sentence each.
         snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
     """
@@ -101,6 +104,7 @@ class Explanation:
     poisson: dict[str, float]
     missing: tuple[str, ...]
     idle: tuple[str, ...]
+    sag: Sag
     warnings: tuple[str, ...]
     snapshot_columns: int
     snapshot_bytes: int
@@ -129,7 +133,7 @@ def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
 
     Raises:
         SceneError, MeshError: the scene cannot be built.
-        SolverError: its modes cannot be computed.
+        SolverError: its modes or its sag cannot be computed.
     """
     return explain_model(build(scene, comm))
 
@@ -138,7 +142,7 @@ def explain_model(model: Model) -> Explanation:
     """Say what a built model is. Collective.
 
     Raises:
-        SolverError: its modes cannot be computed.
+        SolverError: its modes or its sag cannot be computed.
     """
     scene, system = model.scene, model.system
     layout = system.layout
@@ -184,22 +188,24 @@ def explain_model(model: Model) -> Explanation:
         poisson=poisson,
         missing=tuple(key for key, r in reports.items() if not r.on and r.gate.matters),
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
-        warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports)),
+        sag=problem.sag,
+        warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
     )
 
 
 def _warnings(
-    scene: Scene, poisson: dict[str, float], omega: Any, dt: float, d: int, effects: dict[str, EffectReport]
+    scene: Scene, poisson: dict[str, float], omega: Any, dt: float, d: int, effects: dict[str, EffectReport], sag: Sag
 ) -> list[str]:
     found = locking(poisson, scene.tissue.order)
     if len(omega):
         found += coarse(float(omega[0]), dt, scene.time_end, "the first period")
-    gravity = effects["gravity"]
-    if gravity.on and gravity.gate.number > SMALL_STRAIN:
+    if effects["gravity"].on and not sag.gradient.small:
         found.append(
-            f"rho g L / E = {gravity.gate.number:.2g} is above {SMALL_STRAIN}: linear elasticity assumes small strains."
+            f"At rest under its weight the tissue would sag by {sag.largest:.2g} m and |grad z| would be above "
+            f"{SMALL_STRAIN} in {sag.gradient.share:.0%} of the body, at most {sag.gradient.largest:.2g}: linear "
+            "elasticity assumes small strains and rotations."
         )
     if scene.effects.rotation:
         found += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))
@@ -253,6 +259,9 @@ def render(result: Explanation, console: Console) -> None:
         line("first periods not computed: the factor would not fit")
     for k, (T, phase) in enumerate(zip(t.periods, t.omega_dt, strict=True), 1):
         line(f"T_{k} = {T:.4g} s, dt/T_{k} = {t.dt / T:.2g}, omega_{k} dt = {phase:.2g}")
+    title("At rest under its weight, the hand held still")
+    for row in sag_rows(result):
+        line(": ".join(row))
     title("Effects")
     for name, e in result.effects.items():
         gate = e.gate
@@ -267,6 +276,19 @@ def render(result: Explanation, console: Console) -> None:
         title("Look at")
     for text in found:
         line(text)
+
+
+def sag_rows(result: Explanation) -> list[tuple[str, str]]:
+    """Load, sag, gradient and validity of the static solution as label and text. Not collective."""
+    sag, assumed = result.sag, "" if result.effects["gravity"].on else " (assumed: gravity is off)"
+    steep = sag.gradient
+    return [
+        ("g", "(" + ", ".join(f"{x:g}" for x in sag.g) + f") m/s2{assumed}"),
+        ("largest |z|", f"{sag.largest:.4g} m"),
+        ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {SMALL_SHARE:.0%} of the body"),
+        ("linear elasticity", f"{'holds' if steep.small else 'does not hold'}: |grad z| is above {SMALL_STRAIN} in "
+         f"{steep.share:.2%} of the body, at most {SMALL_SHARE:.0%} may be"),
+    ]  # fmt: skip
 
 
 def verdict(effect: EffectReport) -> str:

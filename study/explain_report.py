@@ -9,7 +9,7 @@ from fem.effects import Gate
 from fem.scene import Scene
 from fem.scene_file import resolved_toml
 from study.command import origin, write_json
-from study.explain import Explanation, remarks, size_text, verdict
+from study.explain import Explanation, remarks, sag_rows, size_text, verdict
 from study.report import EQUATION, Section, command_line, equation_text, write_report
 
 
@@ -63,6 +63,7 @@ def _sections(found: Explanation) -> list[Section]:
         Section("Look at", text="\n\n".join(remarks(found)) or "Nothing stands out."),
         Section(EQUATION, code=equation_text(found.equation)),
         Section("Sizes", rows=sizes),
+        Section("At rest under its weight, the hand held still", rows=sag_rows(found)),
         Section(
             "Effects", header=("effect", "verdict", "gate", "number", "matters from", "what it says"), rows=effects
         ),
