@@ -30,8 +30,16 @@ def package_version() -> str:
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:
-    """Largest resident memory so far, summed over the ranks [MiB]. Collective."""
-    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+    """Largest resident memory so far, summed over the ranks [MiB]. Collective.
+
+    Linux's VmHWM starts anew with this program, unlike ``ru_maxrss``, which may show that of the launcher.
+    """
+    try:
+        text = Path("/proc/self/status").read_text()
+        local = next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):  # no Linux
+        local = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return float(comm.allreduce(local))
 
 
 def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:

@@ -122,6 +122,9 @@ class Output(Model):
     checkpoint_every: Annotated[int, Field(ge=0)] = Field(
         0, description="steps between restart files [1]; 0: only on interrupt"
     )
+    memory: Literal["auto"] | Positive = Field(
+        "auto", description="memory that a run may take on each node [GiB]; auto: what is free when it starts"
+    )
 
 
 class Scene(Model):

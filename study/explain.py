@@ -14,6 +14,7 @@ from fem.build import build
 from fem.effects import EFFECTS, Gate
 from fem.effects.measure import measure
 from fem.effects.sag import Sag
+from fem.memory import Need, factor_bytes, need
 from fem.modes import lowest_modes
 from fem.petsc import PETSc
 from fem.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
@@ -92,6 +93,7 @@ class Explanation:
         idle: effects that are on and do not matter.
         sag: the tissue at rest under its weight.
         warnings: one sentence each.
+        memory: estimated need of mesh, factor and steps.
         snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
     """
 
@@ -106,6 +108,7 @@ class Explanation:
     idle: tuple[str, ...]
     sag: Sag
     warnings: tuple[str, ...]
+    memory: Need
     snapshot_columns: int
     snapshot_bytes: int
 
@@ -115,19 +118,6 @@ class Explanation:
         return result
 
 
-def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
-    """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection. Not collective.
-
-    nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
-    (2D) and 5e2 to 2e5 (3D) unknowns; 8 byte an entry and 4 an index, of which cholesky has one for d^2 entries.
-    """
-    if name == "cg" or n < 2:
-        return 0.0
-    row = 7.75 * np.log2(n) - 44 if dimension == 2 else 19.5 * n ** (1 / 3) - 85
-    entry = 8 + (4 / dimension**2 if name == "cholesky" else 4)
-    return float(entry * n * np.clip(row, 1, (n + 1) / 2) * copies)
-
-
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
     """Assemble a scene and say what it is. Collective.
 
@@ -135,7 +125,7 @@ def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
         SceneError, MeshError: the scene cannot be built.
         SolverError: its modes or its sag cannot be computed.
     """
-    return explain_model(build(scene, comm))
+    return explain_model(build(scene, comm, run=False))
 
 
 def explain_model(model: Model) -> Explanation:
@@ -190,6 +180,7 @@ def explain_model(model: Model) -> Explanation:
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
         sag=problem.sag,
         warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
+        memory=need(scene, d, topology.index_map(d).size_global, layout.comm, run=True),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
     )
@@ -252,6 +243,10 @@ def render(result: Explanation, console: Console) -> None:
     line(f"{result.solver.name}: {result.solver.reason}")
     if result.solver.factor_bytes:
         line(f"factor about {size_text(result.solver.factor_bytes)} (estimate)")
+    line(
+        f"mesh and matrices about {size_text(result.memory.mesh)} over all ranks, tables of the steps "
+        f"{size_text(result.memory.tables)} on each (estimates)"
+    )
     line(f"snapshots: {result.snapshot_columns} columns, {size_text(result.snapshot_bytes)}")
     title("Time")
     line(f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s")
@@ -260,8 +255,8 @@ def render(result: Explanation, console: Console) -> None:
     for k, (T, phase) in enumerate(zip(t.periods, t.omega_dt, strict=True), 1):
         line(f"T_{k} = {T:.4g} s, dt/T_{k} = {t.dt / T:.2g}, omega_{k} dt = {phase:.2g}")
     title("At rest under its weight, the hand held still")
-    for row in sag_rows(result):
-        line(": ".join(row))
+    for label, value in sag_rows(result):
+        line(f"{label}: {value}")
     title("Effects")
     for name, e in result.effects.items():
         gate = e.gate

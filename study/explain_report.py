@@ -50,6 +50,8 @@ def _sections(found: Explanation) -> list[Section]:
         ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in found.poisson.items())),
         ("solver", f"{solver.name}: {solver.reason}"),
         ("factor, estimated", size_text(solver.factor_bytes) if solver.factor_bytes else "none"),
+        ("mesh and matrices, estimated, over all ranks", size_text(found.memory.mesh)),
+        ("tables of the steps, on each rank", size_text(found.memory.tables)),
         ("snapshots", f"{found.snapshot_columns} columns, {size_text(found.snapshot_bytes)}"),
         ("time", f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s"),
     ]

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from rich.console import Console
 
 from fem.build import build
+from fem.memory import factor_bytes
 from fem.midpoint import midpoint_matrix
 from fem.modes import lowest_modes
 from fem.petsc import PETSc
@@ -21,7 +22,7 @@ from fem.solvers import choose_solver, make_solver
 from fem.strain import SMALL_SHARE, gradient
 from study.cautions import inexact, run_warnings, slowest
 from study.equation import equation
-from study.explain import Explanation, explain, factor_bytes, render, run_explain
+from study.explain import Explanation, explain, render, run_explain
 
 FORCE = {"target": [1.0, 0.0], "drive": "force"}
 RAYLEIGH = {"kind": "rayleigh", "alpha": 0.1, "beta": 0.01}
