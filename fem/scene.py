@@ -224,5 +224,5 @@ def check_dimension(scene: Scene, d: int) -> None:
 
 
 def scene_schema() -> dict[str, Any]:
-    """JSON schema of a scene file. Not collective."""
-    return Scene.model_json_schema(by_alias=True)
+    """JSON schema of a scene file; `study.scene_schema` adds what only the packages above know. Not collective."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)
