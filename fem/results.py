@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from fem.build import Model
-from fem.outputs import hand_axes, unit
+from fem.outputs import hand_axes, make_outputs, unit
 from fem.petsc import Array
 from fem.run import Trajectory
 from fem.scene_file import resolved_toml, scene_hash
@@ -69,6 +69,7 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
         "hand_final": run.q_s[-1].tolist(),
         "output_names": list(run.output_names),
         "output_final": run.outputs[-1].tolist(),
+        "output_places": {o.name: o.place for o in make_outputs(model.scene, model.system) if o.place},
         "energy_drift": run.energy_drift,
         **({} if run.force is None else {"force_peak": dict(zip(axes, _peaks(run.force), strict=True))}),
         "time": {

@@ -16,6 +16,7 @@ from fem.effects.measure import measure
 from fem.effects.sag import Sag
 from fem.memory import Need, factor_bytes, need
 from fem.modes import lowest_modes
+from fem.outputs import make_outputs
 from fem.petsc import PETSc
 from fem.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
 from fem.strain import SMALL_SHARE, SMALL_STRAIN
@@ -93,6 +94,7 @@ class Explanation:
         idle: effects that are on and do not matter.
         sag: the tissue at rest under its weight.
         warnings: one sentence each.
+        outputs: name and place of each output.
         memory: estimated need of mesh, factor and steps.
         snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
     """
@@ -108,6 +110,7 @@ class Explanation:
     idle: tuple[str, ...]
     sag: Sag
     warnings: tuple[str, ...]
+    outputs: dict[str, str]
     memory: Need
     snapshot_columns: int
     snapshot_bytes: int
@@ -180,6 +183,7 @@ def explain_model(model: Model) -> Explanation:
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
         sag=problem.sag,
         warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
+        outputs={o.name: o.place for o in make_outputs(scene, system) if o.place},
         memory=need(scene, d, topology.index_map(d).size_global, layout.comm, run=True),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
@@ -238,6 +242,8 @@ def render(result: Explanation, console: Console) -> None:
     title("Sizes")
     line(f"n_s = {s.n_s}, n_e = {s.n_e}, states 2n = {s.states}")
     line(f"{s.cells} cells, {s.nodes} nodes, {s.nonzeros} non-zeros in K_ee, {s.ranks} rank(s)")
+    for output, place in result.outputs.items():
+        line(f"output {output}: {place}")
     line("nu = " + ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items()))
     title("Solver")
     line(f"{result.solver.name}: {result.solver.reason}")

@@ -47,6 +47,7 @@ def _sections(found: Explanation) -> list[Section]:
     sizes = [
         ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {s.n_e}, 2n = {s.states}"),
         ("cells, nodes, non-zeros of K_ee", f"{s.cells}, {s.nodes}, {s.nonzeros}"),
+        *((f"output {name}", place) for name, place in found.outputs.items()),
         ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in found.poisson.items())),
         ("solver", f"{solver.name}: {solver.reason}"),
         ("factor, estimated", size_text(solver.factor_bytes) if solver.factor_bytes else "none"),
