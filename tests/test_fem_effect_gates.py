@@ -156,7 +156,11 @@ def test_rotation() -> None:
     called = EFFECTS["rotation"].gate(problem_of(scene_of(effects={"reaction": True}, motion=force)))
     assert called.number == 0.1, "without inertia the hand is as large as the tissue"
     assert called.matters
-    assert not EFFECTS["rotation"].gate(problem_of(scene_of(motion=force))).matters
+    beside = EFFECTS["rotation"].gate(problem_of(scene_of(motion=force)))
+    assert beside.matters, "the reaction is off, but called for: with it the tissue turns the hand"
+    assert beside.proviso == "together with reaction"
+    light = problem_of(scene_of(motion=force, hand={"mass": 100.0, "inertia": 0.25}))
+    assert not EFFECTS["rotation"].gate(light).matters, "no reaction that counts, so nothing turns the hand"
 
 
 def layered_scene(**parts: Any) -> Scene:
