@@ -292,14 +292,14 @@ def _advice(s: Switch, verdict: str, change: float, felt: str, cost: Cost, toler
 def _advice_together(s: Switch, change: float, company: Company, cases: dict[str, Case], tolerance: float) -> str:
     """For an effect that shows only when others are switched too."""
     partners = listed(company.partners)
-    number = f"the outputs by {company.together:.2g}, tolerance {tolerance:g}"
     force = " when a force moves the hand, as in the control problem" if company.forced else ""
+    number = f"the outputs by {company.together:.2g}{force}, tolerance {tolerance:g}"
     if company.either:
-        return f"Keep it, or {partners}: each can go alone, but without both the run changes {number}{force}."
+        return f"Keep it, or {partners}: each can go alone, but leaving out both changes {number}."
     begin = f"{'Keep it' if s.on else 'Switch it on'}{' for control' if force else ''}"
     switched = [name for name in company.partners if EFFECTS[name].active(cases[SCENE].model.scene)]
     state = f"without {partners}" if switched else f"with {partners} on"
-    return f"{begin}, {state}: alone it {_small(change)}, but {state} it changes {number}{force}."
+    return f"{begin}, {state}: alone it {_small(change)}, but {state} it changes {number}."
 
 
 def _small(change: float) -> str:
