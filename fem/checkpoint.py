@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fem.scene import Scene
 
 FORMAT = 3
-FREE_OUTPUT = ("fields", "frames", "checkpoint_every")  # what a run shows and keeps, not what it computes
+FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
 FREE = ("name", "description", "reduction", "study")
 
 

@@ -122,6 +122,9 @@ class Output(Model):
     checkpoint_every: Annotated[int, Field(ge=0)] = Field(
         0, description="steps between restart files [1]; 0: only on interrupt"
     )
+    memory: Literal["auto"] | Positive = Field(
+        "auto", description="memory that a run may take on each node [GiB]; auto: what is free when it starts"
+    )
 
 
 class Scene(Model):
@@ -221,5 +224,5 @@ def check_dimension(scene: Scene, d: int) -> None:
 
 
 def scene_schema() -> dict[str, Any]:
-    """JSON schema of a scene file. Not collective."""
-    return Scene.model_json_schema(by_alias=True)
+    """JSON schema of a scene file; `study.scene_schema` adds what only the packages above know. Not collective."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from fem import materials
 
@@ -26,8 +28,17 @@ def off(value: Any) -> Any:
     return None if value is False else value
 
 
+class OrFalse:
+    """In the JSON schema false stands where Python has None."""
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        schema = handler(core)
+        choices = [choice for choice in schema["anyOf"] if choice != {"type": "null"}]
+        return {"anyOf": [*choices, {"const": False}]}
+
+
 T = TypeVar("T")
-Dropped = Annotated[T | None, BeforeValidator(off)]
+Dropped = Annotated[T | None, BeforeValidator(off), OrFalse()]
 
 
 def check_box(box: list[list[float]] | None, key: str) -> None:
@@ -75,6 +86,27 @@ class Material(Model):
             raise ValueError(f"poisson is {nu}; it must lie between -1 and 0.5, both excluded")
         values["lambda"], values["mu"] = materials.lame(young, nu)
         return values
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """What a file may hold: a name of the library, or one of the two pairs of moduli. Not collective."""
+        reference = handler(core)
+        schema = handler.resolve_ref_schema(reference)
+        lame = dict(schema)
+        name, rho = (lame["properties"][key] for key in ("name", "rho"))
+        young = {
+            "young": {"type": "number", "exclusiveMinimum": 0, "description": "Young's modulus [Pa], > 0"},
+            "poisson": {
+                "type": "number",
+                "exclusiveMinimum": -1,
+                "exclusiveMaximum": 0.5,
+                "description": "Poisson's ratio [1], between -1 and 0.5",
+            },
+        }
+        pair = {**lame, "properties": {"name": name, **young, "rho": rho}, "required": [*young, "rho"]}
+        schema.clear()
+        schema |= {"title": lame["title"], "anyOf": [{"enum": list(materials.LIBRARY)}, lame, pair]}
+        return reference
 
     @model_validator(mode="after")
     def _stable(self) -> Material:

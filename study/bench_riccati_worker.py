@@ -19,6 +19,7 @@ from mpi4py import MPI
 from fem.build import build
 from fem.errors import SoftgraspError
 from fem.petsc import Array
+from fem.results import peak_memory_mb
 from fem.scene_file import load_scene_collective, shipped_scenes
 from lqr.coordinates import costates_to_relative, gain_of, gain_to_relative
 from lqr.galerkin import StructuredGalerkin
@@ -28,7 +29,6 @@ from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.radi import RADI
 from lqr.residual import residual
 from study.bench_peers import to_scipy
-from study.bench_worker import peak_mb
 from study.control_problem import make_problem
 from study.workers import leave_result
 
@@ -107,7 +107,7 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
     """
     comm = MPI.COMM_WORLD
     problem = problem_for(comm, nx, beta)
-    base = peak_mb(comm)
+    base = peak_memory_mb(comm)
     result: dict[str, Any] = {"states": problem.layout.states, "n_e": problem.layout.n_e, "ranks": comm.size}
     rows: dict[str, Any] = {}
     reference: Block | None = None
@@ -117,7 +117,7 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
         except SoftgraspError as error:
             rows[name] = {"error": str(error)}
             continue
-        rows[name] = describe(solution, seconds, base, peak_mb(comm))
+        rows[name] = describe(solution, seconds, base, peak_memory_mb(comm))
         gain = gain_of(solution)
         if reference is None:
             reference = gain

@@ -9,10 +9,9 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from fem.fields import FullField
-from fem.geometry import cell_nodes
 from fem.materials import young_poisson
 from fem.petsc import Array, times_columns, total
+from fem.strain import SMALL_STRAIN, gradient
 
 if TYPE_CHECKING:
     from fem.build import Model
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
 
 LOCKING = 0.49  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu)
 COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
-SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
-SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain of any fine mesh is large
 SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
 EPS = float(np.finfo(float).eps)
 EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
@@ -136,11 +133,12 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]
     if most is not None and total(system.layout.comm, np.array([np.dot(most[1], most[1])]))[0] > sizes.max():
         t, z = most
-    steepest, share = gradients(model, z)
-    if share > SMALL_SHARE:
+    steep = gradient(model, z)
+    if not steep.small:
         found.append(
-            f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {share:.0%} of the body at "
-            f"t = {t:.3g} s, at most {steepest:.2g}: linear elasticity assumes small strains and rotations."
+            f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
+            f"body at t = {t:.3g} s, at most {steep.largest:.2g}: linear elasticity assumes small strains and "
+            "rotations."
         )
     found += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
     return found + inexact(
@@ -181,26 +179,6 @@ def slowest(system: BlockSystem, Z: Array) -> float:
         return 0.0
     Q = centre @ (Q[:, kept] / np.sqrt(squares[kept]))
     return float(np.sqrt(max(np.linalg.eigvalsh(Q.T @ (K + K.T) @ Q / 2)[0], 0.0)))
-
-
-def gradients(model: Model, z: Array) -> tuple[float, float]:
-    """Largest |grad z| between the vertices of a cell [1], and share of the volume above `SMALL_STRAIN`. Collective.
-
-    Args:
-        model: the model.
-        z: displacement against the hand, local rows (n_local,) [m].
-    """
-    space, d = model.space, model.space.mesh.dimension
-    mesh = space.mesh.mesh
-    cells = mesh.topology.index_map(d).size_local
-    nodal = FullField(model).fill(z, np.zeros(space.layout.n_s)).x.array.reshape(-1, d)
-    u = nodal[space.V.dofmap.list[:cells, : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
-    x = mesh.geometry.x[cell_nodes(mesh)[:cells], :d]
-    edges = x[:, 1:] - x[:, :1]
-    size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))
-    volume = np.abs(np.linalg.det(edges))
-    large, whole = total(space.layout.comm, np.array([volume[size > SMALL_STRAIN].sum(), volume.sum()]))
-    return max(space.layout.comm.allgather(float(size.max(initial=0.0)))), float(large / whole)
 
 
 def show_warnings(console: Console, found: list[str]) -> None:

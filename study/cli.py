@@ -73,10 +73,10 @@ def scenes() -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
-    from fem.scene import scene_schema
+    from study.scene_schema import full_schema
 
     if MPI.COMM_WORLD.rank == 0:
-        typer.echo(json.dumps(scene_schema(), indent=2))
+        typer.echo(json.dumps(full_schema(), indent=2))
 
 
 @app.command()

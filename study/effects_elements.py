@@ -11,7 +11,7 @@ from fem.outputs import make_outputs
 from fem.run import RunOptions, Trajectory, simulate
 from fem.scene import Scene
 from study.cautions import LOCKING
-from study.effects_measure import Change, compare
+from study.effects_change import Change, compare, shown
 from study.effects_switch import changed
 
 
@@ -49,7 +49,7 @@ def judge_elements(model: Model, trajectory: Trajectory, tolerance: float) -> El
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None
     other = build(quadratic(model), model.system.layout.comm)
-    change = compare(model, trajectory, other, simulate(other, RunOptions()))
+    change = compare(shown(model, trajectory), shown(other, simulate(other, RunOptions())))
     needed = change.outputs > tolerance
     text = (
         f"Measured at nu = {nu:.4g}: on the same mesh tissue.order = 2 changes the outputs by {change.outputs:.2g} and "

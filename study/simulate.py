@@ -97,6 +97,7 @@ def result_rows(result: dict[str, Any]) -> Rows:
         (name, f"{value:.6g} {unit(name)}")
         for name, value in zip(result["output_names"], result["output_final"], strict=True)
     ]
+    rows += [(name, place) for name, place in result["output_places"].items()]
     if "force_peak" in result:
         peak = ", ".join(f"{axis} {value:.4g} {force_unit(axis)}" for axis, value in result["force_peak"].items())
         rows.append(("largest force on the hand", peak))

@@ -302,8 +302,8 @@ def test_snapshots_that_cannot_fit_are_refused_before_the_run(
     class Tiny:
         available = 1000
 
+    model = small(comm)  # which would not be built either
     monkeypatch.setattr("fem.snapshots.psutil.virtual_memory", lambda: Tiny)
-    model = small(comm)
     needed = 16 * model.system.layout.n_e * 41
     with pytest.raises(ResourceError, match=f"need {needed} bytes"):
         simulate(model)

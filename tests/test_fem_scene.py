@@ -332,6 +332,7 @@ def test_every_key_of_the_schema_states_its_unit() -> None:
     schema = scene_schema()
     json.dumps(schema)
     objects = [schema, *schema["$defs"].values()]
+    objects += [choice for part in objects for choice in part.get("anyOf", [])]
     for part in objects:
         for key, field in part.get("properties", {}).items():
             assert "[" in field.get("description", ""), f"{part.get('title')}.{key}"

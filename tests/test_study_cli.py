@@ -129,7 +129,7 @@ def test_scenes_schema_explain_and_help(tmp_path: Path) -> None:
         assert name in listing.stdout
     assert "tissue" in json.loads(softgrasp("schema").stdout)["properties"]
     muscle = str(ROOT / "demos" / "scenes" / "franka_muscle.toml")
-    assert "rho g L / E" in softgrasp("explain", muscle, "--out", str(tmp_path / "why")).stdout
+    assert "|grad z| of its sag" in softgrasp("explain", muscle, "--out", str(tmp_path / "why")).stdout
     result = json.loads((tmp_path / "why" / "result.json").read_text())
     page = (tmp_path / "why" / "report.html").read_text()
     assert all(name in page for name in result["effects"])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from fem.effects.sag import Sag
     from fem.scene import Scene
     from fem.system import LayerMaterial
 
@@ -55,6 +56,7 @@ class Problem:
         tissue_inertia: moments of inertia of the rigid tissue about the reference, one per rotation [kg m2].
         omega: lowest angular frequencies of the clamped tissue [1/s], ascending; empty when not computed.
         zeta: damping ratio of each of them [1].
+        sag: the tissue at rest under its weight.
     """
 
     scene: Scene
@@ -65,6 +67,7 @@ class Problem:
     tissue_inertia: tuple[float, ...]
     omega: tuple[float, ...]
     zeta: tuple[float, ...]
+    sag: Sag
 
 
 class Effect(Protocol):

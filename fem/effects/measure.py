@@ -10,6 +10,7 @@ from fem.assembly import cells_of_layers
 from fem.contact import bounding_box
 from fem.effects.damping import ratios
 from fem.effects.gate import Problem
+from fem.effects.sag import measure_sag
 from fem.geometry import cell_nodes
 from fem.petsc import Array, times_columns, total
 
@@ -19,12 +20,15 @@ if TYPE_CHECKING:
 
 
 def measure(model: Model, omega: Array, Phi: Array) -> Problem:
-    """Length, masses and damping ratios of a model. Collective.
+    """Length, masses, damping ratios and sag of a model. Collective.
 
     Args:
         model: the model.
         omega: lowest angular frequencies [1/s], (k,), may be empty.
         Phi: their M-orthonormal modes, local rows (n_local, k).
+
+    Raises:
+        SolverError: the static problem cannot be solved.
     """
     mesh, system = model.space.mesh, model.system
     low, high = bounding_box(mesh)
@@ -38,6 +42,7 @@ def measure(model: Model, omega: Array, Phi: Array) -> Problem:
         tissue_inertia=inertia,
         omega=tuple(omega.tolist()),
         zeta=tuple(damping_ratios(system, omega, Phi).tolist()),
+        sag=measure_sag(model),
     )
 
 
