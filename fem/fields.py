@@ -54,6 +54,11 @@ class FullField:
         return self.u
 
 
+def owner_file(series: Path) -> Path:
+    """The small file beside a field series that names its run. Not collective."""
+    return series.with_suffix(".run")
+
+
 class SeriesWriter:
     """Displacement, and velocity if given, against time in files that ParaView opens.
 
@@ -89,10 +94,11 @@ class SeriesWriter:
         self.fields = 0  # known at the first write
         self.file: Any = None
 
-    def rename(self, name: str) -> None:
-        """Choose another stem of the files, before the first write. Not collective."""
+    def rename(self, name: str, run: str = "") -> None:
+        """Choose another stem of the files, and the run's name, before the first write. Not collective."""
         suffixes = (".bp",) if self.format == "vtx" else (".xdmf", ".h5")
         self.files = tuple(self.directory / f"{name}{suffix}" for suffix in suffixes)
+        self.run = run
 
     def write(self, t: float, z: Array, v: Array, q_s: Array, v_s: Array | None = None) -> None:
         """Append one instant. Collective.
@@ -126,6 +132,9 @@ class SeriesWriter:
 
     def _open(self, fields: int) -> None:
         self.fields = fields
+        with agree(self.comm):
+            if self.comm.rank == 0:
+                owner_file(self.files[0]).write_text(self.run)
         written = list(self.written[:fields])
         if self.format == "vtx":
             policy = dolfinx.io.VTXMeshPolicy.reuse  # the mesh does not change: write it once

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -101,8 +102,10 @@ class Run(Stepped):
         force: feedback force on the hand; None takes the scene's motion.
 
     Attributes:
+        name: of this run and those that it resumes, in no other run; its files carry it.
         begun: step at which this run was started or resumed.
         legs: the same of all runs that led here, this one last.
+        beside: names and SHA-256 of further files in the checkpoint's folder; rank 0's count.
     """
 
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
@@ -113,9 +116,9 @@ class Run(Stepped):
         with model.watch.stage("factor"):
             midpoint = TissueMidpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
         solver = solver[0], solver[1] + midpoint.solver.remark
-        store = make_store(
-            system, scene.output.snapshots, scene.time.steps, scene.output.every, options.directory, options.resume
-        )
+        self.name: str = system.layout.comm.bcast(secrets.token_hex(6))
+        kept, fresh = scene.output, None if options.resume else self.name
+        store = make_store(system, kept.snapshots, scene.time.steps, kept.every, options.directory, fresh)
         super().__init__(system.layout, dt, scene.time.steps, midpoint, store, solver)
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
@@ -126,6 +129,7 @@ class Run(Stepped):
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = self.residual_last = 0.0
         self.begun, self.legs = 0, [0]
+        self.beside: dict[str, str] = {}
 
     def _recorders(self) -> tuple[list[tuple[slice, Array]], list[tuple[np.ndarray, Array]]]:
         """Local dofs and column block of every output that this rank has a share in."""
@@ -364,6 +368,7 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
         options.frame(run)
     if run.reached == 0:
         run.take(ts, 1, check=True)
+        run.store.flush(1)
         run.residual_first = run.residual_last
     last, chunk = boundaries[-1], 1
     while run.reached < last:

@@ -58,6 +58,7 @@ def run_simulate(
                 f"; {counted(lost, 'earlier frame')} {'is' if lost == 1 else 'are'} not kept, the pictures do without"
             )
             more = missing if lost else ""
+            more += "; the fields before are left out: another run has written in their place" if frames.foreign else ""
             console.print(f"resumed from step {run.begun} of {run.steps}{more}", soft_wrap=True)
 
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:

@@ -67,9 +67,9 @@ def test_frames_that_nobody_kept_are_told(comm: MPI.Intracomm, mpi_tmp_path: Pat
     said = run(mpi_tmp_path, until=20, resume=True)
     if comm.rank == 0:
         assert "resumed from step 15 of 40; 4 earlier frames are not kept" in said
-        (mpi_tmp_path / "checkpoint" / "frame20.npz").write_bytes(b"PK torn")
+        next(mpi_tmp_path.glob("checkpoint/*-frame20.npz")).write_bytes(b"PK torn")
     comm.Barrier()
-    with pytest.raises(CheckpointError, match=r"frame20\.npz cannot be read"):
+    with pytest.raises(CheckpointError, match=r"frame20\.npz is damaged"):
         run(mpi_tmp_path, resume=True)
 
 
