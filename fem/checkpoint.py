@@ -73,10 +73,20 @@ def _write_manifest(run: Run, manifest: Path, files: list[tuple[str, str]]) -> N
     remove_others(manifest.parent, OLD, [*dict(files), *run.beside])
 
 
+def restart_bytes(run: Run) -> int:
+    """About what a restart file takes, of all ranks. Collective."""
+    return int(run.layout.comm.allreduce(sum(np.asarray(array).nbytes for array in _arrays(run).values())))
+
+
 def _write_rank(run: Run, path: Path) -> str:
     """Write this rank's file and return its SHA-256. Not collective."""
+    return write_arrays(path, _arrays(run))
+
+
+def _arrays(run: Run) -> dict[str, Any]:
+    """What this rank needs to go on. Not collective."""
     midpoint, n = run.midpoint, run.reached
-    arrays = {
+    arrays: dict[str, Any] = {
         "numbering": _numbering(run.layout),
         "state": run.state.array,
         "r": midpoint.held.leave(midpoint.r.array_r),
@@ -92,7 +102,7 @@ def _write_rank(run: Run, path: Path) -> str:
     }
     if run.drive.u is not None:
         arrays["forces"] = run.drive.u[:n]
-    return write_arrays(path, arrays)
+    return arrays
 
 
 def read_checkpoint(run: Run, directory: Path) -> None:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import secrets
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,8 @@ from mpi4py import MPI
 from fem.build import Model
 from fem.checkpoint import read_checkpoint, write_checkpoint
 from fem.drive import Drive, Force, ForceDrive, TableDrive, force_taken
-from fem.errors import Interrupted, SceneError, SolverError, agree
+from fem.errors import Interrupted, ResourceError, SceneError, SolverError, agree
+from fem.interrupt import interruptible
 from fem.midpoint import TissueMidpoint
 from fem.motion import driven_table, force_values, motion_table
 from fem.outputs import Output, make_outputs
@@ -288,29 +286,6 @@ def frame_steps(scene: Scene) -> list[int]:
     return np.linspace(0, steps, min(scene.output.frames, steps) + 1).round().astype(int).tolist()
 
 
-@contextmanager
-def _interruptible(speaks: bool) -> Iterator[list[bool]]:
-    """Turn the first Ctrl-C into a flag and say so on the standard error; a second one interrupts at once."""
-    flag: list[bool] = []
-
-    def note(number: int, frame: Any) -> None:
-        flag.append(True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if speaks:
-            with suppress(OSError):  # nobody listens; print may not be called while another print is under way
-                os.write(2, b"\nstopping as soon as the restart file is written; Ctrl-C again stops at once\n")
-
-    try:
-        previous = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not the main thread: leave signals alone
-        yield flag
-        return
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
 def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:
     """Steps at which a segment must end, and those of them with a frame or a checkpoint.
 
@@ -351,12 +326,24 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
             run.start()
         if options.begin is not None:
             options.begin(run)
-        with _interruptible(model.system.layout.comm.rank == 0) as stop:
+        with interruptible(model.system.layout.comm.rank == 0) as stop:
             _run_segments(run, ts, options, stop)
         return run.trajectory()
     finally:
         ts.destroy()
         run.midpoint.destroy()
+
+
+def _frame(run: Run, options: RunOptions) -> str:
+    """Take a frame; why there is no room for it, or nothing. Collective."""
+    try:
+        if options.frame is not None:
+            options.frame(run)
+    except ResourceError as error:  # of all ranks
+        if run.reached == run.steps:  # a run at its end has nothing to go on with
+            raise
+        return str(error)
+    return ""
 
 
 def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> None:
@@ -382,16 +369,17 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
             run.watch_energy()
         # rank 0 sets the pace, all agree whether somebody asked to stop
         chunk = comm.bcast(int(np.clip(0.2 / max(pace, 1e-7), 1, 10_000)))
-        if options.frame is not None and run.reached in frames:
-            options.frame(run)
+        full = _frame(run, options) if run.reached in frames else ""
         if options.progress is not None:
             options.progress(run)
         stopped = comm.allreduce(bool(stop), MPI.LOR)
         stopped = stopped and run.reached < run.steps  # at the end there is nothing left to stop
-        if run.reached in checkpoints or stopped or (run.reached == last < run.steps):
+        if run.reached in checkpoints or stopped or full or (run.reached == last < run.steps):
             if options.keep is not None:
                 options.keep(run)
             manifest = write_checkpoint(run, options.directory / "checkpoint")
+            if full:
+                raise ResourceError(f"{full}; {manifest} lets --resume go on from step {run.reached}")
             if stopped or run.reached == last:
                 raise Interrupted(
                     f"stopped after step {run.reached} of {run.steps}; {manifest} lets --resume go on from there"

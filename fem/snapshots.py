@@ -14,6 +14,7 @@ from fem.errors import CheckpointError, ResourceError, agree
 from fem.layout import BlockLayout
 from fem.midpoint import TissueState, state_on
 from fem.petsc import Array
+from fem.room import check_room
 from fem.system import BlockSystem
 
 DAMAGE = (OSError, KeyError, ValueError, TypeError, RuntimeError)  # what h5py raises of files that are not whole
@@ -195,6 +196,7 @@ class Hdf5Store(NoStore):
         end = int(np.searchsorted(self.steps, step, side="right"))
         path = self._file(self.system.layout.comm.rank)
         if end > self.written:
+            check_room(self.system.layout.comm, [path], 8 * len(self.buffer) * (end - self.written))
             with agree(self.system.layout.comm):
                 try:
                     with h5py.File(path, "r+") as file:

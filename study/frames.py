@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fem.build import Model
+from fem.checkpoint import restart_bytes
 from fem.errors import CheckpointError, agree
 from fem.fields import SeriesWriter, owner_file
 from fem.gather import gather_picture, vertex_displacement
@@ -17,6 +18,7 @@ from fem.sealed import AGAIN, read_arrays, write_arrays
 from study.shapes import pick_instants, way_done
 
 MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
+LARGE_RESTART = 2**26  # bytes: no room is kept for a larger restart file, it would stop runs that end well
 SUFFIXES = (".bp", ".xdmf", ".h5")
 SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run when few instants are kept
 
@@ -137,8 +139,6 @@ class Frames:
         size = float(total(run.layout.comm, np.array([np.dot(z, z)]))[0])
         if size > self.most[0]:
             self.most = size, t, z.copy()
-        if self.writer is not None:
-            self.writer.write(t, z, v, q_s, v_s)
         if self.pictures and (not self.few or run.reached in self.chosen):
             state = vertex_displacement(self.model, z, q_s)
             self.steps.append(run.reached)
@@ -146,6 +146,9 @@ class Frames:
             self.hands.append(q_s.copy())
             if state is not None:
                 self.states.append(state.astype(np.float32))
+        if self.writer is not None:  # last: when there is no room, the rest goes beside the restart file
+            reserve = restart_bytes(run) if isinstance(run, Run) else 0
+            self.writer.write(t, z, v, q_s, v_s, reserve=reserve if reserve < LARGE_RESTART else 0)
 
     def _ahead(self, run: Run) -> set[int]:
         """Steps of the still picture before they are reached; the hand's table is known unless forces drive it."""

@@ -13,7 +13,7 @@ from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
 from fem.effects import EFFECTS
-from fem.errors import Interrupted
+from fem.errors import Interrupted, ResourceError
 from fem.meshcheck import counted
 from fem.outputs import unit
 from fem.results import force_unit, simulate_result, write_results
@@ -70,7 +70,7 @@ def run_simulate(
         options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
         try:
             run = simulate(model, options)
-        except Interrupted:
+        except (Interrupted, ResourceError):
             if files := frames.close():
                 list_files(console, files)
             raise
