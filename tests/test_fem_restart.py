@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import resource
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import dolfinx
 import h5py
 import meshio
 import numpy as np
@@ -14,10 +18,13 @@ import pytest
 from mpi4py import MPI
 
 from fem.build import build
-from fem.errors import CheckpointError, Interrupted
+from fem.errors import CheckpointError, Interrupted, ResourceError, SceneError
+from fem.room import MARGIN, check_room
 from fem.run import RunOptions, Trajectory, simulate
 from fem.scene import Scene
 from fem.sealed import read_manifest, write_arrays, write_manifest
+from study.cli import app
+from study.frames import Frames
 from study.wp_points import Cache
 from tests.helpers import make_scene
 
@@ -183,3 +190,74 @@ def test_a_mesh_that_changed_in_its_second_file_does_not_go_on(comm: MPI.Intraco
     with pytest.raises(CheckpointError, match="a file that the scene names is not what it was"):
         simulate(build(other, comm), RunOptions(mpi_tmp_path, resume=True))
     assert Cache(mpi_tmp_path / "cache", comm, other).get("point", {}, lambda: {"value": 2}) == {"value": 2}
+
+
+@pytest.fixture
+def small_files() -> Iterator[Callable[[int], None]]:
+    """Limit the size of the files of this process."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("kind", ["vtx", "xdmf"])
+def test_fields_without_room_leave_a_restart_file(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """The library that writes them would end the program; with room again the run ends as the whole run does."""
+    if kind == "vtx" and not dolfinx.has_adios2:
+        pytest.skip("this DOLFINx has no ADIOS2")
+    scene = make_scene(tissue={"cells": [3, 6]}, time={"steps": 12}, output={"fields": kind, "frames": 6})
+    model = build(scene, comm)
+    frames = Frames(model, mpi_tmp_path, pictures=False)
+    free = iter([2**30, 2**30, 2**30, 100])
+    monkeypatch.setattr("fem.room.shutil.disk_usage", lambda path: SimpleNamespace(free=next(free)))
+    options = RunOptions(mpi_tmp_path, frame=frames, begin=frames.begin, keep=frames.keep)
+    with pytest.raises(ResourceError, match=r"100 are free on the disk; free the disk; .*go on from step 6"):
+        simulate(model, options)
+    assert all(path.exists() for path in frames.close())
+    rest = simulate(model, RunOptions(mpi_tmp_path, resume=True))
+    assert np.array_equal(rest.final, simulate(build(scene, comm)).final)
+
+
+@pytest.mark.parametrize("output", [{"fields": "xdmf"}, {"fields": "none", "snapshots": "hdf5"}])
+def test_a_limit_on_files_is_one_sentence(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, small_files: Callable[[int], None], output: dict[str, str]
+) -> None:
+    scene = make_scene(tissue={"cells": [3, 6]}, time={"steps": 12}, output=output)
+    model = build(scene, comm)
+    frames = Frames(model, mpi_tmp_path, pictures=False)
+    small_files(2**18)  # less than the libraries may add at the end
+    with pytest.raises(ResourceError, match=r"no file may pass 262144 bytes here; raise the limit"):
+        simulate(model, RunOptions(mpi_tmp_path, frame=frames, begin=frames.begin))
+    frames.close()
+
+
+def test_room_counts_all_ranks_and_the_size_so_far(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, small_files: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = mpi_tmp_path / f"file{comm.rank}"
+    own.write_bytes(bytes(5000))
+    limit = MARGIN + 6000
+    small_files(limit)
+    check_room(comm, [own], 1000)
+    with pytest.raises(ResourceError, match=f"may pass {limit} bytes"):
+        check_room(comm, [own], 1001)
+    monkeypatch.setattr("fem.room.shutil.disk_usage", lambda path: SimpleNamespace(free=MARGIN + 100 * comm.size + 7))
+    check_room(comm, [own], 100, reserve=7)
+    with pytest.raises(ResourceError, match="are free on the disk"):
+        check_room(comm, [own], 100, reserve=8)
+
+
+@pytest.mark.parametrize("below", ["", "deeper"])
+def test_an_out_that_is_a_file_is_refused_before_the_scene_is_read(mpi_tmp_path: Path, below: str) -> None:
+    (mpi_tmp_path / "file").touch()
+    with pytest.raises(SceneError, match=r"--out .*file is a file; name a folder"):
+        app(["simulate", "no.toml", "--out", str(mpi_tmp_path / "file" / below)], standalone_mode=False)
+
+
+@pytest.mark.serial
+def test_a_full_disk_is_named_by_the_file(tmp_path: Path) -> None:
+    """The device that is always full, through the real writer."""
+    with pytest.raises(OSError, match="No space left"):
+        write_arrays(Path("/dev/full"), {"x": np.zeros(100_000)})
