@@ -138,15 +138,15 @@ def _fitting(run: Run, manifest: Path, entry: dict[str, Any]) -> dict[str, Any]:
         CheckpointError: it is not; the message names the key.
     """
     comm, scene = run.model.system.layout.comm, run.model.scene
-    found, why = {"ranks": entry["ranks"]}, {"ranks": comm.size}
+    before, now = {"ranks": entry["ranks"]}, {"ranks": comm.size}
     same = entry["scene_hash"] == _numbers_hash(scene)
     if not same:
-        found, why = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
-    keys = [*why, *(key for key in found if key not in why)]
+        before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
+    keys = [*now, *(key for key in before if key not in now)]
     for key in sorted(keys, key=lambda key: key in ("tissue.mesh", "motion.csv")):  # their contents count, not the name
-        if found.get(key) != why.get(key) and not _free(key):
+        if before.get(key) != now.get(key) and not _free(key):
             raise CheckpointError(
-                f"{manifest} was written with {key} = {_short(found.get(key))}, this run has {_short(why.get(key))}; "
+                f"{manifest} was written with {key} = {_short(before.get(key))}, this run has {_short(now.get(key))}; "
                 "resume with the same scene and rank count, or run again without --resume"
             )
     if not same:

@@ -169,12 +169,12 @@ class Hdf5Store(NoStore):
             return
         try:
             with h5py.File(path, "r+") as file:
-                found, self.on_file, self.owner = file["Z"].shape, int(file.attrs["written"]), file.attrs["run"]
+                stored, self.on_file, self.owner = file["Z"].shape, int(file.attrs["written"]), file.attrs["run"]
         except DAMAGE as error:
             raise CheckpointError(f"{path} cannot be read ({error}); run again without --resume") from error
-        if found != shape:
+        if stored != shape:
             raise CheckpointError(
-                f"{path} holds {found} numbers, this run needs {shape}; resume with the same scene and rank count, or "
+                f"{path} holds {stored} numbers, this run needs {shape}; resume with the same scene and rank count, or "
                 "run again without --resume"
             )
 

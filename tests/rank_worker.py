@@ -41,12 +41,12 @@ def numbers(folder: Path) -> dict[str, list[float]]:
         "least": [min(comm.allgather(model.system.layout.n_local))],
         "simulate": [*run.outputs[-1], *(float(np.abs(state).sum()) for state in frames.states)],
         "warnings": [len(run_warnings(model, run, frames.most[1:]))],
-        "reduce": [point.error for found in swept for point in found.points],
+        "reduce": [point.error for basis in swept for point in basis.points],
         "control": np.abs(solved.solution.K_s).sum(axis=1).tolist(),
     }
 
 
 if __name__ == "__main__":
-    found = numbers(Path(sys.argv[1]))
+    result = numbers(Path(sys.argv[1]))
     if MPI.COMM_WORLD.rank == 0:
-        sys.stdout.write(json.dumps(found))
+        sys.stdout.write(json.dumps(result))
