@@ -21,6 +21,7 @@ from fem.errors import MeshError, agree
 from fem.geometry import TissueMesh
 from fem.meshcells import check_interfaces, check_straight, corners, cut_cells, dimension_of, shape_of, simplices
 from fem.meshcheck import check_cells
+from fem.meshdigest import mesh_digest
 from fem.meshparts import Parts, find_parts
 
 Floats = npt.NDArray[np.float64]
@@ -88,6 +89,7 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
     facts = (arrays.points.shape[1], arrays.cell_tags is not None, arrays.facet_tags is not None,
              arrays.parts, arrays.facet_sets, arrays.cell_sets) if arrays else None  # fmt: skip
     dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets = comm.bcast(facts)
+    digest = comm.bcast(mesh_digest(arrays) if arrays else "")
     if arrays is None:
         none = np.zeros((0, dimension))
         empty = np.zeros((0, dimension + 1), dtype=np.int64)
@@ -104,6 +106,7 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
         parts,
         facet_sets,
         cell_sets,
+        digest=digest,
     )
 
 

@@ -88,7 +88,8 @@ def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
 
 def times_columns(A: PETSc.Mat, X: Array) -> Array:
     """Return the local rows of A X for dense columns, shape (n_local, k), Fortran order. Collective."""
-    if X.shape[1] >= MANY_COLUMNS and A.getType() != PETSc.Mat.Type.PYTHON:
+    fewest = np.diff(A.getOwnershipRanges()).min()  # rows of a rank; PETSc's product crashes on one without any
+    if X.shape[1] >= MANY_COLUMNS and fewest > 0 and A.getType() != PETSc.Mat.Type.PYTHON:
         return _times_dense(A, X)
     x, y = A.createVecs()
     result = np.empty((y.getLocalSize(), X.shape[1]), order="F")

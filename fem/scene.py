@@ -143,6 +143,7 @@ class Scene(Model):
     study: Study = Field(default_factory=Study, description="how studies judge [various]")
     output: Output = Field(default_factory=Output, description="what is kept [no unit]")
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
+    _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
 
     @property
     def directory(self) -> Path:

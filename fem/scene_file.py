@@ -80,18 +80,20 @@ def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequ
 
 
 def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
-    """SHA-256 of the resolved scene and of the contents of its mesh and csv files, 64 hex digits.
+    """SHA-256 of the resolved scene, of what its mesh file holds and of the bytes of its csv file, 64 hex digits.
 
-    Top-level keys in `without` do not count; nor do folder and name of the files. Not collective.
+    Top-level keys in `without` do not count; nor do folder, name and format of the files. The mesh is the one that
+    the model of this scene was built with; without a model it is read. Not collective.
 
     Raises:
-        SceneError: a file that the scene names cannot be read.
+        SceneError, MeshError: a file that the scene names cannot be read.
     """
     data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
-    for section, key in _FILES:
-        name = data.get(section, {}).get(key)
-        if name is not None:
-            data[section][key] = hashlib.sha256(_bytes(scene, name, f"{section}.{key}")).hexdigest()
+    tissue, motion = data.get("tissue", {}), data.get("motion", {})
+    if tissue.get("mesh") is not None:
+        tissue["mesh"] = scene._mesh_digest or _mesh_digest(scene)
+    if motion.get("csv") is not None:
+        motion["csv"] = hashlib.sha256(_bytes(scene, motion["csv"], "motion.csv")).hexdigest()
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -106,6 +108,14 @@ def resolved_toml(scene: Scene) -> str:
         if isinstance(table, dict):
             lines += ["", f"[{section}]"] + [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
     return "\n".join(lines) + "\n"
+
+
+def _mesh_digest(scene: Scene) -> str:
+    from fem.meshdigest import mesh_digest
+    from fem.meshfile import load_arrays  # meshio is needed for mesh files only
+
+    tissue = scene.tissue
+    return mesh_digest(load_arrays(scene.path(str(tissue.mesh)), tissue.scale, tissue.repair))
 
 
 def _bytes(scene: Scene, name: str, key: str) -> bytes:

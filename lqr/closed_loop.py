@@ -173,7 +173,7 @@ class LoopRun(Stepped):
         if steps < 1:
             raise ControlError(f"steps = {steps} must be at least 1")
         problem = loop.problem
-        store = make_store(problem.system, options.snapshots, steps, options.every, options.directory, False)
+        store = make_store(problem.system, options.snapshots, steps, options.every, options.directory, "")
         super().__init__(problem.layout, loop.dt, steps, loop.midpoint, store, loop.solver)
         self.loop, self.problem, self.drive, self.options = loop, problem, drive, options
         n = problem.layout.n_local

@@ -13,7 +13,7 @@ from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
 from fem.effects import EFFECTS
-from fem.errors import Interrupted
+from fem.errors import Interrupted, ResourceError
 from fem.meshcheck import counted
 from fem.outputs import unit
 from fem.results import force_unit, simulate_result, write_results
@@ -58,6 +58,7 @@ def run_simulate(
                 f"; {counted(lost, 'earlier frame')} {'is' if lost == 1 else 'are'} not kept, the pictures do without"
             )
             more = missing if lost else ""
+            more += "; the fields before are left out: another run has written in their place" if frames.foreign else ""
             console.print(f"resumed from step {run.begun} of {run.steps}{more}", soft_wrap=True)
 
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
@@ -69,7 +70,7 @@ def run_simulate(
         options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
         try:
             run = simulate(model, options)
-        except Interrupted:
+        except (Interrupted, ResourceError):
             if files := frames.close():
                 list_files(console, files)
             raise

@@ -155,7 +155,7 @@ class Cache:
     """Measured points as JSON files by hash, so that an interrupted study goes on where it stopped.
 
     The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
-    of ranks and the version. Collective but for the constructor.
+    of ranks and the version. Collective.
 
     Args:
         folder: where the files are.
@@ -165,7 +165,10 @@ class Cache:
 
     def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene) -> None:
         self.folder, self.comm = folder, comm
-        self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
+        self.scene = ""  # rank 0 looks for the files
+        with agree(comm):
+            if comm.rank == 0:
+                self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
         self.hits = self.misses = 0
 
     def path(self, kind: str, key: Row) -> Path:

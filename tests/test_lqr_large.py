@@ -14,10 +14,13 @@ from mpi4py import MPI
 import lqr.adi
 from fem.build import build
 from fem.errors import CheckpointError, ResourceError, SolverError
+from lqr.adjoint import Right
 from lqr.checks import ControlError
 from lqr.dense import DenseRiccati
 from lqr.galerkin import StructuredGalerkin
 from lqr.newton import NewtonADI
+from lqr.newton_state import Iteration, load_state
+from lqr.plant import Plant
 from lqr.radi import RADI
 from lqr.shifted import factor_bytes, make_shifted
 from lqr.solve import choose, solve
@@ -230,6 +233,33 @@ def test_foreign_restart_file_is_refused(mpi_tmp_path: Path) -> None:
             NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(8)).solve(mine)
         with pytest.raises(CheckpointError, match="another control problem"):
             NewtonADI(checkpoint=folder).solve(foreign)
+
+
+def test_every_damage_of_a_restart_file_of_newton_is_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    problem, folder = problem_of("one_way"), mpi_tmp_path / "restart"
+    with pytest.raises(_StopError):
+        NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(8)).solve(problem)
+    plant, random, nothing = Plant(problem), np.random.default_rng(3), np.zeros((0, 0))
+    for path in (folder / f"newton-solve5-rank{comm.size - 1}.npz", folder / "newton.json"):
+        good = path.read_bytes()
+        bits = [(int(random.integers(len(good))), 1 << int(random.integers(8))) for _ in range(8)]
+        flipped = [good[:i] + bytes([good[i] ^ bit]) + good[i + 1 :] for i, bit in bits]
+        for bad in (*flipped, good[: len(good) // 2], b"", b"PK\x03\x04", b"[]"):
+            comm.Barrier()
+            if comm.rank == 0:
+                path.write_bytes(bad)
+            comm.Barrier()
+            with pytest.raises(CheckpointError, match=rf"{path.name} .*remove the folder"):
+                load_state(folder, plant, Iteration(Right(nothing, nothing)), 1e-10)
+        comm.Barrier()
+        if comm.rank == 0:
+            path.write_bytes(good)
+        comm.Barrier()
+    if comm.rank == 0:
+        (folder / f"newton-solve5-rank{comm.size - 1}.npz").unlink()
+    comm.Barrier()
+    with pytest.raises(CheckpointError, match=r"cannot be read .*remove the folder"):
+        NewtonADI(checkpoint=folder).solve(problem)
 
 
 def test_choice_names_its_reason() -> None:

@@ -126,7 +126,7 @@ def test_an_interrupted_run_goes_on(
     monkeypatch.setattr("study.control.solver_bar", bar(30))
     with pytest.raises(_StopError):
         run()
-    assert len(list(folder.glob("restart-*/newton-rank*.npz"))) == MPI.COMM_WORLD.size
+    assert len(list(folder.glob("restart-*/newton-*-rank*.npz"))) == MPI.COMM_WORLD.size
     solves.clear()
     monkeypatch.setattr("study.control.solver_bar", bar(-1))
     assert "going on from" in run()
