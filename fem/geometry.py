@@ -32,6 +32,7 @@ class TissueMesh:
         parts: what is known of these parts, or None.
         facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
         cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
+        notes: what of the file deserves a warning, one sentence each, on all ranks.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -43,6 +44,7 @@ class TissueMesh:
     parts: Parts | None = None
     facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
     cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
@@ -63,7 +65,7 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
         raise SceneError("tissue.size and tissue.mesh are both missing: give one of them.")
     from fem.meshfile import read_mesh  # meshio is needed for mesh files only
 
-    return read_mesh(comm, scene.directory / tissue.mesh, tissue.scale, tissue.repair)
+    return read_mesh(comm, scene.directory / tissue.mesh, tissue.scale, tissue.repair, tissue.seam)
 
 
 def structured_mesh(

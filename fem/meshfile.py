@@ -22,6 +22,7 @@ from fem.geometry import TissueMesh
 from fem.meshcells import check_interfaces, check_straight, corners, cut_cells, dimension_of, shape_of, simplices
 from fem.meshcheck import check_cells
 from fem.meshparts import Parts, find_parts
+from fem.meshseams import SEAM, doubled_nodes, doubled_text, hanging_nodes, hanging_text, sort_facets
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -49,6 +50,7 @@ class MeshArrays:
         parts: what is known of these parts, or None.
         facet_sets: marks in ``facet_tags`` of each tag number and named set.
         cell_sets: marks in ``cell_tags`` of each tag number and named set.
+        notes: what deserves a warning, one sentence each.
     """
 
     points: Floats
@@ -60,9 +62,12 @@ class MeshArrays:
     parts: Parts | None
     facet_sets: Sets
     cell_sets: Sets
+    notes: tuple[str, ...] = ()
 
 
-def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool = False) -> TissueMesh:
+def read_mesh(
+    comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool = False, seam: float = SEAM
+) -> TissueMesh:
     """Read a mesh and cut its cells into linear triangles or tetrahedra, with its facet and cell tags.
 
     Quadrilaterals, hexahedra, wedges and pyramids are cut as in `fem.meshcells.simplices`, cells of higher order with
@@ -75,7 +80,8 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
         comm: communicator of the mesh.
         path: mesh file in any format of meshio.
         scale: factor of all coordinates, e.g. 1e-3 for a file in millimetres.
-        repair: turn inverted cells round instead of refusing them.
+        repair: turn inverted cells round instead of refusing them, and join doubled nodes instead of warning of them.
+        seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].
 
     Raises:
         MeshError: the file is missing or unreadable, holds polygons, polyhedra or curved cells, a mesh of
@@ -84,10 +90,10 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
     arrays: MeshArrays | None = None
     with agree(comm):
         if comm.rank == 0:
-            arrays = load_arrays(path, scale, repair)
+            arrays = load_arrays(path, scale, repair, seam)
     facts = (arrays.points.shape[1], arrays.cell_tags is not None, arrays.facet_tags is not None,
-             arrays.parts, arrays.facet_sets, arrays.cell_sets) if arrays else None  # fmt: skip
-    dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets = comm.bcast(facts)
+             arrays.parts, arrays.facet_sets, arrays.cell_sets, arrays.notes) if arrays else None  # fmt: skip
+    dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets, notes = comm.bcast(facts)
     if arrays is None:
         none = np.zeros((0, dimension))
         empty = np.zeros((0, dimension + 1), dtype=np.int64)
@@ -104,10 +110,11 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
         parts,
         facet_sets,
         cell_sets,
+        notes,
     )
 
 
-def load_arrays(path: Path, scale: float, repair: bool) -> MeshArrays:
+def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM) -> MeshArrays:
     """Read and check a mesh file. Not collective.
 
     Raises:
@@ -145,11 +152,21 @@ def load_arrays(path: Path, scale: float, repair: bool) -> MeshArrays:
     # Facets with a node that no cell uses belong to leftover geometry.
     kept = np.isin(facets, used).all(axis=1)
     facets = np.searchsorted(used, facets[kept])
-    part_tags, parts = find_parts(points, cells, str(path)) or (None, None)
+    facet_tags = None if facet_tags is None else facet_tags[kept]
+    sides = sort_facets(cells)
+    first = doubled_nodes(points, cells, sides, seam)
+    notes = doubled_text(points, first, seam, repair, str(path))
+    if repair and notes:
+        used, number = np.unique(first, return_inverse=True)
+        points, cells = points[used], check_cells(points[used], number[cells], False, str(path))
+        _, sole = np.unique(np.sort(number[facets], axis=1), axis=0, return_index=True)  # one of both sides of a seam
+        facets, facet_tags = number[facets][sole], None if facet_tags is None else facet_tags[sole]
+        sides = sort_facets(cells)
+    notes += hanging_text(points, hanging_nodes(points, cells, sides, seam), str(path))
+    part_tags, parts = find_parts(points, cells, sides, str(path)) or (None, None)
     return MeshArrays(
-        points, cells, cell_tags, facets, None if facet_tags is None else facet_tags[kept], part_tags, parts,
-        facet_sets, cell_sets,
-    )  # fmt: skip
+        points, cells, cell_tags, facets, facet_tags, part_tags, parts, facet_sets, cell_sets, tuple(notes)
+    )
 
 
 def _read(path: Path) -> meshio.Mesh:
@@ -195,18 +212,23 @@ def _marked(
 ) -> tuple[Integers, Tags | None, Sets]:
     """The simplices of all blocks, one mark each, and the marks of each tag number and named set.
 
-    The marks are the tag numbers of the file, unless its named sets overlap them.
+    The marks count from 0: tag numbers of a file may need more than the 32 bits of a mark.
     """
     if not blocks:
         return np.zeros((0, dimension + 1), dtype=np.int64), None, {}
     nodes = np.concatenate([part[0] for part in cut])
     tags = np.zeros(len(nodes), dtype=np.int64)
+    values: list[int] = []
     if tag_name is not None:
-        tags = np.concatenate([raw.cell_data[tag_name][i][p] for (i, *_), (_, p) in zip(blocks, cut, strict=True)])
+        # Numbers of any size, signed or not, by their place among all: one array of both kinds would be of floats.
+        parts = [np.asarray(raw.cell_data[tag_name][i]) for i, *_ in blocks]
+        values = sorted({value for part in parts for value in np.unique(part).tolist()})
+        place = {value: k for k, value in enumerate(values)}
+        tags = np.concatenate([_placed(part, place)[p] for part, (_, p) in zip(parts, cut, strict=True)])
     named = _named(raw, blocks, cut)
     if tag_name is None and not named:
         return nodes, None, {}
-    marks = tags.astype(np.int64)
+    marks = tags
     for member in named.values():
         mixed = np.intersect1d(marks[member], marks[~member])
         if mixed.size:
@@ -214,13 +236,19 @@ def _marked(
     sets: Sets = {}
     if tag_name is not None:
         for tag, mark in np.unique(np.stack([tags, marks]), axis=1).T.tolist():
-            sets[tag] = (*sets.get(tag, ()), mark)
+            sets[values[tag]] = (*sets.get(values[tag], ()), mark)
     for name, number in _physical_names(raw, dimension).items():
         if tag_name == "gmsh:physical" and number in sets:
             sets[name] = sets[number]
     for name, member in named.items():
         sets[name] = tuple(np.unique(marks[member]).tolist())
     return nodes, marks.astype(np.int32), sets
+
+
+def _placed(part: npt.NDArray[np.integer], place: dict[int, int]) -> Integers:
+    """The place of each number of an array."""
+    values, inverse = np.unique(part, return_inverse=True)
+    return np.array([place[value] for value in values.tolist()], dtype=np.int64)[inverse]
 
 
 def _named(

@@ -125,7 +125,15 @@ class Tissue(Model):
     )
     mesh: Dropped[str] = Field(None, description="mesh file, relative to the scene [no unit]; excludes size, cells")
     scale: Positive = Field(1.0, description="length of one unit of the mesh file [m]")
-    repair: bool = Field(False, description="turn the inverted cells of a mesh file round [no unit]; else refuse them")
+    repair: bool = Field(
+        False,
+        description="turn the inverted cells of a mesh file round and join its doubled nodes [no unit]; "
+        "else refuse those and warn of these",
+    )
+    seam: Annotated[float, Field(gt=0, lt=0.1)] = Field(
+        1e-4,
+        description="boundary nodes of a mesh file closer than this share of the shortest edge there are doubled [1]",
+    )
     order: Literal[1, 2] = Field(1, description="polynomial order of the displacement [1]")
     thickness: Positive = Field(1.0, description="thickness out of the plane [m], 2D only")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
@@ -146,7 +154,7 @@ class Tissue(Model):
             raise ValueError(f"{missing} is missing; give size and cells, or mesh")
         if len(self.cells) != len(self.size):
             raise ValueError(f"cells is {self.cells}; it must have {len(self.size)} entries as size does")
-        for key in ("scale", "repair"):
+        for key in ("scale", "repair", "seam"):
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} needs tissue.mesh; a structured box has no use for it")
         for name, layer in self.layers.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -178,7 +179,7 @@ def gradients(model: Model, z: Array) -> tuple[float, float]:
     return max(space.layout.comm.allgather(float(size.max(initial=0.0)))), float(large / whole)
 
 
-def show_warnings(console: Console, found: list[str]) -> None:
+def show_warnings(console: Console, found: Sequence[str]) -> None:
     """Print warnings in yellow. Not collective."""
     for text in found:
         console.print(Padding.indent(Text(f"warning: {text}", "yellow"), 0), highlight=False)

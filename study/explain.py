@@ -184,7 +184,7 @@ def explain_model(model: Model) -> Explanation:
         poisson=poisson,
         missing=tuple(key for key, r in reports.items() if not r.on and r.gate.matters),
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
-        warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports)),
+        warnings=(*model.space.mesh.notes, *_warnings(scene, poisson, omega, dt, d, reports)),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
     )
