@@ -12,6 +12,7 @@ from fem import materials
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Box = Annotated[list[list[float]], Field(min_length=2, max_length=2)]
+Label = Annotated[str, Field(max_length=80, pattern=r"^[^$\\\n]*$")]  # what figures draw, where $ begins a formula
 Side = Literal["x-", "x+", "y-", "y+", "z-", "z+", "left", "right", "bottom", "top", "front", "back"]
 
 
@@ -44,7 +45,7 @@ def check_box(box: list[list[float]] | None, key: str) -> None:
 class Material(Model):
     """Isotropic linear elastic material, resolved to Lame constants and density."""
 
-    name: str | None = Field(None, description="name in the material library, or a label [no unit]")
+    name: Label | None = Field(None, description="name in the material library, or a label [no unit]")
     lam: float = Field(alias="lambda", description="first Lame constant [Pa]; 3 lambda + 2 mu > 0")
     mu: Positive = Field(description="shear modulus [Pa], > 0")
     rho: Positive = Field(description="mass density [kg/m3], > 0")
