@@ -65,7 +65,8 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
         raise SceneError("tissue.size and tissue.mesh are both missing: give one of them.")
     from fem.meshfile import read_mesh  # meshio is needed for mesh files only
 
-    return read_mesh(comm, scene.directory / tissue.mesh, tissue.scale, tissue.repair, tissue.seam)
+    path = scene.directory / tissue.mesh
+    return read_mesh(comm, path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit)
 
 
 def structured_mesh(

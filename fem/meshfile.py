@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
 from fem.errors import MeshError, agree
+from fem.foreign import read_foreign
 from fem.geometry import TissueMesh
 from fem.meshcells import check_interfaces, check_straight, corners, cut_cells, dimension_of, shape_of, simplices
 from fem.meshcheck import check_cells
@@ -66,7 +65,12 @@ class MeshArrays:
 
 
 def read_mesh(
-    comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool = False, seam: float = SEAM
+    comm: MPI.Intracomm,
+    path: Path,
+    scale: float = 1.0,
+    repair: bool = False,
+    seam: float = SEAM,
+    limit: float | None = None,
 ) -> TissueMesh:
     """Read a mesh and cut its cells into linear triangles or tetrahedra, with its facet and cell tags.
 
@@ -82,15 +86,16 @@ def read_mesh(
         scale: factor of all coordinates, e.g. 1e-3 for a file in millimetres.
         repair: turn inverted cells round instead of refusing them, and join doubled nodes instead of warning of them.
         seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].
+        limit: longest processor time for a file that meshio may never end [s]; by its size if None.
 
     Raises:
-        MeshError: the file is missing or unreadable, holds polygons, polyhedra or curved cells, a mesh of
-            surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted to cut.
+        MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or curved
+            cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
     """
     arrays: MeshArrays | None = None
     with agree(comm):
         if comm.rank == 0:
-            arrays = load_arrays(path, scale, repair, seam)
+            arrays = load_arrays(path, scale, repair, seam, limit)
     facts = (arrays.points.shape[1], arrays.cell_tags is not None, arrays.facet_tags is not None,
              arrays.parts, arrays.facet_sets, arrays.cell_sets, arrays.notes) if arrays else None  # fmt: skip
     dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets, notes = comm.bcast(facts)
@@ -114,13 +119,13 @@ def read_mesh(
     )
 
 
-def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM) -> MeshArrays:
+def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
     """Read and check a mesh file. Not collective.
 
     Raises:
         MeshError: see `read_mesh`.
     """
-    raw = _read(path)
+    raw = _read(path, limit)
     found = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]
     filled = [shape for shape, block in zip(shapes, raw.cells, strict=True) if shape and len(block.data)]
@@ -169,19 +174,20 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM) -> M
     )
 
 
-def _read(path: Path) -> meshio.Mesh:
-    if not path.is_file():
-        raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is taken relative to the scene file.")
-    said = io.StringIO()
+def _read(path: Path, limit: float | None) -> meshio.Mesh:
     try:
-        # meshio prints its complaints and may end the process; one sentence is enough.
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:
-        reason = " ".join(f"{error if not isinstance(error, SystemExit) else ''} {said.getvalue()}".split())
+        if not path.is_file():
+            raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is taken relative to the scene file.")
+        return read_foreign(path, limit)
+    except TimeoutError as error:
         raise MeshError(
-            f"meshio cannot read {path} ({reason or type(error).__name__}): check format and suffix."
-        ) from error
+            f"meshio did not end within {error} s of processor time on {path}, as on damaged files: export it again, "
+            "or raise tissue.read_limit for a large file."
+        ) from None
+    except OSError as error:
+        raise MeshError(f"{path} cannot be read ({error.strerror or error}): name a readable mesh file.") from None
+    except ValueError as error:
+        raise MeshError(f"meshio cannot read {path} ({error}): check format and suffix.") from error
 
 
 def _tag_name(raw: meshio.Mesh) -> str | None:

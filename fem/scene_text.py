@@ -117,7 +117,7 @@ def read_table(path: Path, columns: int) -> list[list[float]]:
         lines = [row for row in csv.reader(io.StringIO(read_text(path))) if row and not row[0].lstrip().startswith("#")]
     except csv.Error as error:
         raise ValueError(f"is no CSV table ({error}); give numbers with commas between") from None
-    rows = []
+    rows: list[list[float]] = []
     for i, line in enumerate(lines):
         try:
             row = [float(entry) for entry in line]

@@ -135,6 +135,9 @@ class Tissue(Model):
         1e-4,
         description="boundary nodes of a mesh file closer than this share of the shortest edge there are doubled [1]",
     )
+    read_limit: Dropped[Positive] = Field(
+        None, description="longest processor time for reading the mesh file [s]; default 10, and 1 more a megabyte"
+    )
     order: Literal[1, 2] = Field(1, description="polynomial order of the displacement [1]")
     thickness: Positive = Field(1.0, description="thickness out of the plane [m], 2D only")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
@@ -155,7 +158,7 @@ class Tissue(Model):
             raise ValueError(f"{missing} is missing; give size and cells, or mesh")
         if len(self.cells) != len(self.size):
             raise ValueError(f"cells is {self.cells}; it must have {len(self.size)} entries as size does")
-        for key in ("scale", "repair", "seam"):
+        for key in ("scale", "repair", "seam", "read_limit"):
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} needs tissue.mesh; a structured box has no use for it")
         for name, layer in self.layers.items():
