@@ -114,14 +114,13 @@ def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool
     nodes = np.flatnonzero(first != np.arange(len(first)))
     if not nodes.size:
         return []
-    count, near = counted(nodes.size, "doubled node"), f"closer than {tolerance:g} of the shortest edge"
+    count, place = counted(nodes.size, "doubled node"), _where(points[first[nodes]])
+    near = f"closer than {tolerance:g} of the shortest edge to another"
     if joined:
-        return [
-            f"{count} of {name} {_where(points[first[nodes]])} {_are(nodes)} joined: {_are(nodes)} {near} to another."
-        ]
+        return [f"{name} had {count} {place}, {near}: tissue.repair joined {'it' if nodes.size == 1 else 'them'}."]
     return [
-        f"{name} has {count} {_where(points[first[nodes]])}, {near} to another, and the body is open there as along a "
-        "crack: set tissue.repair = true to join them, unless a crack is meant."
+        f"{name} has {count} {place}, {near}, and the body is open there as along a crack: "
+        "set tissue.repair = true to join them, unless a crack is meant."
     ]
 
 
@@ -133,10 +132,6 @@ def hanging_text(points: Floats, nodes: Integers, name: str) -> list[str]:
         f"{name} has {counted(nodes.size, 'hanging node')} {_where(points[nodes])} on a side of a cell that has no "
         "corner there, and the body is open there as along a crack: remesh so that cells meet corner to corner."
     ]
-
-
-def _are(nodes: Integers) -> str:
-    return "is" if nodes.size == 1 else "are"
 
 
 def _where(x: Floats) -> str:

@@ -49,7 +49,8 @@ def test_a_seam_of_doubled_nodes_is_named_and_joined(mpi_tmp_path: Path, dimensi
     crack = 2 * (1.0 - max(tip, 0.0))
     assert area(tissue, contact_facets(tissue, whole)) == pytest.approx(BOX[d] + crack, rel=1e-6)  # the shift is 1e-7
     joined = read_mesh(COMM, path, repair=True)
-    assert f"{doubled} doubled nodes of {path} between" in joined.notes[0]
+    assert f"{path} had {doubled} doubled nodes between {ends}" in joined.notes[0]
+    assert "tissue.repair joined them" in joined.notes[0]
     assert joined.parts is None
     assert joined.mesh.geometry.index_map().size_global == (n + 1) ** d
     assert area(joined, contact_facets(joined, whole)) == pytest.approx(BOX[d], rel=WIDE)
