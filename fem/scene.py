@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from fem.scene_control import Control, ControlOutput, Loop, Reduction, Study
-from fem.scene_tissue import Contact, Dropped, Layer, Material, Model, NonNegative, Positive, Tissue
+from fem.scene_tissue import Contact, Dropped, Label, Layer, Material, Model, NonNegative, Positive, Tissue
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -130,7 +130,7 @@ class Output(Model):
 class Scene(Model):
     """A whole scene; relative file names count from `directory`."""
 
-    name: str = Field(min_length=1, description="short name [no unit]")
+    name: Label = Field(min_length=1, description="short name [no unit]")
     description: str = Field("", description="what the scene shows [no unit]")
     tissue: Tissue = Field(description="the soft body [m, Pa, kg/m3]")
     contact: Contact = Field(description="where the hand holds it [m]")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from fem.scene_tissue import Box, Model, Positive, check_box
+from fem.scene_tissue import Box, Label, Model, Positive, check_box
 
 Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 
@@ -85,7 +85,7 @@ class ControlOutput(Model):
     kind: Literal["node", "region", "hand"] = Field(description="a node, the mean of a region, or the hand [no unit]")
     point: list[float] | None = Field(None, description="the node nearest to it is taken [m]; kind node")
     box: Box | None = Field(None, description="[[lo], [hi]] [m]; mean over the nodes inside; kind region")
-    name: str = Field("", description="label [no unit]")
+    name: Label = Field("", description="label [no unit]")
 
     @model_validator(mode="after")
     def _check(self) -> ControlOutput:

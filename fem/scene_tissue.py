@@ -14,6 +14,7 @@ from fem import materials
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Box = Annotated[list[list[float]], Field(min_length=2, max_length=2)]
+Label = Annotated[str, Field(max_length=80, pattern=r"^[^$\\\n]*$")]  # what figures draw, where $ begins a formula
 Side = Literal["x-", "x+", "y-", "y+", "z-", "z+", "left", "right", "bottom", "top", "front", "back"]
 
 
@@ -55,7 +56,7 @@ def check_box(box: list[list[float]] | None, key: str) -> None:
 class Material(Model):
     """Isotropic linear elastic material, resolved to Lame constants and density."""
 
-    name: str | None = Field(None, description="name in the material library, or a label [no unit]")
+    name: Label | None = Field(None, description="name in the material library, or a label [no unit]")
     lam: float = Field(alias="lambda", description="first Lame constant [Pa]; 3 lambda + 2 mu > 0")
     mu: Positive = Field(description="shear modulus [Pa], > 0")
     rho: Positive = Field(description="mass density [kg/m3], > 0")
@@ -157,7 +158,18 @@ class Tissue(Model):
     )
     mesh: Dropped[str] = Field(None, description="mesh file, relative to the scene [no unit]; excludes size, cells")
     scale: Positive = Field(1.0, description="length of one unit of the mesh file [m]")
-    repair: bool = Field(False, description="turn the inverted cells of a mesh file round [no unit]; else refuse them")
+    repair: bool = Field(
+        False,
+        description="turn the inverted cells of a mesh file round and join its doubled nodes [no unit]; "
+        "else refuse those and warn of these",
+    )
+    seam: Annotated[float, Field(gt=0, lt=0.1)] = Field(
+        1e-4,
+        description="boundary nodes of a mesh file closer than this share of the shortest edge there are doubled [1]",
+    )
+    read_limit: Dropped[Positive] = Field(
+        None, description="longest processor time for reading the mesh file [s]; default 10, and 1 more a megabyte"
+    )
     order: Literal[1, 2] = Field(1, description="polynomial order of the displacement [1]")
     thickness: Positive = Field(1.0, description="thickness out of the plane [m], 2D only")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
@@ -178,7 +190,7 @@ class Tissue(Model):
             raise ValueError(f"{missing} is missing; give size and cells, or mesh")
         if len(self.cells) != len(self.size):
             raise ValueError(f"cells is {self.cells}; it must have {len(self.size)} entries as size does")
-        for key in ("scale", "repair"):
+        for key in ("scale", "repair", "seam", "read_limit"):
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} needs tissue.mesh; a structured box has no use for it")
         for name, layer in self.layers.items():

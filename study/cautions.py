@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -181,7 +182,7 @@ def slowest(system: BlockSystem, Z: Array) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(Q.T @ (K + K.T) @ Q / 2)[0], 0.0)))
 
 
-def show_warnings(console: Console, found: list[str]) -> None:
+def show_warnings(console: Console, found: Sequence[str]) -> None:
     """Print warnings in yellow. Not collective."""
     for text in found:
         console.print(Padding.indent(Text(f"warning: {text}", "yellow"), 0), highlight=False)

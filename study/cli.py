@@ -3,7 +3,7 @@
 # ruff: noqa: E402  (the other imports take a second, in which Ctrl-C shall not end in a traceback)
 from __future__ import annotations
 
-from study.streams import outlive_readers, quiet_imports
+from study.streams import outlive_readers, quiet_imports, write_utf8
 
 quiet_imports()
 
@@ -12,6 +12,7 @@ import os
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +22,7 @@ from rich.console import Console
 from rich.text import Text
 
 from fem import _stack as _stack  # threads and MPI before anything numerical
-from fem.errors import SceneError, SoftgraspError
+from fem.errors import SceneError, SoftgraspError, one_line
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -216,6 +217,13 @@ def hardcases(
     raise typer.Exit(0 if result["ok"] else 1)
 
 
+def _check_words(words: Sequence[str]) -> None:
+    """Refuse what DOLFINx, which looks at all arguments, and Python could not read as text."""
+    for word in words:
+        if not word.isascii() and any("\ud800" <= letter <= "\udfff" for letter in word):
+            raise SceneError(f"{word}: this argument is not text here; rename the file or set LC_ALL=C.UTF-8")
+
+
 def _end_all(comm: MPI.Intracomm) -> None:
     """End the other ranks, which may wait for this one. Not collective."""
     sys.stderr.flush()
@@ -228,7 +236,9 @@ def main() -> None:
     """Entry point: one sentence and status 1 for a user's error; a bug on one rank ends all ranks."""
     comm = MPI.COMM_WORLD
     outlive_readers()
+    write_utf8()
     try:
+        _check_words(sys.argv)
         app()
     except SoftgraspError as error:
         if comm.rank == 0:
@@ -238,7 +248,8 @@ def main() -> None:
         raise
     except OSError as error:  # a folder that cannot be made, a full disk: of one rank, so it must end all
         name = f"{error.filename}: " if error.filename else ""
-        sys.stderr.write(f"error: {name}{error.strerror or error}; check --out, its permissions and the free disk\n")
+        reason = one_line(f"{name}{error.strerror or error}; check --out, its permissions and the free disk")
+        sys.stderr.write(f"error: {reason}\n")
         _end_all(comm)
         sys.exit(1)
     except BaseException:

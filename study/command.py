@@ -18,6 +18,7 @@ from fem.build import Model, build
 from fem.results import package_version
 from fem.scene import Scene
 from fem.scene_file import load_scene_collective, resolved_toml, scene_hash
+from study.cautions import show_warnings
 
 
 def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
@@ -33,7 +34,7 @@ def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
 
 
 def open_model(scene: Scene, console: Console) -> Model:
-    """Build a scene and print its size. Collective.
+    """Build a scene and print its size and what its mesh warns of. Collective.
 
     Raises:
         SoftgraspError: the scene cannot be built.
@@ -41,6 +42,7 @@ def open_model(scene: Scene, console: Console) -> Model:
     model = build(scene, MPI.COMM_WORLD)
     layout = model.system.layout
     console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
+    show_warnings(console, model.space.mesh.notes)
     return model
 
 

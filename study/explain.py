@@ -182,7 +182,7 @@ def explain_model(model: Model) -> Explanation:
         missing=tuple(key for key, r in reports.items() if not r.on and r.gate.matters),
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
         sag=problem.sag,
-        warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
+        warnings=(*model.space.mesh.notes, *_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
         outputs={o.name: o.place for o in make_outputs(scene, system) if o.place},
         memory=need(scene, d, topology.index_map(d).size_global, layout.comm, run=True),
         snapshot_columns=columns,

@@ -76,7 +76,8 @@ def run_simulate(
             raise
     files = frames.close()
     result = simulate_result(model, run)
-    result["warnings"] = run_warnings(model, run, frames.most[1:])
+    warnings = run_warnings(model, run, frames.most[1:])
+    result["warnings"] = [*model.space.mesh.notes, *warnings]
     if comm.rank == 0:
         begin = time.perf_counter()
         files = write_results(out, model, run, result) + files + frames.draw(out, run)
@@ -84,7 +85,7 @@ def run_simulate(
         files.append(_report(out, scene, result, rows, path, overrides))
         result["time"]["pictures"] = time.perf_counter() - begin
         show(console, rows)
-        show_warnings(console, result["warnings"])
+        show_warnings(console, warnings)
         list_files(console, files)
     comm.Barrier()
     return result
