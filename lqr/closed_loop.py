@@ -189,7 +189,7 @@ class LoopRun(Stepped):
         self.C_rows = np.ascontiguousarray(problem.C_z[self.rows].T)
         self.seen = np.zeros((steps + 1, len(self.rows)))
         self.residual_first = self.residual_last = 0.0
-        self.paid, self.counted = 0.0, 0
+        self.paid, self.paid_until = 0.0, 0
         self.midpoint.dissipated = 0.0
         self.midpoint.start(self.state)
         self.record(0)
@@ -249,9 +249,9 @@ class LoopRun(Stepped):
     def _check_cost(self) -> None:
         if not np.isfinite(self.options.most):
             return
-        part = float(self._cost(self._outputs(self.counted, self.reached), self.counted)[-1])
+        part = float(self._cost(self._outputs(self.paid_until, self.reached), self.paid_until)[-1])
         self.paid += self.problem.layout.comm.bcast(part)  # the same bits on every rank: they decide when all stop
-        self.counted = self.reached
+        self.paid_until = self.reached
         if not self.paid <= self.options.most:
             raise SolverError(
                 f"the closed loop diverges: at t = {self.reached * self.dt:.6g} s its cost is {self.paid:.3g}, and no "
