@@ -137,6 +137,10 @@ class Control(Model):
 
     @model_validator(mode="after")
     def _check(self) -> Control:
+        names = [output.name or f"y{i + 1}" for i, output in enumerate(self.outputs)]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise ValueError(f"outputs[{names.index(name)}] and outputs[{i}] are both named {name}; name one anew")
         _check_weight("Q", self.Q, definite=False)
         _check_weight("R", self.R, definite=True)
         return self

@@ -24,6 +24,7 @@ from lqr.cost import predicted_cost
 from lqr.gain import Gain
 from lqr.operators import outputs
 from lqr.plant import Block
+from lqr.reduced import norm
 from lqr.reduced_loop import ReducedLoop, ReducedTrajectory
 from lqr.sampled import Sampling
 from lqr.small_plant import m_orthonormal, project
@@ -36,7 +37,7 @@ from study.outputs_named import farthest
 SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
 LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle
 TICKS = 1000  # behind the time of one tick of the controller
-SEGMENTS = 50
+NOTHING = 1e-12  # of the gain: rounding
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,9 @@ def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) ->
         name, gain = "modal", Gain.of(found.solution)
         # the factor spans the modes; what is dropped has 1e-12 of its largest column in X
         V = m_orthonormal(model.system.M_ee, found.solution.Z_v, 1e-6)
+    elif blind(found):
+        name, gain = "hand alone", Gain.of(found.solution)
+        V = np.zeros((n, 0))
     elif basis is None or basis.family is None or best is None:
         return None, "no a-priori gain of small order with tissue in it is certified to be stable"
     else:
@@ -156,6 +160,13 @@ def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) ->
     if not radius.value < largest_radius(found.modal):
         return None, f"{loop_words(law)}, its loop has the spectral radius {radius.value:.3g}, which must be below 1"
     return MadeController(controller, name, layout.comm.bcast(_tick(controller)), radius), ""
+
+
+def blind(found: Design) -> bool:
+    """Whether the optimal gain is one of the hand alone: the outputs see nothing of the tissue. Collective."""
+    problem, K = found.problem, gain_of(found.solution)
+    part = Block(np.zeros_like(K.hand), K.tall)
+    return norm(problem, part) <= NOTHING * norm(problem, K)
 
 
 def gain_of_basis(found: Design, basis: SweptBasis, N: int) -> Gain:

@@ -118,7 +118,7 @@ def test_rotations_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> No
 
 
 def test_distance_is_that_of_the_farthest_output() -> None:
-    y, names = np.array([[3.0, 4.0, 6.0, 0.0, 9.0]]), ("tip.x", "tip.y", "hand.x", "hand.y", "hand.rz")
+    y, names = np.array([[3.0, 4.0, 6.0, 0.0, 9.0]]), ("tip_x", "tip_y", "hand_x", "hand_y", "hand_rz")
     assert farthest(y, np.zeros(5), names).tolist() == [6.0]
     assert farthest(y[:, 4:], np.zeros(1), names[4:]).tolist() == [9.0]  # nothing but a rotation
     assert farthest(y[:, :2], np.zeros(2), ("a", "b")).tolist() == [5.0]
