@@ -67,6 +67,7 @@ class LoopRuns:
         to_come: cost still to come at the end, from the Riccati solution.
         reduced: under the best stable gain of each method: (title, N) and the run, or why it failed.
         small: the controller's own small plant under its gain.
+        limits: of the inputs [N, N m], inf for none; None without any.
     """
 
     plan: LoopPlan
@@ -74,6 +75,7 @@ class LoopRuns:
     to_come: float
     reduced: dict[str, tuple[str, int, LoopTrajectory | str]]
     small: ReducedTrajectory | None
+    limits: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -241,7 +243,8 @@ def run_loops(
     finally:
         loop.destroy()
     to_come = predicted_cost(problem, found.solution, full.final - found.target.state)
-    return LoopRuns(timing, full, to_come, reduced, small_run(model, found, made, timing, law))
+    small, bound = small_run(model, found, made, timing, law), law.bound(problem.layout.n_s)
+    return LoopRuns(timing, full, to_come, reduced, small, bound)
 
 
 def largest_cost(found: Design, timing: LoopPlan) -> float:

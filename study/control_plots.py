@@ -178,7 +178,7 @@ def draw_all(
     others = compared(runs)
     files += figure_histories(
         full.times, full.outputs, full.inputs, full.output_names, out / "histories.png", target=found.target.y,
-        others=others, settle=runs.plan.settle, dimension=d,
+        limits=runs.limits, others=others, settle=runs.plan.settle, dimension=d,
     )  # fmt: skip
     if any(s.reports for s in swept):
         files += figure_reduced(swept, out / "errors.png")

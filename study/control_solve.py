@@ -99,9 +99,16 @@ def actuation(model: Model) -> Actuation:
     scene = model.scene
     if scene.control is None:
         return Actuation()
-    loop = scene.control.loop
-    law = Actuation(loop.rate if loop.sampling == "held" else None, loop.delay, loop.limit)
-    law.bound(model.system.layout.n_s)
+    loop, layout = scene.control.loop, model.system.layout
+    turns = layout.n_s - layout.dimension
+    if loop.limit_torque is not None and turns == 0:
+        raise ControlError(
+            "control.loop.limit_torque limits a hand that does not turn; set effects.rotation = true, or leave it out"
+        )
+    limits = None
+    if loop.limit is not None or loop.limit_torque is not None:
+        limits = (loop.limit or np.inf,) * layout.dimension + (loop.limit_torque or np.inf,) * turns
+    law = Actuation(loop.rate if loop.sampling == "held" else None, loop.delay, limits)
     law.ticks(scene.time_end / scene.time.steps)
     return law
 
