@@ -273,7 +273,7 @@ class DenseRiccati:
         residual = dense_residual(problem, relative, Z)
         if not residual <= self.tolerance:
             raise SolverError(
-                f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.1e}; raise control.tolerance, "
+                f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.1e}; raise control.tolerance "
                 "or weigh Q and R nearer to each other"
             )
         n_e = len(tissue.M)

@@ -28,7 +28,7 @@ from study.control import run_control, with_control
 from study.control_plots import drawn, figure_reduced, unstable
 from study.control_reduced import SweptBasis
 from study.control_report import settled
-from study.control_solve import scene_words
+from study.control_solve import actuation, scene_words
 from tests.browser import look
 
 SCENES = Path(__file__).parent.parent / "demos" / "scenes"
@@ -37,6 +37,7 @@ KEYS = {
     "states", "rank", "newton_steps", "adi_steps", "residual", "optimal_cost", "gain_translation",
     "gain_rigid_velocity", "closed_loop_abscissa", "reduced", "time",
 }  # fmt: skip
+TWINS = "control.outputs=[{kind='node',point=[0.5,0.0],name='tip'},{kind='hand',name='tip'}]"
 POINT = {"N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are"}
 
 
@@ -229,6 +230,10 @@ def test_no_damping_is_diagnosed_and_modal_feedback_offered(tmp_path: Path) -> N
         ("control.outputs=[{kind='node', point=[9.0,9.0]}]", "outside"),
         ("control.loop.sampling='held'", "rate"),
         ("control.Q=[[1.0]]", "control.Q"),
+        ("control.R=1e300", "too far apart for double precision"),
+        ("control.Q=1e300", "too far apart for double precision"),
+        ("control.loop.limit_torque=1.0", "does not turn"),
+        (TWINS, "both named tip"),
     ],
 )
 def test_wrong_scenes_get_a_sentence(tmp_path: Path, change: str, words: str) -> None:
@@ -270,6 +275,35 @@ def test_an_unstable_sampled_loop_writes_nothing_and_names_a_rate(tmp_path: Path
     assert all(
         p["stable"] == (p["sampled_radius"] < 1) for r in found["retune"] for p in r["points"] if not p["reason"]
     )
+
+
+def test_the_tolerance_holds_for_the_dense_method_too(tmp_path: Path) -> None:
+    few = ["tissue.cells=[2,4]", "control.N=[4]", "control.method='dense'"]
+    assert "allowed is 1.0e-15" in refused("paper_lqr", common(tmp_path) / "out", *few, "control.tolerance=1e-15")
+    found = quietly(common(tmp_path) / "fine", *few, "control.tolerance=1e-11")
+    assert found["residual"] <= 1e-11
+
+
+def test_galerkin_with_all_modes_is_exact(tmp_path: Path) -> None:
+    """22 unknowns, fewer than the modes it starts from: the gain of the dense method."""
+    few = ["tissue.cells=[2,4]", "control.N=[4]"]
+    found = [quietly(common(tmp_path) / m, *few, f"control.method='{m}'") for m in ("galerkin", "dense")]
+    assert "all 22 basis vectors" in found[0]["method"]
+    for key in ("gain_translation", "gain_rigid_velocity"):
+        assert np.allclose(found[0][key], found[1][key], rtol=0, atol=1e-8)  # residuals 2e-10 and 2e-13
+    assert found[0]["closed_loop_abscissa"] == pytest.approx(found[1]["closed_loop_abscissa"], rel=1e-7)  # as above
+
+
+def test_forces_and_torques_have_limits_of_their_own() -> None:
+    loop = {"limit": 3.0, "limit_torque": 0.25}
+    outputs = [{"kind": "node", "point": [0.5, 0.0]}, {"kind": "hand"}]
+    for given, bound in (
+        (loop, [3.0, 3.0, 0.25]),
+        ({"limit": 3.0}, [3.0, 3.0, np.inf]),
+        ({"limit_torque": 0.25}, [np.inf, np.inf, 0.25]),
+    ):
+        scene = make_scene(effects={"rotation": True}, control={"outputs": outputs, "loop": given})
+        assert (actuation(build(scene, MPI.COMM_WORLD)).bound(3) == bound).all()
 
 
 @pytest.mark.parametrize("method", ["auto", "modal"])
