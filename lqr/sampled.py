@@ -140,9 +140,9 @@ class SampledLoop:
 
     def judge(self, K: Block, law: Sampling) -> SampledRadius:
         """Radius of a held loop under a gain, transposed, hand-relative. Collective."""
-        found = self._radius(self._parts(K), law)
-        if found.certified or self.n_e > DENSE_LIMIT:
-            return found
+        answer = self._radius(self._parts(K), law)
+        if answer.certified or self.n_e > DENSE_LIMIT:
+            return answer
         self.loop = ModalLoop(self.problem, DENSE_LIMIT)
         return self._radius(self._parts(K), law)
 
@@ -160,8 +160,8 @@ class SampledLoop:
         def at(rate: float) -> tuple[StableRate, bool]:
             ticks = max(1, int(np.ceil(rate * end * (1 - 1e-9))))
             every = max(1, int(np.ceil(end / ticks / law.dt * (1 - 1e-9))))
-            found = self._radius(parts, replace(law, dt=end / ticks / every, every=every))
-            return StableRate(ticks / end, ticks * every, found.value), found.certified and found.value < most
+            answer = self._radius(parts, replace(law, dt=end / ticks / every, every=every))
+            return StableRate(ticks / end, ticks * every, answer.value), answer.certified and answer.value < most
 
         low = 1 / (law.dt * law.every)
         for _ in range(DOUBLINGS):
