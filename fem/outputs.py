@@ -58,7 +58,7 @@ def hand_axes(n_s: int, dimension: int) -> tuple[str, ...]:
 
 def unit(name: str, rate: bool = False) -> str:
     """Unit of a component by the axis that ends its name; of its rate of change on request. Not collective."""
-    return ("rad" if name.replace(".", "_").rsplit("_", 1)[-1].startswith("r") else "m") + ("/s" if rate else "")
+    return ("rad" if name.rsplit("_", 1)[-1].startswith("r") else "m") + ("/s" if rate else "")
 
 
 def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:

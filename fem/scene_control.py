@@ -75,7 +75,10 @@ class Loop(Model):
         "midpoint", description="feedback inside the midpoint rule, or sampled and held as on a robot [no unit]"
     )
     rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
-    limit: Positive | None = Field(None, description="largest absolute load of an actuator [N]; none by default")
+    limit: Positive | None = Field(None, description="largest force on the hand in each direction [N]; none by default")
+    limit_torque: Positive | None = Field(
+        None, description="largest torque on a turning hand about each axis [N m]; none by default"
+    )
     delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
 
 
@@ -141,6 +144,10 @@ class Control(Model):
 
     @model_validator(mode="after")
     def _check(self) -> Control:
+        names = [output.name or f"y{i + 1}" for i, output in enumerate(self.outputs)]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise ValueError(f"outputs[{names.index(name)}] and outputs[{i}] are both named {name}; name one anew")
         _check_weight("Q", self.Q, definite=False)
         _check_weight("R", self.R, definite=True)
         return self

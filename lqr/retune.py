@@ -10,7 +10,7 @@ import numpy as np
 
 from fem.petsc import Array, times_columns, total
 from fem.system import LayerMaterial
-from lqr.abscissa import ModalLoop
+from lqr.abscissa import ModalLoop, SampledRadius
 from lqr.checks import ControlError
 from lqr.coordinates import gain_of
 from lqr.operators import descriptor_adjoint
@@ -18,6 +18,7 @@ from lqr.plant import Block
 from lqr.problem import RiccatiProblem, RiccatiSolution
 from lqr.reduced import GainJudge, gain_error, project
 from lqr.reduced_bases import RiccatiBasis, energy_scaled
+from lqr.sampled import Sampling
 from lqr.small_care import ReducedMatrices, solve_reduced
 from reduction.engines import on_root
 
@@ -112,7 +113,8 @@ class Retuner:
 class BoxPoint:
     """One setting of the box: errors against the full Riccati solution there.
 
-    ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop.
+    ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop, and from tick to
+    tick where its instants are known.
     """
 
     materials: Materials
@@ -122,11 +124,13 @@ class BoxPoint:
     seconds: float
     reason: str = ""
     certified: bool = True
+    sampled: SampledRadius | None = None
 
     @property
     def stable(self) -> bool:
         """Whether the full closed loop was computed and is stable."""
-        return not self.reason and self.certified and self.abscissa_full < 0
+        fine = not self.reason and self.certified and self.abscissa_full < 0
+        return fine and (self.sampled is None or self.sampled.stable)
 
 
 def over_box(
@@ -135,6 +139,7 @@ def over_box(
     solve: Callable[[RiccatiProblem], RiccatiSolution],
     start: Block,
     modes: int | None = None,
+    law: Sampling | None = None,
 ) -> tuple[BoxPoint, ...]:
     """Error of the re-tuned gain at every setting of a box. Collective.
 
@@ -144,6 +149,7 @@ def over_box(
         solve: full solver, the reference.
         start: start minus target, see :func:`lqr.reduced.hand_start`.
         modes: modes of the full closed loop, see :class:`lqr.abscissa.ModalLoop`.
+        law: instants of the loop; None judges the continuous law alone.
     """
     result = []
     comm = retuner.problem.layout.comm
@@ -157,9 +163,17 @@ def over_box(
             continue
         gain = retuner.full_gain(tuned)
         best = solve(problem)
-        found = GainJudge(problem, best, start, ModalLoop(problem, modes)).quality(gain)
-        miss = gain_error(problem, gain_of(best), gain)
+        found = GainJudge(problem, best, start, ModalLoop(problem, modes), law).quality(gain)
+        miss, excess = gain_error(problem, gain_of(best), gain), found.cost_excess
         result.append(
-            BoxPoint(materials, miss, found.cost_excess, found.abscissa, tuned.seconds, certified=found.certified)
+            BoxPoint(
+                materials,
+                miss,
+                excess,
+                found.abscissa,
+                tuned.seconds,
+                certified=found.certified,
+                sampled=found.sampled,
+            )
         )
     return tuple(result)
