@@ -3,14 +3,16 @@
 # ruff: noqa: E402  (the other imports take a second, in which Ctrl-C shall not end in a traceback)
 from __future__ import annotations
 
-from softgrasp.study.shell.streams import outlive_readers, quiet_imports
+from softgrasp.study.shell.streams import outlive_readers, quiet_imports, write_utf8
 
 quiet_imports()
 
 import json
+import os
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +22,7 @@ from rich.console import Console
 from rich.text import Text
 
 from softgrasp.fem import _stack as _stack  # threads and MPI before anything numerical
-from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.errors import SceneError, SoftgraspError, one_line
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -32,7 +34,19 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"),
 ]
-Out = Annotated[Path, typer.Option(help="folder for result.json, tables, pictures and report.html")]
+
+
+def _folder(out: Path | None) -> Path | None:
+    """Refuse a folder that cannot be one before anything is computed."""
+    if out is not None:
+        there = next(path for path in (out, *out.absolute().parents) if path.exists())
+        if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+            why = "cannot be written to" if there.is_dir() else "is a file"
+            raise SceneError(f"--out {out}: {there} {why}; name a folder, which is made if it is missing")
+    return out
+
+
+Out = Annotated[Path, typer.Option(help="folder for result.json, tables, pictures and report.html", callback=_folder)]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
 NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")]
 SceneFile = Annotated[Path, typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship")]
@@ -73,16 +87,18 @@ def scenes() -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
-    from softgrasp.fem.scene.scene import scene_schema
+    from softgrasp.study.shell.schema import full_schema
 
     if MPI.COMM_WORLD.rank == 0:
-        typer.echo(json.dumps(scene_schema(), indent=2))
+        typer.echo(json.dumps(full_schema(), indent=2))
 
 
 @app.command()
 def explain(
     scene: SceneFile,
-    out: Annotated[Path | None, typer.Option(help="also write result.json and report.html into this folder")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="also write result.json and report.html into this folder", callback=_folder)
+    ] = None,
     set_: Overrides = None,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
@@ -156,7 +172,8 @@ def study(
     out: Out = Path("out"),
     set_: Overrides = None,
     tolerance: Annotated[
-        str | None, typer.Option(help="find the cheapest setting with at most this relative error, e.g. 1e-3")
+        str | None,
+        typer.Option(help="find the cheapest setting with at most this error of the deformation, e.g. 1e-2"),
     ] = None,
     budget: Annotated[
         str | None, typer.Option(help="find the most accurate setting within this time per step, e.g. 1ms")
@@ -200,6 +217,13 @@ def hardcases(
     raise typer.Exit(0 if result["ok"] else 1)
 
 
+def _check_words(words: Sequence[str]) -> None:
+    """Refuse what DOLFINx, which looks at all arguments, and Python could not read as text."""
+    for word in words:
+        if not word.isascii() and any("\ud800" <= letter <= "\udfff" for letter in word):
+            raise SceneError(f"{word}: this argument is not text here; rename the file or set LC_ALL=C.UTF-8")
+
+
 def _end_all(comm: MPI.Intracomm) -> None:
     """End the other ranks, which may wait for this one. Not collective."""
     sys.stderr.flush()
@@ -212,7 +236,9 @@ def main() -> None:
     """Entry point: one sentence and status 1 for a user's error; a bug on one rank ends all ranks."""
     comm = MPI.COMM_WORLD
     outlive_readers()
+    write_utf8()
     try:
+        _check_words(sys.argv)
         app()
     except SoftgraspError as error:
         if comm.rank == 0:
@@ -222,7 +248,8 @@ def main() -> None:
         raise
     except OSError as error:  # a folder that cannot be made, a full disk: of one rank, so it must end all
         name = f"{error.filename}: " if error.filename else ""
-        sys.stderr.write(f"error: {name}{error.strerror or error}; check --out, its permissions and the free disk\n")
+        reason = one_line(f"{name}{error.strerror or error}; check --out, its permissions and the free disk")
+        sys.stderr.write(f"error: {reason}\n")
         _end_all(comm)
         sys.exit(1)
     except BaseException:

@@ -32,6 +32,8 @@ class TissueMesh:
         parts: what is known of these parts, or None.
         facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
         cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
+        notes: what of the file deserves a warning, one sentence each, on all ranks.
+        digest: SHA-256 of what was read from the file, on all ranks; empty without one.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -43,6 +45,8 @@ class TissueMesh:
     parts: Parts | None = None
     facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
     cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    digest: str = ""
 
 
 def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
@@ -63,7 +67,10 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
         raise SceneError("tissue.size and tissue.mesh are both missing: give one of them.")
     from softgrasp.fem.mesh.file import read_mesh  # meshio is needed for mesh files only
 
-    return read_mesh(comm, scene.directory / tissue.mesh, tissue.scale, tissue.repair)
+    path = scene.directory / tissue.mesh
+    result = read_mesh(comm, path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit)
+    scene._mesh_digest = result.digest  # the hash of the scene is of what was read, not of what the file says later
+    return result
 
 
 def structured_mesh(

@@ -96,6 +96,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
         nodes=nodes,
         reference=reference,
         extent=float((high - low).max()) or 1.0,
+        held=np.ascontiguousarray(X[contact, :d]),
     )
     return Discretisation(mesh, V, contact, free, is_e, R, layout)
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.text import check_values, parse_toml, read_text
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _FILES = (("tissue", "mesh"), ("motion", "csv"))
@@ -29,6 +30,7 @@ _EXPECTED = {
     "int_from_float": "an integer",
     "bool_type": "true or false",
     "finite_number": "a finite number",
+    "string_pattern_mismatch": "in one line without $ and \\",
 }
 
 
@@ -53,6 +55,10 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     data = _read(file)
     for override in overrides:
         _apply(data, override)
+    try:
+        check_values(data)
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}") from None
     try:
         scene = Scene.model_validate(data)
     except ValidationError as error:
@@ -80,18 +86,20 @@ def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequ
 
 
 def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
-    """SHA-256 of the resolved scene and of the contents of its mesh and csv files, 64 hex digits.
+    """SHA-256 of the resolved scene, of what its mesh file holds and of the bytes of its csv file, 64 hex digits.
 
-    Top-level keys in `without` do not count; nor do folder and name of the files. Not collective.
+    Top-level keys in `without` do not count; nor do folder, name and format of the files. The mesh is the one that
+    the model of this scene was built with; without a model it is read. Not collective.
 
     Raises:
-        SceneError: a file that the scene names cannot be read.
+        SceneError, MeshError: a file that the scene names cannot be read.
     """
     data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
-    for section, key in _FILES:
-        name = data.get(section, {}).get(key)
-        if name is not None:
-            data[section][key] = hashlib.sha256(_bytes(scene, name, f"{section}.{key}")).hexdigest()
+    tissue, motion = data.get("tissue", {}), data.get("motion", {})
+    if tissue.get("mesh") is not None:
+        tissue["mesh"] = scene._mesh_digest or _mesh_digest(scene)
+    if motion.get("csv") is not None:
+        motion["csv"] = hashlib.sha256(_bytes(scene, motion["csv"], "motion.csv")).hexdigest()
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -108,6 +116,15 @@ def resolved_toml(scene: Scene) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _mesh_digest(scene: Scene) -> str:
+    from softgrasp.fem.mesh.digest import mesh_digest
+    from softgrasp.fem.mesh.file import load_arrays  # meshio is needed for mesh files only
+
+    tissue = scene.tissue
+    path = scene.path(str(tissue.mesh))
+    return mesh_digest(load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit))
+
+
 def _bytes(scene: Scene, name: str, key: str) -> bytes:
     try:
         return scene.path(name).read_bytes()
@@ -117,17 +134,17 @@ def _bytes(scene: Scene, name: str, key: str) -> bytes:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_bytes().decode())
+        return parse_toml(read_text(file))
     except FileNotFoundError:
         near = difflib.get_close_matches(file.stem, shipped_scenes(), n=1)
         hint = f"; did you mean demos/scenes/{near[0]}.toml?" if near else "; give the path of a TOML scene file"
         raise SceneError(f"{file}: there is no such scene file{hint}") from None
     except OSError as error:
         raise SceneError(f"{file}: the scene file cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise SceneError(f"{file}: the scene file is not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{file}: the scene file is not valid TOML: {error}") from None
+    except ValueError as error:
+        raise SceneError(f"{file}: the scene file {error}") from None
 
 
 def _apply(data: dict[str, Any], override: str) -> None:
@@ -153,18 +170,20 @@ def _child(node: Any, part: str, override: str, path: str) -> Any:
 
 
 def _index(node: list[Any], part: str, override: str) -> int:
-    if not part.isdecimal() or int(part) >= len(node):
+    if not part.isdecimal() or len(part) > 9 or int(part) >= len(node):
         raise SceneError(f"--set {override}: '{part}' must be an index below {len(node)}")
     return int(part)
 
 
 def _parse(text: str, override: str) -> Any:
     try:
-        table = tomllib.loads(f"value = {text}")
+        table = parse_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
         if re.fullmatch(r"[A-Za-z_./~][A-Za-z0-9_./~+-]*", text):  # the shell ate the quotes
             return text
         raise SceneError(f"--set {override}: '{text}' is not a TOML value; a text is '\"...\"'") from None
+    except ValueError as error:
+        raise SceneError(f"--set {override}: it {error}") from None
     if table.keys() != {"value"}:
         raise SceneError(f"--set {override}: it must hold one value")
     return table["value"]

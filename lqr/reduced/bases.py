@@ -24,6 +24,7 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.engines import EPS, factor, on_root, small_svd
 from softgrasp.reduction.inner import solve_columns
+from softgrasp.reduction.states import BasisError
 
 
 @dataclass(frozen=True)
@@ -342,4 +343,7 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
     """
     if name not in BASES:
         raise ControlError(f"basis '{name}' is unknown; choose one of {', '.join(BASES)}")
-    return BASES[name](problem, costates_to_absolute(problem.system, Z))
+    try:
+        return BASES[name](problem, costates_to_absolute(problem.system, Z))
+    except BasisError as error:
+        raise ControlError(f"nothing to build this basis from ({error})") from error

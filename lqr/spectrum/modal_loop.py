@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
@@ -21,6 +21,28 @@ SOME_MODES = 150
 
 
 @dataclass(frozen=True)
+class SampledRadius:
+    """Spectral radius of a loop from tick to tick, see :mod:`lqr.spectrum.sampled`.
+
+    Attributes:
+        value: largest modulus of an eigenvalue; of the modes kept where not ``exact``.
+        certified: the radius of the whole plant lies on the same side of 1.
+        exact: all modes were kept.
+        reason: why it is not certified; empty when it is.
+    """
+
+    value: float
+    certified: bool = True
+    exact: bool = True
+    reason: str = ""
+
+    @property
+    def stable(self) -> bool:
+        """Certified and below 1."""
+        return self.certified and self.value < 1
+
+
+@dataclass(frozen=True)
 class LoopQuality:
     """The full plant under one gain.
 
@@ -29,17 +51,21 @@ class LoopQuality:
         cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
         certified: its sign is certain: from the whole spectrum, or from :func:`lqr.spectrum.certificate.certified_abscissa`.
         exact: the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth.
+        poles: eigenvalues behind it.
+        sampled: from tick to tick, where the instants of the loop are known.
     """
 
     abscissa: float
     cost_excess: float
     certified: bool = True
     exact: bool = True
+    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    sampled: SampledRadius | None = None
 
     @property
     def stable(self) -> bool:
-        """Whether every eigenvalue is known to lie left of the imaginary axis."""
-        return self.certified and self.abscissa < 0
+        """Whether every eigenvalue is known to lie left of the axis, and in the unit circle where it is sampled."""
+        return self.certified and self.abscissa < 0 and (self.sampled is None or self.sampled.stable)
 
 
 class ModalLoop:
@@ -100,13 +126,14 @@ class ModalLoop:
         def judge() -> LoopQuality:
             F = self.A + self.B @ k
             if not np.isfinite(F).all():
-                return LoopQuality(np.inf, np.inf)
+                return LoopQuality(np.inf, np.inf, poles=np.array([np.inf + 0j]))
             T, U = scipy.linalg.schur(F, output="real")
-            abscissa = float(block_eigenvalues(T).real.max())
+            poles = block_eigenvalues(T)
+            abscissa = float(poles.real.max())
             if not abscissa < 0:
-                return LoopQuality(abscissa, np.inf)
+                return LoopQuality(abscissa, np.inf, poles=poles)
             Y = lyapunov(T, U, difference.T @ self.problem.R @ difference)
-            return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal)
+            return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal, poles=poles)
 
         return on_root(self.comm, judge)
 

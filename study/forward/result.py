@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import hand_axes, unit
+from softgrasp.fem.model.outputs import hand_axes, make_outputs, unit
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import Trajectory
 from softgrasp.fem.scene.file import resolved_toml, scene_hash
@@ -30,8 +30,16 @@ def package_version() -> str:
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:
-    """Largest resident memory so far, summed over the ranks [MiB]. Collective."""
-    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+    """Largest resident memory so far, summed over the ranks [MiB]. Collective.
+
+    Linux's VmHWM starts anew with this program, unlike ``ru_maxrss``, which may show that of the launcher.
+    """
+    try:
+        text = Path("/proc/self/status").read_text()
+        local = next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):  # no Linux
+        local = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return float(comm.allreduce(local))
 
 
 def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
@@ -61,6 +69,7 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
         "hand_final": run.q_s[-1].tolist(),
         "output_names": list(run.output_names),
         "output_final": run.outputs[-1].tolist(),
+        "output_places": {o.name: o.place for o in make_outputs(model.scene, model.system) if o.place},
         "energy_drift": run.energy_drift,
         **({} if run.force is None else {"force_peak": dict(zip(axes, _peaks(run.force), strict=True))}),
         "time": {

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeR
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.file import load_scene_collective, resolved_toml, scene_hash
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.forward.cautions import show_warnings
 from softgrasp.study.forward.result import package_version
 
 
@@ -33,7 +34,7 @@ def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
 
 
 def open_model(scene: Scene, console: Console) -> Model:
-    """Build a scene and print its size. Collective.
+    """Build a scene and print its size and what its mesh warns of. Collective.
 
     Raises:
         SoftgraspError: the scene cannot be built.
@@ -41,6 +42,7 @@ def open_model(scene: Scene, console: Console) -> Model:
     model = build(scene, MPI.COMM_WORLD)
     layout = model.system.layout
     console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
+    show_warnings(console, model.space.mesh.notes)
     return model
 
 
