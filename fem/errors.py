@@ -12,9 +12,23 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # scenes are read without MPI
     from mpi4py import MPI
 
+LONGEST = 590  # letters of a sentence: some lines of a terminal
+
+
+def one_line(text: str) -> str:
+    """Text fit for one line of any terminal: control characters escaped, the middle left out beyond `LONGEST`."""
+    if len(text) > LONGEST:
+        half = (LONGEST - 5) // 2
+        text = f"{text[:half]} ... {text[-half:]}"
+    shown = "".join(c if c.isprintable() or c == "\u00a0" else ascii(c)[1:-1] for c in text)
+    return shown if len(shown) <= LONGEST else one_line(shown)
+
 
 class SoftgraspError(Exception):
     """Base of all errors that end a command with one sentence and a non-zero status."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class SceneError(SoftgraspError):

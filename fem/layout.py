@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from mpi4py import MPI
@@ -23,6 +23,7 @@ class BlockLayout:
         start: global number of the first one.
         nodes: coordinates [m] of the owned free nodes, shape (n_local / d, d).
         reference: the hand's reference point [m], shape (d,).
+        held: coordinates [m] of the owned nodes that follow the hand, shape (k, d).
         extent: longest side of the bounding box of the free nodes [m], the same on every rank.
     """
 
@@ -35,6 +36,7 @@ class BlockLayout:
     nodes: Array
     reference: Array
     extent: float = 1.0
+    held: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def states(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
 MANY_COLUMNS = 8  # below, setting up a product of matrices costs more than it saves
+BLOCK_ENTRIES = 32_768  # about so many of a block of columns
 
 
 @contextmanager
@@ -87,7 +88,8 @@ def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
 
 def times_columns(A: PETSc.Mat, X: Array) -> Array:
     """Return the local rows of A X for dense columns, shape (n_local, k), Fortran order. Collective."""
-    if X.shape[1] >= MANY_COLUMNS and A.getType() != PETSc.Mat.Type.PYTHON:
+    fewest = np.diff(A.getOwnershipRanges()).min()  # rows of a rank; PETSc's product crashes on one without any
+    if X.shape[1] >= MANY_COLUMNS and fewest > 0 and A.getType() != PETSc.Mat.Type.PYTHON:
         return _times_dense(A, X)
     x, y = A.createVecs()
     result = np.empty((y.getLocalSize(), X.shape[1]), order="F")
@@ -101,11 +103,35 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
 
 
 def _times_dense(A: PETSc.Mat, X: Array) -> Array:
-    """The same by PETSc's product with a dense matrix, which reads A once for several columns. Collective."""
-    sizes = (A.getSizes()[1], (None, X.shape[1]))
-    dense = PETSc.Mat().createDense(sizes, array=np.asfortranarray(X), comm=A.comm)
-    product = A.matMult(dense)
-    result = product.getDenseArray().copy(order="K")
-    product.destroy()
-    dense.destroy()
-    return np.asarray(result)
+    """The same by PETSc's product with a dense matrix, which reads A once for several columns. Collective.
+
+    On one rank in blocks that the C library need not ask the system for: half the time of all columns at once (n = 3718
+    and 14638, 30 to 120 columns), and as fast as SciPy's product. On more ranks every block costs messages.
+    """
+    (rows, n), k = A.getSizes()[0], X.shape[1]
+    width = max(MANY_COLUMNS, BLOCK_ENTRIES // max(n, 1)) if A.comm.size == 1 else k
+    result = np.empty((rows, k), order="F")
+    for first in range(0, k, width):
+        part = np.asfortranarray(X[:, first : first + width])
+        sizes = (A.getSizes()[1], (None, part.shape[1]))
+        dense = PETSc.Mat().createDense(sizes, array=part, comm=A.comm)
+        product = A.matMult(dense)
+        result[:, first : first + width] = product.getDenseArray(readonly=True)
+        product.destroy()
+        dense.destroy()
+    return result
+
+
+def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
+    """Run small dense work on rank 0 and broadcast what it returns or raises. Collective."""
+    answer: tuple[Any, Exception | None] = (None, None)
+    if comm.rank == 0:
+        try:
+            answer = (call(), None)
+        except Exception as error:
+            answer = (None, error)
+    result, failure = comm.bcast(answer) if comm.size > 1 else answer
+    if failure is not None:
+        raise failure
+    found: R = result
+    return found

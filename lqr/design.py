@@ -42,12 +42,12 @@ def make_problem(model: Model) -> RiccatiProblem:
     outputs = make_outputs(scene, system)
     p = sum(output.size for output in outputs)
     C_z = np.zeros((system.layout.n_local, p), order="F")
-    first, names = 0, []
+    first, names = 0, list[str]()
     for output in outputs:
         for c in range(output.size):
             # every listed dof enters with the weight of the output; a dof is listed once
             C_z[output.dofs[:, c], first + c] = output.weight
-            names.append(f"{output.name}.{output.axes[c]}")
+        names += output.names
         first += output.size
     control = scene.control
     Q = weight(1.0 if control is None else control.Q, p, "control.Q")

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import care
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
@@ -17,7 +17,6 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.bases import modal_basis
 from softgrasp.lqr.reduced.riccati import project
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
-from softgrasp.reduction.engines import on_root
 
 MODES = 60
 RANK_LEVEL = 1e-10  # singular values of X are counted down to this share of the largest

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from softgrasp.fem.petsc import total
+from softgrasp.fem.petsc import on_root, total
 from softgrasp.lqr.dense.care import care
 from softgrasp.lqr.dense.modal import factor_psd, some_modes
 from softgrasp.lqr.dense.poles import closed_loop_rates
@@ -18,7 +18,6 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import modal_basis
 from softgrasp.lqr.reduced.riccati import lift_gain, project
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
-from softgrasp.reduction.engines import on_root
 
 
 def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) -> RiccatiSolution:

@@ -81,7 +81,7 @@ def make_solver(
         checkpoint: folder for restart files; newton_adi only.
     """
     if method == "dense":
-        return DenseRiccati() if tol is None else DenseRiccati(tolerance=max(tol, 1e-9))
+        return DenseRiccati() if tol is None else DenseRiccati(tolerance=tol)
     if method == "galerkin":
         return StructuredGalerkin(tol=1e-6 if tol is None else tol, progress=progress)
     if method == "radi":

@@ -20,8 +20,8 @@ from softgrasp.reduction.model import Lift, ModelError, Outputs, ReducedModel
 FORMAT = "softgrasp reduced model 1"
 ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns
 PLAIN = (
-    "name", "N", "coordinates", "frame", "structure", "fixed_solid", "alpha", "in_space", "damped", "hand_weight",
-    "two_way", "scene_hash", "seconds",
+    "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
+    "hand_weight", "two_way", "scene_hash", "seconds",
 )  # fmt: skip
 
 
@@ -121,6 +121,7 @@ def _read(path: Path, layout: BlockLayout | None, scene_hash: str | None) -> Red
     if scene_hash is not None and data["scene_hash"] != scene_hash:
         raise ModelError(f"{path} was made for another scene (hash {data['scene_hash'][:12]}); reduce the scene again")
     materials = tuple(LayerMaterial(**m) for m in data.pop("materials"))
+    data["split"] = tuple(data.get("split", ()))
     known = {f.name for f in fields(ReducedModel)}
     return ReducedModel(
         **{key: value for key, value in data.items() if key in known},

@@ -34,6 +34,7 @@ class Basis:
         rate: weight c between displacement and momentum there; 1 unless the coordinates are canonical and weighted.
         pairs: columns come as (first half; second half) with one complex structure on (q, p) or (q, v).
         sigma: singular values the truncation was chosen from, descending (empty when no snapshots were used).
+        split: columns of every part of the decomposition; two for componentwise POD, displacement and velocity.
         seconds: time to build it, by stage.
     """
 
@@ -51,9 +52,15 @@ class Basis:
     rate: float = 1.0
     pairs: bool = False
     sigma: tuple[Array, ...] = ()
+    split: tuple[int, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def N(self) -> int:
-        """Number of basis vectors, the dimension of the first-order reduced model."""
+        """Number of basis vectors, the hand's own included: the dimension of the first-order reduced model."""
         return int(self.V_q.shape[1])
+
+    @property
+    def N_tissue(self) -> int:
+        """Columns without the hand's own 2 n_s; all of them where hand and tissue share their columns."""
+        return self.N - (2 * self.layout.n_s if self.fixed_solid else 0)

@@ -30,10 +30,10 @@ import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.basis import Basis
 from softgrasp.reduction.galerkin import symmetric
-from softgrasp.reduction.inner import solve_columns
 from softgrasp.reduction.small import Operators, Parameters, Parts
 
 MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inherits it

@@ -15,7 +15,6 @@ When a rank has fewer rows than the matrix has columns, it is small: each rank's
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -25,7 +24,7 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.reduction.states import BasisError
 
 EngineName = Literal["tsqr", "svd", "gram"]
@@ -57,21 +56,6 @@ class Factor:
     floor: float
     partial: bool
     square: float
-
-
-def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
-    """Run small dense work on rank 0 and broadcast what it returns or raises. Collective."""
-    answer: tuple[Any, Exception | None] = (None, None)
-    if comm.rank == 0:
-        try:
-            answer = (call(), None)
-        except Exception as error:
-            answer = (None, error)
-    result, failure = comm.bcast(answer) if comm.size > 1 else answer
-    if failure is not None:
-        raise failure
-    found: R = result
-    return found
 
 
 def magnitude(comm: MPI.Intracomm, *blocks: Array) -> float:

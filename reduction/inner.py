@@ -32,7 +32,7 @@ import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, times_columns, total
-from softgrasp.fem.solve.solvers import choose_solver, make_solver
+from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.basis import Basis
 from softgrasp.reduction.states import BasisError
@@ -134,39 +134,6 @@ class Rows:
     def gram(self, X: Array, Y: Array) -> Array:
         """X' Y over all ranks. Collective."""
         return total(self.layout.comm, X.T @ Y)
-
-
-def solve_columns(
-    A: PETSc.Mat, layout: BlockLayout, X: Array, where: str = "the inner product", rtol: float = 1e-12
-) -> Array:
-    """Return the local rows of A^-1 X, A symmetric positive definite, Fortran order. Collective.
-
-    Factored once; columns of zeros cost nothing.
-
-    Args:
-        A: distributed over the ranks of ``layout``.
-        layout: sizes and ownership.
-        X: local rows (n_local, k).
-        where: what it is for, in messages.
-        rtol: of cg, where no direct solver fits.
-
-    Raises:
-        SolverError: the factorisation fails, or the solution has a large residual.
-    """
-    solver = make_solver(A.copy(), choose_solver(layout, few=True)[0], layout, "softgrasp_inner_", rtol)
-    b, x = A.createVecs()
-    result = np.zeros(X.shape, order="F")
-    try:
-        for j in np.flatnonzero(total(layout.comm, np.abs(X).sum(axis=0)) != 0):
-            b.array_w[:] = X[:, j]
-            solver.solve(b, x)
-            solver.check(b, x, where)
-            result[:, j] = x.array_r
-    finally:
-        solver.destroy()
-        b.destroy()
-        x.destroy()
-    return result
 
 
 def orthonormality(basis: Basis, system: BlockSystem) -> float:

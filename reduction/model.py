@@ -26,6 +26,14 @@ class UnstableModelError(SoftgraspError):
     """A reduced model with growing modes was about to be run."""
 
 
+def singular(X: Array) -> bool:
+    """Whether a square matrix is singular to rounding once its rows and columns are balanced. Not collective."""
+    sizes = np.abs(X)
+    rows, columns = (np.sqrt(np.where(m > 0, m, 1.0)) for m in (sizes.max(axis=1), sizes.max(axis=0)))
+    values = np.linalg.svd(X / np.outer(rows, columns), compute_uv=False)
+    return bool(values[-1] <= 4 * len(X) * np.finfo(float).eps * values[0])
+
+
 @dataclass(frozen=True)
 class Lift:
     """Rows that turn reduced states into tissue states relative to the hand; the only distributed part of a model.
@@ -118,12 +126,9 @@ class SmallModel:
         Raises:
             ModelError: E is singular to rounding, as with linearly dependent columns.
         """
-        E = np.abs(self.operators.E)
-        if not np.isfinite(E).all():
+        if not np.isfinite(self.operators.E).all():
             raise ModelError(f"{self.name}: the reduced matrices are not finite; check basis and materials")
-        rows, columns = (np.sqrt(np.where(m > 0, m, 1.0)) for m in (E.max(axis=1), E.max(axis=0)))
-        values = np.linalg.svd(self.operators.E / np.outer(rows, columns), compute_uv=False)
-        if values[-1] <= 4 * self.N * np.finfo(float).eps * values[0]:
+        if singular(self.operators.E):
             raise ModelError(
                 f"{self.name}: the reduced E is singular; its basis vectors are linearly dependent, take fewer"
             )
@@ -153,14 +158,18 @@ class SmallModel:
         """State at rest under gravity with the hand at the origin, (N,).
 
         Raises:
-            ModelError: the hand is not fixed, so that the model has no such coordinates.
+            ModelError: the hand is not fixed, so that the model has no such coordinates, or there is no such state, or
+                more than one.
         """
         if not self.fixed_solid:
             raise ModelError(f"{self.name}: an equilibrium needs a basis with fixed solid modes")
         k = 2 * self.n_s
         x = np.zeros(self.N)
         if self.f.any():
-            x[k:] = -np.linalg.solve(self.operators.A[k:, k:], self.f[k:])
+            A = self.operators.A[k:, k:]
+            if singular(A):  # as with more displacements than velocities in the basis
+                raise ModelError(f"{self.name}: the basis has no single equilibrium under gravity; take another N")
+            x[k:] = -np.linalg.solve(A, self.f[k:])
         return x
 
 
@@ -178,6 +187,7 @@ class ReducedModel:
         parts: small matrices, the same bits on every rank.
         materials: those of the projection.
         outputs: of the scene.
+        split: columns of every part of the basis, see :class:`reduction.basis.Basis`.
         alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
         damped: damping terms were projected.
         hand_weight, two_way: effects of the scene.
@@ -196,6 +206,7 @@ class ReducedModel:
     parts: Parts
     materials: tuple[LayerMaterial, ...]
     outputs: Outputs
+    split: tuple[int, ...] = ()
     alpha: float = 0.0
     in_space: bool = False
     damped: bool = False

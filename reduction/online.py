@@ -36,8 +36,9 @@ class ReducedTrajectory:
     output_names: tuple[str, ...]
 
 
-def _check_stable(model: SmallModel, allow_unstable: bool) -> None:
-    if not (allow_unstable or model.stable):
+def _check_stable(step: Propagator, allow_unstable: bool) -> None:
+    if not (allow_unstable or step.stable):
+        model = step.model
         raise UnstableModelError(
             f"{model.name} with N = {model.N} is unstable (spectral abscissa {model.spectral_abscissa:.2e} 1/s); "
             "choose another N or a structure-preserving basis, or run with allow_unstable"
@@ -69,15 +70,12 @@ def run(
     if (force is None) == (hand is None):
         raise ModelError("give either the force on the hand or the motion of the hand")
     step = prepared(model, dt, hand is not None)
+    _check_stable(step, allow_unstable)
     model = step.model
-    _check_stable(model, allow_unstable)
     inputs = force_inputs(model, force) if hand is None else hand_inputs(model, hand, step.dt)
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
-    x = march(step, inputs, step.X_inverse @ start[model.N - step.size :]) @ step.X.T
-    if hand is None:
-        return trajectory(model, step.dt, x, x @ model.operators.S_q.T, x @ model.operators.S_v.T)
-    q, v = hand
-    return trajectory(model, step.dt, np.hstack([consistent(q, v, step.dt), v, x]), q, v)
+    w = march(step, inputs, step.X_inverse @ start[model.N - step.size :])
+    return trajectory(step, w, hand)
 
 
 def prepared(model: SmallModel | Propagator, dt: float | None, driven: bool) -> Propagator:
@@ -118,10 +116,16 @@ def hand_inputs(model: SmallModel, hand: tuple[Array, Array], dt: float) -> Arra
     return np.hstack([(q[1:] + q[:-1]) / 2, (v[1:] + v[:-1]) / 2, np.diff(v, axis=0) / dt])
 
 
-def trajectory(model: SmallModel, dt: float, x: Array, q: Array, v: Array) -> ReducedTrajectory:
-    """Bundle states (steps + 1, N) with the outputs."""
+def trajectory(step: Propagator, w: Array, hand: tuple[Array, Array] | None) -> ReducedTrajectory:
+    """Bundle states w (steps + 1, k) with the hand, prescribed or of the states, and the outputs."""
+    model, op, x = step.model, step.model.operators, w @ step.X.T
+    if hand is None:
+        q, v = x @ op.S_q.T, x @ op.S_v.T
+    else:
+        q, v = hand
+        x = np.hstack([consistent(q, v, step.dt), v, x])
     y = x @ model.outputs.C_z.T + q @ model.outputs.C_s.T
-    return ReducedTrajectory(dt * np.arange(float(len(x))), x, q, v, y, model.outputs.names)
+    return ReducedTrajectory(step.dt * np.arange(float(len(x))), x, q, v, y, model.outputs.names)
 
 
 class Stepper:
@@ -145,8 +149,8 @@ class Stepper:
         allow_unstable: bool = False,
     ) -> None:
         self.step = prepared(model, dt, False)
+        _check_stable(self.step, allow_unstable)
         model = self.step.model
-        _check_stable(model, allow_unstable)
         k, op = self.step.size, model.operators
         C = model.outputs.C_z + model.outputs.C_s @ op.S_q
         # new state, and outputs of the new state, in one product
@@ -177,45 +181,53 @@ class Stepper:
 def run_batch(
     models: Sequence[SmallModel | Propagator],
     dt: float,
-    forces: Array,
+    forces: Array | None = None,
     allow_unstable: bool = False,
+    hands: tuple[Array, Array] | None = None,
 ) -> list[ReducedTrajectory]:
     """Many parameters or many inputs at once, from rest: one product for the whole batch at a time.
+
+    Conservative models of many parameters go mode by mode, one after the other, since each has angles of its own.
 
     Args:
         models: one for all runs, or one for each; all of one dimension.
         dt: step [s].
         forces: (runs, steps, n_s), or (steps, n_s) for all runs [N, N m].
         allow_unstable: run models with growing modes all the same.
+        hands: q_s and v_s of prescribed hands instead, (runs, steps + 1, n_s) or (steps + 1, n_s) for all runs.
 
     Raises:
         UnstableModelError: a model is unstable and ``allow_unstable`` is not set.
-        ModelError: the batch does not fit together.
+        ModelError: the batch does not fit together, or neither or both of forces and hands are given.
     """
-    steps = [prepared(m, dt, False) for m in models]
-    u = np.asarray(forces, dtype=float)
-    if u.ndim == 2:
-        u = np.broadcast_to(u, (len(steps), *u.shape))
+    if (forces is None) == (hands is None):
+        raise ModelError("give either the forces on the hand or the motions of the hand")
+    steps = [prepared(m, dt, hands is not None) for m in models]
+    tables = [np.asarray(forces, dtype=float)] if hands is None else [np.asarray(table, dtype=float) for table in hands]
+    tables = [np.broadcast_to(t, (len(steps), *t.shape)) if t.ndim == 2 else t for t in tables]
     n_s = steps[0].model.n_s if steps else 0
-    sizes = {s.matrix.shape for s in steps}
-    if len(sizes) != 1 or u.ndim != 3 or u.shape[2] != n_s or (len(steps) not in (1, len(u))):
+    sizes, shape = {s.size for s in steps}, tables[0].shape
+    if (
+        len(sizes) != 1 or len(shape) != 3 or shape[2] != n_s or len(steps) not in (1, shape[0])
+        or any(t.shape != shape for t in tables)
+    ):  # fmt: skip
+        what = "forces" if hands is None else "hands"
         raise ModelError(
-            f"{len(steps)} models of the shapes {sorted(sizes)} do not fit forces of the shape {u.shape}; give one "
-            "model or one for each run, all with one N"
+            f"{len(steps)} models of the dimensions {sorted(sizes)} do not fit {what} of the shape "
+            f"{' and '.join(str(t.shape) for t in tables)}; give one model or one for each run, all with one N"
         )
     for s in steps:
-        _check_stable(s.model, allow_unstable)
-    result = []
-    for i, w in enumerate(_states(steps, u)):
-        s = steps[i if len(steps) > 1 else 0]
-        x, op = w @ s.X.T, s.model.operators
-        result.append(trajectory(s.model, dt, x, x @ op.S_q.T, x @ op.S_v.T))
-    return result
+        _check_stable(s, allow_unstable)
+    own = [None if hands is None else (tables[0][i], tables[1][i]) for i in range(shape[0])]
+    u = tables[0] if hands is None else np.stack([hand_inputs(steps[0].model, h, dt) for h in own if h is not None])
+    many = len(steps) > 1
+    return [trajectory(steps[i if many else 0], w, own[i]) for i, w in enumerate(_states(steps, u))]
 
 
 def _states(steps: Sequence[Propagator], u: Array) -> Array:
     """States w from rest, (runs, steps + 1, k)."""
-    if len(steps) > 1 and sum(s.block.nbytes for s in steps) > TOGETHER:
+    alone = all(s.modal is not None for s in steps) or sum(s.block.nbytes for s in steps) > TOGETHER
+    if len(steps) > 1 and alone:
         return np.stack([march(s, own, np.zeros(s.size)) for s, own in zip(steps, u, strict=True)])
     (runs, number, m), k, b = u.shape, steps[0].size, steps[0].steps
     count = -(-number // b)

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg
 from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, on_root
 from softgrasp.reduction.basis import Coordinates
-from softgrasp.reduction.engines import EngineName, Factor, factor, on_root, small_svd
+from softgrasp.reduction.engines import EngineName, Factor, factor, small_svd
 from softgrasp.reduction.inner import InnerName, Rows, Weight, weights
 from softgrasp.reduction.states import BasisError, Blocks, States
 from softgrasp.reduction.truncation import Columns, Part

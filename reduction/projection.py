@@ -86,6 +86,7 @@ def project(
         parts=parts,
         materials=system.materials,
         outputs=project_outputs(outputs, lift),
+        split=basis.split,
         alpha=damping.alpha,
         in_space=damping.in_space,
         damped=damping.active,

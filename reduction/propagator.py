@@ -11,108 +11,102 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from softgrasp.fem.petsc import Array
+from softgrasp.reduction.modal import Coordinates, Modal, modal_of
 from softgrasp.reduction.model import ModelError, SmallModel
 from softgrasp.reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
 
 STEPS = 8  # in one product: more would not gain at N = 30, where a product costs as much as the call
 BLOCK_ENTRIES = 32_768  # of the matrix of several steps: 256 kB stay in a core's own cache
 
-SLOW = 0.01  # sine or cosine below which one unit in the last place of the other turns by 1e-12 of the angle
-
 
 @dataclass(frozen=True)
 class Propagator:
     """One step in energy coordinates, w_{n+1} = matrix [w_n; u_n; 1], and b of them at once.
 
+    A conservative model also has ``modal``, which runs without either; they are then made when they are first used.
+
     Attributes:
         model: what it steps.
         dt: step [s].
-        matrix: (k, k + m + 1) for m inputs, C order.
-        block: [w_{n+1}; ...; w_{n+b}] = block [w_n; u_n; ...; u_{n+b-1}; 1], (b k, k + b m + 1), C order.
-        X: x = X w, (N or the tissue's own coordinates, k).
-        X_inverse: w = X_inverse x.
+        at: coordinates, x = X w.
+        E, A: of the equations that are stepped, all of the model or those of its tissue.
+        loads: [input of u, constant load], (N or the tissue's own coordinates, m + 1).
         driven: the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step.
+        modal: the same mode by mode, for conservative models.
     """
 
     model: SmallModel
     dt: float
-    matrix: Array
-    block: Array
-    X: Array
-    X_inverse: Array
+    at: Coordinates
+    E: Array
+    A: Array
+    loads: Array
     driven: bool = False
+    modal: Modal | None = None
+
+    @property
+    def X(self) -> Array:
+        """Columns X of x = X w, (N or the tissue's own coordinates, k)."""
+        return self.at.X
+
+    @property
+    def X_inverse(self) -> Array:
+        """Rows of w = X_inverse x."""
+        return self.at.X_inverse
 
     @property
     def size(self) -> int:
         """Length k of w."""
-        return len(self.matrix)
+        return len(self.at.X)
 
     @property
     def steps(self) -> int:
         """Steps b in one product with ``block``."""
-        return len(self.block) // len(self.matrix)
+        return int(np.clip(BLOCK_ENTRIES // max(self.size, 1) ** 2, 1, STEPS))
+
+    @property
+    def stable(self) -> bool:
+        """Nothing grows: by structure where the modes are known, else by the eigenvalues of the model."""
+        return self.modal is not None or self.model.stable
+
+    @cached_property
+    def matrix(self) -> Array:
+        """One step, (k, k + m + 1) for m inputs, C order.
+
+        Raises:
+            ModelError: E - dt/2 A is singular.
+        """
+        dt, X = self.dt, self.X
+        try:
+            implicit = (self.E - dt / 2 * self.A) @ X
+            matrix = np.linalg.solve(implicit, np.hstack([(self.E + dt / 2 * self.A) @ X, dt * self.loads]))
+        except np.linalg.LinAlgError as error:
+            name = self.model.name
+            raise ModelError(f"{name}: E - dt/2 A is singular at dt = {dt:g} s; take another step") from error
+        matrix[:, : self.size] = self._exact(matrix[:, : self.size], 1)
+        return np.ascontiguousarray(matrix)
+
+    @cached_property
+    def block(self) -> Array:
+        """[w_{n+1}; ...; w_{n+b}] = block [w_n; u_n; ...; u_{n+b-1}; 1], (b k, k + b m + 1), C order."""
+        return several(self.matrix, self.steps, self._exact)
+
+    def _exact(self, P: Array, steps: int) -> Array:
+        """Entries of P^steps that are known: rotations, and the free hand."""
+        self.at.fix(P, steps * 2 * np.arctan(self.at.omega * self.dt / 2), steps in (1, self.steps))
+        if self.model.fixed_solid and not (self.model.two_way or self.driven):
+            k = 2 * self.model.n_s
+            P[:k] = 0.0
+            P[:k, :k] = np.eye(k) + np.diag(np.full(self.model.n_s, steps * self.dt), self.model.n_s)
+        return P
 
 
-def rotation(angle: Array) -> tuple[Array, Array]:
-    """Cosine and sine whose squares add up to 1 to about 1e-18, at worst (near 45 degrees) 1e-16.
-
-    Plain rounding leaves |c^2 + s^2 - 1| ~ 1e-16, a systematic growth of 1e-11 over 1e5 steps. Here the larger of the
-    two moves by units in the last place and the smaller one follows on the circle; the angle changes by less than
-    1e-12 of itself. Below :data:`SLOW` that cannot be had, and the angle stays as it is.
-    """
-    wide = np.longdouble  # 64 bits of mantissa or more; where it is a plain double the growth stays at rounding
-    c, s = np.cos(angle), np.sin(angle)
-    large, small = np.where(np.abs(c) > np.abs(s), c, s), np.where(np.abs(c) > np.abs(s), s, c)
-    moves = np.array(sorted(range(-200, 201), key=abs), dtype=float)
-    larges = large[:, None] + moves * np.spacing(np.abs(large))[:, None]
-    squares = np.maximum(1 - larges.astype(wide) ** 2, 0)
-    smalls = np.copysign(np.sqrt(squares), small[:, None]).astype(float)
-    defects = np.abs(squares - smalls.astype(wide) ** 2)
-    # the smallest move that does, else the best one
-    best = np.where((defects < 1e-18).any(axis=1), (defects < 1e-18).argmax(axis=1), defects.argmin(axis=1))
-    rows, fast = np.arange(len(c)), np.abs(small) > SLOW
-    large, small = np.where(fast, larges[rows, best], large), np.where(fast, smalls[rows, best], small)
-    swap = np.abs(c) > np.abs(s)
-    return np.where(swap, large, small), np.where(swap, small, large)
-
-
-@dataclass(frozen=True)
-class _Coordinates:
-    """x = X w, with what is known of a step in w.
-
-    Attributes:
-        X, X_inverse: x = X w and w = X_inverse x.
-        omega: frequencies of the pairs of modes that follow each other from ``first`` on.
-        first: number of the first mode.
-        still: number of coordinates after the modes that nothing moves; the modes then move each other alone. None when
-            other coordinates may move the modes.
-    """
-
-    X: Array
-    X_inverse: Array
-    omega: Array
-    first: int = 0
-    still: int | None = None
-
-    def fix(self, P: Array, angle: Array, often: bool) -> None:
-        """Overwrite the modes by plane rotations, well rounded ones if applied again and again."""
-        if not len(angle):
-            return
-        c, s = rotation(angle) if often else (np.cos(angle), np.sin(angle))
-        i, end = self.first + 2 * np.arange(len(angle)), self.first + 2 * len(angle)
-        if self.still is None:
-            P[self.first : end, self.first : end] = 0.0
-        else:
-            P[: end + self.still] = 0.0
-            P[end : end + self.still, end : end + self.still] = np.eye(self.still)
-        P[i, i], P[i, i + 1], P[i + 1, i], P[i + 1, i + 1] = c, -s, s, c
-
-
-def _coordinates(model: SmallModel, driven: bool) -> _Coordinates:
+def _coordinates(model: SmallModel, driven: bool) -> Coordinates:
     """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
     apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
     found = None if apart or not model.structured else _whole(model)
@@ -123,26 +117,28 @@ def _coordinates(model: SmallModel, driven: bool) -> _Coordinates:
         return tissue
     X, X_inverse = np.eye(N), np.eye(N)
     if tissue is None:
-        return _Coordinates(X, X_inverse, np.zeros(0))
+        return Coordinates(X, X_inverse, np.zeros(0))
     X[k:, k:], X_inverse[k:, k:] = tissue.X, tissue.X_inverse
-    return _Coordinates(X, X_inverse, tissue.omega, k)
+    return Coordinates(X, X_inverse, tissue.omega, k)
 
 
-def _tissue(model: SmallModel, apart: bool) -> _Coordinates:
+def _tissue(model: SmallModel, apart: bool) -> Coordinates:
     """Coordinates of the tissue beside the hand's own; ``apart`` if no hand moves with it, so that it has modes."""
     op, block = model.operators, slice(2 * model.n_s, model.N)
     E, A, L = op.E[block, block], op.A[block, block], energy_factor(op.energy[block, block])
     if L is None:
-        return _Coordinates(np.eye(len(A)), np.eye(len(A)), np.zeros(0))
+        return Coordinates(np.eye(len(A)), np.eye(len(A)), np.zeros(0))
     U, omega = np.eye(len(L)), np.zeros(0)
+    still = None
     if model.structured and apart:
         S = balanced(E, A, L)
         if is_skew(S):
             U, omega = skew_modes((S - S.T) / 2)
-    return _Coordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega)
+            still = len(L) - 2 * len(omega)
+    return Coordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega, 0, still)
 
 
-def _whole(model: SmallModel) -> _Coordinates | None:
+def _whole(model: SmallModel) -> Coordinates | None:
     """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
 
     H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
@@ -162,7 +158,7 @@ def _whole(model: SmallModel) -> _Coordinates | None:
         return None
     U, omega = skew_modes((S - S.T) / 2)
     X, X_inverse = np.hstack([R_plus @ U, V_0 / D[:, None]]), np.vstack([U.T @ R, V_0.T * D])
-    return _Coordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
+    return Coordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
 
 
 def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator:
@@ -190,27 +186,10 @@ def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator
     else:
         inputs, f = op.B, model.f
     loads = np.hstack([inputs, f[:, None]])
-    try:
-        implicit = (E - dt / 2 * A) @ at.X
-        matrix = np.linalg.solve(implicit, np.hstack([(E + dt / 2 * A) @ at.X, dt * loads]))
-    except np.linalg.LinAlgError as error:
-        raise ModelError(f"{model.name}: E - dt/2 A is singular at dt = {dt:g} s; take another step") from error
-    angle = 2 * np.arctan(at.omega * dt / 2)
-    free = n_s if model.fixed_solid and not model.two_way and not driven else 0
-
-    def exact(P: Array, steps: int) -> Array:
-        """Entries of P^steps that are known: rotations, and the free hand."""
-        at.fix(P, steps * angle, steps in (1, count))
-        if free:
-            P[:k] = 0.0
-            P[:k, :k] = np.eye(k) + np.diag(np.full(free, steps * dt), free)
-        return P
-
-    size = len(at.X)
-    count = int(np.clip(BLOCK_ENTRIES // max(size, 1) ** 2, 1, STEPS))
-    matrix[:, :size] = exact(matrix[:, :size], 1)
-    block = several(matrix, count, exact)
-    return Propagator(model, dt, np.ascontiguousarray(matrix), block, at.X, at.X_inverse, driven)
+    step = Propagator(model, dt, at, E, A, loads, driven, modal_of(at, E, A, loads, dt))
+    if step.modal is None:
+        _ = step.block  # needed by every run, and its matrix may be refused
+    return step
 
 
 def several(matrix: Array, steps: int, exact: Callable[[Array, int], Array]) -> Array:
@@ -235,6 +214,8 @@ def march(step: Propagator, inputs: Array, start: Array) -> Array:
     A row of the table is [w of the block; inputs of the next block; 1], so that neither inputs nor results are copied
     in the loop.
     """
+    if step.modal is not None:
+        return step.modal.march(inputs, start)
     k, b, (steps, m) = step.size, step.steps, inputs.shape
     blocks = -(-steps // b)
     rows = np.zeros((blocks + 1, b * k + b * m + 1))

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem.petsc import Array, total
-from softgrasp.reduction.engines import Factor, magnitude, on_root, small_svd
-from softgrasp.reduction.inner import Rows, Weight, solve_columns, weights
+from softgrasp.fem.petsc import Array, on_root, total
+from softgrasp.fem.solve.statics import solve_columns
+from softgrasp.reduction.engines import Factor, magnitude, small_svd
+from softgrasp.reduction.inner import Rows, Weight, weights
 from softgrasp.reduction.pod import Request, cholesky_of, weighted_factor
 from softgrasp.reduction.svd_like import svd_like_pairs, symplectic_repair
 from softgrasp.reduction.truncation import Columns, Part

@@ -105,6 +105,9 @@ METHODS: dict[str, Method] = _methods()
 PAPER_METHODS = ("global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed")
 """The six of the paper, in its order."""
 
+PAPER_PLAIN = ("global_pod", "componentwise_pod")
+"""Those of the six that the paper counts as not structure-preserving; fixed solid modes keep its block structure."""
+
 
 def find_method(name: str) -> Method:
     """Look a basis up.
@@ -179,7 +182,7 @@ def make_bases(
     whole = Basis(
         method.key, states.layout, *(np.zeros((0, 0)),) * 4, method.coordinates, method.frame, method.structure,
         method.fixed, metric, parts[0].rate, method.pairs,
-        tuple(part.scale * part.sigma for part in parts if len(part.sigma)), seconds,
+        tuple(part.scale * part.sigma for part in parts if len(part.sigma)), (), seconds,
     )  # fmt: skip
     return tuple(_cut(whole, columns, c) for c in counts)
 
@@ -214,5 +217,6 @@ def _cut(whole: Basis, columns: Sequence[tuple[Columns, ...]], counts: tuple[int
         V_sv=joined([c.s_p for c in sets]),
         V_q=joined([c.e_q for c in sets]),
         V_p=joined([c.e_p for c in sets]),
+        split=tuple((2 if whole.pairs else 1) * k for k in counts),
         seconds=dict(whole.seconds),
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model
@@ -17,6 +18,8 @@ from softgrasp.reduction.engines import factor
 from softgrasp.reduction.errors import full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.propagator import Propagator, propagator
+
+REST = 1e-9  # of the largest displacement: a solve for an equilibrium leaves 1e-12, a motion of use far more
 
 
 @dataclass(frozen=True)
@@ -49,14 +52,30 @@ def reference(model: Model, trajectory: Trajectory) -> Reference:
     """Bundle a full run with what the comparison needs. Collective.
 
     Raises:
-        SceneError: the run kept no snapshots in memory.
+        SceneError: the run kept no snapshots in memory, or the body is at rest in all of them.
     """
     snapshots = trajectory.snapshots
     if snapshots is None:
         raise SceneError("output.snapshots must be 'memory' for a reduction; bases are built from the states in memory")
+    if at_rest(snapshots):
+        raise SceneError(
+            f"hand and tissue of scene {model.scene.name} stay at rest for the whole run, so there is no motion to "
+            "reduce; give a motion.target away from the start, or another time.start"
+        )
     force = hand_force(model.system, trajectory, snapshots)
     hand = (trajectory.q_s, trajectory.v_s)
     return Reference(model, trajectory, snapshots, full_energy(model.system, snapshots), force, hand)
+
+
+def at_rest(snapshots: Snapshots) -> bool:
+    """Whether no displacement changes by more than rounding from the first snapshot on. Collective."""
+    layout = snapshots.layout
+    z = snapshots.Z[: layout.n_local]
+    change, size = (
+        layout.comm.allreduce(max(float(np.abs(x).max(initial=0.0)) for x in parts), MPI.MAX)
+        for parts in ((z - z[:, :1], snapshots.q_s - snapshots.q_s[:, :1]), (z, snapshots.q_s))
+    )
+    return bool(change <= REST * size)
 
 
 def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots) -> Array:

@@ -8,8 +8,8 @@ import numpy as np
 import scipy.linalg
 from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array
-from softgrasp.reduction.engines import EPS, on_root
+from softgrasp.fem.petsc import Array, on_root
+from softgrasp.reduction.engines import EPS
 
 # eigenvalues of X'JX carry an absolute error eps * |X|^2: a stage takes those that keep about ten digits
 STAGE = 1e-6

@@ -56,7 +56,7 @@ class Truncation:
 
     Attributes:
         N: dimension of the whole basis, with the hand's columns.
-        energy: share of sum sigma^2 to keep in every part, 0 < energy < 1.
+        energy: share of sum sigma^2 to keep at least in every part, 0 < energy < 1.
         tol: relative projection error sqrt(sum of dropped sigma^2 / total) to reach in every part, 0 < tol < 1.
     """
 
@@ -95,7 +95,10 @@ def needed(sigma: Array, total: float, share: float) -> int | None:
 
 
 def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) -> tuple[int, ...]:
-    """Share N - hand columns among the parts, greedily by sigma^2 over the total of the part. Not collective.
+    """Share N - hand columns equally among the parts, the first ones taking one more where it does not divide.
+
+    What a part cannot carry goes to the others. Displacement and velocity need equally many vectors, whatever their
+    singular values say: a displacement without its velocity cannot move. Not collective.
 
     Args:
         parts: families of units.
@@ -122,19 +125,16 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
         raise BasisError(
             f"{name}: N = {N} is more than the snapshots carry above rounding ({found}); ask for N <= {most}", most
         )
-    if len(parts) == 1:
-        return (want,)
-    queue = sorted(
-        (-float(part.sigma[j] ** 2) / part.total, i, j)
-        for i, part in enumerate(parts)
-        for j in range(min(part.rank, want))
-    )
-    chosen = [i for _, i, _ in queue[:want]]
-    return tuple(chosen.count(i) for i in range(len(parts)))
+    counts = [0] * len(parts)
+    for _ in range(want):
+        # the emptiest part that has a vector left, the first of several
+        i = min((i for i, rank in enumerate(ranks) if counts[i] < rank), key=lambda i: counts[i])
+        counts[i] += 1
+    return tuple(counts)
 
 
 def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, name: str) -> tuple[int, ...]:
-    """Units of every part by the rule. Not collective.
+    """Units of every part by the rule; parts are equal, so that each keeps at least its share. Not collective.
 
     Raises:
         BasisError: N does not fit, or the rule asks for more than the rank.
@@ -152,4 +152,4 @@ def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, na
         counts.append(k)
     if not any(counts):
         raise BasisError(f"{name}: the snapshots of the {' and of the '.join(p.title for p in parts)} are zero")
-    return tuple(counts)
+    return tuple(min(max(counts), part.rank) for part in parts)

@@ -8,6 +8,7 @@ from softgrasp.study.shell.streams import quiet_imports
 quiet_imports()
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,19 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"),
 ]
-Out = Annotated[Path, typer.Option(help="folder for result.json, tables, pictures and report.html")]
+
+
+def _folder(out: Path | None) -> Path | None:
+    """Refuse a folder that cannot be one before anything is computed."""
+    if out is not None:
+        there = next(path for path in (out, *out.absolute().parents) if path.exists())
+        if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+            why = "cannot be written to" if there.is_dir() else "is a file"
+            raise SceneError(f"--out {out}: {there} {why}; name a folder, which is made if it is missing")
+    return out
+
+
+Out = Annotated[Path, typer.Option(help="folder for result.json, tables, pictures and report.html", callback=_folder)]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
 NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")]
 SceneFile = Annotated[Path, typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship")]
@@ -79,16 +92,18 @@ def scenes() -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
-    from softgrasp.fem.scene.scene import scene_schema
+    from softgrasp.study.shell.schema import full_schema
 
     if rank() == 0:
-        typer.echo(json.dumps(scene_schema(), indent=2))
+        typer.echo(json.dumps(full_schema(), indent=2))
 
 
 @app.command()
 def explain(
     scene: SceneFile,
-    out: Annotated[Path | None, typer.Option(help="also write result.json and report.html into this folder")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="also write result.json and report.html into this folder", callback=_folder)
+    ] = None,
     set_: Overrides = None,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
@@ -165,7 +180,8 @@ def study(
     out: Out = Path("out"),
     set_: Overrides = None,
     tolerance: Annotated[
-        str | None, typer.Option(help="find the cheapest setting with at most this relative error, e.g. 1e-3")
+        str | None,
+        typer.Option(help="find the cheapest setting with at most this error of the deformation, e.g. 1e-2"),
     ] = None,
     budget: Annotated[
         str | None, typer.Option(help="find the most accurate setting within this time per step, e.g. 1ms")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from softgrasp.fem.effects.sag import Sag
     from softgrasp.fem.scene.scene import Scene
     from softgrasp.fem.system import LayerMaterial
 
@@ -44,7 +45,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Problem:
-    """Scales of one scene; `fem.model.scales` computes them.
+    """Scales of one scene; `fem.fields.scales` computes them.
 
     Attributes:
         scene: the scene.
@@ -55,6 +56,7 @@ class Problem:
         tissue_inertia: moments of inertia of the rigid tissue about the reference, one per rotation [kg m2].
         omega: lowest angular frequencies of the clamped tissue [1/s], ascending; empty when not computed.
         zeta: damping ratio of each of them [1].
+        sag: the tissue at rest under its weight.
     """
 
     scene: Scene
@@ -65,6 +67,7 @@ class Problem:
     tissue_inertia: tuple[float, ...]
     omega: tuple[float, ...]
     zeta: tuple[float, ...]
+    sag: Sag
 
 
 class Effect(Protocol):

@@ -8,7 +8,6 @@ import numpy as np
 
 from softgrasp.fem.effects.gate import Gate, Problem
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.scene.materials import young_poisson
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -43,16 +42,18 @@ class Gravity:
         return ()
 
     def gate(self, problem: Problem) -> Gate:
-        """Strain scale rho g L / E of the softest layer for its weight. Not collective."""
-        gravity = problem.scene.effects.gravity
-        g = EARTH if gravity is None else float(np.linalg.norm(gravity.g))
-        softness = max(m.rho / young_poisson(m.lam, m.mu)[0] for m in problem.materials)
-        number = softness * g * problem.length
-        threshold = 0.01
-        matters = number > threshold
-        if gravity is None:
-            sentence = f"Off; in SI units and with g = {EARTH} it would strain the tissue by about {number:.2g}."
-        else:
-            sentence = f"The weight strains the tissue by about {number:.2g}."
-        proviso = "if its numbers are in SI units" if gravity is None else ""
-        return Gate(number, "rho g L / E", threshold, matters, sentence, proviso)
+        """Gradient of the static displacement under the weight, bending included; `fem.fields.sag` solves for it.
+
+        Not collective.
+        """
+        off, sag, length = problem.scene.effects.gravity is None, problem.sag, problem.length
+        number, threshold = sag.gradient.typical, 0.01
+        bends = f"sag by {sag.largest:.2g} m, {sag.largest / length:.2g} of its length {length:.3g} m"
+        steep = f"|grad z| is {sag.gradient.largest:.2g} at most"
+        begin = (
+            f"Off; in SI units and with g = {EARTH} the tissue would" if off else "Under its weight the tissue would"
+        )
+        holds = "holds" if sag.gradient.small else f"does not hold, {sag.gradient.share:.0%} of the body is above 0.1"
+        sentence = f"{begin} {bends}, by linear elasticity; {steep}: the theory {holds}."
+        proviso = "if its numbers are in SI units" if off else ""
+        return Gate(number, "|grad z| of its sag", threshold, number > threshold, sentence, proviso)

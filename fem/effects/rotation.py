@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from softgrasp.fem.effects import reaction as reaction_gate
 from softgrasp.fem.effects.gate import Gate, Problem, force_drives
 from softgrasp.fem.petsc import Array
 
@@ -64,9 +65,13 @@ class Rotation:
         else:
             number = float(np.max(np.asarray(problem.tissue_inertia) / hand))
         if not self.active(scene):
-            matters = scene.effects.reaction and force_drives(scene) and number > THRESHOLD
+            reaction = scene.effects.reaction
+            pulled = reaction or problem.tissue_mass / scene.hand.mass > reaction_gate.THRESHOLD
+            matters = pulled and force_drives(scene) and number > THRESHOLD
             sentence = (
                 "Off, though the tissue pulls on a hand that a force drives and would turn it."
+                if matters and reaction
+                else "Off; with the reaction, which this scene calls for too, the tissue would turn the hand."
                 if matters
                 else "Off; nothing in this scene turns the hand."
                 if not scene.effects.reaction
@@ -75,7 +80,8 @@ class Rotation:
             condition = ""
             if number > THRESHOLD and not matters:
                 condition = "counts only where a force drives the hand and effects.reaction is on"
-            return Gate(number, symbol, THRESHOLD, matters, sentence, condition=condition)
+            proviso = "together with reaction" if matters and not reaction else ""
+            return Gate(number, symbol, THRESHOLD, matters, sentence, proviso, condition)
         angles = (scene.motion.target or [])[d:]
         turned = scene.motion.profile == "csv" or any(angles)
         torque = force_drives(scene)

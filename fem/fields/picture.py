@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from softgrasp.fem.fields.series import FullField
-from softgrasp.fem.mesh.make import cell_nodes
+from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import cells_of_layers
 from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.petsc import Array, rows_on_root
@@ -110,7 +110,7 @@ def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
     node_dof[cell_nodes(space.mesh.mesh)] = dofmap.list[:, : d + 1]
     dofs = node_dof[:owned]
     full = FullField(model)
-    columns = z.reshape(len(z), -1)
+    columns = z[:, None] if z.ndim == 1 else z  # a rank may own no row
     hands = np.asarray(q_s, dtype=np.float64).reshape(len(q_s), -1)
     local = np.empty((owned, columns.shape[1] * d))
     for j in range(columns.shape[1]):

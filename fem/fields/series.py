@@ -10,6 +10,7 @@ import dolfinx.fem
 import dolfinx.io
 import numpy as np
 
+from softgrasp.fem.disk import check_room
 from softgrasp.fem.errors import ResourceError, agree
 from softgrasp.fem.petsc import Array
 
@@ -54,6 +55,11 @@ class FullField:
         return self.u
 
 
+def owner_file(series: Path) -> Path:
+    """The small file beside a field series that names its run. Not collective."""
+    return series.with_suffix(".run")
+
+
 class SeriesWriter:
     """Displacement, and velocity if given, against time in files that ParaView opens.
 
@@ -89,12 +95,13 @@ class SeriesWriter:
         self.fields = 0  # known at the first write
         self.file: Any = None
 
-    def rename(self, name: str) -> None:
-        """Choose another stem of the files, before the first write. Not collective."""
+    def rename(self, name: str, run: str = "") -> None:
+        """Choose another stem of the files, and the run's name, before the first write. Not collective."""
         suffixes = (".bp",) if self.format == "vtx" else (".xdmf", ".h5")
         self.files = tuple(self.directory / f"{name}{suffix}" for suffix in suffixes)
+        self.run = run
 
-    def write(self, t: float, z: Array, v: Array, q_s: Array, v_s: Array | None = None) -> None:
+    def write(self, t: float, z: Array, v: Array, q_s: Array, v_s: Array | None = None, *, reserve: int = 0) -> None:
         """Append one instant. Collective.
 
         Args:
@@ -102,9 +109,15 @@ class SeriesWriter:
             z, v: relative displacement [m] and velocity [m/s] on the owned free dofs, shape (n_local,).
             q_s: hand, shape (n_s,) [m, rad].
             v_s: its velocity, shape (n_s,) [m/s, rad/s]; without it in the first call no velocity is written.
+            reserve: bytes that must stay free on the disk.
+
+        Raises:
+            ResourceError: the disk is full, or soon will be; what was written before is whole.
         """
+        fields = self.fields or (1 if v_s is None else 2)
+        check_room(self.comm, self.files, self._bytes(fields), reserve)
         if self.file is None:
-            self._open(1 if v_s is None else 2)
+            self._open(fields)
         states = ((z, q_s), (v, v_s))
         for full, written, (tissue, hand) in zip(self.full[: self.fields], self.written, states, strict=False):
             full.fill(tissue, np.zeros(self.full[0].R.shape[1]) if hand is None else hand)
@@ -124,8 +137,21 @@ class SeriesWriter:
         self.file = None
         return self.files
 
+    def _bytes(self, fields: int) -> int:
+        """About what one instant takes of all ranks, with the mesh if it is the first; on rank 0. Not collective."""
+        if self.comm.rank > 0:
+            return 0
+        space = self.written[0].function_space
+        topology = space.mesh.topology
+        nodes, cells = space.dofmap.index_map.size_global, topology.index_map(topology.dim).size_global
+        mesh = 24 * nodes + 8 * cells * (space.dofmap.list.shape[1] + 1) if self.file is None else 0
+        return int(1.5 * mesh + 36 * fields * nodes)  # three numbers a node, half as much for what goes with them
+
     def _open(self, fields: int) -> None:
         self.fields = fields
+        with agree(self.comm):
+            if self.comm.rank == 0:
+                owner_file(self.files[0]).write_text(self.run)
         written = list(self.written[:fields])
         if self.format == "vtx":
             policy = dolfinx.io.VTXMeshPolicy.reuse  # the mesh does not change: write it once

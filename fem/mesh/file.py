@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-from dataclasses import dataclass
 from pathlib import Path
 
 import basix.ufl
@@ -18,6 +15,7 @@ from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, agree
+from softgrasp.fem.mesh.arrays import Floats, Integers, MeshArrays, Sets, Tags
 from softgrasp.fem.mesh.cells import (
     check_interfaces,
     check_straight,
@@ -28,49 +26,26 @@ from softgrasp.fem.mesh.cells import (
     simplices,
 )
 from softgrasp.fem.mesh.check import check_cells
-from softgrasp.fem.mesh.make import TissueMesh
-from softgrasp.fem.mesh.parts import Parts, find_parts
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-Tags = npt.NDArray[np.int32]
+from softgrasp.fem.mesh.digest import mesh_digest
+from softgrasp.fem.mesh.foreign import read_foreign
+from softgrasp.fem.mesh.parts import find_parts
+from softgrasp.fem.mesh.seams import SEAM, doubled_nodes, doubled_text, hanging_nodes, hanging_text, sort_facets
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 
 _SHAPES = {2: "triangle", 3: "tetrahedron"}
 _TAG_NAMES = ("gmsh:physical", "medit:ref", "CellEntityIds")  # preferred names of integer cell data
 _NOT_TAGS = ("gmsh:geometrical",)  # numbers of CAD entities, not marks of the user
 _NO_TAGS: Tags = np.zeros(0, dtype=np.int32)
 
-Sets = dict[int | str, tuple[int, ...]]
 
-
-@dataclass(frozen=True)
-class MeshArrays:
-    """A simplex mesh in arrays, before distribution.
-
-    Attributes:
-        points: shape (n_points, d) [m].
-        cells: shape (n_cells, d + 1).
-        cell_tags: one integer a cell, or None.
-        facets: tagged facets, shape (n_facets, d).
-        facet_tags: one integer a tagged facet, or None.
-        part_tags: number of the facet-connected part of each cell, or None if there is one part only.
-        parts: what is known of these parts, or None.
-        facet_sets: marks in ``facet_tags`` of each tag number and named set.
-        cell_sets: marks in ``cell_tags`` of each tag number and named set.
-    """
-
-    points: Floats
-    cells: Integers
-    cell_tags: Tags | None
-    facets: Integers
-    facet_tags: Tags | None
-    part_tags: Tags | None
-    parts: Parts | None
-    facet_sets: Sets
-    cell_sets: Sets
-
-
-def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool = False) -> TissueMesh:
+def read_mesh(
+    comm: MPI.Intracomm,
+    path: Path,
+    scale: float = 1.0,
+    repair: bool = False,
+    seam: float = SEAM,
+    limit: float | None = None,
+) -> TissueMesh:
     """Read a mesh and cut its cells into linear triangles or tetrahedra, with its facet and cell tags.
 
     Quadrilaterals, hexahedra, wedges and pyramids are cut as in `fem.mesh.cells.simplices`, cells of higher order with
@@ -83,19 +58,22 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
         comm: communicator of the mesh.
         path: mesh file in any format of meshio.
         scale: factor of all coordinates, e.g. 1e-3 for a file in millimetres.
-        repair: turn inverted cells round instead of refusing them.
+        repair: turn inverted cells round instead of refusing them, and join doubled nodes instead of warning of them.
+        seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].
+        limit: longest processor time for a file that meshio may never end [s]; by its size if None.
 
     Raises:
-        MeshError: the file is missing or unreadable, holds polygons, polyhedra or curved cells, a mesh of
-            surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted to cut.
+        MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or curved
+            cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
     """
     arrays: MeshArrays | None = None
     with agree(comm):
         if comm.rank == 0:
-            arrays = load_arrays(path, scale, repair)
+            arrays = load_arrays(path, scale, repair, seam, limit)
     facts = (arrays.points.shape[1], arrays.cell_tags is not None, arrays.facet_tags is not None,
-             arrays.parts, arrays.facet_sets, arrays.cell_sets) if arrays else None  # fmt: skip
-    dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets = comm.bcast(facts)
+             arrays.parts, arrays.facet_sets, arrays.cell_sets, arrays.notes) if arrays else None  # fmt: skip
+    dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets, notes = comm.bcast(facts)
+    digest = comm.bcast(mesh_digest(arrays) if arrays else "")
     if arrays is None:
         none = np.zeros((0, dimension))
         empty = np.zeros((0, dimension + 1), dtype=np.int64)
@@ -112,16 +90,18 @@ def read_mesh(comm: MPI.Intracomm, path: Path, scale: float = 1.0, repair: bool 
         parts,
         facet_sets,
         cell_sets,
+        notes,
+        digest,
     )
 
 
-def load_arrays(path: Path, scale: float, repair: bool) -> MeshArrays:
+def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
     """Read and check a mesh file. Not collective.
 
     Raises:
         MeshError: see `read_mesh`.
     """
-    raw = _read(path)
+    raw = _read(path, limit)
     found = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]
     filled = [shape for shape, block in zip(shapes, raw.cells, strict=True) if shape and len(block.data)]
@@ -153,26 +133,37 @@ def load_arrays(path: Path, scale: float, repair: bool) -> MeshArrays:
     # Facets with a node that no cell uses belong to leftover geometry.
     kept = np.isin(facets, used).all(axis=1)
     facets = np.searchsorted(used, facets[kept])
-    part_tags, parts = find_parts(points, cells, str(path)) or (None, None)
+    facet_tags = None if facet_tags is None else facet_tags[kept]
+    sides = sort_facets(cells)
+    first = doubled_nodes(points, cells, sides, seam)
+    notes = doubled_text(points, first, seam, repair, str(path))
+    if repair and notes:
+        used, number = np.unique(first, return_inverse=True)
+        points, cells = points[used], check_cells(points[used], number[cells], False, str(path))
+        _, sole = np.unique(np.sort(number[facets], axis=1), axis=0, return_index=True)  # one of both sides of a seam
+        facets, facet_tags = number[facets][sole], None if facet_tags is None else facet_tags[sole]
+        sides = sort_facets(cells)
+    notes += hanging_text(points, hanging_nodes(points, cells, sides, seam), str(path))
+    part_tags, parts = find_parts(points, cells, sides, str(path)) or (None, None)
     return MeshArrays(
-        points, cells, cell_tags, facets, None if facet_tags is None else facet_tags[kept], part_tags, parts,
-        facet_sets, cell_sets,
-    )  # fmt: skip
+        points, cells, cell_tags, facets, facet_tags, part_tags, parts, facet_sets, cell_sets, tuple(notes)
+    )
 
 
-def _read(path: Path) -> meshio.Mesh:
-    if not path.is_file():
-        raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is taken relative to the scene file.")
-    said = io.StringIO()
+def _read(path: Path, limit: float | None) -> meshio.Mesh:
     try:
-        # meshio prints its complaints and may end the process; one sentence is enough.
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:
-        reason = " ".join(f"{error if not isinstance(error, SystemExit) else ''} {said.getvalue()}".split())
+        if not path.is_file():
+            raise MeshError(f"The mesh file {path} does not exist: tissue.mesh is taken relative to the scene file.")
+        return read_foreign(path, limit)
+    except TimeoutError as error:
         raise MeshError(
-            f"meshio cannot read {path} ({reason or type(error).__name__}): check format and suffix."
-        ) from error
+            f"meshio did not end within {error} s of processor time on {path}, as on damaged files: export it again, "
+            "or raise tissue.read_limit for a large file."
+        ) from None
+    except OSError as error:
+        raise MeshError(f"{path} cannot be read ({error.strerror or error}): name a readable mesh file.") from None
+    except ValueError as error:
+        raise MeshError(f"meshio cannot read {path} ({error}): check format and suffix.") from error
 
 
 def _tag_name(raw: meshio.Mesh) -> str | None:
@@ -203,18 +194,23 @@ def _marked(
 ) -> tuple[Integers, Tags | None, Sets]:
     """The simplices of all blocks, one mark each, and the marks of each tag number and named set.
 
-    The marks are the tag numbers of the file, unless its named sets overlap them.
+    The marks count from 0: tag numbers of a file may need more than the 32 bits of a mark.
     """
     if not blocks:
         return np.zeros((0, dimension + 1), dtype=np.int64), None, {}
     nodes = np.concatenate([part[0] for part in cut])
     tags = np.zeros(len(nodes), dtype=np.int64)
+    values: list[int] = []
     if tag_name is not None:
-        tags = np.concatenate([raw.cell_data[tag_name][i][p] for (i, *_), (_, p) in zip(blocks, cut, strict=True)])
+        # Numbers of any size, signed or not, by their place among all: one array of both kinds would be of floats.
+        parts = [np.asarray(raw.cell_data[tag_name][i]) for i, *_ in blocks]
+        values = sorted({value for part in parts for value in np.unique(part).tolist()})
+        place = {value: k for k, value in enumerate(values)}
+        tags = np.concatenate([_placed(part, place)[p] for part, (_, p) in zip(parts, cut, strict=True)])
     named = _named(raw, blocks, cut)
     if tag_name is None and not named:
         return nodes, None, {}
-    marks = tags.astype(np.int64)
+    marks = tags
     for member in named.values():
         mixed = np.intersect1d(marks[member], marks[~member])
         if mixed.size:
@@ -222,13 +218,19 @@ def _marked(
     sets: Sets = {}
     if tag_name is not None:
         for tag, mark in np.unique(np.stack([tags, marks]), axis=1).T.tolist():
-            sets[tag] = (*sets.get(tag, ()), mark)
+            sets[values[tag]] = (*sets.get(values[tag], ()), mark)
     for name, number in _physical_names(raw, dimension).items():
         if tag_name == "gmsh:physical" and number in sets:
             sets[name] = sets[number]
     for name, member in named.items():
         sets[name] = tuple(np.unique(marks[member]).tolist())
     return nodes, marks.astype(np.int32), sets
+
+
+def _placed(part: npt.NDArray[np.integer], place: dict[int, int]) -> Integers:
+    """The place of each number of an array."""
+    values, inverse = np.unique(part, return_inverse=True)
+    return np.array([place[value] for value in values.tolist()], dtype=np.int64)[inverse]
 
 
 def _named(

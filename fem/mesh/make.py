@@ -3,46 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import dolfinx.mesh
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 
 if TYPE_CHECKING:
-    from softgrasp.fem.mesh.parts import Parts
     from softgrasp.fem.scene.scene import Scene
-
-
-@dataclass(frozen=True)
-class TissueMesh:
-    """A mesh of linear triangles or tetrahedra and what is known of it.
-
-    Attributes:
-        mesh: distributed mesh; the topological dimension equals the geometric one.
-        dimension: 2 or 3.
-        facet_tags: integer marks of boundary facets, or None.
-        cell_tags: integer marks of cells (layers), or None.
-        source: "structured" or the name of the mesh file, for messages.
-        part_tags: number of the part of each cell, parts hanging together through facets; None if it is one.
-        parts: what is known of these parts, or None.
-        facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
-        cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
-    """
-
-    mesh: dolfinx.mesh.Mesh
-    dimension: int
-    facet_tags: dolfinx.mesh.MeshTags | None
-    cell_tags: dolfinx.mesh.MeshTags | None
-    source: str
-    part_tags: dolfinx.mesh.MeshTags | None = None
-    parts: Parts | None = None
-    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
-    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
 
 
 def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
@@ -63,7 +34,10 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
         raise SceneError("tissue.size and tissue.mesh are both missing: give one of them.")
     from softgrasp.fem.mesh.file import read_mesh  # meshio is needed for mesh files only
 
-    return read_mesh(comm, scene.directory / tissue.mesh, tissue.scale, tissue.repair)
+    path = scene.directory / tissue.mesh
+    result = read_mesh(comm, path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit)
+    scene._mesh_digest = result.digest  # the hash of the scene is of what was read, not of what the file says later
+    return result
 
 
 def structured_mesh(
@@ -102,10 +76,3 @@ def structured_mesh(
     else:
         mesh = dolfinx.mesh.create_box(comm, corners, list(cells))
     return TissueMesh(mesh, dimension, None, None, "structured")
-
-
-def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
-    """Local node numbers of the cells, shape (n_cells, d + 1). Not collective."""
-    geometry = mesh.geometry
-    # DOLFINx 0.10 has no list of dofmaps, 0.11 warns of the single one
-    return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)

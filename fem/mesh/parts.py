@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh.check import components, place_text
+from softgrasp.fem.mesh.seams import Facets
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -39,27 +40,27 @@ class Parts:
     joints: Integers
 
 
-def find_parts(points: Floats, cells: Integers, name: str) -> tuple[npt.NDArray[np.int32], Parts] | None:
+def find_parts(
+    points: Floats, cells: Integers, facets: Facets, name: str
+) -> tuple[npt.NDArray[np.int32], Parts] | None:
     """Label the cells of each facet-connected part from 0; None if the mesh is one part.
 
     Args:
         points: shape (n_points, d) [m].
         cells: simplices, shape (n_cells, d + 1).
+        facets: their facets.
         name: name of the mesh, for messages.
 
     Raises:
         MeshError: a facet has more than two cells.
     """
-    n, corners = cells.shape
-    facets = np.sort(np.concatenate([np.delete(cells, i, axis=1) for i in range(corners)]), axis=1)
-    order = np.lexsort(facets.T)
-    same = (facets[order[1:]] == facets[order[:-1]]).all(axis=1)
-    if (crowded := same[1:] & same[:-1]).any():
-        place = points[facets[order[np.argmax(crowded)]]].mean(axis=0)
+    n = len(cells)
+    if (crowded := facets.same[1:] & facets.same[:-1]).any():
+        place = points[facets.nodes[np.argmax(crowded)]].mean(axis=0)
         raise MeshError(
             f"{name} has facets with more than two cells, the first around {place_text(place)}: remove doubled cells."
         )
-    one, other = order[:-1][same] % n, order[1:][same] % n
+    one, other = facets.cells[:-1][facets.same], facets.cells[1:][facets.same]
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
     count, labels = connected_components(graph.tocsr(), directed=False)
     if count == 1:

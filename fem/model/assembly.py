@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import BlockLayout, bounding_box
-from softgrasp.fem.mesh.make import TissueMesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.system import Component, LayerBlocks
@@ -96,6 +96,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
         nodes=nodes,
         reference=reference,
         extent=float((high - low).max()) or 1.0,
+        held=np.ascontiguousarray(X[contact, :d]),
     )
     return Discretisation(mesh, V, contact, free, is_e, R, layout)
 

@@ -17,6 +17,7 @@ from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise
 from softgrasp.fem.model.contact import rigid_modes
+from softgrasp.fem.model.memory import check_memory, simplices
 from softgrasp.fem.system import (
     BlockSystem,
     LayerBlocks,
@@ -78,15 +79,28 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
-def build(scene: Scene, comm: MPI.Intracomm) -> Model:
+def build(scene: Scene, comm: MPI.Intracomm, *, run: bool = True) -> Model:
     """Mesh, assemble and couple. Collective.
+
+    Args:
+        scene: the scene.
+        comm: ranks.
+        run: its steps will be taken, so their tables must fit too.
 
     Raises:
         SceneError, MeshError: with one sentence that names the key or the file.
+        ResourceError: the memory of a node cannot hold it; estimated before anything is allocated, for a mesh file
+            when its cells are known.
     """
     watch, inventory = Stopwatch(comm), Inventory()
+    boxed = scene.tissue.cells
+    if boxed:
+        check_memory(scene, comm, run, len(boxed), simplices(boxed))
     with watch.stage("mesh"):
         mesh = make_mesh(comm, scene)
+    if not boxed:
+        d = mesh.dimension
+        check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)
     with watch.stage("assembly"):
         space = discretise(mesh, scene)
         layers = assemble(space, scene, inventory)

@@ -14,8 +14,8 @@ from softgrasp.fem.errors import MeshError, SceneError, agree
 from softgrasp.fem.mesh.check import counted, place_text
 
 if TYPE_CHECKING:
-    from softgrasp.fem.mesh.make import TissueMesh
     from softgrasp.fem.mesh.parts import Parts
+    from softgrasp.fem.mesh.tissue_mesh import TissueMesh
     from softgrasp.fem.scene.scene import Contact
 
 Ints = npt.NDArray[np.int32]
@@ -121,7 +121,7 @@ def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
         raise MeshError(
             f"{loose.size} of {groups} separate parts of {source} touch no contact facet, "
             f"the first with {counted(cells.sum(), 'cell')} around {place_text(middle)}: "
-            "remove such parts, join them to the body or extend [contact]."
+            "join them to the body (tissue.repair = true joins doubled nodes), remove them or extend [contact]."
         )
     moving = _moving(parts, held, source)
     if not moving.any():

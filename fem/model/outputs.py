@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.system import BlockSystem
 
@@ -27,6 +29,7 @@ class Output:
         C_s: rigid part, (size, n_s), on every rank.
         point: coordinates [m] of the node, or of the centre of the region.
         axes: of the components, see :func:`hand_axes`.
+        place: the node that is taken, or the nodes of the mean, in words; empty for the hand.
     """
 
     name: str
@@ -36,6 +39,7 @@ class Output:
     C_s: Array
     point: tuple[float, ...] = ()
     axes: tuple[str, ...] = ("x", "y", "z")
+    place: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -54,7 +58,7 @@ def hand_axes(n_s: int, dimension: int) -> tuple[str, ...]:
 
 def unit(name: str, rate: bool = False) -> str:
     """Unit of a component by the axis that ends its name; of its rate of change on request. Not collective."""
-    return ("rad" if name.replace(".", "_").rsplit("_", 1)[-1].startswith("r") else "m") + ("/s" if rate else "")
+    return ("rad" if name.rsplit("_", 1)[-1].startswith("r") else "m") + ("/s" if rate else "")
 
 
 def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
@@ -65,7 +69,8 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     """
     wanted = scene.control.outputs if scene.control is not None else []
     if not wanted:
-        return (_node(system, "tip", _farthest(system)),)
+        tip = _node(system, "tip", _farthest(system))
+        return (replace(tip, place=f"node {_coordinates(tip.point)}, the free one farthest from the hand"),)
     result = []
     for i, output in enumerate(wanted):
         name = output.name or f"y{i + 1}"
@@ -92,7 +97,30 @@ def _node(system: BlockSystem, name: str, point: Array) -> Output:
     mine = layout.comm.rank == rank
     dofs = np.arange(first, first + d)[None, :] if mine else np.zeros((0, d), int)
     C_s = layout.comm.bcast(system.T[first : first + d].copy() if mine else None, root=rank)
-    return Output(name, d, dofs, 1.0, C_s, tuple(where.tolist()))
+    return Output(name, d, dofs, 1.0, C_s, tuple(where.tolist()), place=_taken(system, point, where))
+
+
+def _taken(system: BlockSystem, point: Array, where: Array) -> str:
+    """The node that stands for a point, and how many others are as near. Collective."""
+    layout = system.layout
+
+    def near(nodes: Array) -> tuple[float, int]:
+        """Smallest distance over all ranks, and how many nodes have it."""
+        distance = layout.rounded(np.linalg.norm(nodes - point, axis=1)) if len(nodes) else np.zeros(0)
+        least = min(layout.comm.allgather(float(distance.min(initial=np.inf))))
+        return least, int(total(layout.comm, np.array([float((distance == least).sum())]))[0])
+
+    (least, count), (nearer, _) = near(layout.nodes), near(layout.held)
+    text = f"node {_coordinates(where)}"
+    if count > 1:
+        text += f", one of {count} equally near to {_coordinates(point)}"
+    elif least > 0:
+        text += f", nearest to {_coordinates(point)}"
+    return text + ("; the hand holds a nearer one" if nearer < least else "")
+
+
+def _coordinates(point: Sequence[float] | Array) -> str:
+    return "(" + ", ".join(f"{x + 0.0:.6g}" for x in point) + ")"  # + 0: no -0
 
 
 def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
@@ -101,15 +129,23 @@ def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
     slack = 1e-9 * max(
         layout.extent, float(np.abs(box).max())
     )  # a node on the edge of the box is inside, rounded or not
-    inside = np.flatnonzero(((layout.nodes >= box[0] - slack) & (layout.nodes <= box[1] + slack)).all(axis=1))
+
+    def within(nodes: Array) -> Any:
+        return np.flatnonzero(((nodes >= box[0] - slack) & (nodes <= box[1] + slack)).all(axis=1))
+
+    inside = within(layout.nodes)
+    held = layout.held[within(layout.held)] if len(layout.held) else np.zeros((0, d))
     dofs = inside[:, None] * d + np.arange(d)
-    count = int(total(layout.comm, np.array([float(len(inside))]))[0])
-    if count == 0:
+    free, carried = (int(n) for n in total(layout.comm, np.array([float(len(inside)), float(len(held))])))
+    if free == 0:
         raise SceneError(
             f"control.outputs[{i}].box = {box.tolist()} holds no free node of the body; move or enlarge it"
         )
-    C_s = total(layout.comm, system.T[dofs].sum(axis=0) if len(dofs) else np.zeros((d, layout.n_s))) / count
-    return Output(name, d, dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()))
+    count = free + carried  # nodes in the contact zone move with the hand
+    R = rigid_modes(held, d, layout.n_s > d, layout.reference).reshape(-1, d, layout.n_s)
+    C_s = total(layout.comm, system.T[dofs].sum(axis=0) + R.sum(axis=0)) / count
+    place = f"mean of {count} nodes" + (f", {carried} of them held by the hand" if carried else "")
+    return Output(name, d, dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()), place=place)
 
 
 def _inside(system: BlockSystem, point: list[float], i: int) -> None:

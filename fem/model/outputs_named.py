@@ -25,7 +25,7 @@ def farthest(outputs: Array, target: Array, names: Sequence[str]) -> Array:
     Args:
         outputs: (m, p).
         target: (p,).
-        names: one per column, stem and axis joined by a dot or an underscore; others are taken as one vector.
+        names: one per column, stem and axis joined by an underscore; others are taken as one vector.
     """
     angles = set(turns(names))
     groups: dict[str, list[int]] = {}
@@ -39,5 +39,5 @@ def farthest(outputs: Array, target: Array, names: Sequence[str]) -> Array:
 
 
 def _split(name: str) -> tuple[str, str]:
-    stem, _, axis = name.replace(".", "_").rpartition("_")
+    stem, _, axis = name.rpartition("_")
     return stem, axis

@@ -1,32 +1,34 @@
-"""Restart files: one HDF5 file a rank, and a manifest written last, so that a torn write is never read."""
+"""Restart files: one file of arrays a rank, and a manifest written last that knows the SHA-256 of each."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 
 from softgrasp.fem.errors import CheckpointError, agree
-from softgrasp.fem.scene.file import scene_hash
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.sealed import AGAIN, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 
 if TYPE_CHECKING:
     from softgrasp.fem.run.simulate import Run
     from softgrasp.fem.scene.scene import Scene
 
-FORMAT = 3
-FREE_OUTPUT = ("fields", "frames", "checkpoint_every")  # what a run shows and keeps, not what it computes
+FORMAT = 4
+FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
 FREE = ("name", "description", "reduction", "study")
-
-
-def _rank_file(directory: Path, step: int, rank: int) -> Path:
-    return directory / f"step{step}-rank{rank}.h5"
+OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
 
 
 def write_checkpoint(run: Run, directory: Path) -> Path:
     """Write everything that a bitwise restart needs; older files are removed afterwards. Collective.
+
+    The files carry the name of the run, so that no other run in the folder writes over one that a manifest names.
 
     Returns:
         The manifest file.
@@ -36,74 +38,92 @@ def write_checkpoint(run: Run, directory: Path) -> Path:
     """
     comm = run.model.system.layout.comm
     manifest = directory / "checkpoint.json"
+    name, sha256 = f"{run.name}-step{run.reached}-rank{comm.rank}.npz", ""
     with agree(comm):
         try:
-            directory.mkdir(parents=True, exist_ok=True)
-            _write_rank(run, _rank_file(directory, run.reached, comm.rank))
+            sha256 = _write_rank(run, directory / name)
         except OSError as error:
             raise CheckpointError(
                 f"{directory}: the restart file cannot be written ({error}); free the disk"
             ) from error
+    files = comm.gather((name, sha256))
     with agree(comm):
-        if comm.rank == 0:
-            _write_manifest(run, directory, manifest)
+        if files is not None:
+            _write_manifest(run, manifest, files)
     return manifest
 
 
-def _write_manifest(run: Run, directory: Path, manifest: Path) -> None:
+def _write_manifest(run: Run, manifest: Path, files: list[tuple[str, str]]) -> None:
     """Put the new manifest in place of the old one and remove older states. Rank 0 only."""
     entry = {
         "format": FORMAT,
+        "run": run.name,
         "scene_hash": _numbers_hash(run.model.scene),
         "scene": run.model.scene.model_dump(mode="json", by_alias=True),
         "ranks": run.layout.comm.size,
         "step": run.reached,
         "legs": run.legs,
+        "files": files,
+        "beside": run.beside,
     }
     try:
-        fresh = manifest.with_suffix(".new")
-        fresh.write_text(json.dumps(entry, indent=2) + "\n")
-        fresh.replace(manifest)
+        write_manifest(manifest, entry)
     except OSError as error:
         raise CheckpointError(f"{manifest} cannot be written ({error}); free the disk") from error
-    for old in directory.glob("step*-rank*.h5"):
-        if not old.name.startswith(f"step{run.reached}-"):
-            old.unlink(missing_ok=True)
+    remove_others(manifest.parent, OLD, [*dict(files), *run.beside])
 
 
-def _write_rank(run: Run, path: Path) -> None:
+def restart_bytes(run: Run) -> int:
+    """About what a restart file takes, of all ranks. Collective."""
+    return int(run.layout.comm.allreduce(sum(np.asarray(array).nbytes for array in _arrays(run).values())))
+
+
+def _write_rank(run: Run, path: Path) -> str:
+    """Write this rank's file and return its SHA-256. Not collective."""
+    return write_arrays(path, _arrays(run))
+
+
+def _arrays(run: Run) -> dict[str, Any]:
+    """What this rank needs to go on. Not collective."""
     midpoint, n = run.midpoint, run.reached
-    with h5py.File(path, "w") as file:
-        file["state"] = run.state.array
-        file["r"] = midpoint.held.leave(midpoint.r.array_r)
-        file["pending"] = midpoint.pending
-        file["hand_q"] = run.drive.q[: n + 1]
-        file["hand_v"] = run.drive.v[: n + 1]
-        file["outputs"] = run.local_outputs[: n + 1]
-        file["snapshots"] = run.store.kept(n)
-        file["loads"] = run.drive.c[:n]
-        file["pulls"] = run.pulls[: n + 1]
-        if run.drive.u is not None:
-            file["forces"] = run.drive.u[:n]
-        file["energies"] = [midpoint.dissipated, run.initial_energy, run.peak_energy]
-        file["residual_first"] = run.residual_first
+    arrays: dict[str, Any] = {
+        "numbering": _numbering(run.layout),
+        "state": run.state.array,
+        "r": midpoint.held.leave(midpoint.r.array_r),
+        "pending": midpoint.pending,
+        "hand_q": run.drive.q[: n + 1],
+        "hand_v": run.drive.v[: n + 1],
+        "outputs": run.local_outputs[: n + 1],
+        "snapshots": run.store.kept(n),
+        "loads": run.drive.c[:n],
+        "pulls": run.pulls[: n + 1],
+        "energies": [midpoint.dissipated, run.initial_energy, run.peak_energy],
+        "residual_first": run.residual_first,
+    }
+    if run.drive.u is not None:
+        arrays["forces"] = run.drive.u[:n]
+    return arrays
 
 
 def read_checkpoint(run: Run, directory: Path) -> None:
     """Put a run back where it was stopped. Collective.
 
     Raises:
-        CheckpointError: no restart file, or one of another scene, rank count or format.
+        CheckpointError: no restart file, a damaged one, or one of another scene, rank count, mesh numbering or format.
     """
     comm = run.model.system.layout.comm
     with agree(comm):
-        entry = _manifest(run, directory)
-        path = _rank_file(directory, entry["step"], comm.rank)
-        try:
-            with h5py.File(path) as file:
-                _restore(run, file, entry["step"])
-        except (OSError, KeyError, ValueError, TypeError) as error:
-            raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
+        manifest = directory / "checkpoint.json"
+        entry = _fitting(run, manifest, read_manifest(manifest, FORMAT))
+        name, sha256 = entry["files"][comm.rank]
+        arrays = read_arrays(directory / name, sha256)
+        if not np.array_equal(arrays["numbering"], _numbering(run.layout)):
+            raise CheckpointError(
+                f"{directory / name} was written with other nodes on rank {comm.rank}, as another version of DOLFINx "
+                f"deals them out; {AGAIN}"
+            )
+        run.name, run.beside = entry["run"], entry["beside"]
+        _restore(run, arrays, entry["step"])
         legs = [leg for leg in entry["legs"] if leg < run.reached]
         run.begun, run.legs = run.reached, [*legs, run.reached]
     for vector in (run.state.z, run.state.v, run.midpoint.r):
@@ -111,37 +131,36 @@ def read_checkpoint(run: Run, directory: Path) -> None:
     run.midpoint.join(run.state)
 
 
-def _manifest(run: Run, directory: Path) -> dict[str, Any]:
-    comm = run.model.system.layout.comm
-    manifest = directory / "checkpoint.json"
-    try:
-        entry: dict[str, Any] = json.loads(manifest.read_text())
-    except FileNotFoundError:
-        raise CheckpointError(f"{manifest} does not exist; run once without --resume") from None
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{manifest} cannot be read ({error}); run again without --resume") from error
-    if entry.get("format") != FORMAT:
-        raise CheckpointError(
-            f"{manifest} was written by another version of softgrasp (format {entry.get('format')}, this one reads "
-            f"{FORMAT}); run again without --resume"
-        )
-    scene = run.model.scene
-    found, why = {"ranks": entry.get("ranks")}, {"ranks": comm.size}
-    if entry.get("scene_hash") != _numbers_hash(scene):
-        found, why = _flat(entry.get("scene", {})), _flat(scene.model_dump(mode="json", by_alias=True))
-    keys = [*why, *(key for key in found if key not in why)]
+def _fitting(run: Run, manifest: Path, entry: dict[str, Any]) -> dict[str, Any]:
+    """The manifest's entry if it is of this scene and rank count. Not collective.
+
+    Raises:
+        CheckpointError: it is not; the message names the key.
+    """
+    comm, scene = run.model.system.layout.comm, run.model.scene
+    before, now = {"ranks": entry["ranks"]}, {"ranks": comm.size}
+    same = entry["scene_hash"] == _numbers_hash(scene)
+    if not same:
+        before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
+    keys = [*now, *(key for key in before if key not in now)]
     for key in sorted(keys, key=lambda key: key in ("tissue.mesh", "motion.csv")):  # their contents count, not the name
-        if found.get(key) != why.get(key) and not _free(key):
+        if before.get(key) != now.get(key) and not _free(key):
             raise CheckpointError(
-                f"{manifest} was written with {key} = {_short(found.get(key))}, this run has {_short(why.get(key))}; "
+                f"{manifest} was written with {key} = {_short(before.get(key))}, this run has {_short(now.get(key))}; "
                 "resume with the same scene and rank count, or run again without --resume"
             )
-    if entry.get("scene_hash") != _numbers_hash(scene):
+    if not same:
         raise CheckpointError(
             f"a file that the scene names is not what it was when {manifest} was written; put the old one back, or run "
             "again without --resume"
         )
     return entry
+
+
+def _numbering(layout: BlockLayout) -> Array:
+    """SHA-256 of this rank's nodes in their order, 32 numbers. Not collective."""
+    digest = hashlib.sha256(np.ascontiguousarray(layout.nodes)).digest()
+    return np.frombuffer(digest, dtype=np.uint8).astype(np.float64)
 
 
 def _numbers_hash(scene: Scene) -> str:
@@ -169,24 +188,23 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _restore(run: Run, file: h5py.File, step: int) -> None:
+def _restore(run: Run, arrays: dict[str, Array], step: int) -> None:
     n = step + 1
-    run.store.restore(np.asarray(file["snapshots"]), step)
+    run.store.restore(arrays["snapshots"], step, run.name)
     run.state = run.store.target(step)
-    run.state.array[:] = file["state"][:]
-    r = file["r"][:]
-    if r.shape != run.midpoint.r_array.shape:
-        raise ValueError(f"r has {len(r)} rows, the run {len(run.midpoint.r_array)}")
+    run.state.array[:] = arrays["state"]
+    r, rows = arrays["r"], len(run.midpoint.r_array)
+    if len(r) != rows:
+        raise CheckpointError(f"the restart file holds {len(r)} rows of the right-hand side, this run {rows}; {AGAIN}")
     run.midpoint.r.array_w[:] = run.midpoint.held.enter(r)
-    run.midpoint.pending = file["pending"][:]
-    run.drive.q[:n] = file["hand_q"][:]
-    run.drive.v[:n] = file["hand_v"][:]
-    run.local_outputs[:n] = file["outputs"][:]
-    run.drive.c[:step] = file["loads"][:]
-    run.pulls[:n] = file["pulls"][:]
+    run.midpoint.pending = arrays["pending"]
+    run.drive.q[:n] = arrays["hand_q"]
+    run.drive.v[:n] = arrays["hand_v"]
+    run.local_outputs[:n] = arrays["outputs"]
+    run.drive.c[:step] = arrays["loads"]
+    run.pulls[:n] = arrays["pulls"]
     if run.drive.u is not None:
-        run.drive.u[:step] = file["forces"][:]
-    energies = file["energies"][:]
-    run.midpoint.dissipated, run.initial_energy, run.peak_energy = (float(value) for value in energies)
-    run.residual_first = float(file["residual_first"][()])
+        run.drive.u[:step] = arrays["forces"]
+    run.midpoint.dissipated, run.initial_energy, run.peak_energy = (float(value) for value in arrays["energies"])
+    run.residual_first = float(arrays["residual_first"])
     run.reached = step

@@ -6,7 +6,6 @@ prescribed or driven by a force.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.text import read_table
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -55,26 +55,13 @@ def read_csv(path: Path, columns: int, end: float) -> tuple[Array, Array]:
         SceneError: the file is missing, not numeric, not increasing in time or does not cover [0, end].
     """
     try:
-        with path.open(newline="") as file:
-            rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
+        table = np.array(read_table(path, columns + 1))
     except OSError as error:
         raise SceneError(f"motion.csv: {path} cannot be read ({error.strerror}); name an existing CSV file") from error
-    try:
-        float(rows[0][0])
-    except (ValueError, IndexError):
-        rows = rows[1:]
-    try:
-        table = np.array([[float(x) for x in row] for row in rows])
     except ValueError as error:
-        raise SceneError(f"motion.csv: {path} holds a value that is not a number ({error})") from error
-    if table.ndim != 2 or len(table) < 2 or table.shape[1] != columns + 1:
-        raise SceneError(
-            f"motion.csv: {path} must have at least two rows of {columns + 1} columns "
-            "(time, then one per hand degree of freedom)"
-        )
-    for i, j in np.argwhere(~np.isfinite(table))[:1]:
-        what = "the time" if j == 0 else f"column {j + 1}, at t = {table[i, 0]:g} s,"
-        raise SceneError(f"motion.csv: {path} holds {table[i, j]} as {what} in data row {i + 1}; give finite numbers")
+        raise SceneError(f"motion.csv: {path} {error} (time, then one per hand degree of freedom)") from error
+    if len(table) < 2:
+        raise SceneError(f"motion.csv: {path} has {len(table)} rows of numbers; it must have at least two")
     if (np.diff(table[:, 0]) <= 0).any():
         raise SceneError(f"motion.csv: the times in {path} must increase from row to row")
     if table[0, 0] > 0 or table[-1, 0] < end * (1 - 1e-12):

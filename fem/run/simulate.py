@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
+import secrets
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,19 +12,20 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import Interrupted, SceneError, SolverError, agree
+from softgrasp.fem.errors import Interrupted, ResourceError, SceneError, SolverError, agree
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import read_checkpoint, write_checkpoint
 from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
+from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.motion import driven_table, force_values, motion_table
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
-from softgrasp.fem.scene.scene import Scene, Time
-from softgrasp.fem.solve.solvers import SolverName, choose_solver, make_solver
-from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.solvers import choose_solver
+from softgrasp.fem.solve.statics import equilibrium
 
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
@@ -101,8 +100,10 @@ class Run(Stepped):
         force: feedback force on the hand; None takes the scene's motion.
 
     Attributes:
+        name: of this run and those that it resumes, in no other run; its files carry it.
         begun: step at which this run was started or resumed.
         legs: the same of all runs that led here, this one last.
+        beside: names and SHA-256 of further files in the checkpoint's folder; rank 0's count.
     """
 
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
@@ -113,9 +114,9 @@ class Run(Stepped):
         with model.watch.stage("factor"):
             midpoint = TissueMidpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
         solver = solver[0], solver[1] + midpoint.solver.remark
-        store = make_store(
-            system, scene.output.snapshots, scene.time.steps, scene.output.every, options.directory, options.resume
-        )
+        self.name: str = system.layout.comm.bcast(secrets.token_hex(6))
+        kept, fresh = scene.output, None if options.resume else self.name
+        store = make_store(system, kept.snapshots, scene.time.steps, kept.every, options.directory, fresh)
         super().__init__(system.layout, dt, scene.time.steps, midpoint, store, solver)
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
@@ -126,6 +127,7 @@ class Run(Stepped):
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = self.residual_last = 0.0
         self.begun, self.legs = 0, [0]
+        self.beside: dict[str, str] = {}
 
     def _recorders(self) -> tuple[list[tuple[slice, Array]], list[tuple[np.ndarray, Array]]]:
         """Local dofs and column block of every output that this rank has a share in."""
@@ -259,52 +261,10 @@ class Run(Stepped):
         )
 
 
-def equilibrium(system: BlockSystem, solver: SolverName, time: Time) -> Array:
-    """Static displacement relative to the hand, K_ee z = G g; local rows. Collective.
-
-    Raises:
-        SolverError: the stiffness is singular or the residual too large.
-    """
-    load = system.K_ee.createVecLeft()
-    z = system.K_ee.createVecRight()
-    load.array_w[:] = 0.0 if system.gravity is None else system.G @ system.gravity
-    static = make_solver(system.K_ee.copy(), solver, system.layout, "softgrasp_static_", time.rtol, time.reproducible)
-    static.solve(load, z)
-    static.check(load, z, "the static equilibrium")
-    result = z.array_r.copy()
-    static.destroy()
-    load.destroy()
-    z.destroy()
-    return np.asarray(result)
-
-
 def frame_steps(scene: Scene) -> list[int]:
     """Steps at which ``RunOptions.frame`` is called: ``output.frames`` intervals from start to end."""
     steps = scene.time.steps
     return np.linspace(0, steps, min(scene.output.frames, steps) + 1).round().astype(int).tolist()
-
-
-@contextmanager
-def _interruptible(speaks: bool) -> Iterator[list[bool]]:
-    """Turn the first Ctrl-C into a flag and say so on the standard error; a second one interrupts at once."""
-    flag: list[bool] = []
-
-    def note(number: int, frame: Any) -> None:
-        flag.append(True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if speaks:
-            with suppress(OSError):  # nobody listens; print may not be called while another print is under way
-                os.write(2, b"\nstopping as soon as the restart file is written; Ctrl-C again stops at once\n")
-
-    try:
-        previous = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not the main thread: leave signals alone
-        yield flag
-        return
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set[int]]:
@@ -347,12 +307,24 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
             run.start()
         if options.begin is not None:
             options.begin(run)
-        with _interruptible(model.system.layout.comm.rank == 0) as stop:
+        with interruptible(model.system.layout.comm.rank == 0) as stop:
             _run_segments(run, ts, options, stop)
         return run.trajectory()
     finally:
         ts.destroy()
         run.midpoint.destroy()
+
+
+def _frame(run: Run, options: RunOptions) -> str:
+    """Take a frame; why there is no room for it, or nothing. Collective."""
+    try:
+        if options.frame is not None:
+            options.frame(run)
+    except ResourceError as error:  # of all ranks
+        if run.reached == run.steps:  # a run at its end has nothing to go on with
+            raise
+        return str(error)
+    return ""
 
 
 def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> None:
@@ -364,6 +336,7 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
         options.frame(run)
     if run.reached == 0:
         run.take(ts, 1, check=True)
+        run.store.flush(1)
         run.residual_first = run.residual_last
     last, chunk = boundaries[-1], 1
     while run.reached < last:
@@ -377,16 +350,17 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
             run.watch_energy()
         # rank 0 sets the pace, all agree whether somebody asked to stop
         chunk = comm.bcast(int(np.clip(0.2 / max(pace, 1e-7), 1, 10_000)))
-        if options.frame is not None and run.reached in frames:
-            options.frame(run)
+        full = _frame(run, options) if run.reached in frames else ""
         if options.progress is not None:
             options.progress(run)
         stopped = comm.allreduce(bool(stop), MPI.LOR)
         stopped = stopped and run.reached < run.steps  # at the end there is nothing left to stop
-        if run.reached in checkpoints or stopped or (run.reached == last < run.steps):
+        if run.reached in checkpoints or stopped or full or (run.reached == last < run.steps):
             if options.keep is not None:
                 options.keep(run)
             manifest = write_checkpoint(run, options.directory / "checkpoint")
+            if full:
+                raise ResourceError(f"{full}; {manifest} lets --resume go on from step {run.reached}")
             if stopped or run.reached == last:
                 raise Interrupted(
                     f"stopped after step {run.reached} of {run.steps}; {manifest} lets --resume go on from there"

@@ -10,12 +10,14 @@ import h5py
 import numpy as np
 import psutil
 
+from softgrasp.fem.disk import check_room
 from softgrasp.fem.errors import CheckpointError, ResourceError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.system import BlockSystem
 
+DAMAGE = (OSError, KeyError, ValueError, TypeError, RuntimeError)  # what h5py raises of files that are not whole
 BUFFER_BYTES = 64 * 2**20  # per rank; large enough that HDF5 writes whole chunks
 
 
@@ -70,8 +72,8 @@ class NoStore:
         """Columns in memory that a restart needs."""
         return np.zeros((0, 0))
 
-    def restore(self, columns: Array, step: int) -> None:
-        """Take back what :meth:`kept` gave."""
+    def restore(self, columns: Array, step: int, run: str) -> None:
+        """Take back what :meth:`kept` gave in the run of that name."""
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
         """The stored snapshots, or None when they are not in memory. Collective."""
@@ -110,7 +112,7 @@ class MemoryStore(NoStore):
         """Columns filled so far."""
         return self.Z[:, : int(np.searchsorted(self.steps, step, side="right"))]
 
-    def restore(self, columns: Array, step: int) -> None:
+    def restore(self, columns: Array, step: int, run: str) -> None:
         """Fill the first columns again."""
         self.Z[:, : columns.shape[1]] = columns
 
@@ -129,7 +131,7 @@ class Hdf5Store(NoStore):
         ResourceError: the files of all ranks would not fit on the disk.
     """
 
-    def __init__(self, system: BlockSystem, steps: int, every: int, directory: Path, resume: bool) -> None:
+    def __init__(self, system: BlockSystem, steps: int, every: int, directory: Path, run: str | None) -> None:
         super().__init__(system)
         layout = system.layout
         self.directory = directory
@@ -145,35 +147,34 @@ class Hdf5Store(NoStore):
                         f"{self.needed} bytes and {free} are free in {directory}; set output.every to a larger number"
                     )
         self.steps = np.arange(0, steps + 1, every)
-        self.resume = resume
         rows = 2 * layout.n_local
-        fit = max(1, BUFFER_BYTES // max(8 * rows, 1))
+        fit = max(2, BUFFER_BYTES // max(8 * rows, 1))  # the first step reads one column and writes the next
         self.width = min(layout.comm.allreduce(fit, min), len(self.steps))
         self.buffer = np.zeros((rows, self.width), order="F")
         self.slots = [state_on(self.buffer[:, j], system) for j in range(self.width)]
         self.index = {int(s): j for j, s in enumerate(self.steps)}
         self.written = 0
         with agree(layout.comm):
-            self._open(rows)
+            self._open(rows, run)
 
-    def _open(self, rows: int) -> None:
+    def _open(self, rows: int, run: str | None) -> None:
         path, shape = self._file(self.system.layout.comm.rank), (len(self.steps), rows)
-        if not self.resume:
+        if run is not None:
             try:
                 with h5py.File(path, "w") as file:
-                    file.create_dataset("Z", shape, dtype="f8", chunks=(1, max(rows, 1)))
-                    file.attrs["written"] = 0
+                    file.create_dataset("Z", shape, dtype="f8", chunks=(1, max(rows, 1)), fletcher32=True)
+                    file.attrs["written"], file.attrs["run"] = 0, run
             except OSError as error:
                 raise ResourceError(f"{path} cannot be written ({error}); choose another --out") from error
             return
         try:
             with h5py.File(path, "r+") as file:
-                found, self.on_file = file["Z"].shape, int(file.attrs["written"])
-        except (OSError, KeyError) as error:
+                stored, self.on_file, self.owner = file["Z"].shape, int(file.attrs["written"]), file.attrs["run"]
+        except DAMAGE as error:
             raise CheckpointError(f"{path} cannot be read ({error}); run again without --resume") from error
-        if found != shape:
+        if stored != shape:
             raise CheckpointError(
-                f"{path} holds {found} numbers, this run needs {shape}; resume with the same scene and rank count, or "
+                f"{path} holds {stored} numbers, this run needs {shape}; resume with the same scene and rank count, or "
                 "run again without --resume"
             )
 
@@ -187,14 +188,15 @@ class Hdf5Store(NoStore):
 
     def limit(self, step: int) -> int:
         """Last step before the buffer would overflow."""
-        j = self.written + self.width - 1
-        return int(self.steps[j]) if j < len(self.steps) else 2**62
+        j = self.written + self.width
+        return int(self.steps[j]) - 1 if j < len(self.steps) else 2**62
 
     def flush(self, step: int) -> None:
         """Append the filled slots to this rank's file. Collective."""
         end = int(np.searchsorted(self.steps, step, side="right"))
         path = self._file(self.system.layout.comm.rank)
         if end > self.written:
+            check_room(self.system.layout.comm, [path], 8 * len(self.buffer) * (end - self.written))
             with agree(self.system.layout.comm):
                 try:
                     with h5py.File(path, "r+") as file:
@@ -205,18 +207,28 @@ class Hdf5Store(NoStore):
                     raise ResourceError(f"{path} cannot be written ({error}); free the disk") from error
             self.written = end
 
-    def restore(self, columns: Array, step: int) -> None:
-        """Go on behind what is already in the file.
+    def restore(self, columns: Array, step: int, run: str) -> None:
+        """Go on behind what is already in the file, which is read once to see that it is whole.
 
         Raises:
-            CheckpointError: the file holds less.
+            CheckpointError: the file is of another run, is damaged or holds less.
         """
         self.written = int(np.searchsorted(self.steps, step, side="right"))
+        path = self._file(self.system.layout.comm.rank)
+        if self.owner != run:
+            raise CheckpointError(
+                f"{path} belongs to another run, which was started in this folder later; run again without --resume"
+            )
         if self.on_file < self.written:
-            path = self._file(self.system.layout.comm.rank)
             raise CheckpointError(
                 f"{path} holds {self.on_file} snapshots, step {step} needs {self.written}; run again without --resume"
             )
+        try:
+            with h5py.File(path) as file:
+                for j in range(self.written):
+                    file["Z"][j]  # HDF5 compares the checksum of what it reads
+        except DAMAGE as error:
+            raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
         """Write ``snapshots.h5`` over the rank files. Collective."""
@@ -240,10 +252,10 @@ class Hdf5Store(NoStore):
         return None
 
 
-def make_store(system: BlockSystem, kind: str, steps: int, every: int, directory: Path, resume: bool) -> NoStore:
-    """Store of a run: memory, hdf5 or none. Collective."""
+def make_store(system: BlockSystem, kind: str, steps: int, every: int, directory: Path, run: str | None) -> NoStore:
+    """Store of a run: memory, hdf5 or none; ``run`` is the name of a new run, None resumes. Collective."""
     if kind == "memory":
         return MemoryStore(system, steps, every)
     if kind == "hdf5":
-        return Hdf5Store(system, steps, every, directory, resume)
+        return Hdf5Store(system, steps, every, directory, run)
     return NoStore(system)

@@ -7,9 +7,28 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from softgrasp.fem.scene.tissue import Box, Model, Positive, check_box
+from softgrasp.fem.scene.tissue import Box, Label, Model, Positive, check_box
 
 Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+
+
+_KINDS = ("", "_cotangent_lift", "_svd_like")
+BASES = (
+    *(
+        f"{name}{frame}"
+        for name in ("global_pod", "pod_fixed", "componentwise_pod", "componentwise_pod_fixed")
+        for frame in ("", "_relative")
+    ),
+    *(
+        f"psd{kind}{fixed}{coordinates}{frame}"
+        for kind in _KINDS
+        for fixed in ("", "_fixed")
+        for coordinates in ("", "_qv")
+        for frame in ("", "_relative")
+    ),
+    "craig_bampton",
+)
+"""Names of :mod:`reduction.registry`, here because scenes are read without what builds bases."""
 
 
 class Reduction(Model):
@@ -20,7 +39,7 @@ class Reduction(Model):
     )
     N: list[Annotated[int, Field(ge=1)]] = Field(
         default_factory=lambda: [4, 6, 8, 10, 12, 14, 18, 22, 26, 30, 40, 60],
-        description="reduced dimensions to try [1]",
+        description="numbers of basis vectors to try, the hand's own included [1]",
     )
     energy: Annotated[float, Field(gt=0, lt=1)] = Field(
         0.999, description="share of the snapshot energy that picks N [1], the paper's 99.9 %"
@@ -33,11 +52,15 @@ class Reduction(Model):
     engine: Literal["tsqr", "svd", "gram"] = Field(
         "tsqr", description="factorisation of the snapshots [no unit]; gram is fast and loses small singular values"
     )
-    lambda_range: Range = Field(
-        default_factory=lambda: [30.0, 500.0], description="range of lambda for tests at other parameters [Pa]"
+    lambda_range: Range | None = Field(
+        None,
+        description="range of lambda for tests at other parameters [Pa]; by default 0.6 to 10 times that of the first "
+        "layer",
     )
-    mu_range: Range = Field(
-        default_factory=lambda: [20.0, 500.0], description="range of mu for tests at other parameters [Pa]"
+    mu_range: Range | None = Field(
+        None,
+        description="range of mu for tests at other parameters [Pa]; by default 0.4 to 10 times that of the first "
+        "layer",
     )
 
     train: Literal["corners"] | list[Range] = Field(
@@ -49,7 +72,7 @@ class Reduction(Model):
     @model_validator(mode="after")
     def _check(self) -> Reduction:
         for key in ("lambda_range", "mu_range"):
-            low, high = getattr(self, key)
+            low, high = getattr(self, key) or (0.0, 0.0)
             if low > high:
                 raise ValueError(f"{key} is [{low}, {high}]; the first must not exceed the second")
         return self
@@ -71,7 +94,10 @@ class Loop(Model):
         "midpoint", description="feedback inside the midpoint rule, or sampled and held as on a robot [no unit]"
     )
     rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
-    limit: Positive | None = Field(None, description="largest absolute load of an actuator [N]; none by default")
+    limit: Positive | None = Field(None, description="largest force on the hand in each direction [N]; none by default")
+    limit_torque: Positive | None = Field(
+        None, description="largest torque on a turning hand about each axis [N m]; none by default"
+    )
     delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
 
 
@@ -81,7 +107,7 @@ class ControlOutput(Model):
     kind: Literal["node", "region", "hand"] = Field(description="a node, the mean of a region, or the hand [no unit]")
     point: list[float] | None = Field(None, description="the node nearest to it is taken [m]; kind node")
     box: Box | None = Field(None, description="[[lo], [hi]] [m]; mean over the nodes inside; kind region")
-    name: str = Field("", description="label [no unit]")
+    name: Label = Field("", description="label [no unit]")
 
     @model_validator(mode="after")
     def _check(self) -> ControlOutput:
@@ -137,6 +163,10 @@ class Control(Model):
 
     @model_validator(mode="after")
     def _check(self) -> Control:
+        names = [output.name or f"y{i + 1}" for i, output in enumerate(self.outputs)]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise ValueError(f"outputs[{names.index(name)}] and outputs[{i}] are both named {name}; name one anew")
         _check_weight("Q", self.Q, definite=False)
         _check_weight("R", self.R, definite=True)
         return self

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
@@ -16,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from softgrasp import PACKAGE
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.text import check_values, parse_toml, read_text
 
 if TYPE_CHECKING:  # scenes are listed and explained without MPI
     from mpi4py import MPI
@@ -32,6 +32,7 @@ _EXPECTED = {
     "int_from_float": "an integer",
     "bool_type": "true or false",
     "finite_number": "a finite number",
+    "string_pattern_mismatch": "in one line without $ and \\",
 }
 
 
@@ -63,6 +64,10 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     for override in overrides:
         _apply(data, override)
     try:
+        check_values(data)
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}") from None
+    try:
         scene = Scene.model_validate(data)
     except ValidationError as error:
         raise SceneError(f"{path}: {_explain(error, data)}") from None
@@ -88,22 +93,6 @@ def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequ
     raise result if isinstance(result, Exception) else SceneError(f"{path}: rank 0 sent no scene")
 
 
-def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
-    """SHA-256 of the resolved scene and of the contents of its mesh and csv files, 64 hex digits.
-
-    Top-level keys in `without` do not count; nor do folder and name of the files. Not collective.
-
-    Raises:
-        SceneError: a file that the scene names cannot be read.
-    """
-    data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
-    for section, key in _FILES:
-        name = data.get(section, {}).get(key)
-        if name is not None:
-            data[section][key] = hashlib.sha256(_bytes(scene, name, f"{section}.{key}")).hexdigest()
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
-
-
 def resolved_toml(scene: Scene) -> str:
     """TOML text with every default and absolute file names; it loads to the same scene. Not collective."""
     data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
@@ -117,26 +106,19 @@ def resolved_toml(scene: Scene) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _bytes(scene: Scene, name: str, key: str) -> bytes:
-    try:
-        return scene.path(name).read_bytes()
-    except OSError as error:
-        raise SceneError(f"scene '{scene.name}': {key} = '{name}' cannot be read ({error.strerror})") from None
-
-
 def _read(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_bytes().decode())
+        return parse_toml(read_text(file))
     except FileNotFoundError:
         near = difflib.get_close_matches(file.stem, shipped_scenes(), n=1)
         hint = f"; did you mean demos/scenes/{near[0]}.toml?" if near else "; give the path of a TOML scene file"
         raise SceneError(f"{file}: there is no such scene file{hint}") from None
     except OSError as error:
         raise SceneError(f"{file}: the scene file cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise SceneError(f"{file}: the scene file is not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{file}: the scene file is not valid TOML: {error}") from None
+    except ValueError as error:
+        raise SceneError(f"{file}: the scene file {error}") from None
 
 
 def _apply(data: dict[str, Any], override: str) -> None:
@@ -162,18 +144,20 @@ def _child(node: Any, part: str, override: str, path: str) -> Any:
 
 
 def _index(node: list[Any], part: str, override: str) -> int:
-    if not part.isdecimal() or int(part) >= len(node):
+    if not part.isdecimal() or len(part) > 9 or int(part) >= len(node):
         raise SceneError(f"--set {override}: '{part}' must be an index below {len(node)}")
     return int(part)
 
 
 def _parse(text: str, override: str) -> Any:
     try:
-        table = tomllib.loads(f"value = {text}")
+        table = parse_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
         if re.fullmatch(r"[A-Za-z_./~][A-Za-z0-9_./~+-]*", text):  # the shell ate the quotes
             return text
         raise SceneError(f"--set {override}: '{text}' is not a TOML value; a text is '\"...\"'") from None
+    except ValueError as error:
+        raise SceneError(f"--set {override}: it {error}") from None
     if table.keys() != {"value"}:
         raise SceneError(f"--set {override}: it must hold one value")
     return table["value"]

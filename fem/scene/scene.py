@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import Control, ControlOutput, Loop, Reduction, Study
-from softgrasp.fem.scene.tissue import Contact, Dropped, Layer, Material, Model, NonNegative, Positive, Tissue
+from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, Model, NonNegative, Positive, Tissue
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -122,12 +122,15 @@ class Output(Model):
     checkpoint_every: Annotated[int, Field(ge=0)] = Field(
         0, description="steps between restart files [1]; 0: only on interrupt"
     )
+    memory: Literal["auto"] | Positive = Field(
+        "auto", description="memory that a run may take on each node [GiB]; auto: what is free when it starts"
+    )
 
 
 class Scene(Model):
     """A whole scene; relative file names count from `directory`."""
 
-    name: str = Field(min_length=1, description="short name [no unit]")
+    name: Label = Field(min_length=1, description="short name [no unit]")
     description: str = Field("", description="what the scene shows [no unit]")
     tissue: Tissue = Field(description="the soft body [m, Pa, kg/m3]")
     contact: Contact = Field(description="where the hand holds it [m]")
@@ -140,6 +143,7 @@ class Scene(Model):
     study: Study = Field(default_factory=Study, description="how studies judge [various]")
     output: Output = Field(default_factory=Output, description="what is kept [no unit]")
     _directory: Path = PrivateAttr(default_factory=Path.cwd)
+    _mesh_digest: str = PrivateAttr("")  # of the mesh file, once it was read
 
     @property
     def directory(self) -> Path:
@@ -221,5 +225,5 @@ def check_dimension(scene: Scene, d: int) -> None:
 
 
 def scene_schema() -> dict[str, Any]:
-    """JSON schema of a scene file. Not collective."""
-    return Scene.model_json_schema(by_alias=True)
+    """JSON schema of a scene file; `study.shell.schema` adds what only the packages above know. Not collective."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)

@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from softgrasp.fem.scene import materials
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Box = Annotated[list[list[float]], Field(min_length=2, max_length=2)]
+Label = Annotated[str, Field(max_length=80, pattern=r"^[^$\\\n]*$")]  # what figures draw, where $ begins a formula
 Side = Literal["x-", "x+", "y-", "y+", "z-", "z+", "left", "right", "bottom", "top", "front", "back"]
 
 
@@ -26,8 +29,17 @@ def off(value: Any) -> Any:
     return None if value is False else value
 
 
+class OrFalse:
+    """In the JSON schema false stands where Python has None."""
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        schema = handler(core)
+        choices = [choice for choice in schema["anyOf"] if choice != {"type": "null"}]
+        return {"anyOf": [*choices, {"const": False}]}
+
+
 T = TypeVar("T")
-Dropped = Annotated[T | None, BeforeValidator(off)]
+Dropped = Annotated[T | None, BeforeValidator(off), OrFalse()]
 
 
 def check_box(box: list[list[float]] | None, key: str) -> None:
@@ -44,7 +56,7 @@ def check_box(box: list[list[float]] | None, key: str) -> None:
 class Material(Model):
     """Isotropic linear elastic material, resolved to Lame constants and density."""
 
-    name: str | None = Field(None, description="name in the material library, or a label [no unit]")
+    name: Label | None = Field(None, description="name in the material library, or a label [no unit]")
     lam: float = Field(alias="lambda", description="first Lame constant [Pa]; 3 lambda + 2 mu > 0")
     mu: Positive = Field(description="shear modulus [Pa], > 0")
     rho: Positive = Field(description="mass density [kg/m3], > 0")
@@ -75,6 +87,27 @@ class Material(Model):
             raise ValueError(f"poisson is {nu}; it must lie between -1 and 0.5, both excluded")
         values["lambda"], values["mu"] = materials.lame(young, nu)
         return values
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """What a file may hold: a name of the library, or one of the two pairs of moduli. Not collective."""
+        reference = handler(core)
+        schema = handler.resolve_ref_schema(reference)
+        lame = dict(schema)
+        name, rho = (lame["properties"][key] for key in ("name", "rho"))
+        young = {
+            "young": {"type": "number", "exclusiveMinimum": 0, "description": "Young's modulus [Pa], > 0"},
+            "poisson": {
+                "type": "number",
+                "exclusiveMinimum": -1,
+                "exclusiveMaximum": 0.5,
+                "description": "Poisson's ratio [1], between -1 and 0.5",
+            },
+        }
+        pair = {**lame, "properties": {"name": name, **young, "rho": rho}, "required": [*young, "rho"]}
+        schema.clear()
+        schema |= {"title": lame["title"], "anyOf": [{"enum": list(materials.LIBRARY)}, lame, pair]}
+        return reference
 
     @model_validator(mode="after")
     def _stable(self) -> Material:
@@ -125,7 +158,18 @@ class Tissue(Model):
     )
     mesh: Dropped[str] = Field(None, description="mesh file, relative to the scene [no unit]; excludes size, cells")
     scale: Positive = Field(1.0, description="length of one unit of the mesh file [m]")
-    repair: bool = Field(False, description="turn the inverted cells of a mesh file round [no unit]; else refuse them")
+    repair: bool = Field(
+        False,
+        description="turn the inverted cells of a mesh file round and join its doubled nodes [no unit]; "
+        "else refuse those and warn of these",
+    )
+    seam: Annotated[float, Field(gt=0, lt=0.1)] = Field(
+        1e-4,
+        description="boundary nodes of a mesh file closer than this share of the shortest edge there are doubled [1]",
+    )
+    read_limit: Dropped[Positive] = Field(
+        None, description="longest processor time for reading the mesh file [s]; default 10, and 1 more a megabyte"
+    )
     order: Literal[1, 2] = Field(1, description="polynomial order of the displacement [1]")
     thickness: Positive = Field(1.0, description="thickness out of the plane [m], 2D only")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
@@ -146,7 +190,7 @@ class Tissue(Model):
             raise ValueError(f"{missing} is missing; give size and cells, or mesh")
         if len(self.cells) != len(self.size):
             raise ValueError(f"cells is {self.cells}; it must have {len(self.size)} entries as size does")
-        for key in ("scale", "repair"):
+        for key in ("scale", "repair", "seam", "read_limit"):
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} needs tissue.mesh; a structured box has no use for it")
         for name, layer in self.layers.items():

@@ -117,7 +117,13 @@ def riccati_schur(A: Array, G: Array, H: Array) -> tuple[Array, Complex, int]:
     h = H * scale[:, None] * scale / weight
     n = len(A)
     hamiltonian = np.block([[a, -g], [-h, -a.T]])
-    T, U, stable = scipy.linalg.schur(hamiltonian, output="real", sort="lhp")
+    try:
+        T, U, stable = scipy.linalg.schur(hamiltonian, output="real", sort="lhp")
+    except np.linalg.LinAlgError as error:  # eigenvalues that rounding moves over the axis while they are sorted
+        raise ControlError(
+            f"the stable eigenvalues of the Hamiltonian matrix cannot be told from the others ({error}): Q and R are "
+            "too far apart, or some mode is hardly damped"
+        ) from error
     values = block_eigenvalues(T)
     check_axis(hamiltonian, values, stable)
     top, bottom = U[:n, :n], U[n:, :n]

@@ -272,7 +272,10 @@ class DenseRiccati:
         relative = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
         residual = dense_residual(problem, relative, Z)
         if not residual <= self.tolerance:
-            raise SolverError(f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.0e}")
+            raise SolverError(
+                f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.1e}; raise control.tolerance "
+                "or weigh Q and R nearer to each other"
+            )
         n_e = len(tissue.M)
         return RiccatiSolution(
             Z_s=Z[: 2 * n_s],

@@ -96,7 +96,7 @@ class Controller:
         self._offset = self.u_bar - self.K @ self.x_bar
         self._lower = np.full(n_s, -np.inf) if self.limits is None else -self.limits
         self._upper = -self._lower
-        self._model = _tissue_step(self.plant, self.period)
+        self.model = _tissue_step(self.plant, self.period)
         self.reset()
 
     @property
@@ -121,7 +121,7 @@ class Controller:
     def step(self, q_s: Array, v_s: Array) -> Array:
         """One tick: take the measured hand, carry the tissue on, return the load [N, N m]. Not collective."""
         n_s, x = self.n_s, self._x
-        step, accelerated, dragged, constant = self._model
+        step, accelerated, dragged, constant = self.model
         if not self._fresh:
             old = x[n_s : 2 * n_s]
             tissue = step @ x[2 * n_s :]

@@ -57,7 +57,7 @@ def to_python_control(plant: SmallPlant, K: Array) -> Exported:
     names = {
         "states": state_names(plant),
         "inputs": [f"u_{i + 1}" for i in range(B.shape[1])],
-        "outputs": output_names(plant),
+        "outputs": [name.replace(".", "_") for name in output_names(plant)],  # their names hold no dots
     }
     # without removing states: python-control may drop those it thinks uncontrollable
     options = {"remove_useless_states": False, **names}

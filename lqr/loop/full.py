@@ -40,6 +40,7 @@ class LoopOptions:
         frame: observer with ``run.state``, ``run.drive.q``, ``run.drive.v``, ``run.reached`` and ``run.dt``, the same
             as in a forward run.
         progress: called between segments, with ``run.reached`` and ``run.steps``.
+        most: cost beyond which the run stops: no loop that works pays it.
     """
 
     snapshots: Literal["none", "memory", "hdf5"] = "none"
@@ -48,6 +49,7 @@ class LoopOptions:
     frames: Sequence[int] = ()
     frame: Callable[[Any], None] | None = None
     progress: Callable[[Any], None] | None = None
+    most: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ class ClosedLoop:
 
         Raises:
             ControlError: the actuation does not fit, or the implicit input of a step is singular.
-            SolverError: a solve failed, or the loop diverged; the message names the time.
+            SolverError: a solve failed, the loop diverged, or its cost leaves the bound; the message names the time.
         """
         actuation, options = actuation or Actuation(), options or LoopOptions()
         bound = actuation.bound(self.problem.layout.n_s)
@@ -149,9 +151,9 @@ class ClosedLoop:
             if held
             else ImplicitDrive(self.plant, gain, target, bound, steps)
         )
-        run = LoopRun(self, drive, start, steps, options)
+        run = LoopRun(self, drive, start, steps, options, target)
         run.execute()
-        return run.trajectory(target, bound)
+        return run.trajectory(bound)
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
@@ -167,15 +169,18 @@ class LoopRun(Stepped):
         start: state at t = 0.
         steps: number of steps.
         options: what to keep.
+        target: where the cost is zero.
     """
 
-    def __init__(self, loop: ClosedLoop, drive: Drive, start: PlantState, steps: int, options: LoopOptions) -> None:
+    def __init__(
+        self, loop: ClosedLoop, drive: Drive, start: PlantState, steps: int, options: LoopOptions, target: Target
+    ) -> None:
         if steps < 1:
             raise ControlError(f"steps = {steps} must be at least 1")
         problem = loop.problem
-        store = make_store(problem.system, options.snapshots, steps, options.every, options.directory, False)
+        store = make_store(problem.system, options.snapshots, steps, options.every, options.directory, "")
         super().__init__(problem.layout, loop.dt, steps, loop.midpoint, store, loop.solver)
-        self.loop, self.problem, self.drive, self.options = loop, problem, drive, options
+        self.loop, self.problem, self.drive, self.options, self.target = loop, problem, drive, options, target
         n = problem.layout.n_local
         self.state.z.array_w[:] = start.z
         self.state.v.array_w[:] = start.v_z
@@ -184,6 +189,7 @@ class LoopRun(Stepped):
         self.C_rows = np.ascontiguousarray(problem.C_z[self.rows].T)
         self.seen = np.zeros((steps + 1, len(self.rows)))
         self.residual_first = self.residual_last = 0.0
+        self.paid, self.paid_until = 0.0, 0
         self.midpoint.dissipated = 0.0
         self.midpoint.start(self.state)
         self.record(0)
@@ -201,7 +207,7 @@ class LoopRun(Stepped):
         """Let TS run to the last step, in segments. Collective.
 
         Raises:
-            SolverError: a solve failed or the state is no longer finite.
+            SolverError: a solve failed, the state is no longer finite, or the cost leaves its bound.
         """
         frames = {int(n) for n in self.options.frames} if self.options.frame is not None else set()
         ends = set(np.linspace(0, self.steps, min(CHUNKS, self.steps) + 1).round().astype(int).tolist())
@@ -221,6 +227,7 @@ class LoopRun(Stepped):
                     if goal == 1:
                         self.residual_first = self.residual_last
                 self._check_finite()
+                self._check_cost()
                 if self.options.frame is not None and end in frames:
                     self.options.frame(self)
                 if self.options.progress is not None:
@@ -239,13 +246,36 @@ class LoopRun(Stepped):
                 "at this rate, delay and limit"
             )
 
-    def trajectory(self, target: Target, bound: Array | None) -> LoopTrajectory:
+    def _check_cost(self) -> None:
+        if not np.isfinite(self.options.most):
+            return
+        part = float(self._cost(self._outputs(self.paid_until, self.reached), self.paid_until)[-1])
+        self.paid += self.problem.layout.comm.bcast(part)  # the same bits on every rank: they decide when all stop
+        self.paid_until = self.reached
+        if not self.paid <= self.options.most:
+            raise SolverError(
+                f"the closed loop diverges: at t = {self.reached * self.dt:.6g} s its cost is {self.paid:.3g}, and no "
+                f"loop that works pays more than {self.options.most:.3g}; raise control.loop.rate or the limit, leave "
+                "out the delay, or lower control.Q"
+            )
+
+    def _outputs(self, first: int, last: int) -> Array:
+        """At the grid points from first to last. Collective."""
+        part = slice(first, last + 1)
+        rigid = self.drive.q[part] @ self.problem.C_s.T
+        return np.asarray(rigid + total(self.problem.layout.comm, self.seen[part] @ self.C_rows.T))
+
+    def _cost(self, outputs: Array, first: int) -> Array:
+        """From the grid point ``first`` on, as far as there are outputs. Not collective."""
+        u = self.drive.u[first : first + len(outputs) - 1] - self.target.u
+        return accumulated_cost(outputs - self.target.y, u, self.problem.Q, self.problem.R, self.dt)
+
+    def trajectory(self, bound: Array | None) -> LoopTrajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
         problem, drive = self.problem, self.drive
         comm, n = problem.layout.comm, problem.layout.n_local
-        rigid = drive.q @ problem.C_s.T
-        outputs = rigid + total(comm, self.seen @ self.C_rows.T)
-        cost = accumulated_cost(outputs - target.y, drive.u - target.u, problem.Q, problem.R, self.dt)
+        rigid, outputs = drive.q @ problem.C_s.T, self._outputs(0, self.steps)
+        cost = self._cost(outputs, 0)
         times = np.asarray(self.dt * np.arange(self.steps + 1), dtype=np.float64)
         saturated = 0.0
         if bound is not None:

@@ -7,14 +7,13 @@ from functools import partial
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array, PETSc, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
 from softgrasp.lqr.dense.modal import assemble_space
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.operators import damp
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import steady_input
-from softgrasp.reduction.engines import on_root
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def project(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
 
     Args:
         problem: the plant.
-        V: shapes of z, local rows (n_local, k), linearly independent.
+        V: shapes of z, local rows (n_local, k), linearly independent; k = 0 leaves the hand alone.
 
     Raises:
         ControlError: the columns of V are linearly dependent.
@@ -114,8 +113,9 @@ def project(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
     small = total(comm, np.stack([V.T @ M_V, V.T @ K_V, V.T @ D_V]))
     M, K, D = (small + small.transpose(0, 2, 1)) / 2
     G, C_z = total(comm, V.T @ system.G), total(comm, V.T @ problem.C_z)
-    values = np.linalg.eigvalsh(M / np.sqrt(np.outer(np.diag(M), np.diag(M)))) if (np.diag(M) > 0).all() else [0.0]
-    if not values[0] > 1e-12:  # rounding of the products is about 1e-15 k
+    size = np.diag(M)
+    values = np.linalg.eigvalsh(M / np.sqrt(np.outer(size, size))) if (size > 0).all() else np.zeros(1)
+    if not values.min(initial=1.0) > 1e-12:  # rounding of the products is about 1e-15 k
         raise ControlError(f"the {k} shapes of the tissue are linearly dependent; orthonormalise them first")
     space = assemble_space(problem, M, K, D, G, C_z)
     f = np.zeros(len(space.E))
@@ -133,7 +133,7 @@ def m_orthonormal(M: PETSc.Mat, V: Array, tolerance: float = 1e-10) -> Array:
 
     def normalising(gram: Array) -> Array:
         values, vectors = np.linalg.eigh((gram + gram.T) / 2)
-        keep = values > tolerance**2 * values[-1]
+        keep = values > tolerance**2 * values.max(initial=0.0)
         return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
 
     for _ in range(2):  # the second pass repairs what rounding left after the first

@@ -10,14 +10,13 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, Complex
+from softgrasp.fem.petsc import Array, Complex, on_root
 from softgrasp.lqr.lowrank.adjoint import Right, closed_adjoint, mass_right
 from softgrasp.lqr.lowrank.compress import compress, gram
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import WINDOW, ShiftQueue
 from softgrasp.lqr.plant.block import Block
-from softgrasp.reduction.engines import on_root
 
 Progress = Callable[[dict[str, float]], None]
 SQUEEZE = 480  # columns of Z from which it is compressed on the way: memory of a large scene

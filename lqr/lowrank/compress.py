@@ -6,11 +6,10 @@ import numpy as np
 import scipy.linalg
 from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
-from softgrasp.reduction.engines import on_root
 
 COLUMNS = 64  # columns whose products are held at a time
 PROBES = 8  # sums of columns whose products estimate a norm

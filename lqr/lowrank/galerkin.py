@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.adi import Progress
 from softgrasp.lqr.lowrank.modal_start import (
     MODES,
@@ -27,7 +27,6 @@ from softgrasp.lqr.lowrank.shifts import shift_range
 from softgrasp.lqr.lowrank.solution import Outcome, make_solution
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.reduction.engines import on_root
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
 ROUNDING = 1e-13  # of a Gram matrix: columns independent to 3e-7
@@ -179,8 +178,9 @@ class StructuredGalerkin:
 
     V starts with the lowest modes and K_ee^{-1} C_z and grows by S(p)^{-1} C_z (one complex solve each) at
     frequencies between the last mode and the highest one, until the gain changes by less than the tolerance between
-    two spaces. The small problem keeps the second-order form and the energy, so it is stable whenever the tissue is
-    damped. The residual of such a solution is large although the gain is right; it is reported, not judged.
+    two spaces, or the space holds all of the tissue. The small problem keeps the second-order form and the energy, so
+    it is stable whenever the tissue is damped. The residual of such a solution is large although the gain is right; it
+    is reported, not judged.
 
     Attributes:
         tol: bound on the relative change of the gain between the last two spaces, see :func:`gain_change`.
@@ -221,6 +221,8 @@ class StructuredGalerkin:
         finally:
             tissue.destroy()
         reason = f"galerkin: {level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
+        if level.small.order == plant.layout.n_e:
+            reason = f"galerkin: all {level.small.order} basis vectors that there are"
         outcome = Outcome(level.Z, level.gain, reason, 1e-10, history, counts, seconds, lean=True)
         result = make_solution(plant, outcome, check=False)
         result.seconds["total"] = time.perf_counter() - begin
@@ -244,7 +246,10 @@ class StructuredGalerkin:
         # two-way the reaction of the hand loads the tissue as well
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
         level, space = solve_level(plant, space)
-        change, used = np.inf, 0
+        change, used, whole = np.inf, 0, plant.layout.n_e
+        if level.small.order == whole:
+            history.append({"basis": float(whole), "solve": 0.0, "change": 0.0})
+            return level, used
         for i in range(self.max_iterations):
             # the static response first; shift number k + 1 belongs to frequency number k
             take = [0j] if i == 0 else [_response_shift(plant, w) for w in wanted[used - 1 :][: self.per_step]]
@@ -253,7 +258,7 @@ class StructuredGalerkin:
                 parts = [response.real] if p.imag == 0 else [response.real, response.imag]
                 space = space.grown(plant, np.hstack(parts))
             used += len(take)
-            if space.V.shape[1] < level.small.order + len(take):  # nothing new: no evidence either
+            if space.V.shape[1] < min(level.small.order + len(take), whole):  # nothing new: no evidence either
                 continue
             new, space = solve_level(plant, space, level)
             change, level = gain_change(plant, new, level), new
@@ -261,7 +266,7 @@ class StructuredGalerkin:
             history.append(entry)
             if self.progress is not None:
                 self.progress(entry)
-            if change <= self.tol:
+            if change <= self.tol or level.small.order == whole:
                 return level, used
         raise SolverError(
             f"galerkin: the gain still changes by {change:.1e} at {level.small.order} basis vectors, tolerance "

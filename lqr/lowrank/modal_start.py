@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.care import care, lyapunov, riccati_residual
@@ -16,7 +16,6 @@ from softgrasp.lqr.dense.small_care import FAST_RESIDUAL, ReducedMatrices, fast_
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.reduction.engines import on_root
 
 MODES = 30
 MORE_MODES = 60  # when the last of MODES is still lightly damped

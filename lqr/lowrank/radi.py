@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, Columns, Progress
 from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, make_right, mass_right
 from softgrasp.lqr.lowrank.compress import gram
@@ -20,7 +20,6 @@ from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
 from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.reduction.engines import on_root
 
 
 @dataclass

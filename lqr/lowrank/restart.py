@@ -1,4 +1,4 @@
-"""Restart files of Newton-ADI: one file a rank, replaced only when complete."""
+"""Restart files of Newton-ADI: one file a rank, and a manifest written last that knows the SHA-256 of each."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 
 from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.sealed import read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 from softgrasp.lqr.lowrank.adi import SHARE, Columns, Sweep
 from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 
-FORMAT = 2
+FORMAT = 3
 
 
 @dataclass
@@ -56,15 +57,15 @@ def fingerprint(plant: Plant) -> str:
     return digest.hexdigest()
 
 
-def _file(folder: Path, plant: Plant) -> Path:
-    return folder / f"newton-rank{plant.comm.rank}.npz"
+def _manifest(folder: Path) -> Path:
+    return folder / "newton.json"
 
 
 def _pack(name: str, right: Right) -> dict[str, Array]:
     return {f"{name}_hand": right.hand, f"{name}_rows": right.rows}
 
 
-def _unpack(name: str, data: np.lib.npyio.NpzFile) -> Right:
+def _unpack(name: str, data: dict[str, Array]) -> Right:
     return Right(data[f"{name}_hand"], data[f"{name}_rows"])
 
 
@@ -76,7 +77,6 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> No
     """
     keys = sorted(set.intersection(*map(set, state.history))) if state.history else []  # the last of a sweep has more
     entries: dict[str, Any] = {
-        "format": np.array(FORMAT),
         "fingerprint": np.array(fingerprint(plant)),
         "numbers": np.array([state.step, state.solves, sweep.steps]),
         "norms": np.array([state.achieved, sweep.first]),
@@ -92,19 +92,21 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> No
     if state.factor is not None:
         U, signs = state.factor
         entries |= {"factor_hand": U.hand, "factor_tall": U.tall, "factor_signs": signs}
-    path = _file(folder, plant)
-    fresh = path.with_suffix(".new.npz")
-
-    def write() -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez(fresh, allow_pickle=False, **entries)
-
-    for act in (write, lambda: fresh.replace(path)):  # no rank replaces its file before all have written theirs
-        with agree(plant.comm):
+    comm = plant.comm
+    name, sha256 = f"newton-solve{state.solves}-rank{comm.rank}.npz", ""
+    with agree(comm):
+        try:
+            sha256 = write_arrays(folder / name, entries)
+        except OSError as error:
+            raise CheckpointError(f"{folder}: the restart file cannot be written ({error}); free the disk") from error
+    files = comm.gather((name, sha256))
+    with agree(comm):
+        if files is not None:
             try:
-                act()
+                write_manifest(_manifest(folder), {"format": FORMAT, "ranks": comm.size, "files": files})
             except OSError as error:
-                raise CheckpointError(f"{path}: the restart file cannot be written ({error}); free the disk") from error
+                raise CheckpointError(f"{_manifest(folder)} cannot be written ({error}); free the disk") from error
+            remove_others(folder, ["newton-*"], dict(files))
 
 
 def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> Sweep | None:
@@ -113,27 +115,25 @@ def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> Swee
     Raises:
         CheckpointError: the files are damaged or belong to another problem, tolerance apart, or rank count.
     """
-    path = _file(folder, plant)
-    if not any(plant.comm.allgather(path.exists())):
+    comm, manifest = plant.comm, _manifest(folder)
+    if not comm.bcast(manifest.exists()):
         return None
     sweep: Sweep | None = None
-    with agree(plant.comm):
-        try:
-            with np.load(path) as data:
-                if int(data["format"]) != FORMAT or str(data["fingerprint"]) != fingerprint(plant):
-                    raise CheckpointError(
-                        f"{path} belongs to another control problem or rank count; remove it or name another folder"
-                    )
-                sweep = _restore(plant, state, data, tol)
-        except (OSError, KeyError, ValueError) as error:
-            raise CheckpointError(f"{path} is damaged or missing ({error}); remove the folder {folder}") from error
-    steps = plant.comm.allgather(None if sweep is None else (state.solves, sweep.steps))
-    if len(set(steps)) > 1:
-        raise CheckpointError(f"the restart files in {folder} are of different solves; remove the folder")
+    advice = f"remove the folder {folder}"
+    with agree(comm):
+        entry = read_manifest(manifest, FORMAT, advice)
+        foreign = f"{manifest} belongs to another control problem or rank count; {advice} or name another one"
+        if entry["ranks"] != comm.size:
+            raise CheckpointError(foreign)
+        name, sha256 = entry["files"][comm.rank]
+        data = read_arrays(folder / name, sha256, advice)
+        if str(data["fingerprint"]) != fingerprint(plant):
+            raise CheckpointError(foreign)
+        sweep = _restore(plant, state, data, tol)
     return sweep
 
 
-def _restore(plant: Plant, state: Iteration, data: np.lib.npyio.NpzFile, tol: float) -> Sweep:
+def _restore(plant: Plant, state: Iteration, data: dict[str, Array], tol: float) -> Sweep:
     state.step, state.solves, steps = (int(value) for value in data["numbers"])
     state.achieved, first = (float(value) for value in data["norms"])
     keys = [str(key) for key in data["history_keys"]]

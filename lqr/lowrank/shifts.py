@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
-from softgrasp.reduction.engines import on_root
 
 WINDOW = 10  # blocks of Z whose Ritz values give the next shifts
 EARLY = 1  # shifts still to come when the next are chosen: another core or rank can factor ahead meanwhile

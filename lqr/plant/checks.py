@@ -8,6 +8,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.petsc import Array
 
 EPS = float(np.finfo(np.float64).eps)
+APART = 1e30  # of Q and R, either way: the gain goes with the root of their ratio, its squares must keep some digits
 
 
 class ControlError(SoftgraspError):
@@ -19,7 +20,7 @@ def check_weights(Q: Array, R: Array, outputs: int, inputs: int) -> None:
 
     Raises:
         ControlError: a weight has the wrong shape, an entry that is no number, is not symmetric or has a forbidden
-            eigenvalue.
+            eigenvalue, or the two are too far apart.
     """
     for name, W, order, definite in (("Q", Q, outputs, False), ("R", R, inputs, True)):
         if W.shape != (order, order):
@@ -38,6 +39,12 @@ def check_weights(Q: Array, R: Array, outputs: int, inputs: int) -> None:
             raise ControlError(f"R has the eigenvalue {least:.3g}; all must be > 0, every input must cost something")
         if not definite and least < -noise:
             raise ControlError(f"Q has the eigenvalue {least:.3g}; all must be >= 0, no output may be rewarded")
+    reward, price = float(np.abs(Q).max(initial=0.0)), np.linalg.eigvalsh(R)
+    if reward and not (reward / APART < price[0] and price[-1] < reward * APART):
+        raise ControlError(
+            f"Q has entries up to {reward:.3g} and R eigenvalues from {price[0]:.3g} to {price[-1]:.3g}, too far apart "
+            f"for double precision; keep their ratio between {1 / APART:.0e} and {APART:.0e}"
+        )
 
 
 def check_finite(**arrays: Array | None) -> None:

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.reduction.inner import solve_columns
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.petsc import Array, on_root, times_columns, total
+from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.dense.poles import closed_loop_rates
 from softgrasp.lqr.lowrank.compress import gram, triangular
@@ -22,8 +23,8 @@ from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_re
 from softgrasp.lqr.plant.operators import reach
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
-from softgrasp.reduction.engines import EPS, factor, on_root, small_svd
-from softgrasp.reduction.inner import solve_columns
+from softgrasp.reduction.engines import EPS, factor, small_svd
+from softgrasp.reduction.states import BasisError
 
 
 @dataclass(frozen=True)
@@ -342,4 +343,7 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
     """
     if name not in BASES:
         raise ControlError(f"basis '{name}' is unknown; choose one of {', '.join(BASES)}")
-    return BASES[name](problem, costates_to_absolute(problem.system, Z))
+    try:
+        return BASES[name](problem, costates_to_absolute(problem.system, Z))
+    except BasisError as error:
+        raise ControlError(f"nothing to build this basis from ({error})") from error

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.plant.block import Block
@@ -18,8 +18,8 @@ from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
 from softgrasp.lqr.reduced.riccati import GainJudge, gain_error, project
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
-from softgrasp.reduction.engines import on_root
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop, SampledRadius
+from softgrasp.lqr.spectrum.sampled import Sampling
 
 Materials = tuple[LayerMaterial, ...]
 
@@ -112,7 +112,8 @@ class Retuner:
 class BoxPoint:
     """One setting of the box: errors against the full Riccati solution there.
 
-    ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop.
+    ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop, and from tick to
+    tick where its instants are known.
     """
 
     materials: Materials
@@ -122,11 +123,13 @@ class BoxPoint:
     seconds: float
     reason: str = ""
     certified: bool = True
+    sampled: SampledRadius | None = None
 
     @property
     def stable(self) -> bool:
         """Whether the full closed loop was computed and is stable."""
-        return not self.reason and self.certified and self.abscissa_full < 0
+        fine = not self.reason and self.certified and self.abscissa_full < 0
+        return fine and (self.sampled is None or self.sampled.stable)
 
 
 def over_box(
@@ -135,6 +138,7 @@ def over_box(
     solve: Callable[[RiccatiProblem], RiccatiSolution],
     start: Block,
     modes: int | None = None,
+    law: Sampling | None = None,
 ) -> tuple[BoxPoint, ...]:
     """Error of the re-tuned gain at every setting of a box. Collective.
 
@@ -144,6 +148,7 @@ def over_box(
         solve: full solver, the reference.
         start: start minus target, see :func:`lqr.reduced.riccati.hand_start`.
         modes: modes of the full closed loop, see :class:`lqr.spectrum.modal_loop.ModalLoop`.
+        law: instants of the loop; None judges the continuous law alone.
     """
     result = []
     comm = retuner.problem.layout.comm
@@ -157,9 +162,17 @@ def over_box(
             continue
         gain = retuner.full_gain(tuned)
         best = solve(problem)
-        found = GainJudge(problem, best, start, ModalLoop(problem, modes)).quality(gain)
-        miss = gain_error(problem, gain_of(best), gain)
+        found = GainJudge(problem, best, start, ModalLoop(problem, modes), law).quality(gain)
+        miss, excess = gain_error(problem, gain_of(best), gain), found.cost_excess
         result.append(
-            BoxPoint(materials, miss, found.cost_excess, found.abscissa, tuned.seconds, certified=found.certified)
+            BoxPoint(
+                materials,
+                miss,
+                excess,
+                found.abscissa,
+                tuned.seconds,
+                certified=found.certified,
+                sampled=found.sampled,
+            )
         )
     return tuple(result)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
 from softgrasp.lqr.plant.block import Block
@@ -18,8 +18,8 @@ from softgrasp.lqr.plant.operators import descriptor, descriptor_adjoint, dynami
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop
-from softgrasp.reduction.engines import on_root
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop, SampledRadius
+from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radius
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class GainReport:
         time_are: seconds for the reduced equation.
         reason: why there is no gain; empty when there is one.
         certified: the sign of the abscissa is certain, see :class:`lqr.spectrum.modal_loop.LoopQuality`.
+        sampled: the loop from tick to tick, where its instants are known.
     """
 
     method: str
@@ -66,11 +67,13 @@ class GainReport:
     time_are: float
     reason: str = ""
     certified: bool = True
+    sampled: SampledRadius | None = None
 
     @property
     def stable(self) -> bool:
         """Whether the full closed loop was computed and is stable. A gain without this mark is never offered."""
-        return not self.reason and self.certified and self.abscissa_full < 0
+        fine = not self.reason and self.certified and self.abscissa_full < 0
+        return fine and (self.sampled is None or self.sampled.stable)
 
 
 def project(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
@@ -143,10 +146,16 @@ class GainJudge:
         solution: the Riccati solution of the full plant.
         start: start minus target of hand and tissue, hand-relative, one column.
         loop: the full closed loop; made here when None.
+        law: instants of the loop; None judges the continuous law alone.
     """
 
     def __init__(
-        self, problem: RiccatiProblem, solution: RiccatiSolution, start: Block, loop: ModalLoop | None = None
+        self,
+        problem: RiccatiProblem,
+        solution: RiccatiSolution,
+        start: Block,
+        loop: ModalLoop | None = None,
+        law: Sampling | None = None,
     ) -> None:
         self.problem = problem
         self.Z, self.K = factor_of(solution), gain_of(solution)
@@ -154,26 +163,42 @@ class GainJudge:
         self.start = start
         self.loop = ModalLoop(problem) if loop is None else loop
         self.whole: ModalLoop | None = None
+        self.law, self.ticks = law, SampledLoop(problem, self.loop)
         self.optimal = float(np.sum(gram(problem.layout.comm, self.Z, descriptor(problem, start)) ** 2))
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
 
     def quality(self, gain: Block) -> LoopQuality:
-        """Abscissa and cost excess of any gain. Collective.
+        """Abscissa, cost excess and sampled radius of any gain. Collective.
 
         Large scenes take the abscissa from :func:`lqr.spectrum.certificate.certified_abscissa` and the cost from the
         lowest modes; where the certificate fails, all modes are taken as long as a dense spectrum is affordable.
         """
         if self.loop.complete:
-            return self.loop.quality(gain, self.K, self.start, self.optimal)
+            return self._sampled(gain, self.loop.quality(gain, self.K, self.start, self.optimal))
         spectrum = certified_abscissa(self.problem, gain)
         if not spectrum.certified and self.problem.layout.n_e <= DENSE_LIMIT:
-            if self.whole is None:
-                self.whole = ModalLoop(self.problem, DENSE_LIMIT)
-            return self.whole.quality(gain, self.K, self.start, self.optimal)
+            return self.by_all_modes(gain)
         found = self.loop.quality(gain, self.K, self.start, self.optimal)
         excess = found.cost_excess if spectrum.value < 0 else np.inf
-        return LoopQuality(spectrum.value, excess, spectrum.certified, spectrum.exact)
+        poles = spectrum.eigenvalues
+        return self._sampled(gain, LoopQuality(spectrum.value, excess, spectrum.certified, spectrum.exact, poles))
+
+    def by_all_modes(self, gain: Block) -> LoopQuality:
+        """The same from the whole spectrum, up to :data:`lqr.spectrum.modal_loop.DENSE_LIMIT` modes. Collective."""
+        if self.whole is None:
+            self.whole = self.loop if self.loop.complete else ModalLoop(self.problem, DENSE_LIMIT)
+            self.ticks = SampledLoop(self.problem, self.whole)
+        return self._sampled(gain, self.whole.quality(gain, self.K, self.start, self.optimal))
+
+    def _sampled(self, gain: Block, found: LoopQuality) -> LoopQuality:
+        """With the radius from tick to tick; that of the law at the midpoint follows from the poles. Collective."""
+        if self.law is None:
+            return found
+        if self.law.every:
+            return replace(found, sampled=self.ticks.judge(gain, self.law))
+        radius = SampledRadius(midpoint_radius(found.poles, self.law.dt), found.certified, found.exact)
+        return replace(found, sampled=radius)
 
     def report(self, basis: RiccatiBasis) -> GainReport:
         """All figures of one basis; a reduced equation without solution is reported, not raised. Collective."""
@@ -192,6 +217,7 @@ class GainJudge:
             abscissa_full=found.abscissa,
             time_are=reduced.seconds,
             certified=found.certified,
+            sampled=found.sampled,
         )
 
 

@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
 
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import damp, reach
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.reduction.engines import on_root
 
 ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
 DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
 SOME_MODES = 150
+
+
+@dataclass(frozen=True)
+class SampledRadius:
+    """Spectral radius of a loop from tick to tick, see :mod:`lqr.spectrum.sampled`.
+
+    Attributes:
+        value: largest modulus of an eigenvalue; of the modes kept where not ``exact``.
+        certified: the radius of the whole plant lies on the same side of 1.
+        exact: all modes were kept.
+        reason: why it is not certified; empty when it is.
+    """
+
+    value: float
+    certified: bool = True
+    exact: bool = True
+    reason: str = ""
+
+    @property
+    def stable(self) -> bool:
+        """Certified and below 1."""
+        return self.certified and self.value < 1
 
 
 @dataclass(frozen=True)
@@ -30,17 +51,21 @@ class LoopQuality:
         certified: its sign is certain: from the whole spectrum, or from
             :func:`lqr.spectrum.certificate.certified_abscissa`.
         exact: the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth.
+        poles: eigenvalues behind it.
+        sampled: from tick to tick, where the instants of the loop are known.
     """
 
     abscissa: float
     cost_excess: float
     certified: bool = True
     exact: bool = True
+    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    sampled: SampledRadius | None = None
 
     @property
     def stable(self) -> bool:
-        """Whether every eigenvalue is known to lie left of the imaginary axis."""
-        return self.certified and self.abscissa < 0
+        """Whether every eigenvalue is known to lie left of the axis, and in the unit circle where it is sampled."""
+        return self.certified and self.abscissa < 0 and (self.sampled is None or self.sampled.stable)
 
 
 class ModalLoop:
@@ -101,13 +126,14 @@ class ModalLoop:
         def judge() -> LoopQuality:
             F = self.A + self.B @ k
             if not np.isfinite(F).all():
-                return LoopQuality(np.inf, np.inf)
+                return LoopQuality(np.inf, np.inf, poles=np.array([np.inf + 0j]))
             T, U = scipy.linalg.schur(F, output="real")
-            abscissa = float(block_eigenvalues(T).real.max())
+            poles = block_eigenvalues(T)
+            abscissa = float(poles.real.max())
             if not abscissa < 0:
-                return LoopQuality(abscissa, np.inf)
+                return LoopQuality(abscissa, np.inf, poles=poles)
             Y = lyapunov(T, U, difference.T @ self.problem.R @ difference)
-            return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal)
+            return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal, poles=poles)
 
         return on_root(self.comm, judge)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.lowrank.modal_start import plant_modes
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.reduction.inner import solve_columns
 
 MODES = 60
 
@@ -34,6 +34,11 @@ def least_beta(problem: RiccatiProblem) -> float:
     if system.damping.matrix is None:
         return system.damping.beta
     return min((m.beta for m in system.materials), default=0.0)
+
+
+def tail_modes(problem: RiccatiProblem, k: int) -> tuple[Array, Array]:
+    """The k lowest frequencies and modes, two-way with the hand floating. Collective."""
+    return plant_modes(Plant(problem), k) if problem.system.two_way else some_modes(problem, k)[:2]
 
 
 class Tail:
@@ -61,9 +66,10 @@ class Tail:
     Args:
         problem: the plant; :func:`why_no_bound` must be empty.
         K: gain, transposed, hand-relative.
+        modes: :func:`tail_modes`, when they are there already.
     """
 
-    def __init__(self, problem: RiccatiProblem, K: Block) -> None:
+    def __init__(self, problem: RiccatiProblem, K: Block, modes: tuple[Array, Array] | None = None) -> None:
         system, n, n_s = problem.system, problem.layout.n_local, problem.layout.n_s
         comm = problem.layout.comm
         inverse = np.linalg.inv(problem.M_s)
@@ -76,11 +82,11 @@ class Tail:
         gain_z, gain_v = K.tall[:n], K.tall[n:]
         if system.two_way:  # the hand gives way: q_s = M_s^{-1} (u / s^2 - G'z)
             gain_z, gain_v = gain_z - force @ hand_q, gain_v - force @ hand_v
-        k = min(MODES, problem.layout.n_e)
-        self.omega, Phi = plant_modes(Plant(problem), k) if system.two_way else some_modes(problem, k)[:2]
+        self.omega, Phi = tail_modes(problem, min(MODES, problem.layout.n_e)) if modes is None else modes
         columns = np.hstack([gain_z, gain_v, force])
         size = total(comm, Phi.T @ columns)
-        self.modes = np.linalg.norm(np.stack(np.hsplit(size, 3)), axis=2)
+        self.parts = np.hsplit(size, 3)  # gain on z and v, and force, of each mode
+        self.modes = np.linalg.norm(np.stack(self.parts), axis=2)
         # the rest itself: as a difference of norms it would lose half the digits
         rest = columns - _moved_mass(problem, Phi) @ size
         self.rest_z, self.rest_v, self.rest_force = _norms(problem, rest, _inverse_mass(problem, rest), 3)

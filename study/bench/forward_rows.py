@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import resource
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +31,7 @@ from softgrasp.study.bench.peers import (
     has_pymor,
     to_scipy,
 )
+from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.jobs import leave_result
 from softgrasp.study.shell.timing import interleave, medians, timed, warm
 
@@ -70,19 +69,6 @@ def bench_scene(comm: MPI.Intracomm, dimension: int, cells: list[int], steps: in
     return load_scene_collective(comm, shipped_scenes()["paper_forward"], changes)
 
 
-def peak_mb(comm: MPI.Intracomm) -> float:
-    """Largest resident memory so far, summed over the ranks [MiB]. Collective.
-
-    Linux's VmHWM starts anew with this program, unlike ``ru_maxrss``, which may show that of the launcher.
-    """
-    try:
-        text = Path("/proc/self/status").read_text()
-        mine = next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmHWM")) / 1024
-    except (OSError, StopIteration):
-        mine = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return float(comm.allreduce(mine))
-
-
 def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dict[str, list[float]], float, float]:
     """Build and factor several times: last model, seconds, peak memory after the first, seconds of a TS step."""
     seconds: dict[str, list[float]] = {"mesh": [], "assembly": [], "factor": []}
@@ -98,7 +84,7 @@ def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dic
             run.advance_to(ts, 3)
             n = comm.bcast(int(np.clip(0.05 * run.reached / run.seconds, 1, 400)))
             pace = timed(comm, lambda: run.advance_to(ts, 3 + n)) / n  # noqa: B023  (called at once)
-            memory = peak_mb(comm)
+            memory = peak_memory_mb(comm)
             ts.destroy()
         run.midpoint.destroy()
         gc.collect()
@@ -247,7 +233,7 @@ def measure(
     """
     cells = cells_for(dimension, size)
     build(bench_scene(comm, dimension, [2] * (dimension - 1) + [4], 1), comm)  # compiles the forms
-    base = peak_mb(comm)
+    base = peak_memory_mb(comm)
     model, seconds, memory, pace = _builds(comm, bench_scene(comm, dimension, cells, PAPER_STEPS), repeats)
     k = int(np.clip(repeat_seconds / pace, 3, 50_000))
     scene = bench_scene(comm, dimension, cells, repeats * (k + warm(k)) + 10)
@@ -261,13 +247,13 @@ def measure(
 def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int) -> dict[str, Any]:
     """A large scene once, from the mesh to the end, nothing stored. Collective."""
     cells = cells_for(dimension, size)
-    base = peak_mb(comm)
+    base = peak_memory_mb(comm)
     begin = time.perf_counter()
     model = build(bench_scene(comm, dimension, cells, steps), comm)
     run = simulate(model)
     result = _row(comm, model, cells, {name: run.seconds[name] for name in ("mesh", "assembly", "factor")})
     return result | {
-        "memory_mb": peak_mb(comm),
+        "memory_mb": peak_memory_mb(comm),
         "memory_base_mb": base,
         "repeats": 1,
         "steps_per_repeat": steps,

@@ -28,8 +28,8 @@ from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_of, gain_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.study.bench.forward_rows import peak_mb
 from softgrasp.study.bench.peers import to_scipy
+from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.jobs import leave_result
 
 METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
@@ -107,7 +107,7 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
     """
     comm = MPI.COMM_WORLD
     problem = problem_for(comm, nx, beta)
-    base = peak_mb(comm)
+    base = peak_memory_mb(comm)
     result: dict[str, Any] = {"states": problem.layout.states, "n_e": problem.layout.n_e, "ranks": comm.size}
     rows: dict[str, Any] = {}
     reference: Block | None = None
@@ -117,7 +117,7 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
         except SoftgraspError as error:
             rows[name] = {"error": str(error)}
             continue
-        rows[name] = describe(solution, seconds, base, peak_mb(comm))
+        rows[name] = describe(solution, seconds, base, peak_memory_mb(comm))
         gain = gain_of(solution)
         if reference is None:
             reference = gain

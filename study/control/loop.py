@@ -12,10 +12,10 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.scene.file import scene_hash
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller, layout_hash, save_gain
 from softgrasp.lqr.loop.cost import predicted_cost
@@ -25,7 +25,11 @@ from softgrasp.lqr.loop.small_plant import m_orthonormal, project
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.gain import Gain
-from softgrasp.study.control.solve import Design, actuation
+from softgrasp.lqr.plant.operators import outputs
+from softgrasp.lqr.reduced.riccati import norm
+from softgrasp.lqr.spectrum.modal_loop import SampledRadius
+from softgrasp.lqr.spectrum.sampled import Sampling
+from softgrasp.study.control.solve import Design, actuation, largest_radius, loop_words
 from softgrasp.study.control.sweep import MANY_STATES, SweptBasis, fast_order
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.loop import move_steps
@@ -33,7 +37,7 @@ from softgrasp.study.pictures.loop import move_steps
 SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
 LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle
 TICKS = 1000  # behind the time of one tick of the controller
-SEGMENTS = 50
+NOTHING = 1e-12  # of the gain: rounding
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class LoopRuns:
         to_come: cost still to come at the end, from the Riccati solution.
         reduced: under the best stable gain of each method: (title, N) and the run, or why it failed.
         small: the controller's own small plant under its gain.
+        limits: of the inputs [N, N m], inf for none; None without any.
     """
 
     plan: LoopPlan
@@ -70,6 +75,7 @@ class LoopRuns:
     to_come: float
     reduced: dict[str, tuple[str, int, LoopTrajectory | str]]
     small: ReducedTrajectory | None
+    limits: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -80,11 +86,13 @@ class MadeController:
         controller: what a robot runs.
         name: basis that its gain came from.
         tick: seconds of one tick, median.
+        radius: of the plant under it from tick to tick, at the period, step and delay of the scene.
     """
 
     controller: Controller
     name: str
     tick: float
+    radius: SampledRadius
 
 
 def plan(model: Model, found: Design, own_end: bool) -> LoopPlan:
@@ -109,8 +117,8 @@ def plan(model: Model, found: Design, own_end: bool) -> LoopPlan:
     return LoopPlan(dt, longer, settle, note)
 
 
-def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) -> MadeController | None:
-    """The best certified a-priori gain of a small order as a controller; None when there is none. Collective.
+def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) -> tuple[MadeController | None, str]:
+    """The best certified a-priori gain of a small order as a controller; None and why when there is none. Collective.
 
     Its states are [q_s, v_s, eta, eta'] with z = V eta, V the modes of the basis. The gain that is lifted by the filter
     W'z of these modes acts on them only, so that the small controller is the gain that was judged.
@@ -123,8 +131,11 @@ def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) ->
         name, gain = "modal", Gain.of(found.solution)
         # the factor spans the modes; what is dropped has 1e-12 of its largest column in X
         V = m_orthonormal(model.system.M_ee, found.solution.Z_v, 1e-6)
+    elif blind(found):
+        name, gain = "hand alone", Gain.of(found.solution)
+        V = np.zeros((n, 0))
     elif basis is None or basis.family is None or best is None:
-        return None
+        return None, "no a-priori gain of small order with tissue in it is certified to be stable"
     else:
         name, gain = basis.name, gain_of_basis(found, basis, best.N)
         V = basis.family.at(best.N).U.tall[n:, -((best.N - 2 * layout.n_s) // 2) :]
@@ -144,7 +155,20 @@ def make_controller(model: Model, found: Design, swept: Sequence[SweptBasis]) ->
         layout_hash(layout),
         {"scene": model.scene.name, "method": name, "N": plant.N},
     )
-    return MadeController(controller, name, layout.comm.bcast(_tick(controller)))
+    law = found.judge.law
+    if law is None or not law.every:  # the scene's own law acts within the step, which no robot can
+        law = Sampling(controller.period, 1)
+    radius = found.judge.ticks.controller(controller, law)
+    if not radius.value < largest_radius(found.modal):
+        return None, f"{loop_words(law)}, its loop has the spectral radius {radius.value:.3g}, which must be below 1"
+    return MadeController(controller, name, layout.comm.bcast(_tick(controller)), radius), ""
+
+
+def blind(found: Design) -> bool:
+    """Whether the optimal gain is one of the hand alone: the outputs see nothing of the tissue. Collective."""
+    problem, K = found.problem, gain_of(found.solution)
+    part = Block(np.zeros_like(K.hand), K.tall)
+    return norm(problem, part) <= NOTHING * norm(problem, K)
 
 
 def gain_of_basis(found: Design, basis: SweptBasis, N: int) -> Gain:
@@ -202,7 +226,8 @@ def run_loops(
     frames.chosen = set(shown)
     loop = ClosedLoop(problem, timing.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible)
     try:
-        options = LoopOptions(frames=shown, frame=frames, progress=progress)
+        most = largest_cost(found, timing)
+        options = LoopOptions(frames=shown, frame=frames, progress=progress, most=most)
         full = loop.run(Gain.of(found.solution), found.target, timing.steps, law, found.start, options)
         reduced: dict[str, tuple[str, int, LoopTrajectory | str]] = {}
         for basis, N in others:
@@ -210,14 +235,22 @@ def run_loops(
             gain = gain_of_basis(found, basis, N)
             run: LoopTrajectory | str
             try:
-                run = loop.run(gain, found.target, timing.steps, law, found.start, LoopOptions(progress=progress))
+                options = LoopOptions(progress=progress, most=most)
+                run = loop.run(gain, found.target, timing.steps, law, found.start, options)
             except SolverError as error:  # limits or sampling may upset what the continuous law stabilises
                 run = str(error)
             reduced[basis.name] = (basis.title, N, run)
     finally:
         loop.destroy()
     to_come = predicted_cost(problem, found.solution, full.final - found.target.state)
-    return LoopRuns(timing, full, to_come, reduced, small_run(model, found, made, timing, law))
+    small, bound = small_run(model, found, made, timing, law), law.bound(problem.layout.n_s)
+    return LoopRuns(timing, full, to_come, reduced, small, bound)
+
+
+def largest_cost(found: Design, timing: LoopPlan) -> float:
+    """A thousand times what the optimal loop and one that does nothing would pay. Collective."""
+    y = outputs(found.problem, found.error)[:, 0]
+    return 1e3 * (found.judge.optimal + timing.dt * timing.steps * float(y @ found.problem.Q @ y))
 
 
 def best_gains(swept: Sequence[SweptBasis], layout: BlockLayout) -> list[tuple[SweptBasis, int]]:

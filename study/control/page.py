@@ -15,9 +15,11 @@ from softgrasp.fem.model.outputs import hand_axes
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
+from softgrasp.lqr.reduced.retune import BoxPoint
+from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.loop import LoopRuns, MadeController, distance
 from softgrasp.study.control.solve import Design, scene_words
-from softgrasp.study.control.sweep import TITLES, Retuned, SweptBasis, report_dict
+from softgrasp.study.control.sweep import TITLES, Retuned, SweptBasis, radius_of, report_dict
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures.animation import speed_up
 from softgrasp.study.report.equation_control import control_text
@@ -26,8 +28,9 @@ from softgrasp.study.report.origin import command_line, made_with, origin, peak_
 from softgrasp.study.report.page import Section, write_report
 
 Row = tuple[Any, ...]
-REDUCED_HEADER = ("basis", "N", "error of P", "error of K", "excess cost", "abscissa [1/s]", "reduced ARE [ms]", "gain")
-BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", "excess cost", "abscissa [1/s]", "re-tuned in [ms]", "gain")
+SPECTRUM = ("abscissa [1/s]", "radius a tick")
+REDUCED_HEADER = ("basis", "N", "error of P", "error of K", "excess cost", *SPECTRUM, "reduced ARE [ms]", "gain")
+BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", "excess cost", *SPECTRUM, "re-tuned in [ms]", "gain")
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
 CAPTIONS = {
     "move.png": "The move to the target at some instants, full plant under the optimal gain.",
@@ -88,6 +91,9 @@ def control_result(model: Model, found: Found, watch: Stopwatch) -> dict[str, An
         "closed_loop_abscissa": d.quality.abscissa,
         "closed_loop_certified": d.quality.certified,
         "closed_loop_exact": d.quality.exact,
+        "sampled_radius": None if d.quality.sampled is None else d.quality.sampled.value,
+        "sampled_certified": d.quality.sampled is not None and d.quality.sampled.certified,
+        "sampled_exact": d.quality.sampled is not None and d.quality.sampled.exact,
         "stable": d.quality.stable,
         "findings": [scene_words(f.sentence) for f in d.diagnosis.findings],
         "damping_enough": d.diagnosis.damping_enough,
@@ -110,6 +116,7 @@ def _retuned(r: Retuned) -> dict[str, Any]:
             "error_K": p.error_K,
             "cost_excess": p.cost_excess,
             "abscissa_full": p.abscissa_full,
+            "sampled_radius": radius_of(p),
             "time": p.seconds,
             "stable": p.stable,
             "reason": p.reason,
@@ -123,7 +130,8 @@ def _controller(made: MadeController | None) -> dict[str, Any] | None:
     if made is None:
         return None
     c = made.controller
-    return {"method": made.name, "N": c.plant.N, "period": c.period, "time_tick": made.tick}
+    return {"method": made.name, "N": c.plant.N, "period": c.period, "time_tick": made.tick,
+            "sampled_radius": made.radius.value}  # fmt: skip
 
 
 def _loop(found: Found) -> dict[str, Any]:
@@ -181,12 +189,16 @@ def summary_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
         ("optimal cost from the start", f"{result['optimal_cost']:.6g}"),
     ]
     word = "" if result["closed_loop_certified"] else ", not certified for the modes left out"
-    word = word if result["stable"] or word else ": not stable"
+    word = word if result["closed_loop_abscissa"] < 0 or word else ": not stable"
     if not word and not result["closed_loop_exact"]:
         word = ", a lower bound; stable for certain"
     if word and "stay on the imaginary axis" in result["method"]:
         word = ": that of the modes left out, zero to rounding"
     rows.append(("closed-loop spectral abscissa", f"{result['closed_loop_abscissa']:.4g} 1/s{word}"))
+    if result["sampled_radius"] is not None:
+        kept = "" if result["sampled_exact"] else ", of the modes kept"
+        kept += "" if result["sampled_certified"] else ", not certified for the modes left out"
+        rows.append(("spectral radius from tick to tick", f"{result['sampled_radius']:.6g}{kept}"))
     for label, key in (("gain, body displaced", "gain_translation"), ("gain, body moving", "gain_rigid_velocity")):
         rows.append((label, "; ".join(" ".join(f"{v:.5g}" for v in row) for row in np.array(result[key]))))
     rows.append(
@@ -220,10 +232,14 @@ def _fast(r: dict[str, Any]) -> str:
     )
 
 
-def _mark(stable: bool, certified: bool, reason: str) -> str:
-    if reason:
+def _mark(gain: GainReport | BoxPoint) -> str:
+    if gain.reason:
         return "none"
-    return "stable" if stable else ("unstable" if certified else "not certified")
+    if gain.stable or not gain.certified:
+        return "stable" if gain.stable else "not certified"
+    if gain.abscissa_full >= 0 or gain.sampled is None:
+        return "unstable"
+    return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
 
 
 def reduced_rows(swept: Sequence[SweptBasis]) -> list[Row]:
@@ -234,8 +250,9 @@ def reduced_rows(swept: Sequence[SweptBasis]) -> list[Row]:
             r.N,
             *(None if r.reason or not np.isfinite(x) else float(x) for x in (r.error_P, r.error_K, r.cost_excess)),
             None if r.reason else r.abscissa_full,
+            None if r.sampled is None else radius_of(r),
             None if r.reason else 1e3 * r.time_are,
-            _mark(r.stable, r.certified, r.reason),
+            _mark(r),
         )
         for s in swept
         for r in s.reports
@@ -250,9 +267,9 @@ def box_rows(r: Retuned) -> list[Row]:
             p.materials[0].mu,
             *(
                 None if p.reason or not np.isfinite(x) else float(x)
-                for x in (p.error_K, p.cost_excess, p.abscissa_full, 1e3 * p.seconds)
+                for x in (p.error_K, p.cost_excess, p.abscissa_full, radius_of(p), 1e3 * p.seconds)
             ),
-            _mark(p.stable, p.certified, p.reason),
+            _mark(p),
         )
         for p in r.points
     ]

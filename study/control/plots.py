@@ -189,8 +189,8 @@ def draw_all(
     full, d = runs.full, found.problem.layout.dimension
     others = compared(runs)
     files += figure_histories(
-        full.times, full.outputs, full.inputs, _names(full.output_names), out / "histories.png", target=found.target.y,
-        others=others, settle=runs.plan.settle, dimension=d,
+        full.times, full.outputs, full.inputs, full.output_names, out / "histories.png", target=found.target.y,
+        limits=runs.limits, others=others, settle=runs.plan.settle, dimension=d,
     )  # fmt: skip
     if any(s.reports for s in swept):
         files += figure_reduced(swept, out / "errors.png")
@@ -208,10 +208,6 @@ def compared(runs: LoopRuns) -> dict[str, tuple[Array, Array]]:
     paper = sorted((float(run.cost[-1]), name) for name, (_, _, run) in ran.items() if name != "structured")
     names = [name for name in ("structured", *(name for _, name in paper[-1:])) if name in ran]
     return {f"{ran[n][0]}, $N = {ran[n][1]}$": (ran[n][2].outputs, ran[n][2].inputs) for n in names}
-
-
-def _names(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name.replace(".", "_") for name in names)
 
 
 def _move(out: Path, found: Design, runs: LoopRuns, frames: Frames) -> list[Path]:

@@ -16,10 +16,10 @@ from rich.markup import escape
 from rich.progress import Progress, TaskProgressColumn
 from rich.table import Table
 
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.scene.control import Control, ControlOutput
-from softgrasp.fem.scene.file import scene_hash
 from softgrasp.study.control.loop import make_controller, plan, run_loops, save_controllers
 from softgrasp.study.control.page import Found, control_result, summary_rows, write_all
 from softgrasp.study.control.solve import design
@@ -163,9 +163,11 @@ def control_model(
         with watch.stage("retune"):
             retuned, why = retune(model, solved, swept, counted(bar, "re-tuning"))
         notes += [text for text in (few, why and f"no re-tuning: {why}") if text]
-    made = make_controller(model, solved, swept)
-    if made is None:
-        notes.append("no small controller: no a-priori gain of small order with tissue in it is certified to be stable")
+    made, why = make_controller(model, solved, swept)
+    notes += [f"no small controller: {why}"] if why else []
+    sampled = solved.quality.sampled
+    if sampled is not None and sampled.reason:
+        notes.append(f"the loop from tick to tick is not certified: {sampled.reason}")
     timing = plan(model, solved, own_end)
     notes += [timing.note] if timing.note else []
     frames = Frames(model, out, pictures)

@@ -24,7 +24,8 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainJudge
 from softgrasp.lqr.riccati import Method, choose, solve
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, LoopQuality, ModalLoop
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, LoopQuality, ModalLoop, SampledRadius
+from softgrasp.lqr.spectrum.sampled import Sampling
 
 Progress = Callable[[dict[str, float]], None]
 NAMES: dict[str, Method] = {
@@ -35,6 +36,7 @@ NAMES: dict[str, Method] = {
     "dense": "dense",
 }
 MODAL_MODES, MODAL_CANDIDATES = 10, 40
+ROUNDING = 1e-8  # of an eigenvalue on the unit circle
 WHOLE_SPECTRUM = 500  # n_e up to which the Schur form of all modes, about a second, may judge every gain
 
 
@@ -97,11 +99,27 @@ def actuation(model: Model) -> Actuation:
     scene = model.scene
     if scene.control is None:
         return Actuation()
-    loop = scene.control.loop
-    law = Actuation(loop.rate if loop.sampling == "held" else None, loop.delay, loop.limit)
-    law.bound(model.system.layout.n_s)
+    loop, layout = scene.control.loop, model.system.layout
+    turns = layout.n_s - layout.dimension
+    if loop.limit_torque is not None and turns == 0:
+        raise ControlError(
+            "control.loop.limit_torque limits a hand that does not turn; set effects.rotation = true, or leave it out"
+        )
+    limits = None
+    if loop.limit is not None or loop.limit_torque is not None:
+        limits = (loop.limit or np.inf,) * layout.dimension + (loop.limit_torque or np.inf,) * turns
+    law = Actuation(loop.rate if loop.sampling == "held" else None, loop.delay, limits)
     law.ticks(scene.time_end / scene.time.steps)
     return law
+
+
+def sampling(model: Model) -> Sampling:
+    """The instants of the scene's loop. Not collective.
+
+    Raises:
+        ControlError: the tick is no multiple of the time step.
+    """
+    return Sampling.of(actuation(model), model.scene.time_end / model.scene.time.steps)
 
 
 def difference(start: PlantState, target: PlantState) -> Block:
@@ -137,7 +155,8 @@ def design(model: Model, watch: Stopwatch, progress: Progress | None = None, che
         checkpoint: folder for the solver's restart files.
 
     Raises:
-        SoftgraspError: no solution, not converged, or a gain that does not stabilise the full plant.
+        SoftgraspError: no solution, not converged, or a gain that does not stabilise the full plant at the scene's own
+            step, rate and delay.
     """
     with watch.stage("diagnosis"):
         problem, diagnosis, modal = check(model)
@@ -147,12 +166,14 @@ def design(model: Model, watch: Stopwatch, progress: Progress | None = None, che
         solution = _modal(problem, diagnosis) if modal else _solve(model, problem, progress, checkpoint)
     with watch.stage("judge"):
         error = difference(start, target.state)
-        judge, quality = _judge(problem, solution, error)
-    if quality.certified and not quality.stable and not modal:
+        judge, quality = _judge(problem, solution, error, sampling(model))
+    if quality.certified and not quality.abscissa < 0 and not modal:
         raise SolverError(
             f"the gain leaves the closed loop with the spectral abscissa {quality.abscissa:.1e}/s, which must be "
             "negative; add damping, or try another control.method"
         )
+    with watch.stage("judge"):
+        _require_sampled(model, judge, gain_of(solution), quality.sampled, modal)
     return Design(problem, solution, target, start, error, diagnosis, judge, quality, modal)
 
 
@@ -183,20 +204,51 @@ def every_mode(problem: RiccatiProblem) -> ModalLoop:
     return ModalLoop(problem, problem.layout.n_e)
 
 
-def _judge(problem: RiccatiProblem, solution: RiccatiSolution, error: Block) -> tuple[GainJudge, LoopQuality]:
+def _judge(
+    problem: RiccatiProblem, solution: RiccatiSolution, error: Block, law: Sampling
+) -> tuple[GainJudge, LoopQuality]:
     """The lowest modes and shift-and-invert; all modes where that does not converge, as far as they fit."""
-    judge = GainJudge(problem, solution, error, ModalLoop(problem, min(SOME_MODES, problem.layout.n_e)))
+    judge = GainJudge(problem, solution, error, ModalLoop(problem, min(SOME_MODES, problem.layout.n_e)), law)
     try:
         return judge, worth(judge, gain_of(solution), DENSE_LIMIT)
     except SolverError:
         if problem.layout.n_e > DENSE_LIMIT:
             raise
-    judge = GainJudge(problem, solution, error, every_mode(problem))
+    judge = GainJudge(problem, solution, error, every_mode(problem), law)
     return judge, judge.quality(gain_of(solution))
 
 
+def loop_words(law: Sampling) -> str:
+    """Rate and delay of a held loop. Not collective."""
+    return f"sampled at {1 / (law.dt * law.every):.6g} Hz" + (" and one tick late" if law.delay else "")
+
+
+def largest_radius(modal: bool) -> float:
+    """Below it a controller is written; modal feedback leaves undamped modes on the circle. Not collective."""
+    return 1 + ROUNDING if modal else 1.0
+
+
+def _require_sampled(model: Model, judge: GainJudge, gain: Block, radius: SampledRadius | None, modal: bool) -> None:
+    """Refuse a held loop that is unstable, with a rate that is not. Collective."""
+    law, most = judge.law, largest_radius(modal)
+    if law is None or not law.every or radius is None or radius.value < most:
+        return
+    good = judge.ticks.stable_rate(gain, law, model.scene.time_end, most)
+    advice = "no rate makes it stable"
+    if good is not None:
+        steps = "" if good.steps == model.scene.time.steps else f" with time.steps = {good.steps}"
+        advice = (
+            f"it begins to be stable at control.loop.rate = {good.rate:.9g}{steps} (radius {good.radius:.6g}), so take "
+            "a higher one"
+        )
+    raise SolverError(
+        f"the loop {loop_words(law)} is unstable: its spectral radius from tick to tick is {radius.value:.4g}, which "
+        f"must be below 1; {advice}, or lower control.Q for a slower move"
+    )
+
+
 def worth(judge: GainJudge, gain: Block, whole: int = WHOLE_SPECTRUM) -> LoopQuality:
-    """Abscissa and cost excess; all modes of a small scene where shift-and-invert gives no certificate. Collective.
+    """Abscissa, cost, radius; all modes of a small scene where shift-and-invert gives no certificate. Collective.
 
     Args:
         judge: with the lowest modes.
@@ -206,4 +258,4 @@ def worth(judge: GainJudge, gain: Block, whole: int = WHOLE_SPECTRUM) -> LoopQua
     found = judge.quality(gain)
     if found.certified or judge.problem.layout.n_e > whole:
         return found
-    return every_mode(judge.problem).quality(gain, judge.K, judge.start, judge.optimal)
+    return judge.by_all_modes(gain)

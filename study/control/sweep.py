@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model
-from softgrasp.lqr.plant.block import Block
+from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import factor_of
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
@@ -19,8 +19,7 @@ from softgrasp.lqr.reduced.retune import BoxPoint, Materials, Retuner, over_box
 from softgrasp.lqr.reduced.riccati import GainReport, ReducedRiccati, factor_error, gain_error, reduce_riccati
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality
-from softgrasp.reduction.engines import on_root
-from softgrasp.study.control.solve import WHOLE_SPECTRUM, Design, every_mode, worth
+from softgrasp.study.control.solve import WHOLE_SPECTRUM, Design, worth
 from softgrasp.study.reduce.box import box_materials, outside
 
 TITLES = {
@@ -133,7 +132,13 @@ def judged(found: Design, family: BasisFamily, N: int) -> GainReport:
         quality = worth(found.judge, reduce_riccati(found.problem, family.at(N)).gain)
     except SolverError:  # the spectrum did not converge
         return _without_spectrum(found, family, N)
-    return replace(report, abscissa_full=quality.abscissa, cost_excess=quality.cost_excess, certified=quality.certified)
+    return replace(
+        report,
+        abscissa_full=quality.abscissa,
+        cost_excess=quality.cost_excess,
+        certified=quality.certified,
+        sampled=quality.sampled,
+    )
 
 
 def _without_spectrum(found: Design, family: BasisFamily, N: int) -> GainReport:
@@ -142,7 +147,7 @@ def _without_spectrum(found: Design, family: BasisFamily, N: int) -> GainReport:
     reduced = reduce_riccati(problem, family.at(N))
     quality = LoopQuality(nothing, nothing, False)
     if problem.layout.n_e <= WHOLE_SPECTRUM:
-        quality = every_mode(problem).quality(reduced.gain, judge.K, judge.start, judge.optimal)
+        quality = judge.by_all_modes(reduced.gain)
     return GainReport(
         family.name,
         N,
@@ -152,13 +157,19 @@ def _without_spectrum(found: Design, family: BasisFamily, N: int) -> GainReport:
         quality.abscissa,
         reduced.seconds,
         certified=quality.certified,
+        sampled=quality.sampled,
     )
 
 
 def report_dict(report: GainReport) -> dict[str, Any]:
     """One point of result.json. Not collective."""
     keys = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
-    return {key: getattr(report, key) for key in keys}
+    return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
+
+
+def radius_of(report: GainReport | BoxPoint) -> float:
+    """Spectral radius from tick to tick; nan where there is no gain. Not collective."""
+    return float("nan") if report.sampled is None else report.sampled.value
 
 
 @dataclass(frozen=True)
@@ -211,7 +222,7 @@ def retune(
         tuner = Retuner(found.problem, basis.family.at(N))
         points: list[BoxPoint] = []
         for materials in settings:
-            points += _at(tuner, materials, full, found.error, modes)
+            points += _at(tuner, materials, full, found, modes)
             done += 1
             if notify is not None:
                 notify(done, len(settings) * len(chosen))
@@ -223,11 +234,11 @@ def _at(
     tuner: Retuner,
     materials: Materials,
     full: Callable[[RiccatiProblem], RiccatiSolution],
-    error: Block,
+    found: Design,
     modes: int,
 ) -> Sequence[BoxPoint]:
     try:
-        points = over_box(tuner, [materials], full, error, modes)
+        points = over_box(tuner, [materials], full, found.error, modes, found.judge.law)
     except (ControlError, SolverError) as failed:  # the full solution, not the re-tuned one
         nothing = float("nan")
         return [BoxPoint(materials, nothing, nothing, nothing, nothing, f"no reference: {failed}")]

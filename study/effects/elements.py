@@ -10,7 +10,7 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import RunOptions, Trajectory, simulate
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.measure import Change, compare
+from softgrasp.study.effects.change import Change, compare, shown
 from softgrasp.study.effects.switch import changed
 from softgrasp.study.forward.cautions import LOCKING
 
@@ -49,7 +49,7 @@ def judge_elements(model: Model, trajectory: Trajectory, tolerance: float) -> El
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None
     other = build(quadratic(model), model.system.layout.comm)
-    change = compare(model, trajectory, other, simulate(other, RunOptions()))
+    change = compare(shown(model, trajectory), shown(other, simulate(other, RunOptions())))
     needed = change.outputs > tolerance
     text = (
         f"Measured at nu = {nu:.4g}: on the same mesh tissue.order = 2 changes the outputs by {change.outputs:.2g} and "

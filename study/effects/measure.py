@@ -1,4 +1,4 @@
-"""What an effect costs and what it changes: builds, factors, steps, memory and outputs of several scenes side by side.
+"""What an effect costs: builds, factors, steps and memory of several scenes side by side.
 
 Times are interleaved, so that the noise of the machine hits all scenes alike; work and memory are counted, not timed:
 PETSc counts the operations of a step, and every matrix, vector and array that a run holds is added up.
@@ -17,9 +17,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, PETSc, whole_copy
-from softgrasp.fem.run.drive import Force
 from softgrasp.fem.run.motion import motion_table
-from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.order import dissect
@@ -323,71 +322,3 @@ def count_objects(comm: MPI.Intracomm, cases: dict[str, Case], scenes: dict[str,
     """Let PETSc count what each case creates, in order. Collective."""
     for name, case in cases.items():
         case.objects, case.objects_in_steps = objects_of(comm, scenes[name])
-
-
-# --- changes
-
-
-@dataclass(frozen=True)
-class Change:
-    """Largest change of the outputs over the run.
-
-    Attributes:
-        outputs: max |y - y'| over max |y|, y the displacements of all outputs [1].
-        deformation: the same of the outputs relative to the rigid motion of the hand [1].
-        absolute: max |y - y'| [m].
-    """
-
-    outputs: float
-    deformation: float
-    absolute: float
-
-
-def compare(model: Model, a: Trajectory, other: Model, b: Trajectory) -> Change:
-    """Change between two runs of the same outputs; angles of a hand output do not count. Not collective."""
-    d = model.system.layout.dimension
-
-    def places(model: Model, values: Array) -> Array:
-        """Displacements, shape (steps + 1, outputs, d)."""
-        control = model.scene.control
-        kinds = [o.kind for o in control.outputs] if control is not None and control.outputs else ["node"]
-        widths = [model.system.layout.n_s if kind == "hand" else d for kind in kinds]
-        starts = np.cumsum([0, *widths[:-1]])
-        return np.stack([values[:, at : at + d] for at in starts], axis=1)
-
-    def gap(x: Array, y: Array) -> tuple[float, float]:
-        scale = max(float(np.linalg.norm(v, axis=2).max()) for v in (x, y))
-        largest = float(np.linalg.norm(x - y, axis=2).max())
-        return largest, (largest / scale if scale > 0 else 0.0)
-
-    x, y = places(model, a.outputs), places(other, b.outputs)
-    rigid = places(model, a.outputs_rigid), places(other, b.outputs_rigid)
-    absolute, outputs = gap(x, y)
-    return Change(outputs, gap(x - rigid[0], y - rigid[1])[1], absolute)
-
-
-def force_of_motion(scene: Scene, model: Model) -> Force:
-    """The force that would carry the bare hand along the prescribed motion, u_n = M_hand a_n. Not collective.
-
-    A hand with more freedoms than the scene's gets no load on them, one with fewer none of those it lacks.
-
-    Raises:
-        SceneError: a csv file does not fit.
-    """
-    u = motion_table(scene, model.system.layout.n_s).a @ model.system.M_hand.T
-
-    def force(n: int, t: float, q: Array, v: Array) -> Array:
-        result, shared = np.zeros(len(q)), min(len(q), u.shape[1])
-        result[:shared] = u[n, :shared]
-        return result
-
-    return force
-
-
-def run_case(case: Case, force: Force | None = None) -> Trajectory:
-    """The whole run of a case. Collective.
-
-    Raises:
-        SolverError: a solve failed.
-    """
-    return simulate(case.model, RunOptions(), force)

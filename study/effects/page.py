@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 CAPTION = (
     "Each effect switched on against off, the rest of the scene as it is. Left: largest change of the outputs over the "
     "run, relative to their largest displacement; under a force, the same with the hand driven by the force that would "
-    "carry it along the motion without tissue, for effects that the run itself does not show. Right: what the effect "
-    "adds to the time of a step (median and quartiles of paired samples) and to the memory that the run holds. "
+    "carry it along the motion without tissue, for effects that the run itself does not show; with a partner, the "
+    "change by an effect that shows only when another one is switched too. Right: what the effect adds to "
+    "the time of a step (median and quartiles of paired samples) and to the memory that the run holds. "
     "Grey: quartiles of the scene's step time against itself. Open marks: the effect is off in the scene and was tried."
 )
 
@@ -59,6 +61,22 @@ def write_effects(
     return result, files
 
 
+def listed(names: Sequence[str]) -> str:
+    """Names as one reads them: a, b and c. Not collective."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]])) or "none"
+
+
+def judged_again(study: EffectsStudy) -> str:
+    """What each effect changes beside all that are advised, one sentence. Not collective."""
+    parts = [
+        f"{f.name} {f.company.change.outputs:.1e}"
+        + (f" ({f.company.control:.1e} under a force)" if f.company.control is not None else "")
+        for f in study.findings
+        if f.company is not None
+    ]
+    return f"judged again with {listed(study.advised)} on, each changes the outputs by: {', '.join(parts)}."
+
+
 def marks(study: EffectsStudy) -> list[Mark]:
     """What the picture shows: the effects that were tried. Not collective."""
     return [
@@ -69,6 +87,7 @@ def marks(study: EffectsStudy) -> list[Mark]:
             label=f.label,
             change=f.change.outputs,
             control=f.control,
+            together=f.company.together if f.company is not None and f.company.partners else None,
             step=f.cost.step_relative,
             quartiles=f.cost.step_quartiles,
             memory=f.cost.memory_relative,
@@ -82,7 +101,8 @@ def write_csv(study: EffectsStudy, path: Path) -> Path:
     """One row an effect; empty where nothing was tried. Rank 0 only."""
     header = [
         "effect", "on", "value", "verdict", "gate", "gate_threshold", "gate_matters", "change_outputs",
-        "change_deformation", "change_absolute [m]", "change_under_force", "assembly [s]", "setup [s]", "step [s]",
+        "change_deformation", "change_absolute [m]", "change_under_force", "change_advised",
+        "change_advised_under_force", "partners", "assembly [s]", "setup [s]", "step [s]",
         "step_relative", "step_low", "step_high", "flops", "memory [byte]", "memory_relative", "off_is_free",
     ]  # fmt: skip
     with path.open("w", newline="") as file:
@@ -97,6 +117,8 @@ def _csv_row(f: Finding) -> list[Any]:
     row: list[Any] = [f.name, int(f.on), f.value, f.verdict, gate.number, gate.threshold, int(gate.matters)]
     row += ["", "", ""] if change is None else [change.outputs, change.deformation, change.absolute]
     row.append("" if f.control is None else f.control)
+    beside = f.company
+    row += ["", "", ""] if beside is None else [beside.change.outputs, beside.control, " ".join(beside.partners)]
     if cost is None:
         row += [""] * 9
     else:
@@ -108,12 +130,14 @@ def _csv_row(f: Finding) -> list[Any]:
 def verdict_rows(study: EffectsStudy) -> list[tuple[Any, ...]]:
     """The table of verdicts with a header row. Not collective."""
     rows: list[tuple[Any, ...]] = [
-        ("effect", "is", "verdict", "outputs", "deformation", "under force", "gate", "threshold")
+        ("effect", "is", "verdict", "outputs", "deformation", "under force", "beside advised", "gate", "threshold")
     ]
     for f in study.findings:
         gate, change = f.gate.gate, f.change
         cells = (None, None) if change is None else (change.outputs, change.deformation)
-        rows.append((f.name, "on" if f.on else "off", f.label, *cells, f.control, gate.number, gate.threshold))
+        beside = None if f.company is None else f.company.change.outputs
+        row = (f.name, "on" if f.on else "off", f.label, *cells, f.control, beside, gate.number, gate.threshold)
+        rows.append(row)
     return rows
 
 
@@ -175,10 +199,12 @@ def _report(
         (f"{f.name}: {f.value}" if f.on else f"{f.name}, tried: {f.value}" if f.value else f.name, f.advice)
         for f in study.findings
     ]
+    advice.append(("all together", judged_again(study)))
     advice += [("look at", text) for text in study.warnings]
     how = [
         ("tolerance", f"{study.tolerance:g}: relative change of the outputs that counts"),
-        ("needed", "changes the outputs of the run by more than the tolerance"),
+        ("needed", "changes the outputs of the run by more than the tolerance, alone or with others that are advised"),
+        ("beside advised", "the effect switched alone, all others as advised; effects that show only so join them"),
         ("optional", "does not, but costs nothing, or the control problem feels it"),
         ("wasted", "costs work or memory and nothing shows it"),
         ("noise", "paired samples do not agree, or by less than steps of the scene differ from one another"),

@@ -32,6 +32,7 @@ class Mark:
         label: the verdict in words.
         change: of the outputs of the run [1].
         control: of the outputs under a force [1]; None when that is no question.
+        together: of the outputs when the effects that bring it out are switched too [1]; None when it needs none.
         step: added share of a step's time, median [1].
         quartiles: of its samples [1].
         memory: added share of the memory [1].
@@ -43,6 +44,7 @@ class Mark:
     label: str
     change: float
     control: float | None
+    together: float | None
     step: float
     quartiles: tuple[float, float]
     memory: float
@@ -85,7 +87,7 @@ def figure_effects(
 
 
 def _changes(ax: Any, marks: Sequence[Mark], rows: Any, tolerance: float) -> None:
-    values = [v for m in marks for v in (m.change, m.control) if v is not None and v > ROUNDING]
+    values = [v for m in marks for v in (m.change, m.control, m.together) if v is not None and v > ROUNDING]
     low, high = min([*values, tolerance]), max([*values, tolerance])
     left = 10.0 ** (np.floor(np.log10(low)) - 1)  # a decade for those that change nothing
     nothing = 1.5 * left
@@ -94,6 +96,8 @@ def _changes(ax: Any, marks: Sequence[Mark], rows: Any, tolerance: float) -> Non
         look: dict[str, Any] = {"color": colour, "mfc": colour if mark.on else "white", "mew": 1.3, "ls": "none"}
         if mark.control is not None and mark.control > ROUNDING:
             ax.plot(mark.control, row, marker="D", ms=4.5, zorder=2, **look)
+        if mark.together is not None:
+            ax.plot(mark.together, row, marker="^", ms=6, zorder=2, **look)
         if mark.change > ROUNDING:
             ax.plot(mark.change, row, marker="o", ms=7, zorder=3, **look)
         else:
@@ -113,6 +117,8 @@ def _changes(ax: Any, marks: Sequence[Mark], rows: Any, tolerance: float) -> Non
     entries = [Line2D([], [], marker="o", ms=6, label="this run", **grey)]
     if any(m.control is not None and m.control > ROUNDING for m in marks):
         entries.append(Line2D([], [], marker="D", ms=4.5, label="under a force", **grey))
+    if any(m.together is not None for m in marks):
+        entries.append(Line2D([], [], marker="^", ms=6, label="with a partner", **grey))
     if not all(m.on for m in marks):
         entries.append(Line2D([], [], marker="o", ms=6, mfc="white", label="off, tried", **grey))
     _legend(ax, entries)

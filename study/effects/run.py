@@ -17,24 +17,16 @@ from rich.padding import Padding
 from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
+from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import ResourceError
-from softgrasp.fem.model.build import build
-from softgrasp.fem.model.scales import rigid_inertia
+from softgrasp.fem.fields.scales import rigid_inertia
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.effects.change import Change, Company, Experiments, Names, Together, judge_together
 from softgrasp.study.effects.elements import Elements, judge_elements
 from softgrasp.study.effects.judge import TIMER, Cost, OffProof, cost_of, judge, prove_off, quartiles
-from softgrasp.study.effects.measure import (
-    Case,
-    Change,
-    bare_output,
-    compare,
-    count_objects,
-    force_of_motion,
-    measure_builds,
-    measure_steps,
-    run_case,
-)
-from softgrasp.study.effects.page import write_effects
+from softgrasp.study.effects.measure import Case, bare_output, count_objects, measure_builds, measure_steps
+from softgrasp.study.effects.page import judged_again, listed, write_effects
 from softgrasp.study.effects.switch import Switch, scales_of, switches
 from softgrasp.study.forward.explain import EffectReport, Explanation, explain_model
 from softgrasp.study.shell.session import list_files, open_scene, progress_bar
@@ -56,6 +48,7 @@ class Finding:
         change: of the outputs of the run; None when not tried.
         control: change of the outputs when a force moves the hand; None when that is no question, or not needed to
             judge.
+        company: the same judged again beside all other advised effects; None when not tried.
         cost: None when not tried.
         proof: for an effect that is off.
     """
@@ -68,6 +61,7 @@ class Finding:
     advice: str
     change: Change | None
     control: float | None
+    company: Company | None
     cost: Cost | None
     proof: OffProof | None
 
@@ -83,6 +77,7 @@ class EffectsStudy:
 
     Attributes:
         findings: in the order of `fem.effects.EFFECTS`.
+        advised: effects that are on when every advice is followed, for control alone included.
         explanation: of the scene as it is; its warnings are repeated in the report.
         tolerance: relative change that counts [1].
         repeats: samples behind each median of a step; builds may have fewer.
@@ -95,6 +90,7 @@ class EffectsStudy:
     """
 
     findings: tuple[Finding, ...]
+    advised: tuple[str, ...]
     explanation: Explanation
     tolerance: float
     repeats: int
@@ -128,6 +124,7 @@ class EffectsStudy:
             "noise": list(self.noise),
             "base": self.base,
             "effects": effects,
+            "advised": list(self.advised),
             "off_is_free": all(f.proof.holds for f in self.findings if f.proof is not None),
             "missing": list(self.explanation.missing),
             "idle": list(self.explanation.idle),
@@ -155,7 +152,8 @@ def study_effects(
     scene = bare_output(scene)
     model = build(scene, comm)  # also compiles the forms
     explanation = explain_model(model)
-    found = switches(scene, scales_of(model.system.layout, rigid_inertia(model), explanation.time.omega))
+    scales = scales_of(model.system.layout, rigid_inertia(model), explanation.time.omega)
+    found = switches(scene, scales)
     scenes = {SCENE: scene} | {s.name: s.other for s in found if s.other is not None} | {AGAIN: scene}
     _fits(comm, explanation, len(scenes))
     repeats, done = scene.study.repeats, 0
@@ -168,7 +166,12 @@ def study_effects(
             progress(min(done, work), work)
 
     cases = measure_builds(comm, scenes, repeats, tick)
-    changes, elements = _changes(scene, found, cases, tick)
+    on = frozenset(s.name for s in found if s.on)
+    runs = Experiments(scene, scales, {on: cases[SCENE].model, **_switched(on, found, cases)})
+    changes = _changes(runs, found, tick)
+    needed = (s.name for s in found if s.other is not None and _counts(s, changes[s.name], explanation, scene))
+    together = judge_together(runs, tuple(changes), frozenset(needed), scene.study.tolerance)
+    elements = judge_elements(runs.models[on], runs.first, scene.study.tolerance)
     done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
     count_objects(comm, cases, scenes)
@@ -177,7 +180,8 @@ def study_effects(
     noise = max(TIMER, float(np.abs(ratio).max()))
     layout, mesh = model.system.layout, explanation.sizes
     return EffectsStudy(
-        findings=tuple(_finding(s, explanation, cases, changes, noise) for s in found),
+        findings=tuple(_finding(s, explanation, cases, changes, together, noise) for s in found),
+        advised=together.on,
         explanation=explanation,
         tolerance=scene.study.tolerance,
         repeats=repeats,
@@ -211,47 +215,53 @@ def _fits(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
 Changes = dict[str, tuple[Change, float | None]]
 
 
-def _changes(
-    scene: Scene, found: tuple[Switch, ...], cases: dict[str, Case], tick: Callable[[], None]
-) -> tuple[Changes, Elements | None]:
-    """Change of this run and, for effects that do not show there, under the force that would make its motion.
+def _switched(on: Names, found: tuple[Switch, ...], cases: dict[str, Case]) -> dict[Names, Model]:
+    """The models that differ from the scene in one effect. Not collective."""
+    return {on ^ {s.name}: cases[s.name].model for s in found if s.other is not None}
 
-    The second only where a control problem lets a force move the hand that this run moves by itself.
-    """
-    base, result = cases[SCENE], {}
-    trajectory, forced = run_case(base), None
-    force = force_of_motion(scene, base.model) if _forced_later(scene) else None
+
+def _changes(runs: Experiments, found: tuple[Switch, ...], tick: Callable[[], None]) -> Changes:
+    """Change by each effect alone, and under a force for those that do not show in the run. Collective."""
+    result: Changes = {}
     for s in found:
         tick()
         if s.other is None:
             continue
-        case = cases[s.name]
-        change = compare(base.model, trajectory, case.model, run_case(case))
-        control = None
-        if force is not None and change.outputs <= scene.study.tolerance:
-            forced = forced or run_case(base, force)
-            control = compare(base.model, forced, case.model, run_case(case, force)).outputs
-        result[s.name] = (change, control)
-    return result, judge_elements(base.model, trajectory, scene.study.tolerance)
+        other = runs.on ^ {s.name}
+        change = runs.change(runs.on, other)
+        hidden = change.outputs <= runs.scene.study.tolerance
+        result[s.name] = (change, runs.control(runs.on, other) if hidden else None)
+    return result
 
 
-def _forced_later(scene: Scene) -> bool:
-    return scene.control is not None and scene.motion.drive == "motion"
+def _counts(s: Switch, changes: tuple[Change, float | None], explanation: Explanation, scene: Scene) -> bool:
+    """Whether the effect shows in the scene as it is, or its control problem needs it. Not collective."""
+    change, control = changes
+    return change.outputs > scene.study.tolerance or bool(_felt(s, control, explanation.effects[s.name], scene))
 
 
-def _finding(s: Switch, explanation: Explanation, cases: dict[str, Case], changes: Changes, noise: float) -> Finding:
+def _finding(
+    s: Switch, explanation: Explanation, cases: dict[str, Case], changes: Changes, together: Together, noise: float
+) -> Finding:
     scene = cases[SCENE].model.scene
     gate, tolerance = explanation.effects[s.name], scene.study.tolerance
     proof = None if s.on else prove_off(s.name, cases[SCENE], cases[AGAIN])
     if s.other is None:
-        return Finding(s.name, s.on, s.value, gate, "not tried", f"Not tried: {s.reason}.", None, None, None, proof)
-    change, control = changes[s.name]
+        advice = f"Not tried: {s.reason}."
+        return Finding(s.name, s.on, s.value, gate, "not tried", advice, None, None, None, None, proof)
+    (change, control), company = changes[s.name], together.company[s.name]
     pair = (cases[SCENE], cases[s.name]) if s.on else (cases[s.name], cases[SCENE])
     cost = cost_of(*pair, noise)
     felt = _felt(s, control, gate, scene)
-    verdict = judge(change.outputs, bool(felt), cost.any, tolerance)
-    advice = _advice(s, verdict, change.outputs, felt, cost, tolerance)
-    return Finding(s.name, s.on, s.value, gate, verdict, advice, change, control, cost, proof)
+    shows = max(change.outputs, 0.0 if company.forced else company.together)
+    verdict = judge(shows, bool(felt) or company.forced, cost.any, tolerance)
+    if company.partners:
+        advice = _advice_together(s, change.outputs, company, cases, tolerance)
+    else:
+        advice = _advice(s, verdict, change.outputs, felt, cost, tolerance)
+        if verdict == "needed" and company.change.outputs <= tolerance:
+            advice += f" Beside the other advised effects it changes them by {company.change.outputs:.1e} only."
+    return Finding(s.name, s.on, s.value, gate, verdict, advice, change, control, company, cost, proof)
 
 
 def _felt(s: Switch, control: float | None, gate: EffectReport, scene: Scene) -> str:
@@ -270,13 +280,30 @@ def _advice(s: Switch, verdict: str, change: float, felt: str, cost: Cost, toler
         if s.strength is not None and change < 0.1:  # where the change still grows with the strength
             text += f"; below about {s.strength * tolerance / change:.2g} {s.unit} it would not show"
         return text + "."
-    small = "changes nothing" if change == 0 else f"changes the outputs by {change:.1e} only"
+    small = _small(change)
     if felt:
         return f"{'Keep' if s.on else 'Switch'} it{'' if s.on else ' on'} for control alone: it {small}, but {felt}."
     if verdict == "wasted":
         text = "Switch it off: it" if s.on else "Rightly off: it would cost and not show: it"
         return f"{text} {small} and adds {_extra(cost)}."
     return f"{'Keep or drop it' if s.on else 'Rightly off'}: it {small} and costs nothing in this run."
+
+
+def _advice_together(s: Switch, change: float, company: Company, cases: dict[str, Case], tolerance: float) -> str:
+    """For an effect that shows only when others are switched too."""
+    partners = listed(company.partners)
+    force = " when a force moves the hand, as in the control problem" if company.forced else ""
+    number = f"the outputs by {company.together:.2g}{force}, tolerance {tolerance:g}"
+    if company.either:
+        return f"Keep it, or {partners}: each can go alone, but leaving out both changes {number}."
+    begin = f"{'Keep it' if s.on else 'Switch it on'}{' for control' if force else ''}"
+    switched = [name for name in company.partners if EFFECTS[name].active(cases[SCENE].model.scene)]
+    state = f"without {partners}" if switched else f"with {partners} on"
+    return f"{begin}, {state}: alone it {_small(change)}, but {state} it changes {number}."
+
+
+def _small(change: float) -> str:
+    return "changes nothing" if change == 0 else f"changes the outputs by {change:.1e} only"
 
 
 def _extra(cost: Cost) -> str:
@@ -335,6 +362,7 @@ def show(study: EffectsStudy, console: Console) -> None:
     for f in study.findings:
         value = f" ({f.value})" if f.value and f.on else f" (tried {f.value})" if f.value else ""
         console.print(Padding.indent(escape(f"{f.name}{value}: {f.advice}"), 2), highlight=False)
+    console.print(Padding.indent(escape(judged_again(study)), 2), highlight=False)
     for text in study.warnings:
         console.print(Padding.indent(escape(f"look at: {text}"), 2), highlight=False)
     off = [f for f in study.findings if f.proof is not None]

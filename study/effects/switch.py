@@ -83,10 +83,13 @@ def scales_of(layout: BlockLayout, rigid: tuple[float, tuple[float, ...]], omega
 
 def switches(scene: Scene, scales: Scales) -> tuple[Switch, ...]:
     """Every effect with the scene in which it is switched the other way. Not collective."""
-    return tuple(
-        _without(scene, name, scales.dimension) if effect.active(scene) else _with(scene, name, scales)
-        for name, effect in EFFECTS.items()
-    )
+    return tuple(switch(scene, name, scales) for name in EFFECTS)
+
+
+def switch(scene: Scene, name: str, scales: Scales) -> Switch:
+    """One effect with the scene in which it is switched the other way. Not collective."""
+    active = EFFECTS[name].active(scene)
+    return _without(scene, name, scales.dimension) if active else _with(scene, name, scales)
 
 
 def neutral(scene: Scene, name: str, d: int) -> Scene | None:

@@ -5,12 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
-from rich.padding import Padding
-from rich.text import Text
 
-from softgrasp.fem.fields.series import FullField
-from softgrasp.fem.mesh.make import cell_nodes
+from softgrasp.fem.fields.strain import SMALL_STRAIN, gradient
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.scene.materials import young_poisson
 
@@ -21,9 +17,8 @@ if TYPE_CHECKING:
 
 LOCKING = 0.49  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu)
 COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
-SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
-SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain of any fine mesh is large
 SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
+EPS = float(np.finfo(float).eps)
 EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
 LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
 LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
@@ -67,19 +62,41 @@ def turned(angle: float) -> list[str]:
     return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
 
 
-def inexact(drift: float, residual: float, solver: str, nu: float) -> list[str]:
-    """Drift of the energy or residual of a solve above rounding, as the digits they leave. Not collective.
+def magnified(system: BlockSystem, z: Array) -> float:
+    """Share by which one rounding of K_ee may change the deformation z: eps sum K_ii z_i^2 / z'Kz [1]. Collective.
+
+    Neither residual nor drift knows of it, since both take the rounded matrix for the true one; close to nu = 1/2 they
+    are ten to a hundred times smaller than the error.
+
+    Args:
+        system: the operators.
+        z: local rows of a displacement against the hand, (n_local,).
+    """
+    diagonal = system.K_ee.getDiagonal()
+    parts = np.array([np.dot(diagonal.array_r, z * z), np.dot(z, times_columns(system.K_ee, z[:, None])[:, 0])])
+    diagonal.destroy()
+    largest, energy = total(system.layout.comm, parts)
+    if largest == 0:
+        return 0.0
+    return float(EPS * largest / energy) if energy > 0 else np.inf
+
+
+def inexact(drift: float, residual: float, solver: str, nu: float, rounding: float = 0.0) -> list[str]:
+    """Drift of the energy, residual of a solve or loss to rounding, as the digits they leave. Not collective.
 
     Args:
         drift: energy that nothing explains, over the largest seen [1]; counts for direct solvers.
         residual: largest relative residual of the checked solves [1].
         solver: cholesky, mumps or cg.
         nu: largest Poisson's ratio [1].
+        rounding: what :func:`magnified` gives [1].
     """
-    worst, name = max((residual, "residual"), (0.0 if solver == "cg" else drift, "energy drift"))
+    shares = {"residual": residual, "energy drift": 0.0 if solver == "cg" else drift, "rounding of K": rounding}
+    name = max(shares, key=lambda key: shares[key])
+    worst = shares[name]
     if not worst > EXACT:
         return []
-    if solver == "cg":
+    if solver == "cg" and name == "residual":
         reason = "time.rtol lets cg stop there; a smaller one brings more"
     elif nu > 0.4999:
         reason = f"nu = {_near_half(nu)} makes the matrix of a step nearly singular, which magnifies rounding"
@@ -113,14 +130,17 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]
     if most is not None and total(system.layout.comm, np.array([np.dot(most[1], most[1])]))[0] > sizes.max():
         t, z = most
-    steepest, share = gradients(model, z)
-    if share > SMALL_SHARE:
+    steep = gradient(model, z)
+    if not steep.small:
         found.append(
-            f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {share:.0%} of the body at "
-            f"t = {t:.3g} s, at most {steepest:.2g}: linear elasticity assumes small strains and rotations."
+            f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
+            f"body at t = {t:.3g} s, at most {steep.largest:.2g}: linear elasticity assumes small strains and "
+            "rotations."
         )
     found += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
-    return found + inexact(run.energy_drift, max(run.residuals), run.solver[0], max(poisson.values()))
+    return found + inexact(
+        run.energy_drift, max(run.residuals), run.solver[0], max(poisson.values()), magnified(system, z)
+    )
 
 
 def _near_half(nu: float) -> str:
@@ -156,29 +176,3 @@ def slowest(system: BlockSystem, Z: Array) -> float:
         return 0.0
     Q = centre @ (Q[:, kept] / np.sqrt(squares[kept]))
     return float(np.sqrt(max(np.linalg.eigvalsh(Q.T @ (K + K.T) @ Q / 2)[0], 0.0)))
-
-
-def gradients(model: Model, z: Array) -> tuple[float, float]:
-    """Largest |grad z| between the vertices of a cell [1], and share of the volume above `SMALL_STRAIN`. Collective.
-
-    Args:
-        model: the model.
-        z: displacement against the hand, local rows (n_local,) [m].
-    """
-    space, d = model.space, model.space.mesh.dimension
-    mesh = space.mesh.mesh
-    cells = mesh.topology.index_map(d).size_local
-    nodal = FullField(model).fill(z, np.zeros(space.layout.n_s)).x.array.reshape(-1, d)
-    u = nodal[space.V.dofmap.list[:cells, : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
-    x = mesh.geometry.x[cell_nodes(mesh)[:cells], :d]
-    edges = x[:, 1:] - x[:, :1]
-    size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))
-    volume = np.abs(np.linalg.det(edges))
-    large, whole = total(space.layout.comm, np.array([volume[size > SMALL_STRAIN].sum(), volume.sum()]))
-    return max(space.layout.comm.allgather(float(size.max(initial=0.0)))), float(large / whole)
-
-
-def show_warnings(console: Console, found: list[str]) -> None:
-    """Print warnings in yellow. Not collective."""
-    for text in found:
-        console.print(Padding.indent(Text(f"warning: {text}", "yellow"), 0), highlight=False)

@@ -11,12 +11,16 @@ from rich.markup import escape
 from rich.padding import Padding
 
 from softgrasp.fem.effects import EFFECTS, Gate
+from softgrasp.fem.effects.sag import SMALL_SHARE, Sag
+from softgrasp.fem.fields.scales import measure
+from softgrasp.fem.fields.strain import SMALL_STRAIN
 from softgrasp.fem.model.build import build
-from softgrasp.fem.model.scales import measure
+from softgrasp.fem.model.memory import Need, factor_bytes, need
+from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
-from softgrasp.study.forward.cautions import SMALL_STRAIN, coarse, locking, poisson_ratios, turned
+from softgrasp.study.forward.cautions import coarse, locking, poisson_ratios, turned
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import plain
 
@@ -88,7 +92,10 @@ class Explanation:
         poisson: Poisson's ratio of each material by layer name [1].
         missing: effects that are off and would matter.
         idle: effects that are on and do not matter.
+        sag: the tissue at rest under its weight.
         warnings: one sentence each.
+        outputs: name and place of each output.
+        memory: estimated need of mesh, factor and steps.
         snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
     """
 
@@ -101,7 +108,10 @@ class Explanation:
     poisson: dict[str, float]
     missing: tuple[str, ...]
     idle: tuple[str, ...]
+    sag: Sag
     warnings: tuple[str, ...]
+    outputs: dict[str, str]
+    memory: Need
     snapshot_columns: int
     snapshot_bytes: int
 
@@ -111,34 +121,21 @@ class Explanation:
         return result
 
 
-def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
-    """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection. Not collective.
-
-    nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
-    (2D) and 5e2 to 2e5 (3D) unknowns; 8 byte an entry and 4 an index, of which cholesky has one for d^2 entries.
-    """
-    if name == "cg" or n < 2:
-        return 0.0
-    row = 7.75 * np.log2(n) - 44 if dimension == 2 else 19.5 * n ** (1 / 3) - 85
-    entry = 8 + (4 / dimension**2 if name == "cholesky" else 4)
-    return float(entry * n * np.clip(row, 1, (n + 1) / 2) * copies)
-
-
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
     """Assemble a scene and say what it is. Collective.
 
     Raises:
         SceneError, MeshError: the scene cannot be built.
-        SolverError: its modes cannot be computed.
+        SolverError: its modes or its sag cannot be computed.
     """
-    return explain_model(build(scene, comm))
+    return explain_model(build(scene, comm, run=False))
 
 
 def explain_model(model: Model) -> Explanation:
     """Say what a built model is. Collective.
 
     Raises:
-        SolverError: its modes cannot be computed.
+        SolverError: its modes or its sag cannot be computed.
     """
     scene, system = model.scene, model.system
     layout = system.layout
@@ -184,22 +181,26 @@ def explain_model(model: Model) -> Explanation:
         poisson=poisson,
         missing=tuple(key for key, r in reports.items() if not r.on and r.gate.matters),
         idle=tuple(key for key, r in reports.items() if r.on and not r.gate.matters),
-        warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports)),
+        sag=problem.sag,
+        warnings=(*model.space.mesh.notes, *_warnings(scene, poisson, omega, dt, d, reports, problem.sag)),
+        outputs={o.name: o.place for o in make_outputs(scene, system) if o.place},
+        memory=need(scene, d, topology.index_map(d).size_global, layout.comm, run=True),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
     )
 
 
 def _warnings(
-    scene: Scene, poisson: dict[str, float], omega: Any, dt: float, d: int, effects: dict[str, EffectReport]
+    scene: Scene, poisson: dict[str, float], omega: Any, dt: float, d: int, effects: dict[str, EffectReport], sag: Sag
 ) -> list[str]:
     found = locking(poisson, scene.tissue.order)
     if len(omega):
         found += coarse(float(omega[0]), dt, scene.time_end, "the first period")
-    gravity = effects["gravity"]
-    if gravity.on and gravity.gate.number > SMALL_STRAIN:
+    if effects["gravity"].on and not sag.gradient.small:
         found.append(
-            f"rho g L / E = {gravity.gate.number:.2g} is above {SMALL_STRAIN}: linear elasticity assumes small strains."
+            f"At rest under its weight the tissue would sag by {sag.largest:.2g} m and |grad z| would be above "
+            f"{SMALL_STRAIN} in {sag.gradient.share:.0%} of the body, at most {sag.gradient.largest:.2g}: linear "
+            "elasticity assumes small strains and rotations."
         )
     if scene.effects.rotation:
         found += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))
@@ -241,11 +242,17 @@ def render(result: Explanation, console: Console) -> None:
     title("Sizes")
     line(f"n_s = {s.n_s}, n_e = {s.n_e}, states 2n = {s.states}")
     line(f"{s.cells} cells, {s.nodes} nodes, {s.nonzeros} non-zeros in K_ee, {s.ranks} rank(s)")
+    for output, place in result.outputs.items():
+        line(f"output {output}: {place}")
     line("nu = " + ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items()))
     title("Solver")
     line(f"{result.solver.name}: {result.solver.reason}")
     if result.solver.factor_bytes:
         line(f"factor about {size_text(result.solver.factor_bytes)} (estimate)")
+    line(
+        f"mesh and matrices about {size_text(result.memory.mesh)} over all ranks, tables of the steps "
+        f"{size_text(result.memory.tables)} on each (estimates)"
+    )
     line(f"snapshots: {result.snapshot_columns} columns, {size_text(result.snapshot_bytes)}")
     title("Time")
     line(f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s")
@@ -253,6 +260,9 @@ def render(result: Explanation, console: Console) -> None:
         line("first periods not computed: the factor would not fit")
     for k, (T, phase) in enumerate(zip(t.periods, t.omega_dt, strict=True), 1):
         line(f"T_{k} = {T:.4g} s, dt/T_{k} = {t.dt / T:.2g}, omega_{k} dt = {phase:.2g}")
+    title("At rest under its weight, the hand held still")
+    for label, value in sag_rows(result):
+        line(f"{label}: {value}")
     title("Effects")
     for name, e in result.effects.items():
         gate = e.gate
@@ -267,6 +277,19 @@ def render(result: Explanation, console: Console) -> None:
         title("Look at")
     for text in found:
         line(text)
+
+
+def sag_rows(result: Explanation) -> list[tuple[str, str]]:
+    """Load, sag, gradient and validity of the static solution as label and text. Not collective."""
+    sag, assumed = result.sag, "" if result.effects["gravity"].on else " (assumed: gravity is off)"
+    steep = sag.gradient
+    return [
+        ("g", "(" + ", ".join(f"{x:g}" for x in sag.g) + f") m/s2{assumed}"),
+        ("largest |z|", f"{sag.largest:.4g} m"),
+        ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {SMALL_SHARE:.0%} of the body"),
+        ("linear elasticity", f"{'holds' if steep.small else 'does not hold'}: |grad z| is above {SMALL_STRAIN} in "
+         f"{steep.share:.2%} of the body, at most {SMALL_SHARE:.0%} may be"),
+    ]  # fmt: skip
 
 
 def verdict(effect: EffectReport) -> str:

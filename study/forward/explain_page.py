@@ -8,7 +8,7 @@ from pathlib import Path
 from softgrasp.fem.effects import Gate
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.forward.explain import Explanation, remarks, size_text, verdict
+from softgrasp.study.forward.explain import Explanation, remarks, sag_rows, size_text, verdict
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import command_line, origin
 from softgrasp.study.report.page import EQUATION, Section, equation_text, write_report
@@ -48,9 +48,12 @@ def _sections(found: Explanation) -> list[Section]:
     sizes = [
         ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {s.n_e}, 2n = {s.states}"),
         ("cells, nodes, non-zeros of K_ee", f"{s.cells}, {s.nodes}, {s.nonzeros}"),
+        *((f"output {name}", place) for name, place in found.outputs.items()),
         ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in found.poisson.items())),
         ("solver", f"{solver.name}: {solver.reason}"),
         ("factor, estimated", size_text(solver.factor_bytes) if solver.factor_bytes else "none"),
+        ("mesh and matrices, estimated, over all ranks", size_text(found.memory.mesh)),
+        ("tables of the steps, on each rank", size_text(found.memory.tables)),
         ("snapshots", f"{found.snapshot_columns} columns, {size_text(found.snapshot_bytes)}"),
         ("time", f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s"),
     ]
@@ -64,6 +67,7 @@ def _sections(found: Explanation) -> list[Section]:
         Section("Look at", text="\n\n".join(remarks(found)) or "Nothing stands out."),
         Section(EQUATION, code=equation_text(found.equation)),
         Section("Sizes", rows=sizes),
+        Section("At rest under its weight, the hand held still", rows=sag_rows(found)),
         Section(
             "Effects", header=("effect", "verdict", "gate", "number", "matters from", "what it says"), rows=effects
         ),

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from softgrasp import package_version
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import hand_axes, unit
+from softgrasp.fem.model.outputs import hand_axes, make_outputs, unit
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import Trajectory
-from softgrasp.fem.scene.file import resolved_toml, scene_hash
+from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.study.report.origin import peak_memory_mb
 
 
@@ -47,6 +48,7 @@ def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
         "hand_final": run.q_s[-1].tolist(),
         "output_names": list(run.output_names),
         "output_final": run.outputs[-1].tolist(),
+        "output_places": {o.name: o.place for o in make_outputs(model.scene, model.system) if o.place},
         "energy_drift": run.energy_drift,
         **({} if run.force is None else {"force_peak": dict(zip(axes, _peaks(run.force), strict=True))}),
         "time": {

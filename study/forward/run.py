@@ -13,19 +13,19 @@ from rich.progress import MofNCompleteColumn
 from rich.table import Table
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import Interrupted
+from softgrasp.fem.errors import Interrupted, ResourceError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.model.outputs import unit
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.forward.cautions import run_warnings, show_warnings
+from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import force_unit, simulate_result, write_results
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.origin import command_line, made_with
 from softgrasp.study.report.page import Section, equation_text, write_report
-from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
+from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar, show_warnings
 
 Rows = list[tuple[str, str]]
 
@@ -59,6 +59,7 @@ def run_simulate(
                 f"; {counted(lost, 'earlier frame')} {'is' if lost == 1 else 'are'} not kept, the pictures do without"
             )
             more = missing if lost else ""
+            more += "; the fields before are left out: another run has written in their place" if frames.foreign else ""
             console.print(f"resumed from step {run.begun} of {run.steps}{more}", soft_wrap=True)
 
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
@@ -70,13 +71,14 @@ def run_simulate(
         options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
         try:
             run = simulate(model, options)
-        except Interrupted:
+        except (Interrupted, ResourceError):
             if files := frames.close():
                 list_files(console, files)
             raise
     files = frames.close()
     result = simulate_result(model, run)
-    result["warnings"] = run_warnings(model, run, frames.most[1:])
+    warnings = run_warnings(model, run, frames.most[1:])
+    result["warnings"] = [*model.space.mesh.notes, *warnings]
     if comm.rank == 0:
         begin = time.perf_counter()
         files = write_results(out, model, run, result) + files + frames.draw(out, run)
@@ -84,7 +86,7 @@ def run_simulate(
         files.append(_report(out, scene, result, rows, path, overrides))
         result["time"]["pictures"] = time.perf_counter() - begin
         show(console, rows)
-        show_warnings(console, result["warnings"])
+        show_warnings(console, warnings)
         list_files(console, files)
     comm.Barrier()
     return result
@@ -98,6 +100,7 @@ def result_rows(result: dict[str, Any]) -> Rows:
         (name, f"{value:.6g} {unit(name)}")
         for name, value in zip(result["output_names"], result["output_final"], strict=True)
     ]
+    rows += [(name, place) for name, place in result["output_places"].items()]
     if "force_peak" in result:
         peak = ", ".join(f"{axis} {value:.4g} {force_unit(axis)}" for axis, value in result["force_peak"].items())
         rows.append(("largest force on the hand", peak))

@@ -50,7 +50,7 @@ outputs = [{ kind = "node", point = [0.5, 0.0] }]
 def numeric_keys() -> list[tuple[str, str, str]]:
     """Every numeric key of a scene as (dotted path, number or integer, TOML text with %s for the value)."""
     schema = scene_schema()
-    found = sorted(set(_walk(schema, schema["$defs"], "")))
+    found = sorted({key for key in _walk(schema, schema["$defs"], "") if not key[0].endswith((".young", ".poisson"))})
     for part in ("tissue.material", "tissue.layers.low.material"):  # the other way to write a material
         found.append((f"{part}.young", "number", "{young=%s, poisson=0.3, rho=1.0}"))
         found.append((f"{part}.poisson", "number", "{young=1.0, poisson=%s, rho=1.0}"))

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
-from softgrasp.fem.fields.series import SeriesWriter
+from softgrasp.fem.fields.series import SeriesWriter, owner_file
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.checkpoint import restart_bytes
 from softgrasp.fem.run.simulate import Run, Trajectory, frame_steps
+from softgrasp.fem.sealed import AGAIN, read_arrays, write_arrays
 from softgrasp.study.pictures.shapes import pick_instants, way_done
 
 MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
+LARGE_RESTART = 2**26  # bytes: no room is kept for a larger restart file, it would stop runs that end well
 SUFFIXES = (".bp", ".xdmf", ".h5")
 SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run when few instants are kept
 
@@ -33,6 +35,7 @@ class Frames:
         pictures: keep what figures and animation need.
 
     Attributes:
+        foreign: whether field files of an earlier leg are gone, for another run wrote in their place; rank 0 only.
         most: of the frame with the largest displacement since the start or resume: |z|^2, time [s], z (local rows).
     """
 
@@ -41,9 +44,8 @@ class Frames:
         self.writer = None
         if model.scene.output.fields != "none":
             self.writer = SeriesWriter(model, directory, model.scene.output.fields)
-        self.legs = [0]
+        self.legs, self.foreign = [0], False
         self.saved = 0  # of the frames below, how many lie beside the checkpoint
-        self.swept = False
         self.steps: list[int] = []
         self.most: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(0))
         self.picture = gather_picture(model) if pictures else None
@@ -60,39 +62,42 @@ class Frames:
         Collective.
 
         Raises:
-            CheckpointError: a frame cannot be read.
+            CheckpointError: a frame is damaged or gone.
         """
         self.legs = run.legs
         if self.writer is not None:
-            self.writer.rename(_series(run.begun))
+            self.writer.rename(_series(run.begun), run.name)
         with agree(run.layout.comm):
             if run.layout.comm.rank == 0:
-                self._remove_series(run.begun)
+                self._remove_series(run)
             if self.picture is not None and run.begun:  # rank 0
-                self._load(run.begun)
+                self._load(run)
 
-    def _remove_series(self, begun: int) -> None:
-        """Field files from steps that this run has not reached: those of an earlier run in the same folder."""
-        for path in self.directory.glob("fields-from*"):
-            number = path.stem.removeprefix("fields-from")
-            if number.isdecimal() and (int(number) > begun or begun == 0) and path.suffix in SUFFIXES:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+    def _remove_series(self, run: Run) -> None:
+        """Field files that this run did not leave on its way here: those of another run in the same folder."""
+        own = [_series(leg) for leg in run.legs[:-1]]
+        for path in self.directory.glob("fields*"):
+            stem, number = path.stem, path.stem.removeprefix("fields-from")
+            if path.suffix not in SUFFIXES or not (stem == "fields" or number.isdecimal()):
+                continue
+            owner = owner_file(path)
+            if stem in own and owner.is_file() and owner.read_text() == run.name:
+                continue
+            self.foreign = self.foreign or stem in own
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            if not any(path.with_suffix(suffix).exists() for suffix in SUFFIXES):
+                owner.unlink(missing_ok=True)
 
-    def _load(self, begun: int) -> None:
-        for step, path in _kept(self.directory):
-            if step > begun:
-                break
-            try:
-                with np.load(path) as file:
-                    t, hand, state = float(file["t"]), file["hand"], file["state"]
-            except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-                raise CheckpointError(
-                    f"{path} cannot be read; resume with --no-pictures, or run again without --resume"
-                ) from error
-            self.steps.append(step)
-            self.times.append(t)
-            self.hands.append(hand)
-            self.states.append(state)
+    def _load(self, run: Run) -> None:
+        frames = [
+            read_arrays(self.directory / "checkpoint" / name, sha256, "resume with --no-pictures, or " + AGAIN)
+            for name, sha256 in run.beside.items()
+        ]
+        for frame in sorted(frames, key=lambda frame: int(frame["step"])):
+            self.steps.append(int(frame["step"]))
+            self.times.append(float(frame["t"]))
+            self.hands.append(frame["hand"])
+            self.states.append(frame["state"])
         self.saved = len(self.steps)
 
     def keep(self, run: Run) -> None:
@@ -104,26 +109,17 @@ class Frames:
         with agree(run.layout.comm):
             if run.layout.comm.rank == 0:
                 try:
-                    self._save(run.begun)
+                    self._save(run)
                 except OSError as error:
                     raise CheckpointError(
                         f"{self.directory}: the frames cannot be written ({error}); free the disk"
                     ) from error
 
-    def _save(self, begun: int) -> None:
-        folder = self.directory / "checkpoint"
-        folder.mkdir(parents=True, exist_ok=True)
-        if not self.swept:  # what a run that was killed, or another one, left behind
-            for step, path in _kept(self.directory):
-                if step > begun or begun == 0:
-                    path.unlink(missing_ok=True)
-            self.swept = True
+    def _save(self, run: Run) -> None:
         for i in range(self.saved, len(self.states)):
-            path = folder / f"frame{self.steps[i]}.npz"
-            fresh = path.with_suffix(".new")
-            with fresh.open("wb") as file:
-                np.savez(file, t=self.times[i], hand=self.hands[i], state=self.states[i])
-            fresh.replace(path)
+            name = f"{run.name}-frame{self.steps[i]}.npz"
+            frame = {"step": self.steps[i], "t": self.times[i], "hand": self.hands[i], "state": self.states[i]}
+            run.beside[name] = write_arrays(self.directory / "checkpoint" / name, frame)
         self.saved = len(self.states)
 
     def lacking(self, begun: int) -> int:
@@ -143,8 +139,6 @@ class Frames:
         size = float(total(run.layout.comm, np.array([np.dot(z, z)]))[0])
         if size > self.most[0]:
             self.most = size, t, z.copy()
-        if self.writer is not None:
-            self.writer.write(t, z, v, q_s, v_s)
         if self.pictures and (not self.few or run.reached in self.chosen):
             state = vertex_displacement(self.model, z, q_s)
             self.steps.append(run.reached)
@@ -152,6 +146,9 @@ class Frames:
             self.hands.append(q_s.copy())
             if state is not None:
                 self.states.append(state.astype(np.float32))
+        if self.writer is not None:  # last: when there is no room, the rest goes beside the restart file
+            reserve = restart_bytes(run) if isinstance(run, Run) else 0
+            self.writer.write(t, z, v, q_s, v_s, reserve=reserve if reserve < LARGE_RESTART else 0)
 
     def _ahead(self, run: Run) -> set[int]:
         """Steps of the still picture before they are reached; the hand's table is known unless forces drive it."""
@@ -198,10 +195,3 @@ class Frames:
 def _series(begun: int) -> str:
     """Stem of the field files of the leg that starts from a step."""
     return f"fields-from{begun}" if begun else "fields"
-
-
-def _kept(directory: Path) -> list[tuple[int, Path]]:
-    """Steps of the frames beside the checkpoint and their files, in order."""
-    files = (directory / "checkpoint").glob("frame*.npz")
-    numbers = ((path.stem.removeprefix("frame"), path) for path in files)
-    return sorted((int(number), path) for number, path in numbers if number.isdecimal())

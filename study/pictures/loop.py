@@ -97,7 +97,10 @@ def figure_histories(
                     height = (unit[0] if part is lengths else 1.0) * value
                     ax.axhline(height, color=TARGET, lw=1.0, ls=(0, (1, 1.2)), zorder=0)
             axes[-1].set_ylabel("distance to target,\nlargest from then on [m]")
-        _limits(axes[first], limits, d)
+        bounds = np.broadcast_to(np.asarray(np.inf if limits is None else limits, dtype=np.float64), inputs.shape[1:])
+        _limits(axes[first], bounds, slice(0, d))
+        if d < inputs.shape[1]:
+            _limits(axes[first + 1], bounds, slice(d, None))
         for ax, part in zip(axes, panels, strict=False):
             ax.set_ylabel(f"outputs [{unit[1]}]" if part is lengths else "rotation [rad]")
         axes[first].set_ylabel("force [N]")
@@ -140,14 +143,11 @@ def _steps(ax: Any, times: Array, values: Array, look: dict[str, Any]) -> None:
         ax.step(at, column, where="post", color=CYCLE[j % len(CYCLE)], **look)
 
 
-def _limits(ax: Any, limits: npt.ArrayLike | None, d: int) -> None:
-    if limits is None:
-        return
-    bounds = np.broadcast_to(np.asarray(limits, dtype=np.float64), (d,)) if np.ndim(limits) == 0 else np.asarray(limits)
-    for bound in {float(b) for b in bounds[:d] if np.isfinite(b)}:
+def _limits(ax: Any, limits: Array, part: slice) -> None:
+    for bound in {float(b) for b in limits[part] if np.isfinite(b)}:
         for value in (-bound, bound):
             ax.axhline(value, color="#999999", lw=0.8, ls=(0, (4, 2)), zorder=0)
-    ax.margins(y=0.08)
+        ax.margins(y=0.08)
 
 
 def _legends(axes: Any, names: list[list[str]], inputs: int, d: int, runs: list[str], aimed: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +18,7 @@ from softgrasp.study.report.files import plain
 
 TRIES = 4  # settings that are run to check a prediction
 MARGIN = 0.75  # of the tolerance that the full run behind a reduced model may use
-SNAPSHOTS = 1e8  # entries of the snapshots behind a reduced model
+SNAPSHOTS = 1.5e8  # entries of the snapshots behind a reduced model
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 MORE = 3  # reduced dimensions tried beyond the predicted one
 
@@ -93,6 +92,24 @@ def seconds_text(value: float | None) -> str:
     return f"{value / 1e-6:.3g} us"
 
 
+def advice(shares: Row, details: Row) -> str:
+    """What to refine first: that which carries the largest share of an error. Not collective.
+
+    Args:
+        shares: of space, time and maybe reduction.
+        details: cells and order of the mesh.
+    """
+    largest = max(shares, key=lambda name: float(shares[name]))
+    better = {
+        "space": ("a finer mesh, tissue.cells" if details["cells"] else "a finer mesh file")
+        + (", or tissue.order = 2" if details["order"] == 1 else ""),
+        "time": "more time.steps",
+        "reduction": "a larger N, reduction.N",
+    }[largest]
+    parts = ", ".join(f"{name} {value:.1e}" for name, value in shares.items())
+    return f"Of its error, {largest} carries the largest share ({parts}): {better} would help first."
+
+
 class Asker:
     """Answers for one study; ``tried`` are the points that were measured for them. Its methods are collective.
 
@@ -113,7 +130,7 @@ class Asker:
 
     def meets(self, point: WorkPoint, tolerance: float) -> bool:
         """Whether a measured error holds with the error of the reference on top."""
-        return point.ok and point.error + self.truth.error <= tolerance
+        return point.ok and self.truth.range_of(point.error)[1] <= tolerance
 
     def measure(self, setting: Setting) -> WorkPoint:
         """Run a setting that the diagram does not hold."""
@@ -205,15 +222,15 @@ class Asker:
         full = self.cheapest(tolerance)
         small = self.small(tolerance) if self.reduced else None
         if full is not None:
-            found["full"] = _row(full[1], full[0].error, full[0].seconds, full[0].setting.overrides)
+            found["full"] = self.row(full[1], full[0].error, full[0].seconds)
             words.append(
                 f"Cheapest full run within {tolerance:g}: {full[1].label}: predicted error {full[0].error:.1e} in "
-                f"{seconds_text(full[0].seconds)}, measured {full[1].error:.1e} in {seconds_text(full[1].seconds)} "
-                f"(deformation {full[1].details['error_deformation']:.1e})."
+                f"{seconds_text(full[0].seconds)}, measured {full[1].error:.1e} of the deformation "
+                f"({full[1].details['error_displacement']:.1e} of the displacement) in {seconds_text(full[1].seconds)}."
             )
         if small is not None:
             predicted, point = small
-            found["reduced"] = _row(point, predicted["error"], predicted["seconds"], [])
+            found["reduced"] = self.row(point, predicted["error"], predicted["seconds"])
             words.append(
                 f"For many runs: {point.label}: predicted error {predicted['error']:.1e} in "
                 f"{seconds_text(predicted['seconds'])} a run, measured {point.error:.1e} in "
@@ -227,7 +244,8 @@ class Asker:
         elif self.reduced and small is None:
             words.append("No reduced model that was tried meets it.")
         words.append(
-            f"The reference's own error, {self.truth.error:.1e}, is added to every measured error before comparing."
+            f"Errors are those of the deformation, the outputs against the hand, over the largest such output. The "
+            f"reference's own error, {self.truth.error:.1e}, is added to every measured one before comparing."
         )
         words += self._against_own_mesh(tolerance)
         return Answer("tolerance", tolerance, bool(found), tuple(words), found, closest)
@@ -237,11 +255,16 @@ class Asker:
         every = [*usable(self.forward), *usable(self.reduced), *usable(self.tried)]
         best = min(every, key=lambda p: p.error)
         words = [
-            f"Nothing tried meets {tolerance:g}; closest is {best.label} with the error {best.error:.1e} in "
-            f"{seconds_text(best.seconds)}."
+            f"Nothing tried meets {tolerance:g}; closest is {best.label} with the error {best.error:.1e}, give or take "
+            f"{self.truth.error:.1e}, in {seconds_text(best.seconds)}."
         ]
+        words.append(advice(self.shares(best), best.details))
         if self.truth.error >= tolerance:
-            words.append("The reference itself is not known that well, so that nothing can be shown to meet it.")
+            part = self.truth.largest_part
+            words.append(
+                "The reference itself is not known that well, so that nothing can be shown to meet it: most of its "
+                f"own error is the {part} part, and would need {self.truth.need}."
+            )
         else:
             large = self.beyond(tolerance)
             if large is not None:
@@ -249,17 +272,53 @@ class Asker:
                     f"Predicted to meet it, but too large to be tried here: {large.setting.label}, error "
                     f"{large.error:.1e} in {seconds_text(large.seconds)}."
                 )
-        return _row(best, None, None, []), words
+        return self.row(best), words
+
+    def shares(self, point: WorkPoint) -> Row:
+        """About how much of a point's error space, the time step and the reduced model carry. Not collective.
+
+        What the reference does not know about space counts with space.
+        """
+        d = point.details
+        cells = None if d["cells"] is None else tuple(d["cells"])
+        predict = self.predictor
+        space = predict.space_error((cells, d["order"])) + self.truth.space[0]
+        parts = {"space": space, "time": predict.time_error(d["steps"])}
+        return parts | ({"reduction": d["error_outputs_full"]} if point.question == "reduced" else {})
+
+    def row(self, point: WorkPoint, error: float | None = None, seconds: float | None = None) -> Row:
+        """A setting with its predicted and measured numbers, and the ``--set`` that repeat it. Not collective."""
+        d: dict[str, Any] = point.details
+        names = ("cells", "order", "steps", "solver", "method", "N")
+        measured = ("error_deformation", "error_displacement", "error_range", "p50", "p99", "max", "scratch",
+                    "per_step", "error_outputs_full", "error_full")  # fmt: skip
+        sets = setting_of(point).overrides
+        if self.runs.reference is not None:
+            sets.append(f"hand.reference={self.runs.reference}")  # the default moves a little with the mesh
+        if point.question == "reduced":
+            sets += [f"reduction.methods=['{d['method']}']", f"reduction.N=[{d['N']}]"]
+        row: Row = plain(
+            {
+                "label": point.label,
+                "command": "reduce" if point.question == "reduced" else "simulate",
+                "setting": {k: d[k] for k in names if d.get(k) is not None},
+                "set": sets,
+                "predicted": None if error is None else {"error": error, "seconds": seconds},
+                "measured": {"error": point.error, "seconds": point.seconds, **{k: d[k] for k in measured if k in d}},
+                "shares": self.shares(point),
+            }
+        )
+        return row
 
     def _against_own_mesh(self, tolerance: float) -> list[str]:
         """The paper's question: the fastest reduced model of the scene's own mesh against its own full run."""
-        good = [p for p in usable(self.reduced) if p.details["error_full"] <= tolerance]
+        good = [p for p in usable(self.reduced) if p.details["error_outputs_full"] <= tolerance]
         if not good:
             return []
         p = min(good, key=lambda p: p.seconds)
         return [
             f"Against the full run on the scene's own mesh alone, whose error is not counted then, {p.label} has the "
-            f"state error {p.details['error_full']:.1e} in {seconds_text(p.seconds)} a run."
+            f"error {p.details['error_outputs_full']:.1e} in {seconds_text(p.seconds)} a run."
         ]
 
     def budget(self, seconds: float) -> Answer:
@@ -276,7 +335,7 @@ class Asker:
             fit = [p for p in timed if p.details["p99"] <= seconds]
             if fit:
                 best = min(fit, key=lambda p: (p.error, p.details["p99"]))
-                found[kind] = _row(best, None, None, [])
+                found[kind] = self.row(best)
                 words.append(f"{_name(kind)} within {seconds_text(seconds)} a step: {best.label}: {_step_words(best)}.")
             elif timed:
                 best = min(timed, key=lambda p: p.details["p99"])
@@ -285,7 +344,7 @@ class Asker:
                     f"nearest is {best.label}: {_step_words(best)}."
                 )
         timed = [p for p in [*self.forward, *self.reduced] if p.details.get("p99") is not None]
-        closest = None if found or not timed else _row(min(timed, key=lambda p: p.details["p99"]), None, None, [])
+        closest = None if found or not timed else self.row(min(timed, key=lambda p: p.details["p99"]))
         over = [k for k, row in found.items() if row["measured"]["max"] > seconds]
         if over:
             words.append(
@@ -303,20 +362,3 @@ def _step_words(point: WorkPoint) -> str:
     d = point.details
     times = ", ".join(f"{name} {seconds_text(d[name])}" for name in ("p50", "p99", "max"))
     return f"error {point.error:.1e}, step {times}"
-
-
-def _row(point: WorkPoint, error: float | None, seconds: float | None, overrides: Sequence[str]) -> Row:
-    """A setting with its predicted and measured numbers."""
-    d: dict[str, Any] = point.details
-    names = ("cells", "order", "steps", "solver", "method", "N")
-    measured = ("error_deformation", "p50", "p99", "max", "scratch", "per_step", "error_full")
-    found: Row = plain(
-        {
-            "label": point.label,
-            "setting": {k: d[k] for k in names if d.get(k) is not None},
-            "set": list(overrides),
-            "predicted": None if error is None else {"error": error, "seconds": seconds},
-            "measured": {"error": point.error, "seconds": point.seconds, **{k: d[k] for k in measured if k in d}},
-        }
-    )
-    return found

@@ -28,7 +28,10 @@ HEADERS: dict[str, tuple[str, ...]] = {
     "reduced_riccati": (
         "basis", "N", "gain error", "excess cost", "abscissa [1/s]", "equation [ms]", "from nothing [s]", "front",
     ),
-    "loop": ("controller", "steps", "error", "error in time", "error of the cost", "step [us]", "run [s]", "front"),
+    "loop": (
+        "controller", "steps", "error", "displacement", "error in time", "error of the cost", "step [us]", "run [s]",
+        "front",
+    ),
 }  # fmt: skip
 CAPTIONS = {
     "riccati": (
@@ -42,11 +45,11 @@ CAPTIONS = {
         "above 1; crosses: the full closed loop is not stable, or not certified to be."
     ),
     "loop": (
-        "Left: largest distance of the outputs from those of the optimal loop without any time step, over the way to "
-        "go; along a line the step falls. Solid: feedback inside the midpoint rule; dashed: sampled at every step and "
-        "held; open marks: the reduced plant instead of the full one. Upper right: error against the same gain "
-        "without time step. Steps longer than a period of the tissue do not resolve what the start excites. Lower "
-        "right: seconds of a step, range over all steps and median."
+        "Left: largest error of the deformation, the outputs against the hand, against the optimal loop without any "
+        "time step, over its largest deformation; along a line the step falls. Solid: feedback inside the midpoint "
+        "rule; dashed: sampled at every step and held; open marks: the reduced plant instead of the full one. Upper "
+        "right: error against the same gain without time step. Steps longer than a period of the tissue do not resolve "
+        "what the start excites. Lower right: seconds of a step, range over all steps and median."
     ),
 }
 
@@ -75,7 +78,8 @@ def rows_of_control(name: str, points: Sequence[WorkPoint], front_only: bool = F
                      1e3 * p.seconds, d["scratch"])  # fmt: skip
         else:
             step = None if d["per_step"] is None else 1e6 * d["per_step"]
-            cells = (p.series, d["steps"], p.error, d["error_time"], d["cost_error"], step, p.seconds)
+            errors = p.error, d["error_displacement"], d["error_time"]
+            cells = (p.series, d["steps"], *errors, d["cost_error"], step, p.seconds)
         rows.append((*(_number(c) for c in cells), mark))
     return rows
 

@@ -198,7 +198,7 @@ def figure_loop(points: Sequence[WorkPoint], error: float, out_png: Path) -> tup
                 step.plot([min(per_step), max(per_step)], [-k, -k], color=style["color"], lw=0.8)
                 step.plot([np.median(per_step)], [-k], **(style | {"ls": ""}))
         draw_front(ax, good, lambda p: p.seconds, lambda p: p.error)
-        axes_log(ax, "time of a run [s]", "error of the outputs over the way to go")
+        axes_log(ax, "time of a run [s]", "relative error of the deformation")
         axes_log(order, "time steps", "error in time")
         _steps_axes(step, names)
         if _band(ax, error):

@@ -8,14 +8,16 @@ from dataclasses import dataclass, replace
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, interpolate, power_law
 from softgrasp.study.precision.full import FullRuns, errors_of, largest
+from softgrasp.study.precision.meshes import halved_meshes, nested_meshes, smallest_mesh
 from softgrasp.study.precision.points import LEAST_STEPS, Row, Setting, WorkPoint, least_steps, scene_setting
-from softgrasp.study.precision.reference import Reference, nested_meshes
+from softgrasp.study.precision.reference import Reference
 
 SHARES = (2.0, 1.0, 0.5, 0.25, 0.125)  # of the scene's steps
 CG_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 POINT_WORK = {2: 8e6, 3: 6e5}  # unknowns times steps of a point of the diagram
-LARGEST = {2: 150_000, 3: 40_000}  # unknowns of a setting that no run of the diagram tried
-GROWTH = 4.0  # and its work over that of the largest point
+LARGEST = {2: 300_000, 3: 60_000}  # unknowns of a setting that no run of the diagram tried
+GROWTH = 8.0  # and its work over that of the largest point
+MESHES = 5  # of each order, besides the scene's own
 FINEST = 3  # numbers of steps behind a slope in time: coarser ones may not resolve the motion
 CLEAR = 2.0  # times the error of the reference, from which on an error has an order
 SAFETY = 0.9  # of the tolerance that a predicted error may use
@@ -28,7 +30,7 @@ class Prediction:
 
     Attributes:
         setting: which.
-        error: relative error of the outputs.
+        error: relative error of the deformation.
         seconds: of a whole run.
         point: of the diagram, when the setting was run for it.
     """
@@ -47,9 +49,8 @@ def step_counts(steps: int, least: int = LEAST_STEPS) -> list[int]:
 def forward_settings(scene: Scene, d: int) -> list[Setting]:
     """Settings of the diagram, the most steps of each mesh first; then solvers at the scene's own. Not collective."""
     own = scene_setting(scene)
-    meshes = nested_meshes(scene)
     groups: list[Group] = [(own.cells, own.order)]
-    groups += [(cells, order) for order in (1, 2) for cells in (meshes[:-1] or (None,))]
+    groups += [(cells, order) for order in (1, 2) for cells in (halved_meshes(scene, MESHES) or (None,))]
     found = []
     for cells, order in dict.fromkeys(groups):
         for steps in step_counts(scene.time.steps, least_steps(scene)):
@@ -63,13 +64,14 @@ def forward_settings(scene: Scene, d: int) -> list[Setting]:
 
 
 def to_point(setting: Setting, row: Row, runs: FullRuns, reference: Reference, series: str = "") -> WorkPoint:
-    """A run as a point of the diagram. Not collective."""
-    error, deformation = errors_of(runs.series(row), reference.series)
+    """A run as a point of the diagram; its error may be anything in ``error_range``. Not collective."""
+    error, displacement = errors_of(runs.series(row), reference.series)
     kept = ("n_e", "states", "steps", "dt", "mesh", "assembly", "factor", "per_step", "p50", "p99", "max")
     details = {
         "cells": None if setting.cells is None else list(setting.cells), "order": setting.order,
         "solver": setting.solver, "rtol": setting.rtol if setting.solver == "cg" else None,
-        "error_deformation": deformation, **{key: row[key] for key in kept},
+        "error_deformation": error, "error_displacement": displacement, "error_range": reference.range_of(error),
+        **{key: row[key] for key in kept},
     }  # fmt: skip
     return WorkPoint("forward", series or setting.mesh, setting.label, row["seconds"], error, True, details)
 
@@ -103,7 +105,7 @@ def sweep_forward(scene: Scene, runs: FullRuns, reference: Reference) -> list[Wo
 
 
 def setting_of(point: WorkPoint) -> Setting:
-    """The setting of a point of the forward diagram. Not collective."""
+    """The setting of the full run of a point, or behind a reduced one. Not collective."""
     d = point.details
     cells = None if d["cells"] is None else tuple(d["cells"])
     return Setting(cells, d["order"], d["steps"], d["solver"], d["rtol"] or 1e-10)
@@ -144,6 +146,9 @@ def forward_slopes(points: Sequence[WorkPoint], reference_error: float) -> list[
 class Predictor:
     """Error and time of any setting from the points of the diagram: error <= space(mesh) + time(steps).
 
+    The change between s and S steps of order 2 is (1 - (s / S)^2) of the error with s, and the error with S is a
+    quarter of that with S / 2.
+
     Args:
         scene: the study's scene.
         points: of the forward diagram.
@@ -163,10 +168,14 @@ class Predictor:
         names = [p.series for p in changing]
         # the mesh with the most steps tried tells about time, the finest of those
         best_name = max(names, key=lambda n: (names.count(n), n), default="")
-        self.time = [p for p in changing if p.series == best_name]
+        most = max((p.details["steps"] for p in self.plain if p.series == best_name), default=1)
+        self.time = {
+            int(p.details["steps"]): p.details["error_time"] / (1 - (p.details["steps"] / most) ** 2)
+            for p in changing if p.series == best_name
+        }  # fmt: skip
 
     def space_error(self, group: Group) -> float:
-        """Error of a mesh at its most steps; of others by the slope of their order."""
+        """Error of a mesh at its most steps; of others by the slope of their element order."""
         if group in self.space:
             return self.space[group].error
         cells, order = group
@@ -178,11 +187,8 @@ class Predictor:
         return interpolate(cells[0], [c[0] for c, _ in known], [p.error for _, p in known])
 
     def time_error(self, steps: int) -> float:
-        """Change of the outputs through the time step; order 2 beyond the steps tried."""
-        if not self.time:
-            return 0.0
-        counts = [p.details["steps"] for p in self.time]
-        return interpolate(steps, counts, [p.details["error_time"] for p in self.time], -2.0)
+        """Error through the time step; order 2 beyond the steps tried."""
+        return interpolate(steps, list(self.time), list(self.time.values()), -2.0) if self.time else 0.0
 
     def predict(self, setting: Setting) -> Prediction:
         """Error and times of a setting. Not collective."""
@@ -207,11 +213,10 @@ class Predictor:
     def candidates(self) -> list[Prediction]:
         """All settings worth a thought: tried ones, other steps on their meshes, and finer meshes. Not collective."""
         groups = list(self.space)
-        nested = nested_meshes(self.scene)
-        if nested:
-            coarse = nested[0]
+        if self.scene.tissue.cells is not None:
+            coarse = smallest_mesh(self.scene)
             widest = max((c[0] for c, _ in groups if c is not None), default=coarse[0])
-            for k in (*range(1, 17), *range(18, 32, 2), *range(32, 64, 4), *range(64, 257, 16)):
+            for k in (*range(1, 17), *range(18, 32, 2), *range(32, 64, 4), *range(64, 257, 16), 384, 512, 768, 1024):
                 cells = tuple(n * k for n in coarse)
                 groups += [(cells, order) for order in (1, 2) if (cells, order) not in self.space]
                 if cells[0] > 16 * widest:

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from softgrasp.fem.fields.probe import Probe, make_probe
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.points import Cache, Guard, Row, Setting, as_array, variant
-from softgrasp.study.precision.probe import Places, Probe, make_probe, run_probed
+from softgrasp.study.precision.probe import Places, run_probed
 
 BURST_SECONDS = 0.05  # of the steps in each repeat after the first, which is the whole run
 BUILD_SECONDS = 2.0  # builds are repeated about this long
@@ -21,7 +22,7 @@ BUILD_SECONDS = 2.0  # builds are repeated about this long
 
 @dataclass(frozen=True)
 class Series:
-    """Outputs over time: displacements y and deformations y - rigid, side by side.
+    """Outputs over time: deformations y - rigid, what the tissue does, and displacements y, side by side.
 
     Attributes:
         times: (steps + 1,) [s].
@@ -39,20 +40,19 @@ class Series:
             return self.values
         return np.asarray(CubicSpline(self.times, self.values)(times))
 
-    def gap(self, other: Array) -> tuple[float, float]:
-        """Largest displacement and largest deformation of a difference on these times [m]. Not collective."""
-        return largest(other, self.dimension)
-
 
 def largest(values: Array, d: int) -> tuple[float, float]:
-    """Largest length of the displacements in the first half of the columns, and in the second. Not collective."""
+    """Largest length of the vectors in the first half of the columns, and in the second. Not collective."""
     places = values.reshape(len(values), 2, -1, d)
     found = np.linalg.norm(places, axis=3).max(axis=(0, 2))
     return float(found[0]), float(found[1])
 
 
 def errors_of(found: Series, true: Series) -> tuple[float, float]:
-    """Largest error over the largest value, of displacement and of deformation. Not collective."""
+    """Largest error over the largest value: of the deformation, the measure of a study, and of the displacement.
+
+    The rigid motion of the hand is many times the deformation, and hides it in the second. Not collective.
+    """
     scale = largest(true.values, true.dimension)
     gap = largest(found.values - true.at(found.times), true.dimension)
     return tuple(g / s if s > 0 else 0.0 for g, s in zip(gap, scale, strict=True))  # type: ignore[return-value]
@@ -117,7 +117,7 @@ class FullRuns:
             if comm.bcast(sum(map(sum, seconds.values()))) > BUILD_SECONDS:
                 break
         row = {stage: statistics.median(values) for stage, values in seconds.items()}
-        probe = make_probe(model, self.places)
+        probe = make_probe(model.space, self.places.points, self.scene.effects.rotation)
         self._mesh = (setting, model, probe, row)
         return model, probe, row
 
@@ -149,4 +149,4 @@ class FullRuns:
             "max": float(steps.max()),
         }
         row["seconds"] = row["mesh"] + row["assembly"] + row["factor"] + setting.steps * row["per_step"]
-        return row | {"times": first.times, "values": np.hstack([first.y, first.y - first.rigid])}
+        return row | {"times": first.times, "values": np.hstack([first.own, first.y])}

@@ -1,7 +1,9 @@
 """The question of the closed loop: controller x time step against the error of the trajectory, its cost and time.
 
 The reference has no time step: with y - y_bar = C exp(F t) e(0), F = A + B K on the modes of the tissue, the optimal
-loop is known at every instant up to the modes left out, and halving their number shows what those are worth.
+loop is known at every instant up to the modes left out, and halving their number shows what those are worth. Errors are
+those of the outputs against the hand, y - C_s q_s, over the largest such output on the way; beside them stand those of
+y itself, over the way to go, in which the motion of the hand hides the tissue.
 """
 
 from __future__ import annotations
@@ -13,10 +15,11 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.outputs_named import farthest
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
@@ -29,7 +32,6 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import reduce_riccati
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
-from softgrasp.reduction.engines import on_root
 from softgrasp.study.control.sweep import TITLES, fast_order, judged, orders
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.points import LEAST_STEPS, Row, WorkPoint, number
@@ -141,7 +143,7 @@ class LoopRuns:
     # --- reference
 
     def exact(self, what: Feedback, steps: int) -> Array:
-        """Outputs y - y_bar under a gain without any time step, at the instants of a grid, (steps + 1, p)."""
+        """:func:`exact_outputs` of a gain at the instants of a grid, (steps + 1, 2 p)."""
         most = self.counts[0]
         if what not in self._exact:
             self._exact[what] = exact_outputs(self.runs, self.runs.design.judge.loop, self.gain(what), most)
@@ -151,7 +153,12 @@ class LoopRuns:
         """Error estimate of the reference, cost and what is to come at the end, from the cache when they are there.
 
         Keys: error, modes, complete, optimal, to_come.
+
+        Raises:
+            ControlError: no output moves against the hand.
         """
+        if not self.layout.comm.allreduce(bool(np.any(self.runs.problem.C_z)), MPI.LOR):
+            raise ControlError("no output moves against the hand, so that there is no deformation whose error counts")
 
         def measure() -> Row:
             design, most, best = self.runs.design, self.counts[0], Feedback()
@@ -159,7 +166,7 @@ class LoopRuns:
             modes, error = len(loop.plant.omega), 0.0
             if not loop.complete:
                 coarse = exact_outputs(self.runs, ModalLoop(design.problem, modes // 2), self.gain(best), most)
-                error = largest(true - coarse, names) / largest(true, names)
+                error = errors_of(coarse, true, names)[0]
             run = self._full(Controller(best), most)[0]
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
             return {"error": error, "modes": modes, "complete": loop.complete, "optimal": design.judge.optimal,
@@ -258,29 +265,31 @@ class LoopRuns:
     def _row(self, what: Controller, steps: int) -> Row:
         """Errors, cost and seconds of one controller and step.
 
-        Keys: error against the optimal loop, error_time against the same gain without time step, cost_error.
+        Keys: error of the deformation and error_displacement against the optimal loop, error_time of the deformation
+        against the same gain without time step, cost_error.
         """
         ending = self.reference_row()
         row: Row = {"steps": steps, "dt": self.scene.time_end / steps, "basis": what.gain.basis, "N": what.gain.N,
                     "held": what.held, "reduced_plant": what.reduced, "reason": "", "error": None, "seconds": None,
-                    "per_step": None, "error_time": None, "cost_error": None}  # fmt: skip
+                    "per_step": None, "error_displacement": None, "error_time": None, "cost_error": None}  # fmt: skip
         run: Any
         try:
             run, means = self._reduced(what, steps) if what.reduced else self._full(what, steps)
         except (SolverError, ControlError) as failed:
             return row | {"reason": str(failed)}
-        y, true = run.outputs - self.runs.design.target.y, self.exact(Feedback(), steps)
-        names = self.runs.problem.names
-        scale = largest(true, names)
-        error = largest(y - true, names) / scale
-        if not error <= GONE:
+        problem, target = self.runs.problem, self.runs.design.target
+        names, y = problem.names, run.outputs - target.y
+        both = np.hstack([y - (run.q_s - target.state.q_s) @ problem.C_s.T, y])
+        error, displacement = errors_of(both, self.exact(Feedback(), steps), names)
+        if not displacement <= GONE:
             return row | {"reason": "far from the reference"}
         per_step = statistics.median(means)
         setup = run.seconds["prepare" if what.reduced else "factor"]
         due = ending["optimal"] - ending["to_come"]
         return row | {
-            "error": error, "per_step": per_step, "seconds": setup + steps * per_step, "setup": setup,
-            "error_time": largest(y - self.exact(what.gain, steps), names) / scale,
+            "error": error, "error_displacement": displacement, "per_step": per_step,
+            "seconds": setup + steps * per_step, "setup": setup,
+            "error_time": errors_of(both, self.exact(what.gain, steps), names)[0],
             "cost": float(run.cost[-1]), "cost_error": abs(float(run.cost[-1]) - due) / ending["optimal"],
         }  # fmt: skip
 
@@ -290,11 +299,24 @@ def largest(values: Array, names: Sequence[str]) -> float:
     return float(farthest(values, np.zeros(values.shape[1]), names).max())
 
 
+def errors_of(values: Array, true: Array, names: Sequence[str]) -> tuple[float, float]:
+    """Largest error over the largest value, of each half of the columns (m, 2 p). Not collective."""
+    p = true.shape[1] // 2
+    halves = (slice(0, p), slice(p, 2 * p))
+    return tuple(largest(values[:, h] - true[:, h], names) / largest(true[:, h], names) for h in halves)  # type: ignore[return-value]
+
+
 def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -> Array:
-    """C exp(F t_n) e(0), (steps + 1, p), F = A + B K. Collective."""
+    """C exp(F t_n) e(0), F = A + B K: y - y_bar without the part C_s of the hand, and with it, (steps + 1, 2 p).
+
+    Collective.
+    """
     K = modal.gain(Block(gain.K_s.T, np.concatenate([gain.K_z, gain.K_v])))
     e = modal.state(runs.design.error)[:, 0]
-    C, dt = modal.plant.space.C, runs.scene.time_end / steps
+    whole, dt = modal.plant.space.C, runs.scene.time_end / steps
+    own = whole.copy()
+    own[:, : runs.layout.n_s] = 0.0
+    C = np.vstack([own, whole])
 
     def march() -> Array:
         step = scipy.linalg.expm(dt * (modal.A + modal.B @ K))

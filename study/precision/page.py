@@ -16,14 +16,18 @@ from rich.table import Table
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.reduction.registry import METHODS
-from softgrasp.study.control.sweep import TITLES as BASIS_TITLES
-from softgrasp.study.precision.answer import seconds_text
+from softgrasp.study.precision.answer import Answer, seconds_text
 from softgrasp.study.precision.control_page import HEADERS, control_sections, draw_control, notes, rows_of_control
-from softgrasp.study.precision.fit import Slope, pareto
+from softgrasp.study.precision.fit import pareto
 from softgrasp.study.precision.plots import figure_budget, figure_forward, figure_reduced, figure_series
 from softgrasp.study.precision.points import CONTROL, TITLES, Asked, Row, WorkPoint
-from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
+from softgrasp.study.precision.tables import (
+    FORWARD_HEADER,
+    REDUCED_HEADER,
+    forward_rows,
+    reduced_rows,
+    slope_rows,
+)
 from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.files import plain, write_json, write_scene
@@ -37,31 +41,21 @@ if TYPE_CHECKING:
 
 PAPER_SCENE = "paper_forward"
 FIRST = ("question", "series", "label", "seconds", "error", "ok", "pareto")
-FORWARD_HEADER = (
-    "setting",
-    "unknowns",
-    "error",
-    "deformation",
-    "assembly [s]",
-    "factor [s]",
-    "step [us]",
-    "run [s]",
-    "front",
-)
-REDUCED_HEADER = ("setting", "N", "state error", "output error", "online [s]", "from nothing [s]", "front")
 CAPTIONS = {
     "work_forward.png": (
-        "Relative error of the outputs over the run against the time of a whole run (mesh, assembly, factor, steps). "
+        "Relative error of the deformation, the outputs against the hand over the run, against the time of a whole run "
+        "(mesh, assembly, factor, steps). In the grey band the error of the reference is the larger one. "
         "Along a thin line the mesh stays and the steps grow. Right: order in space at the most steps, and change "
         "through the time step on every mesh."
     ),
     "work_reduced.png": (
-        "Relative error of the state against the full run on the same mesh and steps. Left: time of one reduced run "
+        "Relative error of the deformation, the outputs against the hand, against the full run on the same mesh and "
+        "steps. Left: time of one reduced run "
         "once the model is there. Right: with everything before it. Open marks: the hand is part of the basis. "
         "Unstable models are left out."
     ),
     "work_bases.png": "What a basis leaves of the snapshots against the time to make it; open marks miss it.",
-    "work_budget.png": "Time of single steps against the error of the outputs, with the budget.",
+    "work_budget.png": "Time of single steps against the error of the deformation, with the budget.",
 }
 
 
@@ -94,7 +88,7 @@ def write_study(
         "pareto": {name: [p.label for p in pareto(points)] for name, points in study.points.items()},
         "slopes": [vars(s) for s in study.slopes],
         "skipped": study.skipped,
-        "answers": [a.to_dict() for a in study.answers],
+        "answers": [_answer(a, path, overrides, comm.size) for a in study.answers],
         "measured_for_the_answers": [p.to_row() for p in study.tried],
         "runs": {"measured": study.measured, "cached": study.cached},
         "memory_peak_mb": peak_memory_mb(comm),
@@ -115,14 +109,29 @@ def write_study(
     return result
 
 
+def _answer(answer: Answer, path: Path, overrides: list[str], ranks: int) -> Row:
+    """An answer for JSON, each of its settings with the command that runs it again. Not collective."""
+    row = answer.to_dict()
+    for part in (row.get("full"), row.get("reduced"), row["closest"]):
+        if part is not None:
+            part["command"] = command_line(part["command"], path, [*overrides, *part["set"]], ranks)
+    return row
+
+
+def _commands(row: Row) -> list[str]:
+    """Commands that run what an answer names, in the order of its sentences. Not collective."""
+    return [row[key]["command"] for key in ("full", "reduced", "closest") if row.get(key) is not None]
+
+
 def _reference(truth: Reference | None) -> Row | None:
     """The reference of the forward questions for JSON. Not collective."""
     if truth is None:
         return None
     return {
-        "note": truth.note, "error": truth.error, "error_deformation": truth.error_deformation,
-        "space": truth.space, "time": truth.time, "mixed": truth.mixed, "order": truth.order,
-        "extrapolated": truth.extrapolated, "settings": [s.label for s in truth.settings],
+        "note": truth.note, "error": truth.error, "error_displacement": truth.error_displacement,
+        "space": truth.space, "time": truth.time, "mixed": truth.mixed, "order": truth.limit.order,
+        "expected_order": truth.limit.expected, "extrapolated": truth.limit.extrapolated,
+        "settings": [s.label for s in truth.settings],
     }  # fmt: skip
 
 
@@ -164,52 +173,7 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
     return found
 
 
-# --- tables
-
-
-def forward_rows(points: Sequence[WorkPoint], front_only: bool = False) -> list[tuple[Any, ...]]:
-    """Rows under ``FORWARD_HEADER``. Not collective."""
-    front, rows = pareto(points), []
-    for p in front if front_only else points:
-        d = p.details
-        numbers = (d["assembly"], d["factor"], 1e6 * d["per_step"], p.seconds)
-        rows.append((p.label, d["n_e"], p.error, d["error_deformation"], *numbers, "*" if p in front else ""))
-    return rows
-
-
-def reduced_rows(points: Sequence[WorkPoint], front_only: bool = False) -> list[tuple[Any, ...]]:
-    """Rows under ``REDUCED_HEADER``; the front is that of the state error. Not collective."""
-    front = state_front(points)
-    rows = []
-    for p in sorted(front, key=lambda p: p.seconds) if front_only else points:
-        d = p.details
-        name = METHODS[p.series].title if p.series in METHODS else p.series
-        mark = "*" if p in front else "" if p.ok else "unstable"
-        rows.append((name, d["N"], d["error_full"], p.error, p.seconds, d["scratch"], mark))
-    return rows
-
-
-def state_front(points: Sequence[WorkPoint]) -> list[WorkPoint]:
-    """Front of state error against online time. Not collective."""
-    by_state = {
-        id(p): WorkPoint(p.question, p.series, p.label, p.seconds, p.details["error_full"], p.ok) for p in points
-    }
-    front = pareto(list(by_state.values()))
-    return [p for p in points if by_state[id(p)] in front]
-
-
-def slope_rows(slopes: Sequence[Slope]) -> list[tuple[Any, ...]]:
-    """Question, series, what against what, power, points. Not collective."""
-    names: dict[str, dict[str, str]] = {
-        "reduced": {key: method.title for key, method in METHODS.items()},
-        "riccati": METHOD_TITLES,
-        "reduced_riccati": BASIS_TITLES,
-    }
-    return [
-        (s.question.replace("_", " "), names.get(s.question, {}).get(s.series, s.series), s.against,
-         f"{s.power:+.2f}", s.count)
-        for s in slopes
-    ]  # fmt: skip
+# --- terminal
 
 
 def show(console: Console, study: WorkStudy, result: dict[str, Any]) -> None:
@@ -233,14 +197,16 @@ def show(console: Console, study: WorkStudy, result: dict[str, Any]) -> None:
         console.print(f"{', '.join(names)}: left out, {reason}", markup=False)
     if is_paper(study) and study.full:
         console.print(
-            f"The paper: {PAPER_FULL} s for the full run, here {study.full['seconds']:.3g} s; {PAPER_REDUCED} s and an "
-            "error of about 1e-3 at N = 14.",
+            f"The paper: {PAPER_FULL} s for the full run, here {study.full['seconds']:.3g} s; {PAPER_REDUCED} s and a "
+            "state error of about 1e-3 at N = 14.",
             markup=False,
         )
-    for answer in study.answers:
+    for answer, row in zip(study.answers, result["answers"], strict=True):
         style = "bold" if answer.met else "bold red"
         for k, sentence in enumerate(answer.sentences):
             console.print(sentence, style=style if k == 0 else None, markup=False, soft_wrap=True)
+        for command in _commands(row):
+            console.print(f"  {command}", markup=False, soft_wrap=True)
     runs = result["runs"]
     console.print(f"{runs['measured']} runs measured, {runs['cached']} from the cache", style="dim")
     list_files(console, [Path(file) for file in result["files"]])
@@ -291,7 +257,10 @@ def _report(
     pictures: Sequence[Path],
 ) -> Path:
     drawn = {p.name for p in pictures}
-    sections = [Section("Answer", text="\n\n".join(a.sentences)) for a in study.answers]
+    sections = [
+        Section("Answer", text="\n\n".join(a.sentences), code="\n".join(_commands(row)))
+        for a, row in zip(study.answers, result["answers"], strict=True)
+    ]
     if study.reference is not None:
         sections.append(Section("Reference", text=study.reference.note, rows=_reference_rows(study.reference)))
     sections.append(Section("Size", rows=_sizes(study)))
@@ -341,7 +310,7 @@ def _report(
 
 def _reference_rows(truth: Reference) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = [
-        (f"error estimate, {name}", f"{a:.1e} of the outputs, {b:.1e} of their deformation")
+        (f"error estimate, {name}", f"{a:.1e} of the deformation, {b:.1e} of the displacement")
         for name, (a, b) in (("space", truth.space), ("time", truth.time), ("mixed", truth.mixed))
     ]
     return [*rows, ("runs behind it", "; ".join(s.label for s in truth.settings))]
@@ -351,8 +320,8 @@ def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
     if study.reference is not None:
         rows += [
-            ("error", "max over the run of |y - y*|, over max |y*|; y displacements at the places of the outputs"),
-            ("deformation", "the same after removing the rigid motion of the hand"),
+            ("error", "max over the run of |y - y*|, over max |y*|; y the outputs against the hand, the deformation"),
+            ("displacement", "the same of the whole displacements, in which the motion of the hand hides the tissue"),
             ("places", "the same points of the body on every mesh, not the nearest nodes"),
             ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
         ]
@@ -362,7 +331,10 @@ def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
     ]
     if is_paper(study):
         rows.append(
-            ("the paper", f"{PAPER_FULL} s full, {PAPER_REDUCED} s and about 1e-3 at N = 14, on its own machine")
+            (
+                "the paper",
+                f"{PAPER_FULL} s full, {PAPER_REDUCED} s and a state error of about 1e-3 at N = 14, own machine",
+            )
         )
     seconds = seconds_text(result["time"]["total"])
     return [*rows, *made_with(result), ("time of this study", seconds)]

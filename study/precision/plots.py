@@ -18,12 +18,10 @@ from softgrasp.study.precision.points import WorkPoint
 from softgrasp.study.reduce.plots import LOOKS, SPARE
 from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
 
-PAPER_ERROR = 1e-3  # about, of PSD at N = 14: the paper, section 4.1
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))
 FRONT: dict[str, Any] = {"color": HAND, "lw": 1.6, "alpha": 0.35, "zorder": 1}
 THIN: dict[str, Any] = {"lw": 0.6, "alpha": 0.6, "zorder": 2}
-STAR: dict[str, Any] = {"ls": "", "marker": "*", "ms": 9, "color": "#D00000", "mec": "white", "mew": 0.5, "zorder": 6}
 LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
 Value = Callable[[WorkPoint], float]
 
@@ -72,7 +70,7 @@ def _seconds(p: WorkPoint) -> float:
 def figure_forward(
     points: Sequence[WorkPoint], slopes: Sequence[Slope], reference_error: float, paper: bool, out_png: Path
 ) -> tuple[Path, Path]:
-    """Error of the outputs against the time of a whole run; beside it orders in space and time; PNG and PDF.
+    """Error of the deformation against the time of a whole run; beside it orders in space and time; PNG and PDF.
 
     Args:
         points: of the forward question.
@@ -99,7 +97,7 @@ def figure_forward(
         solvers = [p for p in usable(points) if p.series == "solver"]
         ax.plot([p.seconds for p in solvers], [p.error for p in solvers], ls="", marker="x", ms=4, color=GREEN)
         draw_front(ax, points, _seconds, _error)
-        axes_log(ax, "time of a run [s]", "relative error of the outputs")
+        axes_log(ax, "time of a run [s]", "relative error of the deformation")
         handles = [_order_handle(order, plain) for order in (1, 2)]
         handles += [Line2D([], [], ls="", marker="x", ms=4, color=GREEN, label="other solvers")]
         handles += [Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)]
@@ -156,20 +154,20 @@ def _orders(space: Any, time: Any, plain: Sequence[WorkPoint], slopes: Sequence[
 
 
 def figure_reduced(points: Sequence[WorkPoint], full: float, paper: bool, out_png: Path) -> tuple[Path, Path]:
-    """Error of the state against the online time, and against that from nothing; PNG and PDF.
+    """Error of the deformation against the online time, and against that from nothing; PNG and PDF.
 
     Args:
         points: of the reduced question.
         full: seconds of the full run on the same mesh and steps.
-        paper: draw the paper's point.
+        paper: draw the paper's times; its error is one of the state.
         out_png: name of the picture; the PDF gets its stem.
     """
     names = list(dict.fromkeys(p.series for p in points))
     others = [n for n in names if n not in LOOKS]
     look = {**LOOKS, **{key: SPARE[i % len(SPARE)] for i, key in enumerate(others)}}
 
-    def state(p: WorkPoint) -> float:
-        return float(p.details["error_full"])
+    def error(p: WorkPoint) -> float:
+        return float(p.details["error_outputs_full"])
 
     def scratch(p: WorkPoint) -> float:
         return float(p.details["scratch"])
@@ -186,14 +184,14 @@ def figure_reduced(points: Sequence[WorkPoint], full: float, paper: bool, out_pn
                 colour, dashes, marker = look[name]
                 fill = "full" if dashes == "-" else "none"
                 ax.plot(
-                    [x(p) for p in mine], [state(p) for p in mine], color=colour, ls=dashes, marker=marker, ms=3.2,
+                    [x(p) for p in mine], [error(p) for p in mine], color=colour, ls=dashes, marker=marker, ms=3.2,
                     fillstyle=fill, **THIN,
                 )  # fmt: skip
-            draw_front(ax, points, x, state)
-            axes_log(ax, label, "relative error of the state" if ax is axes[0] else "")
+            draw_front(ax, points, x, error)
+            axes_log(ax, label, "relative error of the deformation" if ax is axes[0] else "")
             ax.axvline(full, color="#888888", lw=0.9, ls=(0, (4, 3)), zorder=0)
         if paper:
-            axes[0].plot([PAPER_REDUCED], [PAPER_ERROR], **STAR)
+            axes[0].axvline(PAPER_REDUCED, **(LINE | {"ls": ":"}))
             axes[1].axvline(PAPER_FULL, **LINE)
         handles = [
             Line2D([], [], color=look[n][0], ls=look[n][1], marker=look[n][2], ms=3.2, lw=0.6, label=_title(n))
@@ -202,7 +200,7 @@ def figure_reduced(points: Sequence[WorkPoint], full: float, paper: bool, out_pn
         handles += [Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)]
         handles += [Line2D([], [], color="#888888", lw=0.9, ls=(0, (4, 3)), label="full run")]
         if paper:
-            handles += [Line2D([], [], label=f"paper, N = 14: {PAPER_REDUCED} s", **STAR)]
+            handles += [Line2D([], [], label=f"paper, N = 14: {PAPER_REDUCED} s", **(LINE | {"ls": ":"}))]
             handles += [Line2D([], [], label=f"paper, full: {PAPER_FULL} s", **LINE)]
         rows = -(-len(handles) // 3)
         figure.subplots_adjust(left=0.085, right=0.985, bottom=0.13, top=1 - (0.05 + 0.14 * rows) / 3.7, wspace=0.06)
@@ -235,7 +233,7 @@ def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) ->
 def figure_budget(
     forward: Sequence[WorkPoint], reduced: Sequence[WorkPoint], budget: float, out_png: Path
 ) -> tuple[Path, Path]:
-    """Time of a step, median to 99 % and the largest, against the error of the outputs; PNG and PDF."""
+    """Time of a step, median to 99 % and the largest, against the error of the deformation; PNG and PDF."""
     groups = (("full model", BLUE, forward), ("reduced models", ORANGE, reduced))
     with paper_style():
         figure, ax = plt.subplots(figsize=(0.75 * WIDTH, 3.3), layout="constrained")
@@ -249,6 +247,8 @@ def figure_budget(
             ax.plot([p.details["p50"] for p in good], y, ls="", marker="o", ms=2.8, color=colour, label=name)
             ax.plot([p.details["max"] for p in good], y, ls="", marker="|", ms=4, color=colour, alpha=0.6)
         ax.axvline(budget, label="the budget", **(LINE | {"zorder": 5}))
-        axes_log(ax, "time of a step [s]: median, bar to 99 %, thin to the largest", "relative error of the outputs")
+        axes_log(
+            ax, "time of a step [s]: median, bar to 99 %, thin to the largest", "relative error of the deformation"
+        )
         ax.legend(loc="best")
         return save(figure, out_png)

@@ -18,13 +18,13 @@ from mpi4py import MPI
 
 from softgrasp import package_version
 from softgrasp.fem.errors import Interrupted, SceneError, agree
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.scene.file import scene_hash
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.switch import changed
 from softgrasp.study.report.files import plain
 
-FORMAT = 1  # of the cached files
+FORMAT = 2  # of the cached files
 LEAST_STEPS = 4  # of a run
 QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati", "loop")
 CONTROL = ("riccati", "reduced_riccati", "loop")  # of these, the ones about feedback
@@ -74,10 +74,8 @@ class Setting:
     def overrides(self) -> list[str]:
         """Arguments of ``--set`` that give this setting."""
         found = [] if self.cells is None else [f"tissue.cells={list(self.cells)}"]
-        found += [f"tissue.order={self.order}", f"time.steps={self.steps}"]
-        if self.solver != "auto":
-            found += [f"time.solver={self.solver}", f"time.rtol={self.rtol:g}"]
-        return found
+        found += [f"tissue.order={self.order}", f"time.steps={self.steps}", f"time.solver={self.solver}"]
+        return found + ([f"time.rtol={self.rtol:g}"] if self.solver == "cg" else [])
 
     def unknowns(self, d: int) -> int:
         """About how many tissue unknowns a structured mesh has. Not collective."""
@@ -157,7 +155,7 @@ class Cache:
     """Measured points as JSON files by hash, so that an interrupted study goes on where it stopped.
 
     The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
-    of ranks and the version. Collective but for the constructor.
+    of ranks and the version. Collective.
 
     Args:
         folder: where the files are.
@@ -167,7 +165,10 @@ class Cache:
 
     def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene) -> None:
         self.folder, self.comm = folder, comm
-        self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
+        self.scene = ""  # rank 0 looks for the files
+        with agree(comm):
+            if comm.rank == 0:
+                self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
         self.hits = self.misses = 0
 
     def path(self, kind: str, key: Row) -> Path:
@@ -266,7 +267,7 @@ class Asked:
     """What is asked of a study.
 
     Attributes:
-        tolerance: relative error of the outputs to answer for, or None.
+        tolerance: relative error of the deformation to answer for, or None.
         budget: seconds of a step to answer for, or None.
         names: arguments of ``--question``, each one or several with commas; empty asks all questions.
     """

@@ -1,7 +1,7 @@
 """The outputs of a scene at fixed places of the body, so that runs on different meshes can be compared.
 
 A node output is the displacement of the node nearest to a point, which differs from mesh to mesh. Here the point itself
-counts: y(p) = R(p) q_s + sum_i phi_i(p) z_i with the shape functions phi_i of the cell that holds p.
+counts, see :mod:`fem.fields.probe`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.fields.probe import Probe
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Run, RunOptions
@@ -38,55 +38,41 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Probe:
-    """Outputs on one mesh, y = weights z[dofs] + C_s q_s, d components an output.
-
-    Attributes:
-        dofs: local tissue dofs that enter, (k,).
-        weights: (p, k), p = outputs times d.
-        C_s: rigid part, (p, n_s), on every rank.
-        dimension: d.
-    """
-
-    dofs: np.ndarray
-    weights: Array
-    C_s: Array
-    dimension: int
-
-    def of_rows(self, comm: MPI.Intracomm, L: Array) -> Array:
-        """Weights on the columns of a distributed block of displacements (n_local, N): (p, N). Collective."""
-        return total(comm, self.weights @ L[self.dofs])
-
-
-@dataclass(frozen=True)
 class Probed:
     """One run of the full model at fixed places.
 
     Attributes:
         times: (steps + 1,) [s].
-        y: displacements, (steps + 1, p) [m], on every rank.
+        own: displacements against the hand, (steps + 1, p) [m], on every rank.
         rigid: the part that moves with the hand, same shape.
         stamps: seconds of every step on the slowest rank, (steps,).
         factor: seconds of the factorisation.
     """
 
     times: Array
-    y: Array
+    own: Array
     rigid: Array
     stamps: Array
     factor: float
+
+    @property
+    def y(self) -> Array:
+        """Displacements, (steps + 1, p) [m]."""
+        return self.own + self.rigid
 
 
 def find_places(scene: Scene, model: Model) -> Places:
     """Places of the scene's outputs: points as the scene names them, regions by a grid, else the farthest node.
 
-    Collective.
+    A scene that sees nothing but its hand counts as one without outputs, since no tissue is in them. Collective.
 
     Raises:
         SceneError: an output lies outside the body.
     """
-    found = make_outputs(scene, model.system)
     wanted = scene.control.outputs if scene.control is not None else []
+    if all(output.kind == "hand" for output in wanted):
+        scene, wanted = scene.model_copy(update={"control": None}), []
+    found = make_outputs(scene, model.system)
     low, high = model.system.layout.bounds()
     points = []
     for i, output in enumerate(found):
@@ -102,91 +88,6 @@ def find_places(scene: Scene, model: Model) -> Places:
             named = wanted[i].point if wanted else None
             points.append(np.array([output.point if named is None else named], dtype=float))
     return Places(tuple(o.name for o in found), tuple(points))
-
-
-def make_probe(model: Model, places: Places) -> Probe:
-    """Weights of all places on the mesh of a model. Collective."""
-    layout, space = model.system.layout, model.space
-    d, n_s, comm = layout.dimension, layout.n_s, layout.comm
-    index_map = space.V.dofmap.index_map
-    first = index_map.local_range[0]
-    position = np.full(index_map.size_local, -1)
-    position[space.free] = np.arange(len(space.free))
-    corners = _corners(model)
-    rows: list[dict[int, float]] = []
-    C_s = np.zeros((len(places.points) * d, n_s))
-    for i, points in enumerate(places.points):
-        entries: dict[int, float] = {}
-        if not len(points):
-            C_s[i * d : (i + 1) * d, :d] = np.eye(d)  # the hand's own displacement
-        for point in points:
-            nodes, values, where = _locate(model, corners, point)
-            rigid = rigid_modes(where[None, :], d, model.scene.effects.rotation, layout.reference)
-            C_s[i * d : (i + 1) * d] += rigid / len(points)
-            for node, value in zip(nodes - first, values, strict=True):
-                if 0 <= node < len(position) and position[node] >= 0:
-                    entries[int(position[node])] = entries.get(int(position[node]), 0.0) + value / len(points)
-        rows.append(entries)
-    free = sorted({node for entries in rows for node in entries})
-    column = {node: k for k, node in enumerate(free)}
-    weights = np.zeros((len(rows) * d, len(free) * d))
-    for i, entries in enumerate(rows):
-        for node, value in entries.items():
-            for c in range(d):
-                weights[i * d + c, column[node] * d + c] = value
-    dofs = (np.array(free, dtype=int)[:, None] * d + np.arange(d)).ravel()
-    comm.Barrier()
-    return Probe(dofs, weights, C_s, d)
-
-
-def _corners(model: Model) -> Array:
-    """Corners of the owned cells, (cells, d + 1, d). Not collective."""
-    mesh, d = model.space.mesh.mesh, model.space.mesh.dimension
-    owned = mesh.topology.index_map(d).size_local
-    return np.asarray(mesh.geometry.x[mesh.geometry.dofmaps[0][:owned]][:, :, :d])
-
-
-def barycentric(corners: Array, point: Array) -> Array:
-    """Barycentric coordinates of a point in simplices (cells, d + 1, d): (cells, d + 1). Not collective."""
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    rest = np.linalg.solve(edges, (point - corners[:, 0])[:, :, None])[:, :, 0]
-    return np.column_stack([1 - rest.sum(axis=1), rest])
-
-
-def _locate(model: Model, corners: Array, point: Array) -> tuple[np.ndarray, Array, Array]:
-    """Global nodes of the cell that holds a point, their shape functions there, and the place. Collective.
-
-    Outside the body the nearest cell's coordinates are cut to it.
-    """
-    comm = model.system.layout.comm
-    best, answer = -np.inf, None
-    if len(corners):
-        lam = barycentric(corners, point)
-        cell = int(np.round(lam.min(axis=1), 9).argmax())
-        best = float(lam[cell].min())
-        inside = np.clip(lam[cell], 0, None)
-        inside /= inside.sum()
-        answer = (*_shape(model, cell, corners[cell], inside), inside @ corners[cell])
-    root = int(np.argmax(comm.allgather(best)))
-    nodes, values, where = comm.bcast(answer, root=root)
-    return np.asarray(nodes), np.asarray(values), np.asarray(where)
-
-
-def _shape(model: Model, cell: int, corners: Array, lam: Array) -> tuple[np.ndarray, Array]:
-    """Global nodes of a cell and their shape functions at barycentric coordinates lam (P1 or P2). Not collective."""
-    V, d = model.space.V, model.space.mesh.dimension
-    local = V.dofmap.cell_dofs(cell)
-    nodes = V.dofmap.index_map.local_to_global(np.asarray(local, dtype=np.int32))
-    values = np.empty(len(local))
-    for k, x in enumerate(V.tabulate_dof_coordinates()[local][:, :d]):
-        at = barycentric(corners[None], x)[0]
-        on = np.flatnonzero(at > 0.25)  # 1 at a corner, 1/2 and 1/2 at the middle of an edge
-        if len(on) == 1:
-            one = lam[on[0]]
-            values[k] = one if model.scene.tissue.order == 1 else one * (2 * one - 1)
-        else:
-            values[k] = 4 * lam[on[0]] * lam[on[1]]
-    return nodes, values
 
 
 class ProbedRun(Run):
@@ -236,9 +137,9 @@ def run_probed(model: Model, probe: Probe, until: int | None = None) -> Probed:
         stamps = np.empty_like(run.stamps[:last])
         comm.Allreduce(run.stamps[:last], stamps, MPI.MAX)
         rigid = run.drive.q[: last + 1] @ probe.C_s.T
-        y = total(comm, run.local_outputs[: last + 1]) + rigid
+        own = total(comm, run.local_outputs[: last + 1])
         times = run.end * np.arange(last + 1) / run.steps
-        return Probed(times, y, rigid, stamps, model.watch.seconds["factor"])
+        return Probed(times, own, rigid, stamps, model.watch.seconds["factor"])
     finally:
         ts.destroy()
         run.midpoint.destroy()

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.fields.probe import Probe, make_probe
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import scene_hash
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.engines import ENGINES, factor, small_svd
 from softgrasp.reduction.model import ReducedModel
@@ -28,7 +29,6 @@ from softgrasp.reduction.states import States
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import Row, Setting, WorkPoint, number, scene_setting
-from softgrasp.study.precision.probe import Probe, make_probe
 from softgrasp.study.precision.reference import Reference
 from softgrasp.study.reduce.sweep import Point, bases_of, chosen_methods, comparison_of, measure, sizes_for
 
@@ -60,7 +60,8 @@ class ReducedRuns:
             fresh = Model(
                 self.runs.variant(self.setting, "memory"), model.space, model.system, model.inventory, Stopwatch(comm)
             )
-            self._made = (reference(fresh, simulate(fresh)), make_probe(fresh, self.runs.places), fresh)
+            probe = make_probe(fresh.space, self.runs.places.points, self.scene.effects.rotation)
+            self._made = (reference(fresh, simulate(fresh)), probe, fresh)
         return self._made
 
     def rows(self, name: str, sizes: Sequence[int]) -> list[Row]:
@@ -93,7 +94,7 @@ class ReducedRuns:
     def _point(self, name: str, row: Row, full: Row) -> WorkPoint:
         series = Series(np.array(row["times"], float), np.array(row["values"], float), full["dimension"])
         finite = bool(np.isfinite(series.values).all())
-        error, deformation = errors_of(series, self.truth.series) if finite else (float("inf"), float("inf"))
+        error, displacement = errors_of(series, self.truth.series) if finite else (float("inf"), float("inf"))
         scratch = row["time_offline"] + row["time_setup"] + row["time_online"]
         scratch += full["seconds"] if METHODS[name].snapshots else full["mesh"] + full["assembly"]
         kept = {k: v for k, v in row.items() if k not in ("times", "values")}
@@ -101,9 +102,10 @@ class ReducedRuns:
         details = {
             "method": name, **kept,
             "error_full": number(row["error"]), "error_full_deformation": number(row["error_deformation"]),
-            "error_outputs_full": gap, "error_deformation": deformation, "scratch": scratch, "mesh": self.setting.mesh,
+            "error_outputs_full": gap, "error_deformation": error, "error_displacement": displacement,
+            "error_range": self.truth.range_of(error), "scratch": scratch, "mesh": self.setting.mesh,
             "steps": self.setting.steps, "cells": None if self.setting.cells is None else list(self.setting.cells),
-            "order": self.setting.order,
+            "order": self.setting.order, "solver": self.setting.solver, "rtol": None,
         }  # fmt: skip
         details.pop("error", None)
         label = f"{METHODS[name].title}, N = {row['N']}, {self.setting.label}"
@@ -129,7 +131,7 @@ def _measured(model: ReducedModel, point: Point, against: FullRun, probe: Probe)
     stamps = np.array([comm.allreduce(float(np.quantile(stamps, q)), MPI.MAX) for q in (0.5, 0.99, 1.0)])
     row: Row = {k: getattr(point, k) for k in Point.__dataclass_fields__}
     row |= dict(zip(("p50", "p99", "max"), stamps.tolist(), strict=True))
-    return row | {"times": found.times, "values": np.hstack([y, own])}
+    return row | {"times": found.times, "values": np.hstack([own, y])}
 
 
 def _steps(model: ReducedModel, against: FullRun) -> Array:
@@ -167,12 +169,12 @@ def own_setting(scene: Scene) -> Setting:
 
 
 def reduced_slopes(points: Sequence[WorkPoint]) -> list[Slope]:
-    """Slope of the state error against N, and of online time against N, for every basis. Not collective."""
+    """Slope of the error of the outputs against N, and of online time against N, for every basis. Not collective."""
     found = []
     for name in dict.fromkeys(p.series for p in points):
         mine = [p for p in points if p.series == name and p.ok]
         for against, values in (
-            ("state error against N", [p.details["error_full"] for p in mine]),
+            ("error against N", [p.details["error_outputs_full"] for p in mine]),
             ("online seconds against N", [p.seconds for p in mine]),
         ):
             power = power_law([p.details["N"] for p in mine], values)

@@ -2,140 +2,178 @@
 
     y* = y(m, S) + time part + space part,
     time part  = (y(m, S) - y(m, S/2)) / 3                       order 2 of the midpoint rule
-    space part = y(M, s) + (y(M, s) - y(M/2, s)) / (2^p - 1) - y(m, s)
+    space part = L(M1, M2, M3) - y(m, s)
 
-with nested P2 meshes M, M/2, M/4 ... , a middle one m, many steps S and few steps s; p is the order that three meshes
-show. Space and time are refined apart, since both at once would cost the product. The error estimate adds up
+with a middle mesh m, many steps S, few steps s, and meshes M1 < M2 < M3, all P2, M3 the finest that the work allows.
+Space and time are refined apart, since both at once would cost the product. The ends of the contact zone are singular,
+so that every uniform mesh converges with the order p = 2 alpha of :func:`study.precision.meshes.singular_order`,
+whatever the elements: L is the limit of y + a h^p + b h^(p + 1) through the three. The order that the three show has to
+agree with p, else L is y(M3, s) itself. The error estimate adds up
 
-    space: change of the extrapolated solution from the meshes (M/2, M/4, M/8) to (M, M/2, M/4)
+    space: |L - L'|, L' the limit of y + a h^p through the two finest (|y(M3, s) - L'| where L is not extrapolated)
     time:  the time part itself
-    mixed: how much the time part changes from mesh m to m/2.
+    mixed: how much the time part changes from mesh m to one of half its cells, or of P1 where there is none.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import ceil
 
 import numpy as np
 
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.full import FullRuns, Series, largest
-from softgrasp.study.precision.points import Setting, least_steps
+from softgrasp.study.precision.meshes import (
+    WORK,
+    edges,
+    few_steps,
+    fits,
+    limit_weights,
+    nested_meshes,
+    observed_order,
+    singular_order,
+)
+from softgrasp.study.precision.points import Setting
 
-WORK = {2: 4e7, 3: 3e6}  # unknowns times steps of the finest run: about 10 s on a quiet core
-UNKNOWNS = {2: 150_000, 3: 40_000}
-FINER = 4.5  # the finest mesh has at most so many times the scene's cells along an edge
-FEW_STEPS = 60  # least of a run
 ROUGH = 0.05  # error of a reference that is worth a warning
-ORDERS = (0.4, 5.0)  # between which an observed order is believed
+NEAR = 0.5  # between the order that meshes show and the one that the singular ends leave
+APART = (0.5, 0.75)  # of the finest mesh, cells along an edge of the two others that show the order with it
+STILL = 1e-12  # of the displacement: an output that moves less against the hand moves with it
+ADVICE = {
+    "space": "finer meshes than the time allows here",
+    "time": "more steps, time.steps",
+    "mixed": "more steps, time.steps, on finer meshes",
+}
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Outputs in the limit of fine meshes.
+
+    Attributes:
+        values: (steps + 1, 2 p) [m].
+        gap: what they may be off, same shape.
+        order: that the meshes show, None without one.
+        expected: order that the singular ends leave; None where there is one mesh only.
+        extrapolated: the values are not those of the finest mesh.
+    """
+
+    values: Array
+    gap: Array
+    order: float | None
+    expected: float | None
+    extrapolated: bool
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The reference solution with its error estimate, relative to the largest displacement and deformation.
+    """The reference solution with its error estimate, relative to the largest deformation and displacement.
 
     Attributes:
         series: the solution.
-        space, time, mixed: parts of the estimate, each (displacement, deformation).
-        order: observed in space, None when three meshes do not show one.
-        extrapolated: the space part was extrapolated.
+        space, time, mixed: parts of the estimate, each (deformation, displacement).
+        limit: in space.
         settings: that were run.
-        note: one sentence.
+        note: one sentence or more.
     """
 
     series: Series
     space: tuple[float, float]
     time: tuple[float, float]
     mixed: tuple[float, float]
-    order: float | None
-    extrapolated: bool
+    limit: Limit
     settings: tuple[Setting, ...]
     note: str
 
     @property
     def error(self) -> float:
-        """Estimated relative error of the displacement."""
+        """Estimated relative error of the deformation."""
         return self.space[0] + self.time[0] + self.mixed[0]
 
     @property
-    def error_deformation(self) -> float:
-        """Estimated relative error of the deformation."""
+    def error_displacement(self) -> float:
+        """Estimated relative error of the displacement."""
         return self.space[1] + self.time[1] + self.mixed[1]
 
+    def range_of(self, error: float) -> tuple[float, float]:
+        """Between what the true error of a setting lies, when so much was measured against this reference."""
+        return max(error - self.error, 0.0), error + self.error
 
-def edges(scene: Scene) -> list[list[float]]:
-    """Coordinates that mesh lines should meet, as shares of each edge of the body: ends of contact and layers."""
-    size, origin = scene.tissue.size or [], scene.tissue.origin or [0.0] * len(scene.tissue.size or [])
-    boxes = [layer.box for layer in scene.tissue.layers.values()] + [scene.contact.box]
-    found = []
-    for a, (length, low) in enumerate(zip(size, origin, strict=True)):
-        shares = {round((corner[a] - low) / length, 12) for box in boxes if box is not None for corner in box}
-        found.append(sorted(s for s in shares if 0 < s < 1))
-    return found
+    @property
+    def largest_part(self) -> str:
+        """Name of the part that carries most of the error: space, time or mixed."""
+        parts = {"space": self.space[0], "time": self.time[0], "mixed": self.mixed[0]}
+        return max(parts, key=lambda name: parts[name])
 
-
-def fits(cells: int, shares: list[float]) -> bool:
-    """Whether all coordinates lie on lines of a uniform mesh. Not collective."""
-    return all(abs(cells * s - round(cells * s)) < 1e-6 for s in shares)
-
-
-def fitted(target: float, shares: list[float]) -> int | None:
-    """Number of cells nearest to a target whose lines meet all coordinates; None when none within a half does."""
-    span = range(max(1, ceil(target / 1.6)), int(target * 1.6) + 2)
-    good = [n for n in span if fits(n, shares)]
-    return min(good, key=lambda n: (abs(n - target), -n)) if good else None
+    @property
+    def need(self) -> str:
+        """What would make that part smaller."""
+        part = self.largest_part
+        return "a finer mesh" if part == "space" and self.limit.expected is None else ADVICE[part]
 
 
-def nested_meshes(scene: Scene) -> tuple[tuple[int, ...], ...]:
-    """Meshes that halve the cells from one to the next, coarse to fine; empty on a mesh file. Not collective.
+def space_limit(sizes: list[float], values: list[Array], expected: float, d: int) -> Limit:
+    """Limit of values on two meshes or more with cells of size h, coarse to fine. Not collective."""
+    plain = sum(w * v for w, v in zip(limit_weights(sizes[-2:], [expected]), values[-2:], strict=True))
+    shown = None
+    if len(values) >= 3:
+        changes = [largest(b - a, d)[0] for a, b in zip(values[-3:-1], values[-2:], strict=True)]
+        shown = observed_order(sizes[-3:], changes)
+    if shown is None or abs(shown - expected) > NEAR:
+        return Limit(values[-1], plain - values[-1], shown, expected, False)
+    weights = limit_weights(sizes[-3:], [expected, expected + 1])
+    limit = sum(w * v for w, v in zip(weights, values[-3:], strict=True))
+    return Limit(np.asarray(limit), limit - plain, shown, expected, True)
 
-    The coarsest has about a quarter of the scene's cells along an edge (a half, or all, when the ends of contact zone
-    and layers lie on mesh lines only then). The finest is what the work allows.
+
+@dataclass(frozen=True)
+class Plan:
+    """Settings behind a reference.
+
+    Attributes:
+        space: meshes at few steps, coarse to fine.
+        middle, below: meshes, at few steps, on which time is refined.
+        base: the scene's steps.
     """
-    cells = scene.tissue.cells
-    if cells is None:
-        return ()
-    lines, d = edges(scene), len(cells)
-    coarse: tuple[int, ...] = tuple(max(1, round(n / 4)) for n in cells)
-    for part in (4, 2, 1):
-        tried = [fitted(max(n / part, 1.0), shares) for n, shares in zip(cells, lines, strict=True)]
-        if all(n is not None for n in tried):
-            coarse = tuple(n for n in tried if n is not None)
-            break
-    steps = few_steps(scene)
-    found = [coarse]
-    while True:
-        finer = tuple(2 * n for n in found[-1])
-        unknowns = Setting(finer, 2, steps).unknowns(d)
-        wide = max(f / c for f, c in zip(finer, cells, strict=True)) > FINER
-        if wide or unknowns > UNKNOWNS[d] or unknowns * steps > WORK[d]:
-            return tuple(found)
-        found.append(finer)
+
+    space: tuple[Setting, ...]
+    middle: Setting
+    below: Setting
+    base: int
+
+    def at(self, mesh: Setting, multiple: int) -> Setting:
+        """A mesh with a multiple of the scene's steps."""
+        return Setting(mesh.cells, mesh.order, multiple * self.base)
+
+    @property
+    def settings(self) -> tuple[Setting, ...]:
+        """All to run."""
+        fine = (self.at(self.middle, 2), self.at(self.middle, 4), self.at(self.below, 4))
+        return tuple(dict.fromkeys((*self.space, self.middle, self.below, *fine)))
 
 
-def few_steps(scene: Scene) -> int:
-    """Steps of the runs on the finest meshes. Not collective."""
-    n = scene.time.steps
-    return n // 2 if n >= 2 * max(FEW_STEPS, least_steps(scene)) else n
+def make_plan(scene: Scene) -> Plan:
+    """Settings behind the reference of a scene. Not collective."""
+    few, meshes = few_steps(scene), nested_meshes(scene)
+    if len(meshes) < 2:  # nothing to refine: P1 beside P2 tells what there is to know
+        cells = meshes[0] if meshes else None
+        low, high = Setting(cells, 1, few), Setting(cells, 2, few)
+        return Plan((low, high), high, low, scene.time.steps)
 
+    def coarser(cells: float) -> Setting:
+        fit = [c for c in meshes if c[0] <= cells]
+        return Setting(fit[-1] if fit else meshes[0], 2, few)
 
-def observed_order(coarse: Array, middle: Array, fine: Array, d: int) -> float | None:
-    """Order p with |middle - coarse| = 2^p |fine - middle|; None outside :data:`ORDERS`. Not collective."""
-    first, second = largest(middle - coarse, d)[1], largest(fine - middle, d)[1]
-    if not (first > 0 and second > 0):
-        return None
-    p = float(np.log2(first / second))
-    return p if ORDERS[0] <= p <= ORDERS[1] else None
-
-
-def extrapolate(values: list[Array], d: int) -> tuple[Array, float | None]:
-    """Richardson limit of the last values of a sequence of halved meshes, and the order. Not collective."""
-    p = observed_order(values[-3], values[-2], values[-1], d) if len(values) >= 3 else None
-    if p is None:
-        return values[-1], None
-    return values[-1] + (values[-1] - values[-2]) / (2**p - 1), p
+    fine = meshes[-1][0]
+    space = tuple(dict.fromkeys((*(coarser(share * fine) for share in APART), coarser(fine))))
+    middle, d = coarser(max(fine / 4, meshes[1][0])), len(meshes[0])
+    if middle.unknowns(d) * 4 * scene.time.steps > WORK[d]:
+        middle = coarser(fine / 4)
+    cells = middle.cells or meshes[0]
+    below = Setting(cells, 1, few) if cells == meshes[0] else coarser(cells[0] / 2)
+    return Plan(space, middle, below, scene.time.steps)
 
 
 def make_reference(scene: Scene, runs: FullRuns) -> Reference:
@@ -143,79 +181,74 @@ def make_reference(scene: Scene, runs: FullRuns) -> Reference:
 
     Raises:
         SolverError: a run failed.
+        SceneError: the outputs move with the hand, so that there is no deformation to measure.
     """
-    meshes: tuple[tuple[int, ...] | None, ...] = nested_meshes(scene) or (None,)
-    few, base = few_steps(scene), scene.time.steps
-    space = [Setting(cells, 2, few) for cells in meshes]
-    if len(space) == 1:  # nothing to refine: P1 beside P2 tells what there is to know
-        space = [Setting(space[0].cells, 1, few), space[0]]
-    middle = space[max(len(space) - 3, 1 if len(space) > 2 else len(space) - 1)]
-    below = space[max(space.index(middle) - 1, 0)]
-    time = [Setting(middle.cells, middle.order, 2 * base), Setting(middle.cells, middle.order, 4 * base)]
-    mixed = Setting(below.cells, below.order, 4 * base)
-    found = {s: runs.series(runs.run(s, 1)) for s in (*space, *time, mixed)}
-    result = combine(found, space, middle, below, base)
-    if result.error > ROUGH:
-        hint = " That is too much to judge by: the scene's steps or meshes do not resolve its motion; raise time.steps."
-        result = replace(result, note=result.note + hint)
-    if all(fits(n, shares) for n, shares in zip(scene.tissue.cells or (), edges(scene), strict=True)):
-        return result
-    hint = " The scene's own mesh has no lines at the ends of its contact zone or layers, which adds to its error."
-    return replace(result, note=result.note + hint)
-
-
-def combine(
-    found: dict[Setting, Series], space: list[Setting], middle: Setting, below: Setting, base: int
-) -> Reference:
-    """y* and its error estimate from the runs. Not collective."""
-    d = found[middle].dimension
-    S, half = (Setting(middle.cells, middle.order, k * base) for k in (4, 2))
-    fine = found[S]
-    t, few = fine.times, found[middle].times
-
-    def on(series: Series, times: Array) -> Array:
-        return series.at(times)
-
-    time_part = (fine.values - on(found[half], t)) / 3
-    values = [found[s].values for s in space]
-    limit, p = extrapolate(values, d)
-    if len(values) >= 4 and p is not None:
-        before, q = extrapolate(values[:-1], d)
-        gap = limit - before if q is not None else values[-1] - values[-2]
+    plan = make_plan(scene)
+    series = {s: runs.series(runs.run(s, 1)) for s in plan.settings}
+    d = series[plan.middle].dimension
+    values = [series[s].values for s in plan.space]
+    if plan.space[0].order == 1:
+        limit = Limit(values[-1], values[-1] - values[0], None, None, False)
     else:
-        gap = limit - values[-1] if p is not None else values[-1] - values[-2]
-    correction = Series(few, limit - found[middle].values, d)
-    total = fine.values + time_part + on(correction, t)
-    change = on(fine, few) - found[middle].values
-    lower = found[Setting(below.cells, below.order, 4 * base)]
-    mixed = change - (on(lower, few) - found[below].values) if below != middle else np.zeros_like(change)
+        sizes = [1.0 / s.cells[0] for s in plan.space if s.cells]
+        limit = space_limit(sizes, values, singular_order(scene), d)
+    return combine(scene, plan, series, limit)
+
+
+def combine(scene: Scene, plan: Plan, series: dict[Setting, Series], limit: Limit) -> Reference:
+    """y* and its error estimate from the runs. Not collective.
+
+    Raises:
+        SceneError: the outputs move with the hand.
+    """
+    middle, below = series[plan.middle], series[plan.below]
+    fine, half = series[plan.at(plan.middle, 4)], series[plan.at(plan.middle, 2)]
+    d, t, few = middle.dimension, fine.times, middle.times
+    time_part = (fine.values - half.at(t)) / 3
+    total = fine.values + time_part + Series(few, limit.values - middle.values, d).at(t)
+    change = fine.at(few) - middle.values
+    lower = series[plan.at(plan.below, 4)].at(few) - below.values
     scale = largest(total, d)
+    if not scale[0] > STILL * max(scale[1], 1e-300):
+        raise SceneError(
+            "control.outputs: no output moves against the hand, so that there is no deformation whose error could be "
+            "told; name a point of the tissue, in a scene that moves"
+        )
 
     def relative(values: Array) -> tuple[float, float]:
         return tuple(g / s if s > 0 else 0.0 for g, s in zip(largest(values, d), scale, strict=True))  # type: ignore[return-value]
 
-    space_error, time_error, mixed_error = (relative(v) for v in (gap, time_part, mixed))
-    return Reference(
-        series=Series(t, total, d),
-        space=space_error,
-        time=time_error,
-        mixed=mixed_error,
-        order=p,
-        extrapolated=p is not None,
-        settings=tuple(found),
-        note=_note(space, middle, base, p, space_error[0] + time_error[0] + mixed_error[0]),
-    )
+    reference = Reference(
+        Series(t, total, d), relative(limit.gap), relative(time_part), relative(change - lower), limit,
+        tuple(series), "",
+    )  # fmt: skip
+    return replace(reference, note=_note(scene, plan, reference))
 
 
-def _note(space: list[Setting], middle: Setting, base: int, p: float | None, error: float) -> str:
-    meshes = " to ".join([space[0].mesh, space[-1].mesh])
-    if space[0].cells is None or len(space) < 3 or p is None:
-        how = f"from {meshes}, not extrapolated, since their changes show no order"
-        if space[0].cells is None:
-            how = f"from {meshes}, whose difference is all that is known in space, since the mesh comes from a file"
+def _note(scene: Scene, plan: Plan, reference: Reference) -> str:
+    """What the reference is built from, how good it is, and what is wrong with it."""
+    limit, meshes = reference.limit, [s.mesh for s in plan.space]
+    seen = "no order" if limit.order is None else f"the order {limit.order:.2f}"
+    if limit.expected is None:
+        how = f"from {' to '.join(meshes)}, whose difference is all that is known in space, since the mesh is given"
+    elif limit.extrapolated:
+        how = (
+            f"extrapolated in space from {', '.join(meshes)} with the order {limit.expected:.2f} that the ends of the "
+            f"contact zone leave; these meshes show {seen}"
+        )
     else:
-        how = f"extrapolated in space from {meshes} with the observed order {p:.2f}"
-    return (
-        f"Reference: {how}, and in time with {4 * base} steps on {middle.mesh}; its own relative error is estimated as "
-        f"{error:.1e}."
+        how = (
+            f"from {meshes[-1]}, not extrapolated, since {', '.join(meshes)} show {seen} instead of "
+            f"{limit.expected:.2f}"
+        )
+    words = (
+        f"Reference: {how}; in time with {4 * plan.base} steps on {plan.middle.mesh}. Its own relative error of the "
+        f"deformation is estimated as {reference.error:.1e} (displacement {reference.error_displacement:.1e}); the "
+        "measured errors may be wrong by as much either way."
     )
+    if reference.error > ROUGH:
+        part = reference.largest_part
+        words += f" That is too much to judge by: most of it is the {part} part, and would need {reference.need}."
+    if not all(fits(n, shares) for n, shares in zip(scene.tissue.cells or (), edges(scene), strict=False)):
+        words += " The scene's own mesh has no lines at the ends of its contact zone or layers, which adds error."
+    return words

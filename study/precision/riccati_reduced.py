@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.small_care import solve_reduced
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import factor_of, gain_of
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import gain_error, reduce_riccati
-from softgrasp.reduction.engines import on_root
 from softgrasp.study.control.sweep import TITLES, judged, orders, report_dict
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.points import Row, WorkPoint, number

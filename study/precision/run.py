@@ -52,7 +52,7 @@ from softgrasp.study.precision.reduced import (
     sweep_bases,
     sweep_reduced,
 )
-from softgrasp.study.precision.reference import Reference, make_reference, nested_meshes
+from softgrasp.study.precision.reference import Reference, make_plan, make_reference
 from softgrasp.study.precision.riccati import SECOND, ControlRuns, riccati_slopes, riccati_work, sweep_riccati
 from softgrasp.study.precision.riccati_reduced import (
     basis_work,
@@ -117,7 +117,7 @@ def run_study(
         out: folder of the results.
         overrides: arguments of ``--set``.
         console: for the tables.
-        tolerance: relative error of the outputs to answer for; None asks nothing.
+        tolerance: relative error of the deformation to answer for; None asks nothing.
         budget: seconds of a step to answer for; None asks nothing.
         questions: arguments of ``--question``, see :class:`study.precision.points.Asked`; None asks all.
         quiet: no progress bar.
@@ -286,8 +286,5 @@ def control_work(control: ControlRuns, wanted: Sequence[str]) -> float:
 
 def _expected(scene: Scene, runs: FullRuns, methods: int, d: int) -> float:
     """Expected work of the forward questions, for the time left. Not collective."""
-    meshes: tuple[tuple[int, ...] | None, ...] = nested_meshes(scene) or (None,)
-    own = own_setting(scene)
-    space = [runs.work(type(own)(cells, 2, own.steps)) for cells in meshes]
-    points = sum(runs.work(s) for s in forward_settings(scene, d))
-    return float(2 * sum(space) + points + REDUCED_WORK * (methods + 1))
+    settings = [*make_plan(scene).settings, *forward_settings(scene, d)]
+    return float(sum(runs.work(s) for s in settings) + REDUCED_WORK * (methods + 1))

@@ -26,6 +26,7 @@ from softgrasp.study.report.files import plain
 
 GRID = 3  # test values of each constant, from corner to corner of the box
 METHODS_TESTED = 4
+LAMBDA_SHARES, MU_SHARES = (0.6, 10.0), (0.4, 10.0)  # of the scene's own constants: the paper's box around its 50, 50
 
 
 @dataclass(frozen=True)
@@ -95,13 +96,19 @@ def _deformation(point: Point) -> float:
     return point.error_deformation if np.isfinite(point.error_deformation) else np.inf
 
 
+def box_of(model: Model) -> tuple[list[float], list[float]]:
+    """Ranges of lambda and mu of the first layer [Pa]: the scene's, or shares of its own constants. Not collective."""
+    ranges, first = model.scene.reduction, model.system.materials[0]
+    lam, mu = ranges.lambda_range, ranges.mu_range
+    return lam or [share * first.lam for share in LAMBDA_SHARES], mu or [share * first.mu for share in MU_SHARES]
+
+
 def outside(model: Model) -> str:
     """Why the scene's own constants lie outside the box, so that errors there say nothing; empty when inside."""
-    ranges, first = model.scene.reduction, model.system.materials[0]
-    for key, value, (low, high) in (
-        ("lambda", first.lam, ranges.lambda_range),
-        ("mu", first.mu, ranges.mu_range),
-    ):
+    first, box = model.system.materials[0], box_of(model)
+    for key, value, (low, high) in zip(("lambda", "mu"), (first.lam, first.mu), box, strict=True):
+        if value <= 0:
+            return f"{key} = {value:.4g} Pa of the scene is not positive, and the box is logarithmic"
         if not low <= value <= high:
             return (
                 f"{key} = {value:.4g} Pa of the scene lies outside reduction.{key}_range = [{low:g}, {high:g}]; "
@@ -112,17 +119,17 @@ def outside(model: Model) -> str:
 
 def grid_of(model: Model) -> list[tuple[float, float]]:
     """Lame constants on a grid of the scene's box, logarithmically."""
-    ranges = model.scene.reduction
-    lam, mu = (np.geomspace(r[0], r[1], GRID).tolist() for r in (ranges.lambda_range, ranges.mu_range))
+    lam, mu = (np.geomspace(low, high, GRID).tolist() for low, high in box_of(model))
     return [(a, b) for a in lam for b in mu]
 
 
 def training_of(model: Model) -> list[tuple[float, float]]:
     """Lame constants of the runs that train bases beside the scene's own."""
-    wanted = model.scene.reduction
-    if wanted.train == "corners":
-        return [(a, b) for a in wanted.lambda_range for b in wanted.mu_range]
-    return [(a, b) for a, b in wanted.train]
+    train = model.scene.reduction.train
+    if train == "corners":
+        lam, mu = box_of(model)
+        return [(a, b) for a in lam for b in mu]
+    return [(a, b) for a, b in train]
 
 
 def materials_at(model: Model, lam: float, mu: float) -> tuple[LayerMaterial, ...]:
@@ -177,7 +184,7 @@ def cases_of(against: Reference, swept: Sequence[Swept], states: States | None) 
         cases += [Case(s.method, point.N, False, model) for point, model in points]
         if states is None or not s.method.snapshots:
             continue
-        sizes = [point.columns for point, _ in points]
+        sizes = [point.N for point, _ in points]
         bases, _ = bases_of(s.method.key, states, sizes, full.scene.reduction, {})
         for basis, (point, _) in zip(bases, points, strict=False):
             cases.append(Case(s.method, point.N, True, project(basis, full.system, outputs)))

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.reduce.box import box_of
 from softgrasp.study.reduce.tables import (
     BOX_HEADER,
     ERROR_HEADER,
-    LEVELS,
     N_NOTE,
     TIME_HEADER,
     box_note,
     box_rows,
+    error_note,
     error_rows,
     inner_note,
     refused_rows,
@@ -30,10 +31,10 @@ if TYPE_CHECKING:
     from softgrasp.study.reduce.run import Reduced
 
 CAPTIONS = {
-    "errors.png": "Relative errors of the paper's six methods against N. First the state that the basis is built "
-    "from: [q_s, v_s, q_e, v_e], for PSD [q_s, p_s, q_e, p_e]; then [q_s, v_s, q_e, v_e] for all; then the deformation "
-    "alone, after removing the rigid motion of the hand; then the energy of the tissue. Thin dotted: projection error, "
-    "which no model of the basis can fall below. Red crosses: unstable models. Errors above 1 are drawn at 1.",
+    "errors.png": "Relative errors of the paper's six methods against N, all columns of V counted. First the "
+    "deformation, after removing the rigid motion of the hand; then the state [q_s, v_s, q_e, v_e], the paper's error; "
+    "then [q_s, p_s, q_e, p_e]; then the energy of the tissue; each the same for every method. Thin dotted: projection "
+    "error, which no model of the basis can fall below. Red crosses: unstable models. Errors above 1 are drawn at 1.",
     "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
     "times.png": "Errors of all models against the time of a run, and against offline plus online time. Open marks: "
     "global bases. Red crosses: unstable models. Errors above 1 are drawn at 1. Dashed: the full run with its matrix "
@@ -89,16 +90,15 @@ def write_all(
 
 def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, str]]) -> list[Section]:
     """Parts of the page."""
-    levels, share = ", ".join(f"{level:.0e}" for level in LEVELS), f"{100 * result['reduction']['energy']:g} %"
+    share = f"{100 * result['reduction']['energy']:g} %"
     explained = (
-        f"{N_NOTE}\n\n{share}: N that keeps this share of the snapshots' energy. Then errors at the N nearest "
-        f"to 14, and the least N of a stable model with an error of at most {levels}. An exclamation mark: "
-        "unstable. Each method is built from the snapshots of one run and repeats it, driven by the same hand. "
-        f"{inner_note(found.swept)}"
+        f"{N_NOTE}\n\n{error_note(share)} Each method is built from the snapshots of one run and repeats it, driven by "
+        f"the same hand. {inner_note(found.swept)}"
     )
     header = (ERROR_HEADER[0], share, *ERROR_HEADER[2:])
     parts = [
         Section("Errors", text=explained, header=header, rows=error_rows(found.swept)),
+        Section("What holds", text="\n\n".join(result["findings"])),
         Section("", figures=figures),
         Section("Times", text="\n\n".join(result["speed_notes"]), header=TIME_HEADER, rows=time_rows(found.speeds)),
     ]
@@ -115,8 +115,7 @@ def box_sections(found: Reduced) -> list[Section]:
     title, box = "Other parameters", found.box
     if box.none:
         return [Section(title, f"No tests at other parameters: {box.none}.")]
-    ranges = found.against.model.scene.reduction
-    text = box_note(box, ranges.lambda_range, ranges.mu_range)
+    text = box_note(box, *box_of(found.against.model))
     text += " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
     parts = [Section(title, text, header=BOX_HEADER, rows=box_rows(box))]
     for N in sorted({case.N for case in box.cases}):

@@ -85,7 +85,7 @@ def compared(swept: Sequence[Swept]) -> list[tuple[Swept, int]]:
 
 
 def _error(found: tuple[Swept, int]) -> float:
-    return found[0].points[found[1]].error
+    return found[0].points[found[1]].error_deformation
 
 
 def gather_views(model: Model, against: Reference, swept: Sequence[Swept]) -> Views | None:

@@ -49,9 +49,9 @@ SPARE = ((BROWN, "-", ">"), (BROWN, "--", "h"), (BROWN, ":", "X"), (BROWN, "-.",
 CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.1, "color": UNSTABLE}
 FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
 QUANTITIES = (
-    ("error", "projection_error", "error of the state"),
-    ("error_qv", "projection_error_qv", r"error of $[q_s, v_s, q_e, v_e]$"),
-    ("error_deformation", "", "error of the deformation"),
+    ("error_deformation", "projection_error_deformation", "error of the deformation"),
+    ("error", "projection_error", r"error of $[q_s, v_s, q_e, v_e]$"),
+    ("error_canonical", "", r"error of $[q_s, p_s, q_e, p_e]$"),
     ("error_energy", "", "error of the energy"),
 )
 
@@ -69,8 +69,9 @@ def of_paper(swept: Sequence[Swept]) -> list[Swept]:
 
 def beyond_paper(swept: Sequence[Swept]) -> list[Swept]:
     """The others, after the best of the paper's at the N compared."""
-    old = [(s.points[i].error, k, s) for k, s in enumerate(of_paper(swept)) if (i := nearest(s.points)) is not None]
-    return [s for _, _, s in sorted(old)[:1]] + [s for s in swept if s.method.key not in PAPER_METHODS and s.points]
+    old = [(s.points[i], s) for s in of_paper(swept) if (i := nearest(s.points)) is not None]
+    first = min(old, key=lambda f: f[0].error_deformation, default=None)
+    return ([] if first is None else [first[1]]) + [s for s in swept if s.method.key not in PAPER_METHODS and s.points]
 
 
 def figure_errors(swept: Sequence[Swept], out_png: Path) -> tuple[Path, Path]:
@@ -106,7 +107,7 @@ def figure_times(swept: Sequence[Swept], full: float, out_png: Path) -> tuple[Pa
     with paper_style():
         figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.4), sharex="col")
         clipped = False
-        for row, (key, _, label) in zip(grid, (QUANTITIES[0], QUANTITIES[2]), strict=True):
+        for row, (key, _, label) in zip(grid, QUANTITIES[:2], strict=True):
             row[0].set_ylabel(label)
             for ax, offline in zip(row, (False, True), strict=True):
                 unit = 1.0 if offline else 1e3

@@ -22,19 +22,20 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save_model
 from softgrasp.reduction.replay import Reference, reference
 from softgrasp.study.forward.result import simulate_result
-from softgrasp.study.reduce.box import Box, box_result, measure_box
+from softgrasp.study.reduce.box import Box, box_of, box_result, measure_box
+from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.page import draw_all, write_all
-from softgrasp.study.reduce.sweep import COMPARED, Swept, best, chosen_methods, sweep
+from softgrasp.study.reduce.sweep import Swept, best, chosen_methods, sweep
 from softgrasp.study.reduce.tables import (
     BOX_HEADER,
     ERROR_HEADER,
-    LEVELS,
     N_NOTE,
     TIME_HEADER,
     FullTimes,
     Speed,
     box_note,
     box_rows,
+    error_note,
     error_rows,
     inner_note,
     refused_rows,
@@ -229,6 +230,7 @@ def reduce_result(model: Model, run: Trajectory, found: Reduced, watch: Stopwatc
             }
             for s in found.swept
         },
+        "findings": findings(found.swept),
         "speed": speed_dicts(found.speeds),
         "speed_notes": speed_notes(whole["n_e"], whole["steps"], found.times, found.speeds),
         "box": box_result(found.box),
@@ -246,12 +248,10 @@ def show(console: Console, found: Reduced, result: dict[str, Any]) -> None:
     """Print the tables."""
     share = f"{100 * result['reduction']['energy']:g} %"
     _print(console, (ERROR_HEADER[0], share, *ERROR_HEADER[2:]), error_rows(found.swept))
-    console.print(
-        f"{share}: N that keeps this energy; then errors at N = {COMPARED}; least stable N with an error up to "
-        f"{', '.join(f'{level:.0e}' for level in LEVELS)}; !: unstable; fixed: with fixed solid modes. {N_NOTE} "
-        f"{inner_note(found.swept)}",
-        style="dim",
-    )
+    note = f"{error_note(share)} fixed: with fixed solid modes. {N_NOTE} {inner_note(found.swept)}"
+    console.print(note, style="dim", markup=False)
+    for sentence in result["findings"]:
+        console.print(sentence, markup=False)
     for sizes, titles, reason in refused_rows(found.swept):
         console.print(_narrow(f"N = {sizes} refused for {titles}: {reason}."), markup=False)
     _print(console, TIME_HEADER, time_rows(found.speeds))
@@ -260,8 +260,7 @@ def show(console: Console, found: Reduced, result: dict[str, Any]) -> None:
     if found.box.none:
         console.print(f"no errors at other parameters: {found.box.none}")
     else:
-        ranges = found.against.model.scene.reduction
-        console.print(box_note(found.box, ranges.lambda_range, ranges.mu_range), markup=False)
+        console.print(box_note(found.box, *box_of(found.against.model)), markup=False)
         _print(console, BOX_HEADER, box_rows(found.box))
 
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.scene.control import Reduction
-from softgrasp.fem.scene.file import scene_hash
 from softgrasp.reduction.basis import Basis
-from softgrasp.reduction.errors import Comparison, View
-from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.errors import Comparison
+from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import METHODS, PAPER_METHODS, Method, find_method, make_bases
@@ -26,7 +26,7 @@ from softgrasp.reduction.truncation import Truncation
 from softgrasp.study.report.files import plain
 
 BEYOND = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
-REPEATS, SETUPS = 15, 3  # behind each median of the online time and of the set-up
+REPEATS, SETUPS = 15, 7  # behind each median of the online time and of the set-up
 COMPARED = 14  # N at which methods are compared: the paper's
 LARGER = 30  # N of the second model that is tested at other parameters
 
@@ -39,30 +39,31 @@ class Point:
     """One basis at one N; errors are relative, times in seconds, the abscissa in 1/s. Unstable runs may overflow.
 
     Attributes:
-        N: columns of the basis that count, see :func:`uncounted`.
-        columns: basis vectors in all, with those of the hand.
-        error: |X - X_r|_F / |X|_F of the snapshot matrix that the basis is built from: [q_s, v_s, q_e, v_e], or
-            [q_s, p_s, q_e, p_e] for a canonical basis [SBRH21].
-        error_qv: the same of [q_s, v_s, q_e, v_e] for every basis.
-        error_deformation: of [z, v_z], after removing the rigid motion of the hand.
+        N: columns of V, the hand's included.
+        N_tissue: columns without the hand's own, which bases with fixed solid modes have.
+        split: of N_tissue over the parts of the decomposition: displacement and velocity of componentwise POD.
+        error_deformation: |X - X_r|_F / |X|_F of X = [z, v_z], after removing the rigid motion of the hand: the measure
+            that tables, pictures and the best method go by.
+        error: the same of X = [q_s, v_s, q_e, v_e], for every basis the paper's error [SBRH21].
+        error_canonical: the same of X = [q_s, p_s, q_e, p_e].
         error_energy: largest error of the tissue's energy over its largest value.
-        projection_error: the floor of ``error`` that the basis sets.
-        projection_error_qv: the floor of ``error_qv``.
+        projection_error_deformation, projection_error: the floors that the basis sets to the first two.
         time_offline: basis and projection; one factorisation of the snapshots serves all N.
-        time_setup: small matrices and propagator at a parameter.
+        time_setup: what a new parameter costs before its run: small matrices, test of stability, propagator.
         time_online: a whole run.
         spectral_abscissa: largest real part of an eigenvalue.
         stable: no growing mode.
     """
 
     N: int
-    columns: int
-    error: float
-    error_qv: float
+    N_tissue: int
+    split: tuple[int, ...]
     error_deformation: float
+    error: float
+    error_canonical: float
     error_energy: float
+    projection_error_deformation: float
     projection_error: float
-    projection_error_qv: float
     time_offline: float
     time_setup: float
     time_online: float
@@ -79,7 +80,7 @@ class Swept:
         points: one for every N.
         models: some of them by the number of their point: those of :func:`noted`. All would fill the memory.
         sigma: singular values of every part of the decomposition.
-        refused: N asked for that this basis cannot have, each with its reason.
+        refused: N in the scene that this basis cannot have, each with its reason.
         kept: N that keeps the wanted share of the energy; None without snapshots.
         inner: inner product of the bases.
     """
@@ -116,9 +117,9 @@ def nearest(points: Sequence[Point], N: int = COMPARED, stable: bool = True) -> 
 
 
 def best(points: Sequence[Point]) -> int | None:
-    """Number of the stable point with the least error."""
-    some = [i for i, p in enumerate(points) if p.stable and np.isfinite(p.error)]
-    return min(some, key=lambda i: points[i].error) if some else None
+    """Number of the stable point with the least error of the deformation."""
+    some = [i for i, p in enumerate(points) if p.stable and np.isfinite(p.error_deformation)]
+    return min(some, key=lambda i: points[i].error_deformation) if some else None
 
 
 def noted(points: Sequence[Point]) -> set[int]:
@@ -127,21 +128,16 @@ def noted(points: Sequence[Point]) -> set[int]:
     return {i for i in found if i is not None}
 
 
-def uncounted(method: Method, n_s: int) -> int:
-    """Columns that N leaves out: the hand's own of canonical bases with fixed solid modes and of Craig-Bampton."""
-    return 2 * n_s if method.fixed and method.preserving else 0
-
-
 def sizes_for(method: Method, n_s: int, wanted: Sequence[int]) -> list[int]:
-    """Numbers of columns that give the dimensions among ``wanted`` that this method can have."""
+    """The dimensions among ``wanted`` that this method can have, ascending; the hand's columns count."""
     none = misfits(method, n_s, wanted)
-    return sorted({N + uncounted(method, n_s) for N in wanted if N not in none})
+    return sorted({N for N in wanted if N not in none})
 
 
 def misfits(method: Method, n_s: int, wanted: Sequence[int]) -> dict[int, str]:
     """Dimensions among ``wanted`` that this method cannot have whatever the snapshots are, with the reason."""
     step = 2 if method.pairs else 1
-    hand = 2 * n_s - uncounted(method, n_s) if method.fixed else 0
+    hand = 2 * n_s if method.fixed else 0
     least = hand + step
     found = {}
     for N in wanted:
@@ -160,7 +156,6 @@ def bases_of(
     What does not fit is noted in ``refused`` by its N, with the reason. Collective.
     """
     method = METHODS[name]
-    hand = uncounted(method, states.layout.n_s)
     inner = None if wanted.inner == "auto" or not method.snapshots else wanted.inner
     rule = [Truncation(energy=wanted.energy)] if method.snapshots else []
     sizes = list(sizes)
@@ -176,8 +171,8 @@ def bases_of(
             what = "the snapshots carry above rounding" if method.snapshots else "this mesh has modes for"
             why = str(error).removeprefix(f"{name}: ")
             if most is not None and beyond:
-                why = f"more than {what}; ask for N <= {most - hand}"
-            refused |= {k - hand: f"N = {k - hand}: {why}" for k in beyond or sizes}
+                why = f"more than {what}; ask for N <= {most}"
+            refused |= {k: f"N = {k}: {why}" for k in beyond or sizes}
             sizes = [k for k in sizes if beyond and k not in beyond]
         else:
             return bases[: len(sizes)], bases[-1].N if rule else None
@@ -206,6 +201,9 @@ def measure(model: ReducedModel, against: Reference, comparison: Comparison | No
         model: which.
         against: the full run.
         comparison: of the largest model of the family; None prepares one for this model alone.
+
+    Raises:
+        ModelError: E or A is singular, so that the model has no run or no equilibrium to start in.
     """
     system = against.model.system
     comparison = comparison or comparison_of(model, against)
@@ -213,19 +211,19 @@ def measure(model: ReducedModel, against: Reference, comparison: Comparison | No
         small = model.at()
         step, drive = prepare(model, small, against, system)
         errors = comparison.errors(model, small, run(step, allow_unstable=True, **drive))
-        own: View = "momenta" if model.coordinates == "qp" else "velocities"
         comm = system.layout.comm
-        setup = _median_time(lambda: prepare(model, model.at(), against, system), SETUPS, comm)
+        setup = _median_time(lambda: prepare(model, model.at(), against, system)[0].stable, SETUPS, comm)
         online = _median_time(lambda: run(step, allow_unstable=True, **drive), REPEATS, comm)
     return Point(
-        N=model.N - uncounted(METHODS[model.name], system.layout.n_s),
-        columns=model.N,
-        error=errors.error_canonical if own == "momenta" else errors.error,
-        error_qv=errors.error,
+        N=model.N,
+        N_tissue=model.N - (2 * system.layout.n_s if model.fixed_solid else 0),
+        split=model.split,
         error_deformation=errors.error_deformation,
+        error=errors.error,
+        error_canonical=errors.error_canonical,
         error_energy=errors.error_energy,
-        projection_error=comparison.floor(own, model, small),
-        projection_error_qv=comparison.floor("velocities", model, small),
+        projection_error_deformation=comparison.floor("deformation", model, small),
+        projection_error=comparison.floor("velocities", model, small),
         time_offline=float(comm.allreduce(sum(model.seconds.values()), MPI.MAX)),
         time_setup=setup,
         time_online=online,
@@ -253,16 +251,20 @@ def sweep(name: str, against: Reference, wanted: Reduction, progress: Progress |
     for i, basis in enumerate(bases):
         if progress is not None:
             progress(name, i, len(bases))
-        models[i] = project(basis, full.system, outputs, key)
-        points.append(measure(models[i], against, comparison))
+        model = project(basis, full.system, outputs, key)
+        try:
+            points.append(measure(model, against, comparison))
+        except ModelError as error:
+            refused[basis.N] = f"N = {basis.N}: {str(error).removeprefix(f'{name}: ')}"
+            continue
+        models[len(points) - 1] = model
         models = {j: models[j] for j in models if j in noted(points)}
-    hand = uncounted(method, full.system.layout.n_s)
     return Swept(
         method=method,
         points=tuple(points),
         models=models,
         sigma=bases[0].sigma if bases else (),
         refused=dict(sorted(refused.items())),
-        kept=None if kept is None else kept - hand,
+        kept=kept,
         inner=bases[0].inner if bases else "",
     )

@@ -14,14 +14,22 @@ from mpi4py import MPI
 from slepc4py import SLEPc
 
 from softgrasp import PACKAGE, package_version
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import PETSc
-from softgrasp.fem.scene.file import scene_hash
 from softgrasp.fem.scene.scene import Scene
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:
-    """Largest resident memory so far, summed over the ranks [MiB]. Collective."""
-    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+    """Largest resident memory so far, summed over the ranks [MiB]. Collective.
+
+    Linux's VmHWM starts anew with this program, unlike ``ru_maxrss``, which may show that of the launcher.
+    """
+    try:
+        text = Path("/proc/self/status").read_text()
+        local = next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):  # no Linux
+        local = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return float(comm.allreduce(local))
 
 
 def machine() -> str:

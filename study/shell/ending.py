@@ -6,13 +6,13 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 from rich.text import Text
 
-from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.shell.streams import outlive_readers
+from softgrasp.fem.errors import SceneError, SoftgraspError, one_line
+from softgrasp.study.shell.streams import outlive_readers, write_utf8
 
 RANK = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")  # set by launchers, known before MPI is loaded
 
@@ -43,10 +43,23 @@ def end_all() -> None:
         MPI.COMM_WORLD.Abort(1)
 
 
+def check_words(words: Sequence[str]) -> None:
+    """Refuse what DOLFINx, which looks at all arguments, and Python could not read as text. Not collective.
+
+    Raises:
+        SceneError: a word is no text.
+    """
+    for word in words:
+        if not word.isascii() and any("\ud800" <= letter <= "\udfff" for letter in word):
+            raise SceneError(f"{word}: this argument is not text here; rename the file or set LC_ALL=C.UTF-8")
+
+
 def run_command(command: Callable[[], object]) -> None:
     """Run a command line to its end. Collective."""
     outlive_readers()
+    write_utf8()
     try:
+        check_words(sys.argv)
         command()
     except SoftgraspError as error:
         if rank() == 0:
@@ -56,7 +69,8 @@ def run_command(command: Callable[[], object]) -> None:
         raise
     except OSError as error:  # a folder that cannot be made, a full disk: of one rank, so it must end all
         name = f"{error.filename}: " if error.filename else ""
-        sys.stderr.write(f"error: {name}{error.strerror or error}; check --out, its permissions and the free disk\n")
+        reason = one_line(f"{name}{error.strerror or error}; check --out, its permissions and the free disk")
+        sys.stderr.write(f"error: {reason}\n")
         end_all()
         sys.exit(1)
     except BaseException:

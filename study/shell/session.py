@@ -11,7 +11,9 @@ from typing import Any
 from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
+from rich.padding import Padding
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.model.build import Model, build
@@ -83,7 +85,7 @@ class Session:
         return scene
 
     def model(self, scene: Scene) -> Model:
-        """Build a scene and print its size. Collective.
+        """Build a scene and print its size and what its mesh warns of. Collective.
 
         Raises:
             SoftgraspError: the scene cannot be built.
@@ -92,6 +94,7 @@ class Session:
         layout = model.system.layout
         sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
         self.console.print(sizes)
+        show_warnings(self.console, model.space.mesh.notes)
         return model
 
     def progress(self, count: ProgressColumn) -> Progress:
@@ -163,3 +166,9 @@ def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
 def open_model(scene: Scene, console: Console) -> Model:
     """See :meth:`Session.model`; for commands that are not one yet. Collective."""
     return Session("", Path(), (), Path(), console).model(scene)
+
+
+def show_warnings(console: Console, found: Sequence[str]) -> None:
+    """Print warnings in yellow. Not collective."""
+    for text in found:
+        console.print(Padding.indent(Text(f"warning: {text}", "yellow"), 0), highlight=False)

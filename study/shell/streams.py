@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import locale
 import os
 import signal
 import sys
@@ -14,7 +15,7 @@ from types import FrameType
 
 
 class Stream(io.TextIOWrapper):
-    """A standard stream; what is written after its reader has gone goes nowhere."""
+    """A standard stream; what is written after its reader has gone goes nowhere, and no letter is beyond it."""
 
     given: io.TextIOWrapper  # kept alive: its end would close the buffer that both use
 
@@ -40,6 +41,13 @@ class Stream(io.TextIOWrapper):
         return written
 
 
+def write_utf8() -> None:
+    """Let files be read and written as UTF-8 in any locale, as scenes and JSON are. Not collective."""
+    if locale.getencoding().lower() != "utf-8":
+        with contextlib.suppress(locale.Error):  # no such locale here: names beyond ASCII then end in a sentence
+            locale.setlocale(locale.LC_CTYPE, "C.UTF-8")
+
+
 def outlive_readers() -> None:
     """Let the program run on when the reader of its output ends. Not collective: call on every rank, in main only.
 
@@ -52,7 +60,7 @@ def outlive_readers() -> None:
             stream = Stream(
                 given.buffer,
                 encoding=given.encoding,
-                errors=given.errors,
+                errors="backslashreplace",
                 line_buffering=given.line_buffering,
                 write_through=given.write_through,
             )

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse
 from mpi4py import MPI
 
+from softgrasp.fem import petsc
 from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import times_columns
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from tests.helpers.models import (
     CUBE,
@@ -43,6 +46,20 @@ EXACT = 1e-12  # sums of about 50 products of order one, each rounded to 1e-16
 def test_the_paper_has_these_sizes(comm: MPI.Intracomm, cells: list[int], states: int) -> None:
     scene = load_scene(shipped_scenes()["paper_forward"], [f"tissue.cells={cells}"])
     assert build(scene, comm).system.layout.states == states
+
+
+@pytest.mark.parametrize("columns", [1, 7, 8, 20])
+def test_products_with_columns_equal_scipy(comm: MPI.Intracomm, columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By vectors, in one block, and in three of which the last is narrow."""
+    monkeypatch.setattr(petsc, "BLOCK_ENTRIES", 1)
+    system = build(make_scene({}), comm).system
+    layout, start = system.layout, system.layout.start
+    X = np.random.default_rng(1).standard_normal((layout.n_e, columns))
+    rows, indices, values = system.K_ee.getValuesCSR()
+    whole = scipy.sparse.csr_matrix((values, indices, rows), shape=(layout.n_local, layout.n_e)) @ X
+    product = times_columns(system.K_ee, np.asfortranarray(X[start : start + layout.n_local]))
+    assert product.flags.f_contiguous
+    np.testing.assert_allclose(product, whole, rtol=0, atol=EXACT * np.abs(whole).max())
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -13,9 +13,11 @@ from softgrasp.fem.effects import EFFECTS, Problem
 from softgrasp.fem.effects.damping import operator, ratios
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
+from softgrasp.fem.effects.sag import Gradient, Sag
 from softgrasp.fem.errors import SolverError
+from softgrasp.fem.fields.sag import measure_sag
+from softgrasp.fem.fields.scales import damping_ratios, measure, rigid_inertia
 from softgrasp.fem.model.build import build
-from softgrasp.fem.model.scales import damping_ratios, measure, rigid_inertia
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
@@ -44,23 +46,67 @@ def problem_of(scene: Scene, **numbers: Any) -> Problem:
         "tissue_inertia": (0.5,),
         "omega": (4.0, 10.0),
         "zeta": (0.0, 0.0),
+        "sag": Sag((0.0, -9.81), 0.5, Gradient(0.4, 0.08, 0.005)),
     }
     return Problem(scene, **(defaults | numbers))
 
 
 def test_gravity() -> None:
-    gate = EFFECTS["gravity"].gate(problem_of(scene_of(effects={"gravity": {"g": [3.0, -4.0]}})))
-    # E = 50 (150 + 100) / 100 = 125: rho g L / E = 1 * 5 * 2 / 125
-    assert gate.number == pytest.approx(0.08, rel=4 * EPS)  # a handful of roundings
+    on = scene_of(effects={"gravity": {"g": [3.0, -4.0]}})
+    gate = EFFECTS["gravity"].gate(problem_of(on))
+    assert gate.number == 0.08
     assert gate.matters
-    weak = EFFECTS["gravity"].gate(problem_of(scene_of(effects={"gravity": {"g": [0.0, -0.1]}})))
-    assert not weak.matters
+    assert "sag by 0.5 m, 0.25 of its length 2 m" in gate.sentence
+    assert "|grad z| is 0.4 at most: the theory holds" in gate.sentence
+    weak = Sag((3.0, -4.0), 0.01, Gradient(0.2, 0.009, 0.001))
+    assert not EFFECTS["gravity"].gate(problem_of(on, sag=weak)).matters, "steep at the edge of the contact zone only"
+    steep = Sag((3.0, -4.0), 1.0, Gradient(0.5, 0.3, 0.25))
+    assert "does not hold, 25% of the body" in EFFECTS["gravity"].gate(problem_of(on, sag=steep)).sentence
     off = EFFECTS["gravity"].gate(problem_of(scene_of()))
-    assert off.number == pytest.approx(9.81 * 2 / 125, rel=4 * EPS)  # a handful of roundings
     assert off.sentence.startswith("Off")
-    layers = (LayerMaterial(50.0, 50.0, 1.0), LayerMaterial(500.0, 500.0, 1.0))
-    both = EFFECTS["gravity"].gate(problem_of(scene_of(), materials=layers))
-    assert both.number == off.number  # the softest layer decides
+    assert off.proviso == "if its numbers are in SI units"
+
+
+def test_a_strip_that_bends_sags_as_a_beam(comm: MPI.Intracomm) -> None:
+    """Held at one end: rho g L / E is 0.1, but the beam sags 2.9 times its length."""
+    L, h, E, nu, rho, g = 0.2, 0.02, 2e4, 0.3, 1e3, 9.81
+    strip = {
+        "tissue": {"size": [L, h], "cells": [20, 2], "order": 2, "material": {"young": E, "poisson": nu, "rho": rho}},
+        "contact": {"sides": ["left"]},
+        "motion": {"profile": "hold"},
+        "effects": {"gravity": {"g": [0.0, -g]}},
+    }
+    model = build(scene_of(**strip), comm)
+    sag = measure_sag(model)
+    bending = E / (1 - nu**2) * h**2 / 12  # plane strain, over the area
+    # beam with shear; cross-sections at the hand stay plane, which the beam does not know: (h / L)^2
+    expected = rho * g * (L**4 / (8 * bending) + L**2 / (2 * 5 / 6 * E / (2 * (1 + nu))))
+    assert sag.largest == pytest.approx(expected, rel=(h / L) ** 2)
+    assert sag.largest > 2 * L
+    # at the tip nothing but a rotation, whose gradient is skew: sqrt(2) times the slope
+    assert sag.gradient.typical == pytest.approx(np.sqrt(2) * rho * g * L**3 / (6 * bending), rel=0.02)  # 5 h of cells
+    assert not sag.gradient.small
+    gate = EFFECTS["gravity"].gate(measure(model, np.zeros(0), np.zeros((model.system.layout.n_local, 0))))
+    assert gate.number == sag.gradient.typical
+    assert rho * g * L / E < 0.1 < gate.number
+
+
+def test_a_hanging_bar_stretches_as_it_should(comm: MPI.Intracomm) -> None:
+    """lambda = 0: z = rho g (L y - y^2 / 2) / E from the top, which P2 holds exactly; gravity off counts as earth's."""
+    mu, rho, L, n = 50.0, 0.1, 2.0, 4
+    bar = {
+        "tissue": {"size": [1.0, L], "cells": [2, n], "order": 2, "material": {"lambda": 0.0, "mu": mu, "rho": rho}},
+        "contact": {"sides": ["top"]},
+        "motion": {"profile": "hold"},
+    }
+    sag = measure_sag(build(scene_of(**bar), comm))
+    assert sag.g == (0.0, -9.81)
+    assert sag.largest == pytest.approx(rho * 9.81 * L**2 / (4 * mu), rel=1e-10)  # direct solve
+    steps = rho * 9.81 * L * (1 - (np.arange(n) + 0.5) / n) / (2 * mu)  # mean slope in each row of cells
+    assert sag.gradient.largest == pytest.approx(steps[0], rel=1e-10)  # as above
+    assert sag.gradient.typical == sag.gradient.largest  # a cell is more than one in a hundred
+    assert sag.gradient.share == 0.0
+    assert sag.gradient.small
 
 
 def test_damping() -> None:
@@ -110,7 +156,11 @@ def test_rotation() -> None:
     called = EFFECTS["rotation"].gate(problem_of(scene_of(effects={"reaction": True}, motion=force)))
     assert called.number == 0.1, "without inertia the hand is as large as the tissue"
     assert called.matters
-    assert not EFFECTS["rotation"].gate(problem_of(scene_of(motion=force))).matters
+    beside = EFFECTS["rotation"].gate(problem_of(scene_of(motion=force)))
+    assert beside.matters, "the reaction is off, but called for: with it the tissue turns the hand"
+    assert beside.proviso == "together with reaction"
+    light = problem_of(scene_of(motion=force, hand={"mass": 100.0, "inertia": 0.25}))
+    assert not EFFECTS["rotation"].gate(light).matters, "no reaction that counts, so nothing turns the hand"
 
 
 def layered_scene(**parts: Any) -> Scene:

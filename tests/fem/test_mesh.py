@@ -16,7 +16,8 @@ from mpi4py import MPI
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.check import check_cells, components, signed_volumes
 from softgrasp.fem.mesh.file import read_mesh
-from softgrasp.fem.mesh.make import TissueMesh, cell_nodes, make_mesh, structured_mesh
+from softgrasp.fem.mesh.make import make_mesh, structured_mesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.scene.tissue import Contact
 
@@ -117,7 +118,9 @@ def test_structured_mesh_volume_and_sides(size: list[float]) -> None:
 def test_make_mesh_takes_size_or_file(mpi_tmp_path: Path) -> None:
     points, cells, facets = grid(2)
     write(mpi_tmp_path / "a.vtu", points, cells, facets)
-    tissue = SimpleNamespace(size=None, origin=None, cells=None, mesh="a.vtu", scale=0.5, repair=False)
+    tissue = SimpleNamespace(
+        size=None, origin=None, cells=None, mesh="a.vtu", scale=0.5, repair=False, seam=1e-4, read_limit=None
+    )
     scene: Any = SimpleNamespace(tissue=tissue, directory=mpi_tmp_path)
     assert volume(make_mesh(COMM, scene)) == pytest.approx(0.5, rel=WIDE)
     tissue.size, tissue.cells = [1.0, 1.0], [2, 2]

@@ -200,7 +200,7 @@ def test_restart_file_of_another_format(comm: MPI.Intracomm, mpi_tmp_path: Path)
     if comm.rank == 0:
         manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 1}))
     comm.Barrier()
-    with pytest.raises(CheckpointError, match=r"another version of softgrasp .format 1, this one reads 3.; run"):
+    with pytest.raises(CheckpointError, match=r"another version of softgrasp .format 1, this one reads 4.; run"):
         simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
 
 
@@ -288,24 +288,14 @@ def test_a_changed_csv_does_not_resume(comm: MPI.Intracomm, mpi_tmp_path: Path) 
         simulate(small(comm, *csv))
 
 
-def test_damaged_checkpoint_is_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
-    with pytest.raises(Interrupted):
-        simulate(small(comm), RunOptions(directory=mpi_tmp_path, until=5))
-    if comm.rank == comm.size - 1:  # damage one rank's file only: every rank must raise
-        (mpi_tmp_path / "checkpoint" / f"step5-rank{comm.rank}.h5").write_bytes(b"not HDF5")
-    comm.Barrier()
-    with pytest.raises(CheckpointError, match="damaged"):
-        simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
-
-
 def test_snapshots_that_cannot_fit_are_refused_before_the_run(
     comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Tiny:
         available = 1000
 
+    model = small(comm)  # which would not be built either
     monkeypatch.setattr("softgrasp.fem.run.snapshots.psutil.virtual_memory", lambda: Tiny)
-    model = small(comm)
     needed = 16 * model.system.layout.n_e * 41
     with pytest.raises(ResourceError, match=f"need {needed} bytes"):
         simulate(model)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import scipy.linalg
 import scipy.sparse
 import skfem
@@ -16,7 +18,9 @@ from numpy.typing import NDArray
 from skfem.helpers import ddot, div, dot, sym_grad
 
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.model.build import Model
+from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.tissue_mesh import cell_nodes
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
@@ -130,7 +134,7 @@ def gather_mesh(mesh: Any) -> tuple[Array, NDArray[np.int64]]:
     comm, d = mesh.comm, mesh.geometry.dim
     to_global = mesh.geometry.index_map().local_to_global(np.arange(len(mesh.geometry.x), dtype=np.int32))
     owned = mesh.topology.index_map(mesh.topology.dim).size_local
-    cells = np.concatenate(comm.allgather(to_global[mesh.geometry.dofmaps[0][:owned]]))
+    cells = np.concatenate(comm.allgather(to_global[cell_nodes(mesh)[:owned]]))
     points = np.empty((mesh.geometry.index_map().size_global, d))
     for index, x in comm.allgather((to_global, mesh.geometry.x[:, :d])):
         points[index] = x
@@ -388,3 +392,37 @@ def close(a: Any, b: Any) -> float:
 def same_everywhere(comm: MPI.Intracomm, value: Array) -> bool:
     """Whether all ranks hold the same bits. Collective."""
     return len(set(comm.allgather(np.ascontiguousarray(value).tobytes()))) == 1
+
+
+# --- a mesh graded towards the ends of the contact zone
+
+
+def graded_model(scene: Scene, comm: MPI.Intracomm) -> Model:
+    """The model of a box whose mesh lines crowd, by a cubic map, where the contact zone ends. Collective.
+
+    Uniform meshes of any elements converge with order 1 there; these do not.
+    """
+    tissue, d = make_mesh(comm, scene), scene.dimension or 0
+    size, x = np.array(scene.tissue.size), tissue.mesh.geometry.x
+    held = {axis for axis, _ in scene.contact.axes(d)}
+    box = np.array(scene.contact.box) / size
+    for axis in range(d):
+        ends = [0.0, 1.0] if axis in held else [float(b) for b in box[:, axis]]
+        x[:, axis] = size[axis] * _crowded(x[:, axis] / size[axis], ends)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("softgrasp.fem.model.build.make_mesh", lambda *_: tissue)
+        return build(scene, comm)
+
+
+def _crowded(s: Array, ends: list[float]) -> Array:
+    """A monotone map of [0, 1] onto itself that keeps the ends and takes the steps near them to the third power."""
+    cuts, moved = sorted({0.0, 1.0, *ends}), s.copy()
+    for a, b in itertools.pairwise(cuts):
+        inside = (s >= a - 1e-12) & (s <= b + 1e-12)
+        t = np.clip((s[inside] - a) / (b - a), 0.0, 1.0)
+        if a in ends and b in ends:
+            t = np.where(t <= 0.5, (2 * t) ** 3 / 2, 1 - (2 - 2 * t) ** 3 / 2)
+        elif a in ends or b in ends:
+            t = t**3 if a in ends else 1 - (1 - t) ** 3
+        moved[inside] = a + (b - a) * t
+    return moved

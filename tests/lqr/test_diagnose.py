@@ -142,7 +142,7 @@ def test_an_output_without_weight_is_a_warning() -> None:
     problem = make(damped(0.002), {"control": {"outputs": [*NODE, {"kind": "hand", "name": "grip"}]}})
     found = diagnose(replace(problem, Q=np.diag([1.0, 1, 0, 1])))
     assert found.solvable
-    assert sentences(found, "warning") == ["control.Q gives no weight to grip.x: the cost ignores it"]
+    assert sentences(found, "warning") == ["control.Q gives no weight to grip_x: the cost ignores it"]
 
 
 def test_a_nan_on_one_rank_is_told_on_all() -> None:

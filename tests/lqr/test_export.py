@@ -12,9 +12,9 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.scene.file import scene_hash
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller, layout_hash, load_gain, save_gain

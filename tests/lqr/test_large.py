@@ -16,9 +16,12 @@ from softgrasp.fem.errors import CheckpointError, ResourceError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.radi import RADI
+from softgrasp.lqr.lowrank.restart import Iteration, load_state
 from softgrasp.lqr.lowrank.shifted import factor_bytes, make_shifted
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.riccati import choose, solve
@@ -230,6 +233,33 @@ def test_foreign_restart_file_is_refused(mpi_tmp_path: Path) -> None:
             NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(8)).solve(mine)
         with pytest.raises(CheckpointError, match="another control problem"):
             NewtonADI(checkpoint=folder).solve(foreign)
+
+
+def test_every_damage_of_a_restart_file_of_newton_is_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    problem, folder = problem_of("one_way"), mpi_tmp_path / "restart"
+    with pytest.raises(_StopError):
+        NewtonADI(checkpoint=folder, checkpoint_every=5, progress=_stop_at(8)).solve(problem)
+    plant, random, nothing = Plant(problem), np.random.default_rng(3), np.zeros((0, 0))
+    for path in (folder / f"newton-solve5-rank{comm.size - 1}.npz", folder / "newton.json"):
+        good = path.read_bytes()
+        bits = [(int(random.integers(len(good))), 1 << int(random.integers(8))) for _ in range(8)]
+        flipped = [good[:i] + bytes([good[i] ^ bit]) + good[i + 1 :] for i, bit in bits]
+        for bad in (*flipped, good[: len(good) // 2], b"", b"PK\x03\x04", b"[]"):
+            comm.Barrier()
+            if comm.rank == 0:
+                path.write_bytes(bad)
+            comm.Barrier()
+            with pytest.raises(CheckpointError, match=rf"{path.name} .*remove the folder"):
+                load_state(folder, plant, Iteration(Right(nothing, nothing)), 1e-10)
+        comm.Barrier()
+        if comm.rank == 0:
+            path.write_bytes(good)
+        comm.Barrier()
+    if comm.rank == 0:
+        (folder / f"newton-solve5-rank{comm.size - 1}.npz").unlink()
+    comm.Barrier()
+    with pytest.raises(CheckpointError, match=r"cannot be read .*remove the folder"):
+        NewtonADI(checkpoint=folder).solve(problem)
 
 
 def test_choice_names_its_reason() -> None:

@@ -10,8 +10,9 @@ import pytest
 import scipy.linalg
 
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.reduction.engines import ENGINES, EngineName
-from softgrasp.reduction.inner import INNERS, InnerName, orthonormality, solve_columns, symplecticity
+from softgrasp.reduction.inner import INNERS, InnerName, orthonormality, symplecticity
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import METHODS, PAPER_METHODS, make_bases, make_basis
 from softgrasp.reduction.states import BasisError, states_of

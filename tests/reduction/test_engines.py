@@ -10,8 +10,8 @@ import typer
 from mpi4py import MPI
 from typer.testing import CliRunner
 
-from softgrasp.fem.petsc import total
-from softgrasp.reduction.engines import ENGINES, EngineName, factor, magnitude, on_root, small_svd
+from softgrasp.fem.petsc import on_root, total
+from softgrasp.reduction.engines import ENGINES, EngineName, factor, magnitude, small_svd
 from softgrasp.reduction.states import BasisError
 from softgrasp.reduction.svd_like import balanced, form, svd_like_pairs
 from softgrasp.reduction.truncation import Columns, Part, Truncation, allocate, counts_of, needed
@@ -312,15 +312,17 @@ def test_needed_counts_the_tail() -> None:
     assert needed(np.zeros(0), 0.0, 0.5) == 0
 
 
-def test_columns_go_to_the_part_with_the_larger_share() -> None:
+def test_parts_share_columns_equally() -> None:
     a, b = part([10.0, 1.0, 0.1]), part([1e-3, 9e-4, 8e-4])
     assert allocate([a, b], 1, 1, 0, "x") == (1, 0)
-    assert allocate([a, b], 1, 4, 0, "x") == (1, 3)  # shares 0.99, 0.01 and 0.41, 0.33, 0.26
-    assert allocate([a, b], 1, 9, 4, "x") == (2, 3)
+    assert allocate([a, b], 1, 4, 0, "x") == (2, 2)  # by sigma^2 over its sum the second would get 3
+    assert allocate([a, b], 1, 9, 4, "x") == (3, 2)
+    assert allocate([part([1.0, 0.5], 1), b], 1, 4, 0, "x") == (1, 3)  # what a part cannot carry goes to the other
     assert allocate([part([1.0, 0.5, 0.1])], 2, 8, 4, "x") == (2,)
-    assert counts_of([a, b], 1, 0, Truncation(energy=0.98), "x") == (1, 3)
-    assert counts_of([a, b], 1, 0, Truncation(tol=0.2), "x") == (1, 3)
-    assert counts_of([a, b], 1, 0, Truncation(tol=0.6), "x") == (1, 2)
+    assert counts_of([a, b], 1, 0, Truncation(energy=0.98), "x") == (3, 3)  # alone the first needs 1
+    assert counts_of([a, b], 1, 0, Truncation(tol=0.2), "x") == (3, 3)
+    assert counts_of([a, b], 1, 0, Truncation(tol=0.6), "x") == (2, 2)
+    assert counts_of([part([1.0, 0.5], 1), b], 1, 0, Truncation(tol=0.6), "x") == (1, 2)
 
 
 @pytest.mark.parametrize(

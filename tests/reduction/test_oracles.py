@@ -44,15 +44,11 @@ def test_componentwise_pod_is_two_pods(key: str, inner: InnerName) -> None:
     assert sum(count) == 12 - hand
     assert not q[:, count[0] :].any()
     assert not p[:, : count[0]].any()
-    shares = []
     for half, (X, V, k) in enumerate(zip(halves(c, key), (q[:, : count[0]], p[:, count[0] :]), count, strict=True)):
         L = root_of(c, key, inner, half)
-        U, s, _ = np.linalg.svd(L.T @ X, full_matrices=False)
+        U = np.linalg.svd(L.T @ X, full_matrices=False)[0]
         assert gap(L.T @ V, U[:, :k]) < 1e-8  # rounding over the gap of the spectrum
-        shares.append((s**2 / np.sum(s**2)).tolist())
-    taken = [x for share, k in zip(shares, count, strict=True) for x in share[:k]]
-    left = [x for share, k in zip(shares, count, strict=True) for x in share[k:]]
-    assert min(taken) > max(left)  # greedy by energy
+    assert count[0] == count[1]  # a displacement needs its velocity, whatever the singular values say
 
 
 @pytest.mark.parametrize("key", ["psd", "psd_fixed", "psd_qv", "psd_fixed_qv", "psd_relative", "psd_fixed_relative"])

@@ -11,7 +11,7 @@ import pytest
 
 from softgrasp.study.paper import at, number, write_page
 
-POINT = {"N": 14, "error": 1e-3, "error_qv": 1e-2, "time_online": 2e-4, "stable": True}
+POINT = {"N": 14, "error": 1e-3, "error_canonical": 1e-2, "error_deformation": 0.1, "time_online": 2e-4, "stable": True}
 REDUCED = {"N": 8, "time_are": 4e-4, "error_P": None, "error_K": 0.1, "stable": False, "reason": ""}
 ROOT = Path(__file__).parents[2]
 
@@ -35,7 +35,7 @@ def results() -> dict[str, dict[str, Any]]:
         "reduce": {
             "methods": methods,
             "about": titles,
-            "speed": [{"method": "psd", "speedup": 200.0, "speedup_whole": 100.0}],
+            "speed": [{"method": "psd", "speedup_same_model": 200.0, "speedup_new_parameter": 100.0}],
         },
         "control": {
             "states": 880,
@@ -53,10 +53,12 @@ def test_page_has_every_row(tmp_path: Path, results: dict[str, dict[str, Any]]) 
     forward = {row["quantity"]: row["here"] for row in found["forward"]}
     assert forward["stable at every N tried"] == "PSD, f"
     assert forward["reduced runs, all six methods and N"] == "0.0002 to 0.0003 s"
-    assert forward["errors of methods that preserve structure, N = 14"] == (
+    assert forward["errors of methods that the paper calls structure-preserving, N = 14"] == (
         "preserving: 0.001, 0.002; not preserving: 0.5 unstable"
     )
-    assert forward["best PSD"].startswith("without fixed solid modes: 0.001 without, 0.002 with")
+    assert forward["best of the six methods, stable, N = 14"] == (
+        "PSD: 0.001; PSD: 0.001 without fixed solid modes, 0.002 with"
+    )
     assert forward["PSD beyond N = 25"] == "0.001 at N = 14, 1e-05 at N = 40"
     control = {row["quantity"]: row["here"] for row in found["control"]}
     assert "not finite" in control["POD of P, N = 8"]

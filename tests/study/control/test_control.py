@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,13 @@ from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.loop.controller import Controller, load_gain
+from softgrasp.lqr.loop.export import to_python_control
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.page import settled
 from softgrasp.study.control.plots import drawn, figure_reduced, unstable
 from softgrasp.study.control.run import run_control, with_control
-from softgrasp.study.control.solve import scene_words
+from softgrasp.study.control.solve import actuation, scene_words
 from softgrasp.study.control.sweep import SweptBasis
 from softgrasp.study.report.files import plain
 from tests.helpers.browser import look
@@ -35,6 +37,7 @@ KEYS = {
     "states", "rank", "newton_steps", "adi_steps", "residual", "optimal_cost", "gain_translation",
     "gain_rigid_velocity", "closed_loop_abscissa", "reduced", "time",
 }  # fmt: skip
+TWINS = "control.outputs=[{kind='node',point=[0.5,0.0],name='tip'},{kind='hand',name='tip'}]"
 POINT = {"N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are"}
 
 
@@ -126,7 +129,7 @@ def test_an_interrupted_run_goes_on(
     monkeypatch.setattr("softgrasp.study.control.run.solver_bar", bar(30))
     with pytest.raises(_StopError):
         run()
-    assert len(list(folder.glob("restart-*/newton-rank*.npz"))) == MPI.COMM_WORLD.size
+    assert len(list(folder.glob("restart-*/newton-*-rank*.npz"))) == MPI.COMM_WORLD.size
     solves.clear()
     monkeypatch.setattr("softgrasp.study.control.run.solver_bar", bar(-1))
     assert "going on from" in run()
@@ -174,6 +177,12 @@ def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
     assert controller.plant.N == result["controller"]["N"] == 12
     u = controller.step(np.zeros(2), np.zeros(2))
     assert np.linalg.norm(u) == pytest.approx(np.hypot(5, 3), rel=1e-4)  # |K_T d| = |d|, at the error of this gain
+    exported = to_python_control(controller.plant, controller.K)
+    assert exported.plant.output_labels == result["loop"]["output_names"] == [n.split()[0] for n in table[0][3:5]]
+    small = controller.plant
+    poles = np.linalg.eigvals(np.linalg.solve(small.E, small.A + small.B @ controller.K))
+    assert exported.closed_loop.poles().real.max() == pytest.approx(poles.real.max(), rel=1e-9)  # one matrix, twice
+    assert result["controller"]["sampled_radius"] < 1
     model = build(load_scene(SCENES / "paper_lqr.toml", SMALL), MPI.COMM_WORLD)
     gain, target = load_gain(out / "gain.npz", model.system.layout)
     assert np.allclose(gain.K_s[:, :2], result["gain_translation"], rtol=0, atol=1e-14)  # the same numbers
@@ -221,10 +230,96 @@ def test_no_damping_is_diagnosed_and_modal_feedback_offered(tmp_path: Path) -> N
         ("control.outputs=[{kind='node', point=[9.0,9.0]}]", "outside"),
         ("control.loop.sampling='held'", "rate"),
         ("control.Q=[[1.0]]", "control.Q"),
+        ("control.R=1e40", "too far apart for double precision"),
+        ("control.Q=1e40", "too far apart for double precision"),
+        ("control.loop.limit_torque=1.0", "does not turn"),
+        (TWINS, "both named tip"),
     ],
 )
 def test_wrong_scenes_get_a_sentence(tmp_path: Path, change: str, words: str) -> None:
     assert words in refused("paper_lqr", common(tmp_path) / "out", change)
+
+
+HELD = "control.loop={{sampling='held',rate={rate},delay=true}}"
+FAST = ["tissue.cells=[2,4]", "time.end=10.0", "control.Q=1e4", "control.N=[4,6]", "output.fields='none'"]
+
+
+def quietly(out: Path, *overrides: str) -> dict[str, Any]:
+    console = Console(file=io.StringIO(), quiet=MPI.COMM_WORLD.rank != 0)
+    return run_control(SCENES / "paper_lqr.toml", out, list(overrides), console, quiet=True, pictures=False)
+
+
+def test_an_unstable_sampled_loop_writes_nothing_and_names_a_rate(tmp_path: Path) -> None:
+    """Stable as a continuous law, lost at 5 Hz and one tick late; just above the rate of the sentence it settles."""
+    out = common(tmp_path) / "out"
+    with pytest.raises(SoftgraspError) as caught:
+        quietly(out, *FAST, "time.steps=50", HELD.format(rate=5.0))
+    assert not out.exists()
+    sentence = str(caught.value)
+    assert "at 5 Hz and one tick late is unstable" in sentence
+    rate, steps = re.findall(r"rate = ([\d.]+) with time.steps = (\d+)", sentence)[0]
+    assert 9 < float(rate) < 12
+    found = quietly(out, *FAST, f"time.steps={steps}", HELD.format(rate=rate))
+    assert found["closed_loop_abscissa"] < 0
+    assert 0.99 < found["sampled_radius"] < 1
+    assert found["sampled_certified"]
+    assert (out / "controller.npz").exists()
+    assert found["controller"]["sampled_radius"] < 1
+    points = [p for part in found["reduced"].values() for p in part if not p["reason"]]
+    lost = [p for p in points if p["abscissa_full"] < 0 and p["sampled_radius"] >= 1]
+    assert lost  # stable as continuous laws
+    assert not any(p["stable"] for p in lost)
+    assert all(p["stable"] == (max(p["sampled_radius"] - 1, p["abscissa_full"]) < 0) for p in points)
+    marks = {(row[0], int(row[1])): row[-1] for row in list(csv.reader((out / "reduced.csv").open()))[1:]}
+    assert "unstable as sampled" in marks.values()
+    assert all(
+        p["stable"] == (p["sampled_radius"] < 1) for r in found["retune"] for p in r["points"] if not p["reason"]
+    )
+
+
+def test_the_tolerance_holds_for_the_dense_method_too(tmp_path: Path) -> None:
+    few = ["tissue.cells=[2,4]", "control.N=[4]", "control.method='dense'"]
+    assert "allowed is 1.0e-15" in refused("paper_lqr", common(tmp_path) / "out", *few, "control.tolerance=1e-15")
+    found = quietly(common(tmp_path) / "fine", *few, "control.tolerance=1e-11")
+    assert found["residual"] <= 1e-11
+
+
+def test_galerkin_with_all_modes_is_exact(tmp_path: Path) -> None:
+    """22 unknowns, fewer than the modes it starts from: the gain of the dense method."""
+    few = ["tissue.cells=[2,4]", "control.N=[4]"]
+    found = [quietly(common(tmp_path) / m, *few, f"control.method='{m}'") for m in ("galerkin", "dense")]
+    assert "all 22 basis vectors" in found[0]["method"]
+    for key in ("gain_translation", "gain_rigid_velocity"):
+        assert np.allclose(found[0][key], found[1][key], rtol=0, atol=1e-8)  # residuals 2e-10 and 2e-13
+    assert found[0]["closed_loop_abscissa"] == pytest.approx(found[1]["closed_loop_abscissa"], rel=1e-7)  # as above
+
+
+def test_forces_and_torques_have_limits_of_their_own() -> None:
+    loop = {"limit": 3.0, "limit_torque": 0.25}
+    outputs = [{"kind": "node", "point": [0.5, 0.0]}, {"kind": "hand"}]
+    for given, bound in (
+        (loop, [3.0, 3.0, 0.25]),
+        ({"limit": 3.0}, [3.0, 3.0, np.inf]),
+        ({"limit_torque": 0.25}, [np.inf, np.inf, 0.25]),
+    ):
+        scene = make_scene(effects={"rotation": True}, control={"outputs": outputs, "loop": given})
+        assert (actuation(build(scene, MPI.COMM_WORLD)).bound(3) == bound).all()
+
+
+@pytest.mark.parametrize("method", ["auto", "modal"])
+def test_outputs_that_see_only_the_hand(tmp_path: Path, method: str) -> None:
+    """A point mass: K = -[sqrt(Q / R), sqrt(2 m sqrt(Q / R))] on displacement and velocity, m = 20."""
+    out = common(tmp_path) / "out"
+    outputs = "control.outputs=[{kind='hand',name='arm'}]"
+    found = quietly(out, "tissue.cells=[2,4]", "control.N=[4]", outputs, f"control.method='{method}'")
+    assert np.allclose(found["gain_translation"], -np.eye(2), rtol=0, atol=1e-9)  # residual of the equation
+    assert np.allclose(found["gain_rigid_velocity"], -np.sqrt(40) * np.eye(2), rtol=0, atol=1e-9)  # as above
+    assert found["loop"]["distance_final"] < 1e-6
+    controller = Controller.load(out / "controller.npz")
+    assert controller.plant.N == 4
+    u = controller.step(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    assert np.allclose(u, [4.0, 3.0 - np.sqrt(40)], rtol=0, atol=1e-9)  # as above
+    assert to_python_control(controller.plant, controller.K).plant.output_labels == ["arm_x", "arm_y"]
 
 
 def test_a_scene_without_control_watches_tip_and_turning_hand() -> None:

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.effects import measure as effects_measure
+from softgrasp.study.effects.change import Experiments, Names, Shown, compare, judge_together, shown
 from softgrasp.study.effects.judge import judge, prove_off
 from softgrasp.study.effects.measure import (
     Case,
     Stepper,
     bare_output,
-    compare,
     fingerprint,
     holdings,
     nothing_of,
@@ -156,6 +157,87 @@ def test_damping_for_control_is_not_called_wasted(comm: MPI.Intracomm) -> None:
     assert "stabilises" in finding.advice
 
 
+# --- several switches at once
+
+
+def largest_change(comm: MPI.Intracomm, *tables: dict[str, Any]) -> float:
+    """The largest relative change of the outputs between two scenes, by numpy alone."""
+    a, b = (simulate(build(make_scene(QUICK, FORCE, table), comm)).outputs for table in tables)
+    return float(np.linalg.norm(a - b, axis=1).max() / max(np.linalg.norm(y, axis=1).max() for y in (a, b)))
+
+
+def test_rotation_shows_only_beside_the_reaction_that_is_advised(comm: MPI.Intracomm) -> None:
+    """A free hand turns when the tissue pulls on it: alone neither advice nor run would tell."""
+    study, by = found(comm, FORCE, {"study": {"tolerance": 0.03}})
+    rotation = by["rotation"]
+    assert rotation.change is not None
+    assert rotation.company is not None
+    assert rotation.change.outputs == 0
+    assert by["reaction"].verdict == rotation.verdict == "needed"
+    assert rotation.company.partners == ("reaction",)
+    assert rotation.advice.startswith("Switch it on, with reaction on: alone it changes nothing")
+    both, one = ({"effects": {"reaction": True, "rotation": r}} for r in (True, False))
+    expected = largest_change(comm, both, one)
+    assert expected > 0.03
+    assert rotation.company.together == pytest.approx(expected, rel=1e-9)  # parallel sums in another order
+    assert {"reaction", "rotation"} <= set(study.advised)
+    # nothing is left that would show beside what is advised
+    for f in study.findings:
+        if f.company is not None and f.name not in study.advised:
+            assert f.company.change.outputs <= 0.03
+
+
+class Table(Experiments):
+    """Experiments whose outputs are a formula of the effects that are on."""
+
+    def __init__(self, on: set[str], output: Callable[[Names], float], forced: Callable[[Names], float] | None) -> None:
+        self.on = frozenset(on)
+        self.force = None if forced is None else lambda n, t, q, v: q
+        self.formulas = {False: output, True: forced or output}
+
+    def of(self, on: Names, forced: bool = False) -> Shown:
+        y = np.full((1, 1, 2), self.formulas[forced](on))
+        return Shown(y, 0 * y)
+
+
+def test_pairs_that_hide_below_the_tolerance_one_by_one() -> None:
+    tried, sizes = ("gravity", "damping", "reaction"), {"gravity": 0.6, "damping": 0.6, "reaction": 0.1}
+
+    def y(on: Names) -> float:
+        return 1 + sum(1e-3 * sizes[name] for name in on)
+
+    off = judge_together(Table(set(), y, None), tried, frozenset(), 1e-3)
+    assert off.on == ("gravity", "damping")
+    assert off.company["gravity"].partners == ("damping",)
+    assert off.company["gravity"].together == pytest.approx(1.2e-3, rel=2e-3)  # relative to 1 + 1.2e-3
+    assert off.company["reaction"].partners == ()
+    on = judge_together(Table(set(tried), y, None), tried, frozenset(), 1e-3)
+    assert on.on == ("gravity",)  # one of both is enough
+    assert on.company["gravity"].either
+    assert on.company["damping"].partners == ()
+    assert judge_together(Table(set(), lambda on: y(on) - 1 + 1e3, None), tried, frozenset(), 1e-3).on == ()
+
+
+def test_an_effect_may_need_two_partners_and_a_force() -> None:
+    tried = ("gravity", "damping", "reaction", "rotation")
+
+    def still(on: Names) -> float:
+        return 1 + 0.1 * (("gravity" in on) + ("reaction" in on))
+
+    def forced(on: Names) -> float:
+        return still(on) + 0.5 * ({"gravity", "reaction", "rotation"} <= on)
+
+    needed = frozenset({"gravity", "reaction"})
+    found = judge_together(Table(set(), still, forced), tried, needed, 1e-2)
+    assert found.on == ("gravity", "reaction", "rotation")
+    assert found.company["rotation"].partners == ("gravity", "reaction")
+    assert found.company["rotation"].forced
+    assert found.company["rotation"].together == pytest.approx(0.5 / 1.7)
+    assert found.company["rotation"].change.outputs == 0
+    assert not judge_together(Table(set(), still, None), tried, needed, 1e-2).company["rotation"].forced
+    assert judge_together(Table(set(), still, None), tried, needed, 1e-2).on == ("gravity", "reaction")
+
+
 # --- numbers against independent ones
 
 
@@ -195,7 +277,7 @@ def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None
     assert b.outputs.shape[1] == a.outputs.shape[1] + 1
     node = np.linalg.norm(b.outputs[:, 3:] - a.outputs[:, 2:], axis=1).max()
     assert node > 0.1  # [m]; the turn moves the tip
-    assert compare(plain, a, turning, b).absolute == pytest.approx(node, rel=1e-12)  # the same sums
+    assert compare(shown(plain, a), shown(turning, b)).absolute == pytest.approx(node, rel=1e-12)  # the same sums
 
 
 def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:

@@ -11,15 +11,18 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
+from softgrasp.fem.effects.sag import SMALL_SHARE
+from softgrasp.fem.fields.strain import gradient
 from softgrasp.fem.model.build import build
+from softgrasp.fem.model.memory import factor_bytes
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
-from softgrasp.study.forward.cautions import gradients, inexact, run_warnings, slowest
-from softgrasp.study.forward.explain import Explanation, explain, factor_bytes, render, run_explain
+from softgrasp.study.forward.cautions import inexact, run_warnings, slowest
+from softgrasp.study.forward.explain import Explanation, explain, render, run_explain
 from softgrasp.study.report.equation import equation
 
 FORCE = {"target": [1.0, 0.0], "drive": "force"}
@@ -179,10 +182,25 @@ def test_slowest_period_and_gradient(comm: MPI.Intracomm) -> None:
     assert slowest(model.system, moving) == pytest.approx(omega[0], rel=1e-8)
     assert slowest(model.system, np.repeat(Phi[:, :1], 4, axis=1)) == 0.0  # a deformation that does not move
     z = 0.3 * (layout.nodes - [0.0, 2.0]) @ np.array([[0.0, 0.0], [1.0, 0.0]])  # shear, zero at the hand
-    most, share = gradients(model, z.ravel())
-    assert most == pytest.approx(0.3, rel=1e-12)  # linear, so exact but for rounding
-    assert share == 1.0
-    assert gradients(model, z.ravel() / 4)[1] == 0.0
+    steep = gradient(model, z.ravel())
+    assert steep.largest == pytest.approx(0.3, rel=1e-12)  # linear, so exact but for rounding
+    assert steep.typical == pytest.approx(0.3, rel=1e-12)  # as above
+    assert steep.share == 1.0
+    assert gradient(model, z.ravel() / 4).share == 0.0
+
+
+def test_typical_gradient_leaves_out_a_hundredth_of_the_body(comm: MPI.Intracomm) -> None:
+    """z_x = y^2 / 2 has the slope of the middle of each row of cells; a row is one in 200 of the body."""
+    rows = 200
+    tissue = {"size": [0.02, 2.0], "cells": [1, rows], "material": {"lambda": 50.0, "mu": 50.0, "rho": 1.0}}
+    model = build(scene_of(tissue=tissue, contact={"sides": ["bottom"]}), comm)
+    z = np.zeros(model.system.layout.n_local)
+    z[::2] = model.system.layout.nodes[:, 1] ** 2 / 2
+    steep = gradient(model, z)
+    slopes = 2.0 * (np.arange(rows) + 0.5) / rows
+    assert steep.largest == pytest.approx(slopes[-1], rel=1e-10)  # differences of nodes lose a few digits
+    assert steep.typical == pytest.approx(slopes[-1 - int(SMALL_SHARE * rows)], rel=1e-10)  # as above
+    assert steep.share == pytest.approx(np.mean(slopes > 0.1), rel=1e-12)  # sums of volumes
 
 
 def test_digits_that_are_left() -> None:
@@ -220,7 +238,8 @@ def test_text_and_json(comm: MPI.Intracomm) -> None:
     result = explain(scene_of(effects={"gravity": {"g": [0.0, -1.0]}}), comm)
     text = text_of(result, 200)
     assert "tissue: M_ee z'' + K_ee z = -G (q_s'' - g)" in text
-    assert "rho g L / E = 0.016" in text  # 1 * 1 * 2 / 125
+    assert "|grad z| of its sag = " in text
+    assert f"largest |z|: {result.sag.largest:.4g} m" in text
     assert f"n_e = {result.sizes.n_e}" in text
     assert max(map(len, text_of(result, 40).splitlines())) <= 40
     data = json.loads(json.dumps(result.to_dict(), allow_nan=False))

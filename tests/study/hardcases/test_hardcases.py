@@ -19,9 +19,10 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.hardcases import carex as hard_carex
 from softgrasp.study.hardcases import numbers as hard_numbers
+from softgrasp.study.hardcases import ranks as hard_rank
 from softgrasp.study.hardcases.cases import Family, Outcome, Row, ours, plain
 from softgrasp.study.hardcases.run import FAMILIES, choose, run_hardcases
-from softgrasp.study.hardcases.textbook import leapfrog, textbook_midpoint
+from softgrasp.study.hardcases.textbook import leapfrog, newmark, solve_twice, staggered_hand, textbook_midpoint
 from tests.helpers.browser import look
 
 pytestmark = pytest.mark.serial
@@ -46,7 +47,17 @@ def test_every_case_keeps_its_bound_or_is_refused(result: tuple[dict[str, Any], 
     assert all(row["plain"]["text"] or row["plain"]["value"] is not None for row in family["rows"])
 
 
-@pytest.mark.parametrize("name", [n for n in FAMILIES if n not in ("restart", "numbers", "outputs")])
+# Families in which the way of a competent engineer does as well as ours: what fails stands in its remark.
+EQUAL = {"contrast": "Jacobi-CG", "damping": "leapfrog", "mass": "once: blows up"}
+
+
+@pytest.mark.parametrize("name", EQUAL)
+def test_the_remark_says_what_the_plainer_way_does(result: tuple[dict[str, Any], Path], name: str) -> None:
+    texts = [row["plain"]["text"] for row in result[0]["families"][name]["rows"]]
+    assert any(EQUAL[name] in text for text in texts)
+
+
+@pytest.mark.parametrize("name", [n for n in FAMILIES if n not in ("restart", "numbers", "outputs", *EQUAL)])
 def test_the_textbook_way_does_worse_somewhere(result: tuple[dict[str, Any], Path], name: str) -> None:
     """Otherwise the family shows nothing."""
     rows = result[0]["families"][name]["rows"]
@@ -169,7 +180,7 @@ def test_known_solutions_solve_their_equations(example: tuple[str, Any, tuple[fl
 
 
 def test_the_textbook_ways_are_right_where_they_should_be() -> None:
-    """One oscillator: the midpoint loop keeps its energy, leapfrog blows up beyond dt = 2 / omega only."""
+    """One oscillator: the implicit rules keep its energy, leapfrog blows up beyond dt = 2 / omega only."""
     M, K = scipy.sparse.csr_matrix([[1.0]]), scipy.sparse.csr_matrix([[4.0]])
     z = np.array([0.3])
     assert textbook_midpoint(M, K, z, 0.1, 1000) < 1e-12  # a thousand roundings
@@ -177,3 +188,57 @@ def test_the_textbook_ways_are_right_where_they_should_be() -> None:
     assert stable is not None
     assert stable < 1e-3  # omega^2 dt^2 / 4 of the energy is exchanged in a period
     assert unstable == math.inf
+    for D in (None, scipy.sparse.csr_matrix([[0.7]])):
+        kept = newmark(M, K, D, z, 1.01, 1000).value
+        assert kept is not None
+        assert kept < 1e-12
+
+
+def test_jacobi_cg_stands_bad_scales() -> None:
+    """Springs of 1, 1e6 and 1e12: three steps with the diagonal as preconditioner, ten times as many are not enough
+    without it."""
+    K = scipy.sparse.diags_array([1.0, 1e6, 1e12]).tocsr()
+    outcome = solve_twice(K, np.ones(3), lambda z: float(np.abs(K @ z - 1).max()))
+    assert outcome.value is not None
+    assert outcome.value < 1e-15
+    assert outcome.text.startswith("Jacobi-CG")
+    assert "stops" not in outcome.text
+
+
+def test_hand_and_tissue_in_turn() -> None:
+    """A light hand on a heavy mass: repeated until both agree the momentum is right, once a step it is lost."""
+    M, K = scipy.sparse.csr_matrix([[1.0]]), scipy.sparse.csr_matrix([[4.0]])
+    light = (M, K, np.ones((1, 1)), np.ones((1, 1)), 0.01 * np.eye(1), np.ones(1), 0.01, 300)
+    agreed = staggered_hand(*light).value
+    assert agreed is not None
+    assert agreed < 1e-10  # the tolerance 1e-12 of a step, three hundred times at most
+    once = staggered_hand(*light, repeat=1).value
+    assert once is not None
+    assert once > 1
+
+
+def test_a_loaded_machine_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All jobs take a hundred times as long: the same row, because the bound counts healthy runs."""
+    limits: list[float] = []
+
+    def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
+        limits.append(limit)
+        if "allreduce" in command[1]:
+            return None, "", limit  # the bare script hangs
+        return (1, "cannot be written", 180.0) if "disk" in command else (0, "", 200.0)
+
+    monkeypatch.setattr(hard_rank, "job", job)
+    for variable in hard_rank.IN_MPI_JOB:
+        monkeypatch.delenv(variable, raising=False)
+    (row,) = hard_rank.rank_rows(True)
+    assert row.ok
+    assert row.ours.value == pytest.approx(0.9)
+    assert row.plain.value == math.inf
+    assert limits[1:] == [200.0 * hard_rank.PATIENCE, 200.0 * hard_rank.BARE_PATIENCE]
+
+
+def test_a_rank_that_waits_for_ever_fails() -> None:
+    command = ["-c", hard_rank.BARE.format(fault="raise OSError")]
+    outcome = hard_rank.judge(command, 1.0, 0.5, "")  # half a second; the bare script never ends
+    assert outcome.value == math.inf
+    assert not number(outcome.value, hard_rank.PATIENCE).ok

@@ -59,7 +59,11 @@ def test_histories_show_the_numbers(tmp_path: Path, drawn: list[Any]) -> None:
 
 
 def test_torques_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None:
-    figure_histories(TIMES, Y, np.hstack([U, U[:, :1]]), ("a", "b"), tmp_path / "t.png", dimension=2)
+    limits = [2.0, np.inf, 0.5]
+    figure_histories(TIMES, Y, np.hstack([U, U[:, :1]]), ("a", "b"), tmp_path / "t.png", dimension=2, limits=limits)
+    _, force, torque = drawn[0].axes
+    assert {line.get_ydata()[0] for line in force.lines[2:]} == {-2.0, 2.0}
+    assert {line.get_ydata()[0] for line in torque.lines[1:]} == {-0.5, 0.5}
     labels = [ax.get_ylabel() for ax in drawn[0].axes]
     assert labels == ["outputs [m]", "force [N]", "torque [N m]"]
 
@@ -118,7 +122,7 @@ def test_rotations_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> No
 
 
 def test_distance_is_that_of_the_farthest_output() -> None:
-    y, names = np.array([[3.0, 4.0, 6.0, 0.0, 9.0]]), ("tip.x", "tip.y", "hand.x", "hand.y", "hand.rz")
+    y, names = np.array([[3.0, 4.0, 6.0, 0.0, 9.0]]), ("tip_x", "tip_y", "hand_x", "hand_y", "hand_rz")
     assert farthest(y, np.zeros(5), names).tolist() == [6.0]
     assert farthest(y[:, 4:], np.zeros(1), names[4:]).tolist() == [9.0]  # nothing but a rotation
     assert farthest(y[:, :2], np.zeros(2), ("a", "b")).tolist() == [5.0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import shlex
 import signal
 import subprocess
 import sys
@@ -19,31 +20,40 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.errors import Interrupted, SceneError
-from softgrasp.fem.model.build import build
+from softgrasp.fem.fields.probe import make_probe
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.reduction.engines import ENGINES
+from softgrasp.study.precision import forward as wp_forward
 from softgrasp.study.precision import full as wp_full
+from softgrasp.study.precision import meshes as wp_meshes
 from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import reduced as wp_reduced
-from softgrasp.study.precision.answer import parse_budget, parse_tolerance
+from softgrasp.study.precision.answer import advice, parse_budget, parse_tolerance
 from softgrasp.study.precision.fit import interpolate, pareto, power_law
 from softgrasp.study.precision.forward import forward_settings
+from softgrasp.study.precision.full import largest
+from softgrasp.study.precision.meshes import corner_exponent, fitted, nested_meshes, singular_order
 from softgrasp.study.precision.page import rows_of
 from softgrasp.study.precision.points import Asked, Setting, WorkPoint, least_steps, variant
-from softgrasp.study.precision.probe import Places, find_places, make_probe, run_probed
-from softgrasp.study.precision.reference import extrapolate, fitted, nested_meshes
+from softgrasp.study.precision.probe import find_places, run_probed
+from softgrasp.study.precision.reference import space_limit
 from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
+from softgrasp.study.reduce.run import run_reduce
 from tests.helpers.browser import look
-from tests.helpers.models import Array, make_scene, rough_save, write_scene
+from tests.helpers.models import Array, graded_model, make_scene, rough_save, write_scene
 
-TOLERANCE, BUDGET = 0.03, 1.0
+TOLERANCE, BUDGET = 0.1, 1.0
+UNKNOWNS, MESHES = {2: 5_000, 3: 5_000}, 3  # of the finest mesh of the reference; in the diagram
+FINE, TRUTH = Setting((16, 32), 2, 512), 0.004  # a graded mesh, and what the run on it may be off
 SMALL: dict[str, Any] = {
     "name": "small",
     "tissue": {"cells": [4, 8]},
     "time": {"steps": 64},
     "motion": {"target": [1.0, 0.5], "duration": 3.0},
     "control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]},
-    "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [4, 8]},
+    "reduction": {"methods": ["psd_svd_like_fixed", "craig_bampton"], "N": [8, 12]},
     "study": {"repeats": 1},
 }
 
@@ -53,6 +63,8 @@ def _few_samples() -> Iterator[None]:
     """No test looks at a time, or at more than the existence of a picture."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wp_full, "BUILD_SECONDS", 0.0)
+        patch.setattr(wp_meshes, "UNKNOWNS", UNKNOWNS)
+        patch.setattr(wp_forward, "MESHES", MESHES)
         patch.setattr(wp_reduced, "CALLS", 5)
         patch.setattr(work_plots, "save", rough_save)
         yield
@@ -78,28 +90,100 @@ def again(folder: Path) -> WorkStudy:
     return study_scene(scene, MPI.COMM_WORLD, folder / "cache", Asked(TOLERANCE, BUDGET))
 
 
-def tip(comm: MPI.Intracomm, setting: Setting) -> Array:
-    """Outputs by the plain simulation; the point is a node of every mesh with an even number of cells across."""
-    run = simulate(build(variant(make_scene(SMALL), setting), comm))
-    return np.column_stack([run.times, run.outputs])
+def tip(comm: MPI.Intracomm, setting: Setting, model: Model | None = None) -> Array:
+    """Outputs against the hand by the plain simulation; the point is a node of meshes with even cells across."""
+    run = simulate(model or build(variant(make_scene(SMALL), setting), comm))
+    return np.asarray(run.outputs - run.outputs_rigid)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Array:
+    """Nothing of the study is in it: lines crowd at the singular ends; off by 0.3 % of the deformation, measured."""
+    comm = MPI.COMM_WORLD
+    return tip(comm, FINE, graded_model(variant(make_scene(SMALL), FINE), comm))
+
+
+def apart(values: Array, true: Array) -> float:
+    every = (len(true) - 1) // (len(values) - 1)
+    return float(np.linalg.norm(values - true[::every], axis=1).max() / np.linalg.norm(true, axis=1).max())
 
 
 # --- the promise
 
 
-def test_tolerance_holds_against_an_independent_finer_run(comm: MPI.Intracomm, result: dict[str, Any]) -> None:
+def test_tolerance_holds_for_the_deformation_against_an_independent_run(
+    comm: MPI.Intracomm, result: dict[str, Any], truth: Array
+) -> None:
     answer = result["answers"][0]
     assert answer["met"]
     full = answer["full"]
     assert full["predicted"]["error"] > 0
     used = full["setting"]
-    found = tip(comm, Setting(tuple(used["cells"]), used["order"], used["steps"]))
-    # finer than every run of the study, and another time grid
-    truth = tip(comm, Setting((24, 48), 2, 8 * used["steps"]))[::8]
-    gap = np.linalg.norm(found[:, 1:] - truth[:, 1:], axis=1).max() / np.linalg.norm(truth[:, 1:], axis=1).max()
-    assert gap <= TOLERANCE
-    # the true error and the one told differ by the errors of both references
-    assert gap == pytest.approx(full["measured"]["error"], abs=2 * result["reference"]["error"])
+    error = apart(tip(comm, Setting(tuple(used["cells"]), used["order"], used["steps"])), truth)
+    assert error <= TOLERANCE
+    low, high = full["measured"]["error_range"]
+    assert low - TRUTH <= error <= high + TRUTH
+    # the hand moves by more than the tissue: the old measure flatters
+    assert full["measured"]["error_displacement"] < 0.5 * full["measured"]["error"]
+
+
+def test_every_point_lies_where_it_is_said_to(comm: MPI.Intracomm, result: dict[str, Any], truth: Array) -> None:
+    rows = [r for r in result["points"]["forward"] if r["steps"] == 64 and r["series"] != "solver"]
+    assert len(rows) >= 6
+    for row in rows:
+        if row["cells"][0] % 2 == 0:
+            error = apart(tip(comm, Setting(tuple(row["cells"]), row["order"], 64)), truth)
+            low, high = row["error_range"]
+            assert low - TRUTH <= error <= high + TRUTH, row["label"]
+
+
+def test_reference_is_as_good_as_it_says_and_not_much_better(
+    comm: MPI.Intracomm, folder: Path, result: dict[str, Any], truth: Array
+) -> None:
+    reference = again(folder).reference
+    assert reference is not None
+    error = apart(reference.series.at(np.linspace(0, 3, len(truth)))[:, :2], truth)
+    assert error <= reference.error + TRUTH
+    assert reference.error <= 30 * error + TRUTH
+    assert reference.error < 0.02  # 0.012 measured, while its finest mesh, 16 x 32, is off by 0.06
+    # ends of the contact zone within a side: order one for every element
+    assert result["reference"]["expected_order"] == 1.0
+    assert result["reference"]["order"] == pytest.approx(1.0, abs=0.15)  # 0.92 measured on meshes up to 16 x 32
+
+
+def test_answers_carry_a_command_that_repeats_them(
+    comm: MPI.Intracomm, result: dict[str, Any], mpi_tmp_path: Path
+) -> None:
+    for kind in ("full", "reduced"):
+        part = result["answers"][0][kind]
+        words = shlex.split(part["command"])
+        words = words[words.index("softgrasp") + 1 :]
+        sets = [value for flag, value in itertools.pairwise(words) if flag == "--set"]
+        assert words[0] == {"full": "simulate", "reduced": "reduce"}[kind]
+        scene = load_scene_collective(comm, Path(words[1]), sets)
+        assert [scene.tissue.cells, scene.tissue.order, scene.time.steps] == [
+            part["setting"][key] for key in ("cells", "order", "steps")
+        ]
+        if kind == "reduced":
+            again = run_reduce(Path(words[1]), mpi_tmp_path, sets, Console(quiet=True), quiet=True, pictures=False)
+            (points,) = again["methods"].values()
+            assert [p["N"] for p in points] == [part["setting"]["N"]]
+            # the same computation, once more
+            assert points[0]["error"] == pytest.approx(part["measured"]["error_full"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shares", "words"),
+    [
+        ({"space": 0.4, "time": 1e-4}, "finer mesh, tissue.cells, or tissue.order = 2"),
+        ({"space": 0.01, "time": 0.2, "reduction": 0.1}, "more time.steps"),
+        ({"space": 0.01, "time": 0.02, "reduction": 0.1}, "a larger N"),
+    ],
+)
+def test_advice_names_what_carries_the_largest_share(shares: dict[str, float], words: str) -> None:
+    text = advice(shares, {"cells": [4, 8], "order": 1})
+    assert words in text
+    assert text.startswith(f"Of its error, {max(shares, key=lambda name: shares[name])} carries the largest share")
 
 
 def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dict[str, Any]) -> None:
@@ -107,7 +191,7 @@ def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dic
     assert reduced["measured"]["error"] + result["reference"]["error"] <= TOLERANCE
     assert reduced["measured"]["seconds"] < result["answers"][0]["full"]["measured"]["seconds"]
     # against its own full run alone it may be better by orders
-    assert reduced["setting"]["N"] in (4, 8)
+    assert reduced["setting"]["N"] in (8, 12)
 
 
 def test_what_nothing_meets_is_said_with_what_came_closest(
@@ -120,6 +204,10 @@ def test_what_nothing_meets_is_said_with_what_came_closest(
     assert answer.closest is not None
     errors = [p.error for points in study.points.values() for p in points if p.question != "bases" and p.ok]
     assert answer.closest["measured"]["error"] == min(errors)
+    # 16 x 32 cells with 64 steps: space is off by 0.06, time by less
+    shares = answer.closest["shares"]
+    assert shares["space"] > shares["time"] > 0
+    assert any(text.startswith("Of its error, space carries the largest share") for text in answer.sentences)
 
 
 def test_budget_takes_the_most_accurate_that_fits(result: dict[str, Any]) -> None:
@@ -178,19 +266,11 @@ def test_interrupted_study_goes_on_to_the_same_errors(
 
 @pytest.mark.serial
 def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: dict[str, Any], tmp_path: Path) -> None:
-    """The real command is killed in the middle, without a chance to clean up."""
+    """The real command, with the limits of these tests, is killed in the middle, without a chance to clean up."""
     file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
-    command = [
-        sys.executable,
-        "-m",
-        "softgrasp.study.cli",
-        "study",
-        str(file),
-        "--out",
-        str(tmp_path),
-        "--question",
-        "forward",
-    ]
+    limits = f"wp_meshes.UNKNOWNS, wp_forward.MESHES = {UNKNOWNS}, {MESHES}"
+    code = f"from study import wp_forward, wp_meshes; {limits}; from softgrasp.study.cli import main; main()"
+    command = [sys.executable, "-c", code, "study", str(file), "--out", str(tmp_path), "--question", "forward"]
     with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL) as process:
         while len(list(cache.glob("run-*.json"))) < 8 and process.poll() is None:
             time.sleep(0.01)
@@ -247,7 +327,7 @@ def test_files_hold_every_point(result: dict[str, Any], folder: Path) -> None:
     assert {r["question"] for r in rows} == {"forward", "reduced", "bases"}
     page = (folder / "report.html").read_text()
     assert page.count("data:image/png") == 4
-    assert "--tolerance 0.03" in page
+    assert "--tolerance 0.1" in page
 
 
 @pytest.mark.serial
@@ -274,46 +354,64 @@ def test_every_question_has_slopes(result: dict[str, Any]) -> None:
 
 
 def test_places_are_the_nodes_of_the_plain_run_where_there_are_any(comm: MPI.Intracomm) -> None:
-    setting = Setting((4, 8), 2, 24)
-    model = build(variant(make_scene(SMALL), setting), comm)
-    found = run_probed(model, make_probe(model, find_places(make_scene(SMALL), model)))
+    setting, scene = Setting((4, 8), 2, 24), make_scene(SMALL)
+    model = build(variant(scene, setting), comm)
+    run = run_probed(model, make_probe(model.space, find_places(scene, model).points, False))
     # sums of a few shape functions: rounding
-    np.testing.assert_allclose(found.y, tip(comm, setting)[:, 1:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run.own, tip(comm, setting), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("order", [1, 2])
-def test_probe_is_exact_for_polynomials_of_its_order(comm: MPI.Intracomm, order: int) -> None:
-    model = build(variant(make_scene(SMALL), Setting((3, 7), order, 4)), comm)
-    point = np.array([0.437, 0.519])  # no node, far from the contact zone
-    probe = make_probe(model, Places(("p",), (point[None, :],)))
-    x, y = model.system.layout.nodes.T
-
-    def f(x: Any, y: Any) -> Any:
-        linear = 0.3 + 1.7 * x - 0.6 * y
-        return linear if order == 1 else linear + 2.1 * x * y - 0.9 * y**2 + x**2
-
-    field = np.column_stack([f(x, y), -f(x, y)]).ravel()
-    value = probe.of_rows(comm, field[:, None])[:, 0]
-    # rounding of a dozen terms
-    np.testing.assert_allclose(value, [f(*point), -f(*point)], rtol=0, atol=1e-12)
+def test_a_scene_that_sees_its_hand_only_is_measured_at_the_farthest_node(comm: MPI.Intracomm) -> None:
+    scene = make_scene(SMALL, {"control": {"outputs": [{"kind": "hand", "name": "hand"}]}})
+    places = find_places(scene, build(scene, comm))
+    assert [p.shape for p in places.points] == [(1, 2)]
+    assert places.points[0][0, 1] == 0.0  # the lower edge; the hand holds the upper part
 
 
-def test_nested_meshes_meet_the_ends_of_the_contact_zone() -> None:
-    meshes = nested_meshes(make_scene(SMALL, {"tissue": {"cells": [15, 30]}}))
-    assert len(meshes) >= 4
-    for coarse, fine in itertools.pairwise(meshes):
-        assert fine == tuple(2 * n for n in coarse)
-    assert all(n % 4 == 0 for _, n in meshes)  # 1.5 of 2.0
+def test_outputs_that_move_with_the_hand_have_no_error(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    held = {"outputs": [{"kind": "node", "point": [0.0, 1.75], "name": "held"}]}
+    with pytest.raises(SceneError, match=r"^control\.outputs: no output moves against the hand"):
+        study_scene(make_scene(SMALL, {"control": held}), comm, mpi_tmp_path, Asked(names=("forward",)))
+
+
+def test_meshes_meet_the_ends_of_the_contact_zone_and_know_no_scene_cells() -> None:
+    scenes = [make_scene(SMALL, {"tissue": {"cells": cells}}) for cells in ([2, 4], [4, 8], [15, 30])]
+    meshes = [nested_meshes(scene) for scene in scenes]
+    assert len(set(meshes)) == 1  # a coarse scene is compared with as fine a reference as a fine one
+    assert len(meshes[0]) >= 4
+    assert all(n % 4 == 0 for _, n in meshes[0])  # 1.5 of 2.0
+    assert all(fine[0] <= 1.5 * coarse[0] for coarse, fine in itertools.pairwise(meshes[0][2:]))
     assert fitted(7.5, [0.75]) == 8
     assert fitted(2.0, [0.333]) is None
 
 
-def test_extrapolation_finds_limit_and_order() -> None:
-    limit = np.array([[1.0, -2.0, 0.5, 0.25]])
-    values = [limit + h**1.5 * np.array([[1.0, 0.3, 1.0, 0.3]]) for h in (0.4, 0.2, 0.1)]
-    found, p = extrapolate(values, 2)
-    assert p == pytest.approx(1.5, abs=1e-9)  # made with this order: rounding
-    np.testing.assert_allclose(found, limit, rtol=0, atol=1e-12)  # rounding
+def test_order_of_the_singular_ends() -> None:
+    assert singular_order(make_scene(SMALL)) == 1.0
+    whole = make_scene(SMALL, {"contact": {"sides": ["top"], "box": None}})
+    # [Williams 1952] at a right angle for nu = 0.25, to three digits
+    assert singular_order(whole) == pytest.approx(2 * 0.745, abs=1e-3)
+    assert corner_exponent(0.5) == pytest.approx(0.5946, abs=1e-4)  # sin(a pi / 2)^2 = 1 - a^2
+
+
+def test_limit_of_values_with_two_powers() -> None:
+    exact = np.array([[1.0, -2.0, 0.5, 0.25]])
+    shape = np.array([[1.0, 0.3, 1.0, 0.3]])
+    sizes = [1 / 8, 1 / 12, 1 / 16]
+    limit = space_limit(sizes, [exact + (h + h**2) * shape for h in sizes], 1.0, 2)
+    assert limit.extrapolated
+    np.testing.assert_allclose(limit.values, exact, rtol=0, atol=1e-12)  # rounding
+    # the next power, and not less
+    assert largest(limit.gap, 2)[0] >= 0.5 * sizes[-1] ** 2
+
+
+def test_an_order_that_no_theory_explains_is_not_extrapolated() -> None:
+    exact, sizes = np.array([[1.0, -2.0, 0.5, 0.25]]), [0.5, 0.25, 0.125]
+    values = [exact + h**3 * np.array([[1.0, 0.3, 1.0, 0.3]]) for h in sizes]
+    limit = space_limit(sizes, values, 1.0, 2)
+    assert limit.order == pytest.approx(3.0, abs=1e-9)  # of this order: rounding
+    assert not limit.extrapolated
+    np.testing.assert_array_equal(limit.values, values[-1])
+    assert largest(limit.gap, 2)[0] >= largest(values[-1] - exact, 2)[0]
 
 
 def test_pareto_and_power_law() -> None:

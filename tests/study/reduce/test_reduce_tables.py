@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.reduction.registry import PAPER_METHODS
+from softgrasp.reduction.registry import METHODS, PAPER_METHODS
 from softgrasp.study.bench.meshes import MeshRow, break_even, exponent, run_mesh_study
-from softgrasp.study.reduce.sweep import BEYOND, Point, best, chosen_methods, nearest, noted
-from softgrasp.study.reduce.tables import least_size, stability
+from softgrasp.study.reduce.findings import findings
+from softgrasp.study.reduce.sweep import BEYOND, Point, Swept, best, chosen_methods, nearest, noted
+from softgrasp.study.reduce.tables import ERROR_HEADER, error_rows, least_size, stability
 from tests.helpers.models import make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
@@ -26,7 +28,7 @@ def test_scene_chooses_methods() -> None:
 
 
 def point(N: int, error: float, stable: bool = True, online: float = 1e-3) -> Point:
-    return Point(N, N, error, error, error, error, error, error, 2.0, 1e-3, online, 0.0 if stable else 1.0, stable)
+    return Point(N, N, (N,), error, *(5 * [2 * error]), 2.0, 1e-3, online, 0.0 if stable else 1.0, stable)
 
 
 def test_choice_of_points() -> None:
@@ -41,11 +43,51 @@ def test_choice_of_points() -> None:
     assert nearest([]) is None
 
 
+def swept_of(key: str, *points: Point) -> Swept:
+    return Swept(METHODS[key], points, {}, ())
+
+
+def test_findings_name_the_best_of_every_measure_and_the_unstable() -> None:
+    """Errors of the state are twice those of the deformation here, so that both measures agree."""
+    swept = [
+        swept_of("componentwise_pod", point(6, 4e-2), point(14, 1e-2), point(30, 1e-1, stable=False)),
+        swept_of("psd", point(6, 2e-2), point(14, 4e-2), point(30, 3e-2)),
+        swept_of("psd_fixed", point(6, 5e-2), point(14, 3e-2), point(30, 4e-2)),
+    ]
+    first, second, third, kept, lost, energy, cost, paper, fixed = findings(swept)
+    assert first == (
+        "Least error of the deformation among stable models: PSD complex SVD at N = 6 (2.0e-02); componentwise POD at "
+        "N = 14 (1.0e-02); PSD complex SVD at N = 30 (3.0e-02)."
+    )
+    assert "the same methods lead as in the deformation" in second
+    assert "the same methods lead as in the deformation" in third
+    assert kept == "Unstable models among the 6 that keep the structure: none."
+    assert lost == "Unstable models among the 3 that do not: 1 (componentwise POD at N = 30)."
+    assert "6.0e-02 to 8.0e-02 in models that keep the structure, 2.0e-02 to 2.0e-02" in energy
+    assert "structure costs a factor of 3.0 here" in cost  # 3e-2 of psd_fixed against 1e-2
+    assert "this holds but for N = 14" in paper
+    assert "6.0e-02 for the former (PSD complex SVD, fixed), 2.0e-02 for the latter (componentwise POD)" in paper
+    assert "this holds but for N = 14; at N = 14: 8.0e-02 for it (PSD complex SVD), 2.0e-02 for the best" in fixed
+    alone = findings([swept_of("craig_bampton", point(8, 1e-2), point(10, 2e-2))])
+    assert len(alone) == 4  # no other to compare structure with, and none of the paper's
+    assert "Craig-Bampton at N = 8 to 10 (2.0e-02 at N = 10)" in alone[0]
+    assert findings([]) == []
+
+
+def test_table_shows_the_deformation_first_and_the_split() -> None:
+    split = replace(point(14, 1e-2), N_tissue=10, split=(5, 5))
+    (row,) = error_rows([swept_of("componentwise_pod_fixed", point(6, 0.2), split, point(30, 1e-3, stable=False))])
+    assert dict(zip(ERROR_HEADER, row, strict=True)) == {
+        "method": "componentwise POD, fixed solid modes", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": "1.0e-02",
+        "state": "2.0e-02", "energy": "2.0e-02", "1e-1": "14", "1e-2": "14", "1e-3": "-", "stable N": "not 30",
+    }  # fmt: skip
+
+
 def test_mesh_study_of_small_meshes(mpi_tmp_path: Path, comm: MPI.Intracomm) -> None:
     console = Console(file=io.StringIO(), quiet=comm.rank != 0)
-    result = run_mesh_study([300, 1200], 60, "psd_fixed", 10, mpi_tmp_path, console, comm)
-    assert [row["N"] for row in result["rows"]] == [10, 10]
-    assert all(row["stable"] and row["error"] < 0.02 for row in result["rows"])  # N = 10 of a coarse run
+    result = run_mesh_study([300, 1200], 60, "psd_fixed_relative", 14, mpi_tmp_path, console, comm)
+    assert [row["N"] for row in result["rows"]] == [14, 14]
+    assert all(row["stable"] and row["error"] < 0.02 for row in result["rows"])  # 10 tissue columns, a coarse run
     if comm.rank == 0:
         assert json.loads((mpi_tmp_path / "mesh_study.json").read_text())["rows"] == result["rows"]
         assert (mpi_tmp_path / "mesh_study.png").stat().st_size > 5000

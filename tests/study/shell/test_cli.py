@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import locale
 import os
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from softgrasp.study.shell.streams import write_utf8
 from tests.helpers.browser import look
 
 ROOT = Path(__file__).parents[3]
@@ -133,10 +135,29 @@ def test_scenes_schema_explain_and_help(tmp_path: Path) -> None:
         assert name in listing.stdout
     assert "tissue" in json.loads(softgrasp("schema").stdout)["properties"]
     muscle = str(ROOT / "demos" / "scenes" / "franka_muscle.toml")
-    assert "rho g L / E" in softgrasp("explain", muscle, "--out", str(tmp_path / "why")).stdout
+    assert "|grad z| of its sag" in softgrasp("explain", muscle, "--out", str(tmp_path / "why")).stdout
     result = json.loads((tmp_path / "why" / "result.json").read_text())
     page = (tmp_path / "why" / "report.html").read_text()
     assert all(name in page for name in result["effects"])
     assert f"2n = {result['sizes']['states']}" in page
     assert look(tmp_path / "why" / "report.html", figures=0) == []
     assert "simulate" in softgrasp("--help").stdout
+
+
+def test_any_locale_reads_and_writes_the_letters_of_a_scene(tmp_path: Path) -> None:
+    before = locale.setlocale(locale.LC_CTYPE)
+    try:
+        locale.setlocale(locale.LC_CTYPE, "C")
+        write_utf8()
+        (tmp_path / "a").write_text("é → λ")  # as commands write their results
+    finally:
+        locale.setlocale(locale.LC_CTYPE, before)
+    assert (tmp_path / "a").read_bytes().decode("utf-8") == "é → λ"
+
+
+def test_an_argument_that_is_no_text_is_one_sentence(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "softgrasp.study.cli", "explain", b"/no\xff.toml"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 1
+    assert run.stderr.startswith("error: /no\\udcff.toml: this argument is not text here")
+    assert run.stderr.count("\n") == 1

@@ -8,7 +8,8 @@ import numpy as np
 
 from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import Problem
-from softgrasp.fem.mesh.make import cell_nodes
+from softgrasp.fem.fields.sag import measure_sag
+from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import cells_of_layers
 from softgrasp.fem.model.contact import bounding_box
 from softgrasp.fem.petsc import Array, times_columns, total
@@ -19,12 +20,15 @@ if TYPE_CHECKING:
 
 
 def measure(model: Model, omega: Array, Phi: Array) -> Problem:
-    """Length, masses and damping ratios of a model. Collective.
+    """Length, masses, damping ratios and sag of a model. Collective.
 
     Args:
         model: the model.
         omega: lowest angular frequencies [1/s], (k,), may be empty.
         Phi: their M-orthonormal modes, local rows (n_local, k).
+
+    Raises:
+        SolverError: the static problem cannot be solved.
     """
     mesh, system = model.space.mesh, model.system
     low, high = bounding_box(mesh)
@@ -38,6 +42,7 @@ def measure(model: Model, omega: Array, Phi: Array) -> Problem:
         tissue_inertia=inertia,
         omega=tuple(omega.tolist()),
         zeta=tuple(damping_ratios(system, omega, Phi).tolist()),
+        sag=measure_sag(model),
     )
 
 

@@ -1,0 +1,46 @@
+"""Room for files that grow: libraries that write fields end the program on a full disk, so it is looked at before."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from mpi4py import MPI
+
+from softgrasp.fem.errors import ResourceError, agree
+
+MARGIN = 2**18  # bytes: tables of contents that the libraries add, more when they close a file
+
+
+def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve: int = 0) -> None:
+    """See that the disk, and the limit of the size of a file, leave room for more. Collective.
+
+    Args:
+        comm: ranks that write.
+        files: what this rank writes to, in one folder that exists; a file may be a folder of files.
+        needed: bytes that come on top, of this rank.
+        reserve: bytes that must stay free besides, of all ranks.
+
+    Raises:
+        ResourceError: the room is too small.
+    """
+    total = comm.allreduce(needed) + MARGIN + reserve
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    with agree(comm):
+        free = shutil.disk_usage(files[0].parent).free
+        if free < total:
+            raise ResourceError(f"{files[0]} needs {total} bytes more and {free} are free on the disk; free the disk")
+        largest = max(map(_largest, files))
+        if limit != resource.RLIM_INFINITY and limit < largest + needed + MARGIN:
+            raise ResourceError(
+                f"{files[0]} needs {needed + MARGIN} bytes more and no file may pass {limit} bytes here; raise the "
+                "limit (ulimit -f)"
+            )
+
+
+def _largest(path: Path) -> int:
+    """Bytes of the largest file of a path, 0 if there is none."""
+    parts = path.rglob("*") if path.is_dir() else [path]
+    return max((part.stat().st_size for part in parts if part.is_file()), default=0)

@@ -1,0 +1,42 @@
+"""The tissue at rest under its weight, as numbers: what the gate of gravity sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain of any fine mesh is large
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Frobenius norm |grad z| of a displacement against the hand, rotations included, between the vertices of a cell.
+
+    Attributes:
+        largest: in any cell [1]; at the edge of the contact zone it grows with every refinement.
+        typical: smallest number that at most `SMALL_SHARE` of the volume exceeds [1].
+        share: of the volume above `SMALL_STRAIN` [1].
+    """
+
+    largest: float
+    typical: float
+    share: float
+
+    @property
+    def small(self) -> bool:
+        """Whether linear elasticity holds: only a small share of the volume is steep."""
+        return self.share <= SMALL_SHARE
+
+
+@dataclass(frozen=True)
+class Sag:
+    """Static displacement z of K_ee z = G g, the hand held still.
+
+    Attributes:
+        g: acceleration of gravity (d,) [m/s2]; without gravity in the scene that of the earth, along the last axis.
+        largest: largest |z| of a node [m].
+        gradient: of z.
+    """
+
+    g: tuple[float, ...]
+    largest: float
+    gradient: Gradient

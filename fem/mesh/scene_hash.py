@@ -1,0 +1,44 @@
+"""The hash of a scene: of its keys, of the mesh that was read and of its csv file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.scene import Scene
+
+
+def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
+    """SHA-256 of the resolved scene, of what its mesh file holds and of the bytes of its csv file, 64 hex digits.
+
+    Top-level keys in `without` do not count; nor do folder, name and format of the files. The mesh is the one that
+    the model of this scene was built with; without a model it is read. Not collective.
+
+    Raises:
+        SceneError, MeshError: a file that the scene names cannot be read.
+    """
+    data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
+    tissue, motion = data.get("tissue", {}), data.get("motion", {})
+    if tissue.get("mesh") is not None:
+        tissue["mesh"] = scene._mesh_digest or _mesh_digest(scene)
+    if motion.get("csv") is not None:
+        motion["csv"] = hashlib.sha256(_bytes(scene, motion["csv"], "motion.csv")).hexdigest()
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def _mesh_digest(scene: Scene) -> str:
+    from softgrasp.fem.mesh.digest import mesh_digest
+    from softgrasp.fem.mesh.file import load_arrays  # meshio is needed for mesh files only
+
+    tissue = scene.tissue
+    path = scene.path(str(tissue.mesh))
+    return mesh_digest(load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit))
+
+
+def _bytes(scene: Scene, name: str, key: str) -> bytes:
+    try:
+        return scene.path(name).read_bytes()
+    except OSError as error:
+        raise SceneError(f"scene '{scene.name}': {key} = '{name}' cannot be read ({error.strerror})") from None

@@ -1,0 +1,49 @@
+"""What a mesh is to the model: cells, tags, parts, and how its file was read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import dolfinx.mesh
+import numpy as np
+import numpy.typing as npt
+
+from softgrasp.fem.mesh.parts import Parts
+
+
+@dataclass(frozen=True)
+class TissueMesh:
+    """A mesh of linear triangles or tetrahedra and what is known of it.
+
+    Attributes:
+        mesh: distributed mesh; the topological dimension equals the geometric one.
+        dimension: 2 or 3.
+        facet_tags: integer marks of boundary facets, or None.
+        cell_tags: integer marks of cells (layers), or None.
+        source: "structured" or the name of the mesh file, for messages.
+        part_tags: number of the part of each cell, parts hanging together through facets; None if it is one.
+        parts: what is known of these parts, or None.
+        facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
+        cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
+        notes: what of the file deserves a warning, one sentence each, on all ranks.
+        digest: SHA-256 of what was read from the file, on all ranks; empty without one.
+    """
+
+    mesh: dolfinx.mesh.Mesh
+    dimension: int
+    facet_tags: dolfinx.mesh.MeshTags | None
+    cell_tags: dolfinx.mesh.MeshTags | None
+    source: str
+    part_tags: dolfinx.mesh.MeshTags | None = None
+    parts: Parts | None = None
+    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    digest: str = ""
+
+
+def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
+    """Local node numbers of the cells, shape (n_cells, d + 1). Not collective."""
+    geometry = mesh.geometry
+    # DOLFINx 0.10 has no list of dofmaps, 0.11 warns of the single one
+    return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)

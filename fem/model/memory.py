@@ -1,0 +1,186 @@
+"""What a scene needs in memory, estimated before anything is allocated, against what the machine has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import psutil
+from mpi4py import MPI
+
+from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.solve.solvers import choose_solver, factor_on_every_rank
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+
+# Peak of mesh, forms and matrices, those of a step included [byte a cell], by dimension and order, measured on boxes
+# of 5e4 to 7e5 simplices; then what each layer adds. With the factor they give 0.8 to 1.04 of what was measured.
+CELL_BYTES = {(2, 1): 1600.0, (2, 2): 9000.0, (3, 1): 2350.0, (3, 2): 31000.0}
+LAYER_BYTES = {(2, 1): 600.0, (2, 2): 3900.0, (3, 1): 900.0, (3, 2): 13000.0}
+NODES = {(2, 1): 1 / 2, (2, 2): 2.0, (3, 1): 1 / 6, (3, 2): 4 / 3}  # a cell, for large regular meshes
+GIB = 2.0**30
+CONTAINER = Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True)
+class Need:
+    """Estimated memory [byte].
+
+    Attributes:
+        mesh: mesh, forms and matrices, spread over the ranks.
+        factor: of the matrix of a step, over all ranks.
+        tables: of hand, loads and outputs over the steps, on every rank.
+    """
+
+    mesh: float
+    factor: float
+    tables: float
+
+    def of(self, share: float, ranks: int) -> float:
+        """What ``ranks`` ranks need that hold this share of the tissue. Not collective."""
+        return share * (self.mesh + self.factor) + ranks * self.tables
+
+
+def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
+    """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection. Not collective.
+
+    nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
+    (2D) and 5e2 to 2e5 (3D) unknowns; 8 byte an entry and 4 an index, of which cholesky has one for d^2 entries.
+    """
+    if name == "cg" or n < 2:
+        return 0.0
+    row = 7.75 * np.log2(n) - 44 if dimension == 2 else 19.5 * n ** (1 / 3) - 85
+    entry = 8 + (4 / dimension**2 if name == "cholesky" else 4)
+    return float(entry * n * np.clip(row, 1, (n + 1) / 2) * copies)
+
+
+def simplices(cells: list[int]) -> int:
+    """Triangles or tetrahedra of a structured box. Not collective."""
+    count = 2 if len(cells) == 2 else 6
+    for n in cells:
+        count *= n
+    return count
+
+
+def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: bool) -> Need:
+    """Estimate the memory of a model and, if it will run, of its steps. Not collective.
+
+    Args:
+        scene: the scene.
+        dimension: 2 or 3.
+        cells: triangles or tetrahedra in all.
+        comm: ranks.
+        run: the steps are taken.
+    """
+    kind, d = (dimension, scene.tissue.order), dimension
+    n_e = max(int(NODES[kind] * cells * d), 1)
+    n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
+    layout = BlockLayout(comm, d, n_s, n_e, 0, 0, np.zeros((0, d)), np.zeros(d))
+    name, _ = choose_solver(layout, scene.time.solver)
+    copies = comm.size if factor_on_every_rank(layout, name, scene.time.reproducible) else 1
+    outputs = sum(n_s if o.kind == "hand" else d for o in scene.control.outputs) if scene.control is not None else d
+    # times; q, v, a, c, pulls and temporaries of the hand's table; outputs, their sum and their rigid share: measured
+    # 194 byte a step for n_s = d = 2
+    row = 8.0 * (2 + 7 * n_s + 4 * outputs)
+    return Need(
+        mesh=cells * (CELL_BYTES[kind] + len(scene.tissue.layers) * LAYER_BYTES[kind]),
+        factor=factor_bytes(name, n_e, d, copies),
+        tables=row * scene.time.steps if run else 0.0,
+    )
+
+
+def free_bytes(scene: Scene) -> float:
+    """Memory that a run may take on this node [byte]: ``output.memory``, or what is free. Not collective."""
+    if scene.output.memory != "auto":
+        return scene.output.memory * GIB
+    free = float(psutil.virtual_memory().available)
+    for limit, used in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
+        try:  # of the container
+            numbers = [float((CONTAINER / name).read_text()) for name in (limit, used)]
+        except (OSError, ValueError):
+            continue
+        free = min(free, max(numbers[0] - numbers[1], 0.0))
+    return free
+
+
+def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int) -> None:
+    """Refuse a model or run that the memory of some node cannot hold. Collective.
+
+    Args:
+        scene: the scene.
+        comm: ranks.
+        run: the steps are taken.
+        dimension: 2 or 3.
+        cells: triangles or tetrahedra in all.
+
+    Raises:
+        ResourceError: on all ranks, with the key, the estimate, what the node has, and what would fit.
+    """
+    node = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    ranks, free = node.size, node.bcast(free_bytes(scene))
+    node.Free()
+    found = need(scene, dimension, cells, comm, run)
+    nodes = comm.allgather((found.of(ranks / comm.size, ranks) / max(free, 1.0), ranks, free))
+    worst, ranks, free = max(nodes)
+    if worst <= 1:
+        return
+    share = ranks / comm.size
+    tissue = share * (found.mesh + found.factor)
+    if ranks * found.tables > tissue:
+        key, given = "time.steps", f"{scene.time.steps}"
+        fits = f"time.steps = {_digits(scene.time.steps * max(free - tissue, 0.0) / (ranks * found.tables))}"
+        parts = "tables of hand, loads and outputs"
+    else:
+        key = "tissue.cells" if scene.tissue.cells else "tissue.mesh"
+        given = f"{scene.tissue.cells}" if scene.tissue.cells else f"'{scene.tissue.mesh}'"
+        fits = _fitting(scene, comm, run, dimension, cells, share, ranks, free)
+        parts = f"mesh and matrices {_size(share * found.mesh)}, factor {_size(share * found.factor)}"
+    where = f"{ranks} rank{'s' if ranks > 1 else ''} of {comm.size} on one node"
+    raise ResourceError(
+        f"{key} = {_short(given)} needs about {_size(found.of(share, ranks))} ({parts}) for {where}, where "
+        f"{_size(free)} may be taken; take about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
+    )
+
+
+def _fitting(
+    scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int, share: float, ranks: int, free: float
+) -> str:
+    """What fits, as text: cells along the edges of a box, or of a mesh file in all. Not collective."""
+    box = scene.tissue.cells
+
+    def smaller(factor: float) -> list[int]:
+        return [max(_digits(factor * n), 1) for n in box or [cells]]
+
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        count = simplices(smaller(middle)) if box else smaller(middle)[0]
+        fits = need(scene, dimension, count, comm, run).of(share, ranks) <= free
+        low, high = (middle, high) if fits else (low, middle)
+    return f"tissue.cells = {smaller(low)}" if box else f"{smaller(low)[0]} of its {cells} cells"
+
+
+def _digits(value: float) -> int:
+    """The first two digits of a number, rounded down. Not collective."""
+    whole = int(value)
+    step: int = 10 ** max(len(str(whole)) - 2, 0)
+    return whole // step * step
+
+
+def _size(size: float) -> str:
+    for unit in ("MiB", "GiB", "TiB"):
+        size /= 1024 if unit != "MiB" else 2**20
+        if size < 1000:
+            break
+    return f"{size:.3g} {unit}"
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 60 else text[:57] + "..."

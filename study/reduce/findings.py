@@ -1,0 +1,165 @@
+"""What a sweep over bases and N shows, in sentences that its numbers make: best methods, structure, the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import numpy as np
+
+from softgrasp.reduction.registry import PAPER_METHODS, PAPER_PLAIN
+from softgrasp.study.reduce.sweep import COMPARED, Point, Swept
+
+MEASURES = (
+    ("error_deformation", "the deformation"),
+    ("error", "the state [q_s, v_s, q_e, v_e]"),
+    ("error_canonical", "[q_s, p_s, q_e, p_e]"),
+)
+
+
+def title_of(swept: Swept) -> str:
+    """Title of a method, short enough for a sentence."""
+    return swept.method.title.replace(", fixed solid modes", ", fixed")
+
+
+def leader(swept: Sequence[Swept], N: int, key: str, stable: bool = True) -> tuple[Swept, Point] | None:
+    """Method with the least value at exactly N, among stable models or all; None without any. Not collective."""
+    models = [
+        (getattr(p, key), k, s, p)
+        for k, s in enumerate(swept)
+        for p in s.points
+        if p.N == N and np.isfinite(getattr(p, key)) and (p.stable or not stable)
+    ]
+    return min(models)[2:] if models else None
+
+
+def sizes_of(swept: Sequence[Swept]) -> list[int]:
+    """All N of any method, ascending. Not collective."""
+    return sorted({p.N for s in swept for p in s.points})
+
+
+def compared_size(swept: Sequence[Swept]) -> int | None:
+    """The N nearest to the one compared, the smaller of two. Not collective."""
+    return min(sizes_of(swept), key=lambda N: (abs(N - COMPARED), N), default=None)
+
+
+def leaders(swept: Sequence[Swept], key: str) -> list[tuple[Swept, list[Point]]]:
+    """Best stable methods in the order of N, with their points in a row. Not collective."""
+    best = [b for N in sizes_of(swept) if (b := leader(swept, N, key)) is not None]
+    groups = [list(group) for _, group in groupby(best, key=lambda b: b[0].method.key)]
+    return [(group[0][0], [p for _, p in group]) for group in groups]
+
+
+def findings(swept: Sequence[Swept]) -> list[str]:
+    """Who is best at which N in which measure, what structure buys, and whether the paper's ranking holds.
+
+    Not collective.
+    """
+    shown = [s for s in swept if s.points]
+    return [*_best(shown), *_stability(shown), *_structure(shown), *_paper(shown)] if shown else []
+
+
+def _best(swept: Sequence[Swept]) -> Iterator[str]:
+    seen: dict[tuple[tuple[str, int], ...], str] = {}
+    for key, name in MEASURES:
+        rows = leaders(swept, key)
+        if not rows:
+            continue
+        order = tuple((s.method.key, p.N) for s, points in rows for p in points)
+        if order in seen:
+            yield f"In {name} the same methods lead as in {seen[order]}."
+            continue
+        seen[order] = name
+        texts = [f"{title_of(s)} at N = {_span([p.N for p in points])} ({_value(points, key)})" for s, points in rows]
+        yield f"Least error of {name} among stable models: {'; '.join(texts)}."
+
+
+def _span(sizes: list[int]) -> str:
+    return str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
+
+
+def _value(points: Sequence[Point], key: str) -> str:
+    """The value at the N compared where it is among the points, else at the last."""
+    p = next((p for p in points if p.N == COMPARED), points[-1])
+    value = f"{getattr(p, key):.1e}"
+    return value if len(points) == 1 else f"{value} at N = {p.N}"
+
+
+def _stability(swept: Sequence[Swept]) -> Iterator[str]:
+    for keeps, label in ((True, "that keep the structure"), (False, "that do not")):
+        group = [s for s in swept if s.method.preserving == keeps]
+        total = sum(len(s.points) for s in group)
+        bad = [(title_of(s), [p.N for p in s.points if not p.stable]) for s in group]
+        count = sum(len(sizes) for _, sizes in bad)
+        if not total:
+            continue
+        where = "; ".join(f"{title} at N = {_list(sizes)}" for title, sizes in bad if sizes)
+        yield f"Unstable models among the {total} {label}: " + (f"{count} ({where})." if count else "none.")
+
+
+def _structure(swept: Sequence[Swept]) -> Iterator[str]:
+    N = compared_size(swept)
+    groups = {
+        keeps: [(s, p) for s in swept if s.method.preserving == keeps for p in s.points if p.N == N and p.stable]
+        for keeps in (True, False)
+    }
+    if N is None or not all(groups.values()):
+        return
+    energies = {keeps: [p.error_energy for _, p in group] for keeps, group in groups.items()}
+    yield (
+        f"Error of the tissue's energy at N = {N}: {min(energies[True]):.1e} to {max(energies[True]):.1e} in models "
+        f"that keep the structure, {min(energies[False]):.1e} to {max(energies[False]):.1e} in stable models that do "
+        "not."
+    )
+    (kept, p), (lost, q) = (min(g, key=lambda b: b[1].error_deformation) for g in groups.values())
+    tiny = np.finfo(float).tiny
+    ratio = max(p.error_deformation, tiny) / max(q.error_deformation, tiny)
+    verdict = f"structure {'costs' if ratio > 1 else 'gains'} a factor of {max(ratio, 1 / ratio):.1f}"
+    yield (
+        f"Least error of the deformation at N = {N}: {p.error_deformation:.1e} with structure ({title_of(kept)}), "
+        f"{q.error_deformation:.1e} without ({title_of(lost)}, stable at this N), so {verdict} here."
+    )
+
+
+def _paper(swept: Sequence[Swept]) -> Iterator[str]:
+    """The paper's two statements on its six methods, in its own error, at every N where both sides have a model."""
+    six = [s for s in swept if s.method.key in PAPER_METHODS]
+    plain = [s for s in six if s.method.key in PAPER_PLAIN]
+    yield from _statement(
+        "PSD, and all with fixed solid modes, which it calls structure-preserving, are better than the other POD bases",
+        [s for s in six if s.method.key not in PAPER_PLAIN], plain, "for the former", "for the latter",
+    )  # fmt: skip
+    psd = [s for s in six if s.method.key == "psd"]
+    others = [s for s in six if s.method.key != "psd"]
+    yield from _statement("PSD without fixed solid modes is the best", psd, others, "for it", "for the best other")
+
+
+def _statement(text: str, left: Sequence[Swept], right: Sequence[Swept], one: str, other: str) -> Iterator[str]:
+    pairs = [
+        (N, a, b)
+        for N in sizes_of([*left, *right])
+        if (a := leader(left, N, "error", stable=False)) and (b := leader(right, N, "error", stable=False))
+    ]
+    if not pairs:
+        return
+    holds = [N for N, (_, p), (_, q) in pairs if p.error < q.error]
+    fails = [N for N, (_, p), (_, q) in pairs if not p.error < q.error]
+    N, (s, p), (t, q) = min(pairs, key=lambda pair: (abs(pair[0] - COMPARED), pair[0]))
+    verdict = (
+        "this holds at every N" if not fails
+        else "this holds at no N" if not holds
+        else f"this holds but for N = {_list(fails)}" if len(fails) < len(holds)
+        else f"this holds at N = {_list(holds)} only"
+    )  # fmt: skip
+    yield (
+        f"The paper: among its six methods, {text}. Here, in its own error of the state, {verdict}; at N = {N}: "
+        f"{p.error:.1e} {one} ({title_of(s)}{_grows(p)}), {q.error:.1e} {other} ({title_of(t)}{_grows(q)})."
+    )
+
+
+def _list(sizes: Sequence[int]) -> str:
+    return ", ".join(map(str, sizes))
+
+
+def _grows(point: Point) -> str:
+    return "" if point.stable else ", unstable"

@@ -1,0 +1,117 @@
+"""Memory is estimated before anything is allocated, and measured as what this program took."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+
+from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.model import memory
+from softgrasp.fem.model.build import build
+from softgrasp.fem.model.memory import check_memory, free_bytes, need, simplices
+from tests.helpers.models import CUBE, make_scene
+
+GIB = 2.0**30
+
+
+@pytest.fixture
+def nothing_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a mesh is made before its memory is estimated")
+
+    monkeypatch.setattr("softgrasp.fem.model.build.make_mesh", refuse)
+
+
+@pytest.mark.usefixtures("nothing_built")
+@pytest.mark.parametrize(
+    ("key", "table"),
+    [
+        ("tissue.cells", {"tissue": {"cells": [100_000, 100_000]}}),
+        ("tissue.cells", {"tissue": {"cells": [10**18, 2]}}),
+        ("time.steps", {"time": {"steps": 10**12}}),
+        ("tissue.cells", CUBE | {"tissue": CUBE["tissue"] | {"cells": [10**4] * 3, "order": 2}}),
+    ],
+)
+def test_what_no_machine_holds_is_refused_before_the_mesh(comm: MPI.Intracomm, key: str, table: dict[str, Any]) -> None:
+    with pytest.raises(ResourceError) as caught:
+        build(make_scene(table), comm)
+    text = str(caught.value)
+    assert text.startswith(f"{key} = ")
+    assert len(text) < 400
+    assert f"rank{'s' if comm.size > 1 else ''} of {comm.size} on one node" in text
+    assert "--set output.memory=GIB" in text
+    assert comm.allgather(text) == [text] * comm.size
+
+
+def test_what_the_sentence_advises_fits(comm: MPI.Intracomm) -> None:
+    big = make_scene(tissue={"cells": [3000, 6000]}, output={"memory": 0.5})
+    with pytest.raises(ResourceError) as caught:
+        build(big, comm)
+    assert "where 512 MiB may be taken" in str(caught.value)
+    text = str(caught.value).split("take about tissue.cells = ")[1].split(" or less")[0]
+    cells = [int(n) for n in text.strip("[]").split(", ")]
+    assert cells[1] == pytest.approx(2 * cells[0], rel=0.1)  # two digits are kept
+    some = make_scene(tissue={"cells": cells}, output={"memory": 0.5})
+    check_memory(some, comm, True, 2, simplices(cells))
+    with pytest.raises(ResourceError):
+        check_memory(some, comm, True, 2, simplices([round(1.25 * n) for n in cells]))
+
+
+def test_steps_count_only_for_a_run(comm: MPI.Intracomm) -> None:
+    scene = make_scene(time={"steps": 10**12})
+    assert build(scene, comm, run=False).system.layout.n_e > 0
+    with pytest.raises(ResourceError, match=r"take about time\.steps = \d+ or less"):
+        build(scene, comm)
+
+
+@pytest.mark.parametrize(("table", "d"), [({}, 2), (CUBE, 3)])
+def test_cells_of_a_box_are_those_of_its_mesh(comm: MPI.Intracomm, table: dict[str, Any], d: int) -> None:
+    scene = make_scene(table)
+    mesh = make_mesh(comm, scene).mesh
+    assert simplices(scene.tissue.cells or []) == mesh.topology.index_map(d).size_global
+
+
+def test_shares_of_the_nodes_add_up(comm: MPI.Intracomm) -> None:
+    found = need(make_scene(), 2, 10**6, comm, run=True)
+    assert found.of(1.0, comm.size) == found.mesh + found.factor + comm.size * found.tables
+    assert found.of(0.5, 1) * 2 == pytest.approx(found.of(1.0, 2), rel=1e-12)  # two nodes, one rank each
+
+
+def test_a_container_limits_what_is_free(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    before = free_bytes(make_scene())
+    (tmp_path / "memory.max").write_text("3000000\n")
+    (tmp_path / "memory.current").write_text("1000000\n")
+    monkeypatch.setattr(memory, "CONTAINER", tmp_path)
+    assert free_bytes(make_scene()) == 2e6 < before
+    (tmp_path / "memory.max").write_text("max\n")
+    assert free_bytes(make_scene()) > 2e6
+    assert free_bytes(make_scene(output={"memory": 2.0})) == 2 * GIB
+
+
+MEASURE = """
+import resource
+import psutil
+from mpi4py import MPI
+from softgrasp.study.forward.result import peak_memory_mb
+print(peak_memory_mb(MPI.COMM_SELF))
+print(psutil.Process().memory_info().rss / 2**20, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+LAUNCH = """
+import os, sys
+block = b"x" * 1_000_000_000
+os.execv(sys.executable, [sys.executable, "-c", sys.argv[1]])
+"""
+
+
+@pytest.mark.serial
+def test_peak_memory_is_not_that_of_the_launcher() -> None:
+    """A program that takes the place of a large one starts anew; getrusage does not."""
+    run = subprocess.run([sys.executable, "-c", LAUNCH, MEASURE], capture_output=True, check=True, text=True)
+    peak, now, usage = (float(x) for x in run.stdout.split())
+    assert usage > 900  # MiB, of the launcher
+    assert 0.9 * now < peak < 600  # DOLFINx and PETSc take a quarter of that

@@ -1,0 +1,115 @@
+"""Meshes that are open although their cells touch: doubled and hanging nodes; and tags of any size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import meshio
+import numpy as np
+import pytest
+
+from softgrasp.fem.errors import MeshError
+from softgrasp.fem.mesh.check import place_text
+from softgrasp.fem.mesh.file import read_mesh
+from softgrasp.fem.mesh.seams import doubled_nodes, sort_facets
+from softgrasp.fem.model.contact import cells_in, contact_facets, held_check
+from tests.fem.test_mesh import COMM, WIDE, area, grid, volume, write, zone
+
+BOX = {2: 6.0, 3: 10.0}  # boundary of (0,1) x (0,2) (x (0,1)): 2 (1 + 2), and 2 (1 2 + 1 1 + 1 2)
+
+
+def torn(dimension: int, n: int, tip: float, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`grid` with a node of its own for the cells above y = 1 wherever x > tip, moved by `shift`; facets as there."""
+    points, cells, facets = grid(dimension, n)
+    seam = np.flatnonzero((points[:, 1] == 1) & (points[:, 0] > tip))
+    number = np.arange(len(points))
+    number[seam] = len(points) + np.arange(len(seam))
+    upper = points[cells].mean(axis=1)[:, 1] > 1
+    cells[upper] = number[cells[upper]]
+    above = points[facets].mean(axis=1)[:, 1] > 1
+    facets[above] = number[facets[above]]
+    return np.vstack([points, points[seam] + shift]), cells, facets
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("tip", [-1.0, 0.25])
+def test_a_seam_of_doubled_nodes_is_named_and_joined(mpi_tmp_path: Path, dimension: int, tip: float) -> None:
+    """Open, the boundary has both sides of the crack more than the box; joined, it is that of the box."""
+    n, d = 4, dimension
+    doubled = (5 if tip < 0 else 3) * 5 ** (d - 2)
+    path = write(mpi_tmp_path / "a.vtu", *torn(d, n, tip, shift=1e-7))
+    tissue = read_mesh(COMM, path)
+    (note,) = tissue.notes
+    low, high = [0.0 if tip < 0 else 0.5, 1.0, 0.0], [1.0, 1.0, 1.0]
+    ends = " and ".join(place_text(np.array(x[:d])) for x in (low, high))
+    assert f"has {doubled} doubled nodes between {ends}, closer" in note
+    assert "tissue.repair = true" in note
+    whole = zone(box=[[-1] * d, [3] * d])
+    crack = 2 * (1.0 - max(tip, 0.0))
+    assert area(tissue, contact_facets(tissue, whole)) == pytest.approx(BOX[d] + crack, rel=1e-6)  # the shift is 1e-7
+    joined = read_mesh(COMM, path, repair=True)
+    assert f"{path} had {doubled} doubled nodes between {ends}" in joined.notes[0]
+    assert "tissue.repair joined them" in joined.notes[0]
+    assert joined.parts is None
+    assert joined.mesh.geometry.index_map().size_global == (n + 1) ** d
+    assert area(joined, contact_facets(joined, whole)) == pytest.approx(BOX[d], rel=WIDE)
+    assert area(joined, contact_facets(joined, zone(facet_tag=5))) == pytest.approx(2.0, rel=WIDE)
+    assert read_mesh(COMM, path, seam=1e-8).notes == ()
+    held_check(joined, contact_facets(joined, zone(["y-"])))
+    if tip < 0:
+        with pytest.raises(MeshError, match=r"tissue\.repair = true joins doubled nodes"):
+            held_check(tissue, contact_facets(tissue, zone(["y-"])))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_hanging_nodes_are_named(mpi_tmp_path: Path, dimension: int) -> None:
+    """Below y = 1 cells of 1/2, above of 1/4: every node of the finer side that the other has not hangs."""
+    coarse, fine = grid(dimension, 2), grid(dimension, 4)
+    low = coarse[1][coarse[0][coarse[1]].mean(axis=1)[:, 1] < 1]
+    high = fine[1][fine[0][fine[1]].mean(axis=1)[:, 1] > 1]
+    every = np.vstack([coarse[0], fine[0]])
+    points, number = np.unique(every, axis=0, return_inverse=True)
+    cells = number.ravel()[np.vstack([low, high + len(coarse[0])])]
+    path = write(mpi_tmp_path / "a.vtu", points, cells)
+    (note,) = read_mesh(COMM, path, repair=True).notes
+    hanging = 5 ** (dimension - 1) - 3 ** (dimension - 1)
+    assert f"{hanging} hanging nodes between" in note
+    middle = ", 1, " if dimension == 3 else ", 1) "
+    assert middle in note
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_conforming_mesh_warns_of_nothing(mpi_tmp_path: Path, dimension: int) -> None:
+    points, cells, _ = grid(dimension, 4)
+    points[:, 0] = points[:, 0] ** 6  # cells of width 2e-4 beside cells of 0.8
+    assert read_mesh(COMM, write(mpi_tmp_path / "a.vtu", points, cells)).notes == ()
+
+
+@pytest.mark.serial
+def test_many_copies_of_a_node_are_one_place() -> None:
+    """Triangles that share nothing: every corner has as many copies as cells meet there."""
+    points, cells, _ = grid(2, 3)
+    apart = np.arange(cells.size).reshape(cells.shape)
+    first = doubled_nodes(points[cells.ravel()], apart, sort_facets(apart), 1e-4)
+    assert len(np.unique(first)) == len(points)
+    assert np.array_equal(points[cells.ravel()], points[cells.ravel()][first])
+
+
+@pytest.mark.parametrize("tags", [(2**32 + 3, 3), (2**63 + 1, 2**63 + 2), (-(2**40), 2**40)])
+def test_tags_beyond_32_bit_stay_apart(mpi_tmp_path: Path, tags: tuple[int, int]) -> None:
+    points, cells, _ = grid(2, 4)
+    upper = points[cells].mean(axis=1)[:, 1] > 1
+    kind = np.uint64 if max(tags) >= 2**63 else np.int64
+    path = mpi_tmp_path / "a.vtu"
+    if COMM.rank == 0:
+        values = np.where(upper, np.array(tags[0], dtype=kind), np.array(tags[1], dtype=kind))
+        meshio.write(
+            path, meshio.Mesh(np.pad(points, ((0, 0), (0, 1))), [("triangle", cells)], cell_data={"a": [values]})
+        )
+    COMM.barrier()
+    tissue = read_mesh(COMM, path)
+    for tag, chosen in zip(tags, (upper, ~upper), strict=True):
+        found = cells_in(tissue, SimpleNamespace(tag=tag, box=None))
+        assert COMM.allreduce(len(found)) == chosen.sum()
+    assert volume(tissue) == pytest.approx(2.0, rel=WIDE)
