@@ -21,7 +21,7 @@ from softgrasp.fem.scene.file import load_scene
 comm = MPI.COMM_WORLD
 scenes = Path(__file__).parent / "scenes"
 scene = load_scene(scenes / "pillow_3d.toml", ["tissue.order=1", "time.steps=200"])
-model = build(scene, comm)
+model = build(scene, comm=comm)
 run = simulate(model)
 
 # %% [markdown]
@@ -64,7 +64,7 @@ changes += ["tissue.layers.core={tag=1, material={young=2e5, poisson=0.4, rho=20
 marked = {}
 for suffix in (".msh", ".vtu"):
     file = (folder / f"pillow{suffix}").as_posix()
-    model = build(load_scene(scenes / "pillow_3d.toml", [*changes, f"tissue.mesh='{file}'"]), comm)
+    model = build(load_scene(scenes / "pillow_3d.toml", [*changes, f"tissue.mesh='{file}'"]), comm=comm)
     marked[suffix] = simulate(model)
 stiff = (marked[".msh"].outputs - marked[".msh"].outputs_rigid)[0, 2]
 difference = np.abs(marked[".vtu"].outputs - marked[".msh"].outputs).max() / np.abs(run.outputs).max()

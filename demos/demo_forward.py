@@ -15,7 +15,7 @@ from softgrasp.fem.scene.file import load_scene
 
 comm = MPI.COMM_WORLD
 scene = load_scene(Path(__file__).parent / "scenes" / "paper_forward.toml")
-model = build(scene, comm)
+model = build(scene, comm=comm)
 layout = model.system.layout
 
 # %% [markdown]

@@ -1,13 +1,39 @@
 """Simulate a rigid robot hand that holds soft tissue, reduce the model, and control it optimally.
 
+    import softgrasp as sg
+    model = sg.build("paper_forward")
+    run = sg.simulate(model)
+    rom = sg.reduce(model, run, "psd", N=14)
+
 The names below are loaded when they are used first; until then neither MPI nor DOLFINx is.
 """
 
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model as Model
+    from softgrasp.fem.model.build import build as build
+    from softgrasp.fem.run.simulate import simulate as simulate
+    from softgrasp.fem.run.trajectory import Trajectory as Trajectory
+    from softgrasp.fem.scene.file import load_scene as load_scene
+    from softgrasp.fem.scene.file import shipped_scenes as shipped_scenes
+    from softgrasp.fem.scene.scene import Scene as Scene
+    from softgrasp.lqr.design import make_controller as make_controller
+    from softgrasp.lqr.design import problem as problem
+    from softgrasp.lqr.loop.controller import Controller as Controller
+    from softgrasp.lqr.loop.full import ClosedLoop as ClosedLoop
+    from softgrasp.lqr.riccati import solve as solve
+    from softgrasp.lqr.spectrum.certificate import abscissa as abscissa
+    from softgrasp.reduction.archive import load as load
+    from softgrasp.reduction.archive import save as save
+    from softgrasp.reduction.reduce import reduce as reduce
+    from softgrasp.reduction.replay import errors as errors
+    from softgrasp.reduction.replay import replay as replay
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: ranks share the cores
     os.environ.setdefault(_variable, "1")
@@ -15,9 +41,36 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: r
 PACKAGE = Path(__file__).parent
 """Folder of the package; in a checkout its subpackages are links to the folders beside it."""
 
+_FACE = {
+    "Scene": "fem.scene.scene",
+    "load_scene": "fem.scene.file",
+    "shipped_scenes": "fem.scene.file",
+    "Model": "fem.model.build",
+    "build": "fem.model.build",
+    "Trajectory": "fem.run.trajectory",
+    "simulate": "fem.run.simulate",
+    "reduce": "reduction.reduce",
+    "replay": "reduction.replay",
+    "errors": "reduction.replay",
+    "save": "reduction.archive",
+    "load": "reduction.archive",
+    "problem": "lqr.design",
+    "solve": "lqr.riccati",
+    "abscissa": "lqr.spectrum.certificate",
+    "ClosedLoop": "lqr.loop.full",
+    "make_controller": "lqr.design",
+    "Controller": "lqr.loop.controller",
+}
+"""What a user imports -> the module that has it."""
+
+__all__ = [
+    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "errors", "load", "load_scene",
+    "make_controller", "problem", "reduce", "replay", "save", "shipped_scenes", "simulate", "solve",
+]  # fmt: skip
+
 
 def package_version() -> str:
-    """Version of the installed distribution, or "source" in a bare checkout. Not collective."""
+    """Version of the installed distribution, or "source" in a bare checkout."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -27,6 +80,14 @@ def package_version() -> str:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _FACE:
+        value = getattr(import_module(f"softgrasp.{_FACE[name]}"), name)
+        globals()[name] = value
+        return value
     if name == "__version__":
         return package_version()
-    raise AttributeError(f"module 'softgrasp' has no attribute {name!r}")
+    raise AttributeError(f"module 'softgrasp' has no attribute {name!r}; it has {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, "__version__"})

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
@@ -14,10 +14,13 @@ from mpi4py import MPI
 from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
+from softgrasp.fem.scene.file import load_scene_collective
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import (
     BlockSystem,
     LayerBlocks,
@@ -25,9 +28,6 @@ from softgrasp.fem.system import (
     coupling,
     tissue_matrices,
 )
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 
 @dataclass
@@ -65,6 +65,34 @@ class Model:
     inventory: Inventory
     watch: Stopwatch
 
+    @property
+    def states(self) -> int:
+        """Number of first-order states 2n = 2 (n_s + n_e)."""
+        return self.system.layout.states
+
+    def with_materials(self, lam: float | None = None, mu: float | None = None, rho: float | None = None) -> Model:
+        """The same mesh with other numbers in every layer: K = mu K_mu + lambda K_lambda, M = rho M_1. Collective.
+
+        Only sums of matrices that are there; nothing is assembled.
+
+        Args:
+            lam, mu: Lame parameters [Pa]; None keeps those of each layer.
+            rho: density [kg/m^d]; None keeps it.
+
+        Raises:
+            SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
+        """
+        changes = {key: value for key, value in (("lam", lam), ("mu", mu), ("rho", rho)) if value is not None}
+        d = self.system.layout.dimension
+        materials = tuple(replace(m, **changes) for m in self.system.materials)
+        for m in materials:
+            if not (np.isfinite([m.lam, m.mu, m.rho]).all() and m.mu > 0 and m.rho > 0 and m.lam + 2 * m.mu / d > 0):
+                raise SceneError(
+                    f"lambda = {m.lam}, mu = {m.mu}, rho = {m.rho} is no material; mu, rho and lambda + 2 mu / {d} "
+                    "must be positive"
+                )
+        return replace(self, system=self.system.with_materials(materials))
+
 
 def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:
     """Material and Kelvin-Voigt time of each layer; cells of no layer carry tissue.material. Not collective."""
@@ -79,11 +107,18 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
-def build(scene: Scene, comm: MPI.Intracomm, *, run: bool = True) -> Model:
-    """Mesh, assemble and couple. Collective.
+def build(
+    scene: Scene | str | Path,
+    overrides: Sequence[str] = (),
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    *,
+    run: bool = True,
+) -> Model:
+    """Mesh, assemble and couple: M q'' + D q' + K q = f + B_u u with q = [q_s; q_e]. Collective.
 
     Args:
-        scene: the scene.
+        scene: a scene, the path of its file, or the name of one that ships.
+        overrides: "section.key=value" each, as after ``--set``; for a file or a name.
         comm: ranks.
         run: its steps will be taken, so their tables must fit too.
 
@@ -92,6 +127,10 @@ def build(scene: Scene, comm: MPI.Intracomm, *, run: bool = True) -> Model:
         ResourceError: the memory of a node cannot hold it; estimated before anything is allocated, for a mesh file
             when its cells are known.
     """
+    if isinstance(scene, str | Path):
+        scene = load_scene_collective(comm, scene, overrides)
+    elif overrides:
+        raise SceneError(f"overrides {list(overrides)} need the file or the name of a scene; change the scene itself")
     watch, inventory = Stopwatch(comm), Inventory()
     boxed = scene.tissue.cells
     if boxed:

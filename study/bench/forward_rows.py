@@ -74,7 +74,7 @@ def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dic
     seconds: dict[str, list[float]] = {"mesh": [], "assembly": [], "factor": []}
     begin, memory, pace = time.perf_counter(), 0.0, 0.0
     for i in range(repeats):
-        model = build(scene, comm)
+        model = build(scene, comm=comm)
         run = Run(model, RunOptions())
         for name, values in seconds.items():
             values.append(model.watch.seconds[name])
@@ -232,7 +232,7 @@ def measure(
         peers: also SciPy and pyMOR (one rank only).
     """
     cells = cells_for(dimension, size)
-    build(bench_scene(comm, dimension, [2] * (dimension - 1) + [4], 1), comm)  # compiles the forms
+    build(bench_scene(comm, dimension, [2] * (dimension - 1) + [4], 1), comm=comm)  # compiles the forms
     base = peak_memory_mb(comm)
     model, seconds, memory, pace = _builds(comm, bench_scene(comm, dimension, cells, PAPER_STEPS), repeats)
     k = int(np.clip(repeat_seconds / pace, 3, 50_000))
@@ -249,7 +249,7 @@ def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int) ->
     cells = cells_for(dimension, size)
     base = peak_memory_mb(comm)
     begin = time.perf_counter()
-    model = build(bench_scene(comm, dimension, cells, steps), comm)
+    model = build(bench_scene(comm, dimension, cells, steps), comm=comm)
     run = simulate(model)
     result = _row(comm, model, cells, {name: run.seconds[name] for name in ("mesh", "assembly", "factor")})
     return result | {

@@ -89,7 +89,7 @@ def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
     Raises:
         SoftgraspError: a solve failed, the snapshots do not fit, or no model has this N.
     """
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     run = simulate(model)
     steps = scene.time.steps
     swept = sweep(scene.reduction.methods[0], reference(model, run), scene.reduction)

@@ -55,7 +55,7 @@ class Answer:
 def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
     """The paper's control problem on nx x 2 nx cells. Collective."""
     changes = [f"tissue.cells=[{nx}, {2 * nx}]", f"effects.damping.beta={beta!r}"]
-    return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm))
+    return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm=comm))
 
 
 def gain_difference(problem: RiccatiProblem, K: Block, reference: Block) -> float:

@@ -103,7 +103,7 @@ def compare(
 def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """Reduced models of random materials, together and one by one. One rank."""
     changes = ["effects.damping={kind='kelvin-voigt', beta=0.002}", "motion={drive='force', profile='hold'}"]
-    model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm)
+    model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm=comm)
     system = model.system
     material, rng = system.materials[0], np.random.default_rng(0)
     force = np.ones((STEPS, system.layout.n_s))
@@ -164,7 +164,7 @@ def dense(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
 def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """Factor and solve at one shift a rank, with whole matrices and spread ones."""
     for d, size in ((2, 10_000), (2, 100_000), (3, 8_000), (3, 20_000), *(((3, 39_000),) if large else ())):
-        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
+        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
         layout = model.system.layout
         F = np.ones((layout.n_local, 3))
         solvers = [make_shifted(model.system, name) for name in ("gathered", "distributed")]
@@ -187,7 +187,7 @@ def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
 def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """Set-up and step of the forward run with PETSc's Cholesky and with MUMPS."""
     for d, size in ((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000), (3, 20_000)):
-        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
+        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
         names = f"CHOLESKY_LIMIT = {softgrasp.fem.solve.solvers.CHOLESKY_LIMIT[d]}"
         yield from _two(comm, model, ("cholesky", "auto"), ("mumps", "auto"), ("set-up", "step"), names, repeats)
 
@@ -197,7 +197,7 @@ def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     if comm.size == 1:
         return
     for d, size in ((3, 10_000), (3, 50_000), *(((3, 200_000), (2, 1_000_000)) if large else ())):
-        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm)
+        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
         names = f"REPEATED_LIMIT = {softgrasp.fem.solve.solvers.REPEATED_LIMIT[d]} / ranks"
         heads = ("whole, set-up", "whole, step")
         yield from _two(comm, model, ("mumps", True), ("mumps", False), heads, names, 1 if size > 60_000 else repeats)

@@ -123,7 +123,7 @@ class Experiments:
                 other = switch(scene, name, self.scales).other
                 scene = scene if other is None else other
         gc.collect()
-        return build(scene, self.comm)
+        return build(scene, comm=self.comm)
 
     def of(self, on: Names, forced: bool = False) -> Shown:
         """Outputs with exactly these effects on. Collective.

@@ -48,7 +48,7 @@ def judge_elements(model: Model, trajectory: Trajectory, tolerance: float) -> El
     nu = max(young_poisson(m.lam, m.mu)[1] for m in model.system.materials)
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None
-    other = build(quadratic(model), model.system.layout.comm)
+    other = build(quadratic(model), comm=model.system.layout.comm)
     change = compare(shown(model, trajectory), shown(other, simulate(other, RunOptions())))
     needed = change.outputs > tolerance
     text = (

@@ -176,7 +176,7 @@ def prove_off(name: str, before: Case, again: Case) -> OffProof:
     counts = [(again.objects, again.objects_in_steps)]
     with_zero = neutral(before.model.scene, name, before.model.system.layout.dimension)
     if with_zero is not None:
-        model = build(with_zero, before.model.system.layout.comm)
+        model = build(with_zero, comm=before.model.system.layout.comm)
         run = Run(model, RunOptions())
         zero = fingerprint(model, run) == before.prints
         run.midpoint.destroy()

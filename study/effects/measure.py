@@ -247,7 +247,7 @@ def measure_builds(
         shift = i % len(names)
         gc.collect()
         for name in names[shift:] + names[:shift]:
-            model = build(scenes[name], comm)
+            model = build(scenes[name], comm=comm)
             with model.watch.stage("setup"):
                 run = Run(model, RunOptions())
             seconds = cases[name].seconds if name in cases else {}
@@ -310,7 +310,7 @@ def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[
     Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
     """
     with counting(comm) as made:
-        stepper = Stepper(build(scene, comm))
+        stepper = Stepper(build(scene, comm=comm))
         stepper.advance(1)
     with counting(comm) as in_steps:
         stepper.advance(STEPS)

@@ -150,7 +150,7 @@ def study_effects(
         ResourceError: the factors of all variants would not fit in memory at once.
     """
     scene = bare_output(scene)
-    model = build(scene, comm)  # also compiles the forms
+    model = build(scene, comm=comm)  # also compiles the forms
     explanation = explain_model(model)
     scales = scales_of(model.system.layout, rigid_inertia(model), explanation.time.omega)
     found = switches(scene, scales)

@@ -128,7 +128,7 @@ def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
         SceneError, MeshError: the scene cannot be built.
         SolverError: its modes or its sag cannot be computed.
     """
-    return explain_model(build(scene, comm, run=False))
+    return explain_model(build(scene, comm=comm, run=False))
 
 
 def explain_model(model: Model) -> Explanation:

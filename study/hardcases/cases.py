@@ -160,7 +160,7 @@ def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Mod
     Raises:
         SceneError, MeshError: as :func:`fem.model.build.build`.
     """
-    return build(load_scene(shipped_scenes()[name], overrides), comm)
+    return build(load_scene(shipped_scenes()[name], overrides), comm=comm)
 
 
 def sparse(A: PETSc.Mat) -> Any:

@@ -138,7 +138,7 @@ def _file_rows(folder: Path, scene: Path, at: int) -> list[Row]:
     mesh = ["tissue={mesh='body.mesh', material={lambda=1.0, mu=1.0, rho=1.0}}", "contact={sides=['left']}"]
 
     def run(changes: list[str]) -> float:
-        simulate(build(load_scene(scene, changes), MPI.COMM_SELF))
+        simulate(build(load_scene(scene, changes), comm=MPI.COMM_SELF))
         return 1.0
 
     def read() -> float:

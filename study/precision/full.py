@@ -108,10 +108,10 @@ class FullRuns:
         self._mesh = None
         comm = self.cache.comm
         seconds: dict[str, list[float]] = {"mesh": [], "assembly": []}
-        build(self.variant(setting), comm)
+        build(self.variant(setting), comm=comm)
         for _ in range(repeats):
             gc.collect()
-            model = build(self.variant(setting), comm)
+            model = build(self.variant(setting), comm=comm)
             for stage, values in seconds.items():
                 values.append(model.watch.seconds[stage])
             if comm.bcast(sum(map(sum, seconds.values()))) > BUILD_SECONDS:

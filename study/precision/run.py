@@ -165,7 +165,7 @@ def study_scene(
     """
     asked = asked or Asked()
     wanted = asked.questions
-    model = build(variant(scene, own_setting(scene)), comm)
+    model = build(variant(scene, own_setting(scene)), comm=comm)
     guard = Guard(comm, progress)
     store = Cache(cache, comm, scene)
     control = ControlRuns(model, store, guard, asked.names) if set(wanted) & set(CONTROL) else None

@@ -90,7 +90,7 @@ class Session:
         Raises:
             SoftgraspError: the scene cannot be built.
         """
-        model = build(scene, self.comm)
+        model = build(scene, comm=self.comm)
         layout = model.system.layout
         sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
         self.console.print(sizes)

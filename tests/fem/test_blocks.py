@@ -45,14 +45,14 @@ EXACT = 1e-12  # sums of about 50 products of order one, each rounded to 1e-16
 @pytest.mark.parametrize(("cells", "states"), [([15, 30], 1916), ([10, 20], 880)])
 def test_the_paper_has_these_sizes(comm: MPI.Intracomm, cells: list[int], states: int) -> None:
     scene = load_scene(shipped_scenes()["paper_forward"], [f"tissue.cells={cells}"])
-    assert build(scene, comm).system.layout.states == states
+    assert build(scene, comm=comm).system.layout.states == states
 
 
 @pytest.mark.parametrize("columns", [1, 7, 8, 20])
 def test_products_with_columns_equal_scipy(comm: MPI.Intracomm, columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """By vectors, in one block, and in three of which the last is narrow."""
     monkeypatch.setattr(petsc, "BLOCK_ENTRIES", 1)
-    system = build(make_scene({}), comm).system
+    system = build(make_scene({}), comm=comm).system
     layout, start = system.layout, system.layout.start
     X = np.random.default_rng(1).standard_normal((layout.n_e, columns))
     rows, indices, values = system.K_ee.getValuesCSR()
@@ -65,7 +65,7 @@ def test_products_with_columns_equal_scipy(comm: MPI.Intracomm, columns: int, mo
 @pytest.mark.parametrize("name", SCENES)
 def test_blocks_equal_scikit_fem(comm: MPI.Intracomm, name: str) -> None:
     changes, held = SCENES[name]
-    model = build(make_scene(*changes, TURNING), comm)
+    model = build(make_scene(*changes, TURNING), comm=comm)
     system, layout, ref = model.system, model.system.layout, reference(model, held)
     free, contact, R = ~ref.held, ref.held, ref.R
 
@@ -89,7 +89,7 @@ def test_blocks_equal_scikit_fem(comm: MPI.Intracomm, name: str) -> None:
 
 @pytest.mark.parametrize("name", [n for n in SCENES if "layers" in n])
 def test_layered_viscosity_equals_scikit_fem(comm: MPI.Intracomm, name: str) -> None:
-    model = build(make_scene(*SCENES[name][0]), comm)
+    model = build(make_scene(*SCENES[name][0]), comm=comm)
     system, ref = model.system, reference(model)
     D = sum(b * K for b, K in zip(ref.betas, ref.K_layers, strict=True))[np.ix_(~ref.held, ~ref.held)]
     assert system.damping.beta == 0
@@ -98,7 +98,7 @@ def test_layered_viscosity_equals_scikit_fem(comm: MPI.Intracomm, name: str) -> 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_stiffness_annihilates_rigid_motions(comm: MPI.Intracomm, name: str) -> None:
-    system = build(make_scene(*SCENES[name][0], TURNING), comm).system
+    system = build(make_scene(*SCENES[name][0], TURNING), comm=comm).system
     K = gather_matrix(system.layout, system.K_ee)
     force = K @ gather_rows(system.layout, system.T) + gather_rows(system.layout, system.K_es)
     assert system.layout.n_s == {2: 3, 3: 6}[system.layout.dimension]
@@ -106,12 +106,12 @@ def test_stiffness_annihilates_rigid_motions(comm: MPI.Intracomm, name: str) -> 
 
 
 def test_mass_of_the_body_is_rho_times_volume(comm: MPI.Intracomm) -> None:
-    system = build(make_scene(CUBE, tissue={"order": 2, "material": {"rho": 3.0}}), comm).system
+    system = build(make_scene(CUBE, tissue={"order": 2, "material": {"rho": 3.0}}), comm=comm).system
     np.testing.assert_allclose(system.M_rigid, 3.0 * 0.48 * np.eye(3), rtol=0, atol=EXACT)
 
 
 def test_matrices_are_symmetric_and_positive(comm: MPI.Intracomm) -> None:
-    system = build(make_scene(TURNING), comm).system
+    system = build(make_scene(TURNING), comm=comm).system
     for A in (system.M_ee, system.K_ee):
         dense = gather_matrix(system.layout, A).toarray()
         assert close(dense, dense.T) < EXACT
@@ -125,8 +125,8 @@ def test_new_materials_equal_a_fresh_build(comm: MPI.Intracomm) -> None:
         "core": {"material": {"lambda": 1.0, "mu": 2.0, "rho": 3.0}},
     }
     base = {"tissue": {"layers": LAYERS}, "effects": damped}
-    fresh = build(make_scene(base, {"tissue": {"layers": other, "material": {"lambda": 4.0}}}), comm).system
-    system = build(make_scene(base), comm).system
+    fresh = build(make_scene(base, {"tissue": {"layers": other, "material": {"lambda": 4.0}}}), comm=comm).system
+    system = build(make_scene(base), comm=comm).system
     changed = system.with_materials(fresh.materials)
     layout = system.layout
     for name in ("M_ee", "K_ee"):
@@ -145,7 +145,7 @@ def test_new_materials_equal_a_fresh_build(comm: MPI.Intracomm) -> None:
 def test_new_viscosity_follows_the_materials(comm: MPI.Intracomm, betas: tuple[float, float]) -> None:
     layers = {"low": {"box": [[0.0, 0.0], [1.0, 0.5]], "material": MATERIAL, "beta": 0.01}}
     damping = {"damping": {"kind": "kelvin-voigt", "beta": 0.02}}
-    system = build(make_scene({"tissue": {"layers": layers}, "effects": damping}), comm).system
+    system = build(make_scene({"tissue": {"layers": layers}, "effects": damping}), comm=comm).system
     low, rest = (replace(m, beta=b) for m, b in zip(system.materials, betas, strict=True))
     changed = system.with_materials((low, rest)).damping
     if betas[0] == betas[1]:

@@ -55,7 +55,7 @@ def kept_nonzeros(P: PETSc.Mat, ordering: str) -> float:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_order_moves_nodes_and_comes_back(comm: MPI.Intracomm, name: str) -> None:
-    system = build(make_scene(*SCENES[name]), comm).system
+    system = build(make_scene(*SCENES[name]), comm=comm).system
     d, n = system.layout.dimension, system.layout.n_e
     K = whole_copy(system.K_ee)
     found = dissect(K, d)
@@ -73,7 +73,7 @@ def test_order_moves_nodes_and_comes_back(comm: MPI.Intracomm, name: str) -> Non
 
 @pytest.mark.serial
 def test_order_keeps_the_factor_thin(comm: MPI.Intracomm) -> None:
-    system = build(make_scene(tissue={"cells": [40, 80]}), comm).system
+    system = build(make_scene(tissue={"cells": [40, 80]}), comm=comm).system
     P = dissect(system.K_ee, 2).matrix(system.K_ee)
     ksp = factor_blocks(P, "test_")
     kept = factor_of(ksp).getInfo()["nz_used"]
@@ -85,7 +85,7 @@ def test_order_keeps_the_factor_thin(comm: MPI.Intracomm) -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_solves_agree_with_a_dense_solve_on_any_ranks(comm: MPI.Intracomm, name: str) -> None:
-    system = build(make_scene(*SCENES[name]), comm).system
+    system = build(make_scene(*SCENES[name]), comm=comm).system
     layout = system.layout
     S = midpoint_matrix(system, 0.01)
     dense = gather_matrix(layout, S).toarray()
@@ -131,7 +131,7 @@ UNSTABLE = {
 @pytest.mark.parametrize("name", UNSTABLE)
 @pytest.mark.parametrize("by", ["petsc", "mumps"])
 def test_single_entries_take_over_where_blocks_lose_digits(comm: MPI.Intracomm, name: str, by: Any) -> None:
-    P = permuted(build(make_scene(UNSTABLE[name]), comm).system.K_ee)
+    P = permuted(build(make_scene(UNSTABLE[name]), comm=comm).system.K_ee)
     blocks, chosen = blocks_of(P), factor_blocks(P, "test_", by)
     assert backward_error(P, blocks) > BACKWARD_ERROR
     assert "sbaij" not in chosen.getOperators()[0].getType()
@@ -143,7 +143,7 @@ def test_single_entries_take_over_where_blocks_lose_digits(comm: MPI.Intracomm, 
 
 def test_choice_is_free_of_the_scale_of_rows(comm: MPI.Intracomm) -> None:
     for scene, single in (({}, False), (HANGING, True)):
-        P = permuted(build(make_scene(scene), comm).system.K_ee)
+        P = permuted(build(make_scene(scene), comm=comm).system.K_ee)
         scale = P.createVecLeft()
         scale.array_w[:] = 10.0 ** np.random.default_rng(0).integers(-5, 6, P.getSize()[0])
         P.diagonalScale(scale, scale)
@@ -157,7 +157,7 @@ def test_large_systems_in_space_leave_single_entries_to_mumps(
     comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(softgrasp.fem.solve.solvers.FEW_LIMIT, 2, 100)
-    system = build(make_scene(HANGING), comm).system
+    system = build(make_scene(HANGING), comm=comm).system
     solver = make_solver(system.K_ee.copy(), "cholesky", system.layout, "test_")
     assert solver.remark == "; in single entries by MUMPS, since blocks would lose digits here"
     solver.destroy()
@@ -166,14 +166,14 @@ def test_large_systems_in_space_leave_single_entries_to_mumps(
 def test_run_says_when_single_entries_took_over(comm: MPI.Intracomm) -> None:
     still = {"motion": {"profile": "hold", "target": None}, "time": {"steps": 1, "end": 1.0}}
     for changes, remark in ((HANGING, True), ({}, False)):
-        run = simulate(build(make_scene(changes, still), comm))
+        run = simulate(build(make_scene(changes, still), comm=comm))
         assert ("single entries by PETSc" in run.solver[1]) == remark
         assert run.energy_drift == 0.0  # nothing moves
 
 
 def test_step_does_not_lose_what_blocks_would(comm: MPI.Intracomm) -> None:
     """One long step of the hanging scene against a dense solve: the stiff part's stretch is 1e-6 of its motion."""
-    system = build(make_scene(HANGING), comm).system
+    system = build(make_scene(HANGING), comm=comm).system
     layout = system.layout
     midpoint = TissueMidpoint(system, 1.0, "cholesky")
     state = state_on(np.zeros(2 * layout.n_local), system)
@@ -189,7 +189,7 @@ def test_step_does_not_lose_what_blocks_would(comm: MPI.Intracomm) -> None:
 
 def test_backward_error_is_that_of_the_matrix_solved_with(comm: MPI.Intracomm) -> None:
     """The factor of P + 1e-6 D^2, D^2 = diag P, leaves D^-1 (r - P w) = 1e-6 D w."""
-    P = permuted(build(make_scene(), comm).system.K_ee)
+    P = permuted(build(make_scene(), comm=comm).system.K_ee)
     other, diagonal = P.copy(), P.getDiagonal()
     diagonal.scale(1 + 1e-6)
     other.setDiagonal(diagonal)
@@ -200,7 +200,7 @@ def test_backward_error_is_that_of_the_matrix_solved_with(comm: MPI.Intracomm) -
 
 
 def test_vanishing_pivot_is_named_on_every_rank(comm: MPI.Intracomm) -> None:
-    system = build(make_scene(), comm).system
+    system = build(make_scene(), comm=comm).system
     S = system.K_ee.copy()
     S.zeroEntries()
     with pytest.raises(SolverError, match=r"cholesky: the factorisation of the tissue matrix \(n_e = \d+\) failed"):
@@ -208,7 +208,7 @@ def test_vanishing_pivot_is_named_on_every_rank(comm: MPI.Intracomm) -> None:
 
 
 def test_state_and_vectors_held_whole_keep_the_same_bits(comm: MPI.Intracomm) -> None:
-    system = build(make_scene(), comm).system
+    system = build(make_scene(), comm=comm).system
     layout = system.layout
     midpoint = TissueMidpoint(system, 0.01, "cholesky")
     z, v = np.random.default_rng(3).standard_normal((2, layout.n_e))
@@ -225,7 +225,7 @@ def test_state_and_vectors_held_whole_keep_the_same_bits(comm: MPI.Intracomm) ->
 def test_restart_file_holds_the_right_hand_side_in_the_order_of_the_layout(
     comm: MPI.Intracomm, mpi_tmp_path: Path
 ) -> None:
-    model = build(make_scene(), comm)
+    model = build(make_scene(), comm=comm)
     with pytest.raises(Interrupted):
         simulate(model, RunOptions(mpi_tmp_path, until=7))
     system, layout = model.system, model.system.layout
@@ -241,7 +241,7 @@ def test_restart_file_holds_the_right_hand_side_in_the_order_of_the_layout(
 
 
 def test_few_solves_in_space_go_to_mumps_earlier(comm: MPI.Intracomm) -> None:
-    layout = build(make_scene(CUBE), comm).system.layout
+    layout = build(make_scene(CUBE), comm=comm).system.layout
     large = replace(layout, n_e=FEW_LIMIT[3] + 3)
     assert choose_solver(large)[0] == "cholesky"
     assert choose_solver(large, few=True)[0] == "mumps"

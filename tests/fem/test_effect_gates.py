@@ -76,7 +76,7 @@ def test_a_strip_that_bends_sags_as_a_beam(comm: MPI.Intracomm) -> None:
         "motion": {"profile": "hold"},
         "effects": {"gravity": {"g": [0.0, -g]}},
     }
-    model = build(scene_of(**strip), comm)
+    model = build(scene_of(**strip), comm=comm)
     sag = measure_sag(model)
     bending = E / (1 - nu**2) * h**2 / 12  # plane strain, over the area
     # beam with shear; cross-sections at the hand stay plane, which the beam does not know: (h / L)^2
@@ -99,7 +99,7 @@ def test_a_hanging_bar_stretches_as_it_should(comm: MPI.Intracomm) -> None:
         "contact": {"sides": ["top"]},
         "motion": {"profile": "hold"},
     }
-    sag = measure_sag(build(scene_of(**bar), comm))
+    sag = measure_sag(build(scene_of(**bar), comm=comm))
     assert sag.g == (0.0, -9.81)
     assert sag.largest == pytest.approx(rho * 9.81 * L**2 / (4 * mu), rel=1e-10)  # direct solve
     steps = rho * 9.81 * L * (1 - (np.arange(n) + 0.5) / n) / (2 * mu)  # mean slope in each row of cells
@@ -235,7 +235,7 @@ def test_inertia_of_a_box(comm: MPI.Intracomm, d: int) -> None:
     scene = scene_of(
         tissue=tissue, contact={"sides": ["left"]}, hand={"reference": [0.0] * d}, motion={"profile": "hold"}
     )
-    mass, inertia = rigid_inertia(build(scene, comm))
+    mass, inertia = rigid_inertia(build(scene, comm=comm))
     # corner of a box: J_z = m (a^2 + b^2) / 3
     a, b, c = 1.0, 2.0, 0.5
     expected = [(a * a + b * b)] if d == 2 else [b * b + c * c, a * a + c * c, a * a + b * b]
@@ -253,12 +253,12 @@ def test_units_build_what_the_model_has(comm: MPI.Intracomm) -> None:
         },
         motion={"target": [1.0, 0.0, 0.1]},
     )
-    system = build(scene, comm).system
+    system = build(scene, comm=comm).system
     np.testing.assert_array_equal(system.gravity, acceleration(scene, system.layout.n_s))
     np.testing.assert_array_equal(system.M_hand, hand_mass(scene, 2))
     assert system.damping == operator(scene, system.layers, system.materials)
     omega, Phi = lowest_modes(system, 3)
-    problem = measure(build(scene, comm), omega, Phi)
+    problem = measure(build(scene, comm=comm), omega, Phi)
     assert problem.length == 2.0
     np.testing.assert_array_equal(problem.zeta, ratios(0.4, 0.01, omega))
     # rotation about the reference is in M_rigid too, from the mass matrix
@@ -284,7 +284,7 @@ def test_modes_against_dense(comm: MPI.Intracomm, order: int) -> None:
         "order": order,
         "material": {"lambda": 50.0, "mu": 50.0, "rho": 2.0},
     }
-    system = build(scene_of(tissue=tissue), comm).system
+    system = build(scene_of(tissue=tissue), comm=comm).system
     before = dict(PETSc.Options().getAll())
     omega, Phi = lowest_modes(system, 5)
     assert dict(PETSc.Options().getAll()) == before
@@ -300,7 +300,7 @@ def test_modes_against_dense(comm: MPI.Intracomm, order: int) -> None:
 def test_modes_on_a_3d_box(comm: MPI.Intracomm) -> None:
     tissue = {"size": [1.0, 1.0, 1.0], "cells": [3, 3, 3], "material": {"lambda": 50.0, "mu": 50.0, "rho": 2.0}}
     scene = scene_of(tissue=tissue, contact={"sides": ["bottom"]}, motion={"profile": "hold"})
-    system = build(scene, comm).system
+    system = build(scene, comm=comm).system
     omega, _ = lowest_modes(system, 6)
     squares = scipy.linalg.eigh(gathered(system.K_ee), gathered(system.M_ee), eigvals_only=True)
     np.testing.assert_allclose(omega**2, squares[:6], rtol=1e-9)  # eigh loses eps |K| / omega_1^2, about 1e-12
@@ -310,7 +310,7 @@ def test_modes_are_the_same_on_one_rank(comm: MPI.Intracomm) -> None:
     """Signs too: compare at the node that lies lowest on the left."""
 
     def corner(c: MPI.Intracomm) -> Array:
-        system = build(scene_of(), c).system
+        system = build(scene_of(), comm=c).system
         _, Phi = lowest_modes(system, 4)
         owner, dof, _ = system.layout.nearest_node(np.zeros(2))
         return np.asarray(c.bcast(Phi[dof : dof + 2] if c.rank == owner else None, owner))
@@ -343,7 +343,7 @@ def test_multiple_modes_are_all_found(comm: MPI.Intracomm) -> None:
 
 
 def test_modes_refuse(comm: MPI.Intracomm) -> None:
-    system = build(scene_of(), comm).system
+    system = build(scene_of(), comm=comm).system
     with pytest.raises(SolverError, match="0 modes are asked for"):
         lowest_modes(system, 0)
     with pytest.raises(SolverError, match="between 1 and n_e"):
@@ -354,7 +354,7 @@ def test_layered_damping_ratios(comm: MPI.Intracomm) -> None:
     """A matrix beta K must give the ratios of the number beta."""
     from dataclasses import replace
 
-    system = build(scene_of(effects={"damping": {"kind": "kelvin-voigt", "beta": 0.02}}), comm).system
+    system = build(scene_of(effects={"damping": {"kind": "kelvin-voigt", "beta": 0.02}}), comm=comm).system
     omega, Phi = lowest_modes(system, 3)
     D = system.K_ee.copy()
     D.scale(0.02)

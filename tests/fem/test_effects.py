@@ -64,7 +64,7 @@ def test_no_effect_compiles_a_form_or_adds_a_matrix(
     comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch, effects: dict[str, Any]
 ) -> None:
     forms = Forms(monkeypatch)
-    model = build(make_scene(effects=effects), comm)
+    model = build(make_scene(effects=effects), comm=comm)
     simulate(model)
     assert len(forms.names) == len(set(forms.names)) == 3
     assert model.inventory.forms == BARE_FORMS
@@ -78,19 +78,19 @@ def test_layers_share_their_forms_and_add_only_their_components(
 ) -> None:
     forms = Forms(monkeypatch)
     scene = make_scene(tissue={"layers": LAYERS}, effects=VISCOUS)
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     assert len(set(forms.names)) == 3
     assert model.inventory.forms == BARE_FORMS
     parts = [f"{key}[{name}]" for name in ("low", "core", "tissue") for key in BARE_FORMS]
     assert sorted(model.inventory.operators) == sorted([*parts, "M_ee", "K_ee", "T", "G", "D_ee"])
-    undamped = build(make_scene(tissue={"layers": {"core": LAYERS["core"]}}), comm)
+    undamped = build(make_scene(tissue={"layers": {"core": LAYERS["core"]}}), comm=comm)
     assert "D_ee" not in undamped.inventory.operators
 
 
 def objects_of_a_run(comm: MPI.Intracomm, **tables: Any) -> dict[str, int]:
     """What PETSc's own log counts as created by build and run, by class; it knows nothing of our bookkeeping."""
     with counting(comm) as made:
-        simulate(build(make_scene(**tables), comm))
+        simulate(build(make_scene(**tables), comm=comm))
     return made
 
 
@@ -132,7 +132,7 @@ def test_off_takes_no_branch_in_the_loop_and_gravity_costs_nothing(comm: MPI.Int
     def extra(effects: dict[str, Any], name: str) -> float:
         """Calls per step: the difference of two runs takes set-up and checks away."""
         short, long = (
-            work_of_a_run(build(make_scene(effects=effects, time={"steps": n}), comm)) for n in (steps, 2 * steps)
+            work_of_a_run(build(make_scene(effects=effects, time={"steps": n}), comm=comm)) for n in (steps, 2 * steps)
         )
         return (long[name] - short[name]) / steps
 
@@ -153,18 +153,18 @@ def bits(model: Model) -> list[bytes]:
 
 def test_effects_off_give_the_same_bits(comm: MPI.Intracomm) -> None:
     """Off, on with strength zero, and off after other scenes ran in the same process."""
-    bare = bits(build(make_scene(), comm))
+    bare = bits(build(make_scene(), comm=comm))
     for effects in NEUTRAL:
-        assert bits(build(make_scene(effects=effects), comm)) == bare, effects
+        assert bits(build(make_scene(effects=effects), comm=comm)) == bare, effects
     everything = GRAVITY | DRAGGED | {"reaction": True, "rotation": True}
-    changed = simulate(build(make_scene(tissue={"layers": LAYERS}, effects=everything), comm))
+    changed = simulate(build(make_scene(tissue={"layers": LAYERS}, effects=everything), comm=comm))
     assert changed.outputs.tobytes() != bare[2]
-    assert bits(build(make_scene(), comm)) == bare
+    assert bits(build(make_scene(), comm=comm)) == bare
 
 
 def test_gravity_reuses_the_coupling(comm: MPI.Intracomm) -> None:
     """The body force is G g, no vector of its own: it equals the integral of rho g phi."""
-    model = build(make_scene(effects=GRAVITY | VISCOUS, tissue={"layers": LAYERS}), comm)
+    model = build(make_scene(effects=GRAVITY | VISCOUS, tissue={"layers": LAYERS}), comm=comm)
     ref = reference(model)
     force = ref.M[~ref.held] @ np.tile([1.0, -9.0], len(ref.nodes))
     assert close(gather_rows(model.system.layout, model.system.G) @ model.system.gravity, force) < 1e-12  # rounding
@@ -174,7 +174,7 @@ def test_gravity_reuses_the_coupling(comm: MPI.Intracomm) -> None:
 @pytest.mark.parametrize("effects", [GRAVITY, GRAVITY | VISCOUS, GRAVITY | DRAGGED, GRAVITY | {"rotation": True}])
 def test_equilibrium_is_static_and_stays(comm: MPI.Intracomm, effects: dict[str, Any], solver: str) -> None:
     scene = make_scene(effects=effects, motion=HOLD, time={"start": "equilibrium", "end": 3.0, "solver": solver})
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     ref, layout = reference(model), model.system.layout
     Z = gather_states(layout, simulate(model).snapshots.Z)
     free = ~ref.held
@@ -193,7 +193,7 @@ def test_a_held_hand_keeps_its_tissue_in_equilibrium(comm: MPI.Intracomm) -> Non
         motion=HOLD | {"drive": "force"},
         time={"start": "equilibrium", "end": 3.0},
     )
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     system = model.system
     holding = -(system.M_hand + system.M_rigid) @ [1.0, -9.0]
     run = simulate(model, force=lambda n, t, q, v: holding)
@@ -208,7 +208,7 @@ def test_free_fall_strains_nothing(comm: MPI.Intracomm, effects: dict[str, Any],
     scene = make_scene(
         effects=effects | WEIGHT | {"reaction": reaction}, motion=HOLD | {"drive": "force"}, time={"end": 3.0}
     )
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     run = simulate(model)
     fall = np.outer(run.times**2 / 2, [1.0, -9.0])
     assert close(run.q_s, fall) < 1e-12  # sixty sums
@@ -218,7 +218,7 @@ def test_free_fall_strains_nothing(comm: MPI.Intracomm, effects: dict[str, Any],
 @pytest.mark.parametrize(("effects", "slows"), [(VISCOUS, False), (RAYLEIGH, False), (DRAGGED, True)])
 def test_rigid_motion_is_dragged_only_on_request(comm: MPI.Intracomm, effects: dict[str, Any], slows: bool) -> None:
     """Hand and tissue coast and turn together: damping against the hand finds nothing to damp."""
-    model = build(make_scene(effects=effects | {"reaction": True, "rotation": True}, time={"end": 3.0}), comm)
+    model = build(make_scene(effects=effects | {"reaction": True, "rotation": True}, time={"end": 3.0}), comm=comm)
     zero = np.zeros(model.system.layout.n_e)
     v_s = np.array([2.0, -1.0, 0.5])
     run = run_from(model, zero, zero, v_s, lambda n, t, q, v: np.zeros(3))
@@ -230,7 +230,7 @@ def test_rigid_motion_is_dragged_only_on_request(comm: MPI.Intracomm, effects: d
 
 @pytest.mark.parametrize("effects", [VISCOUS, RAYLEIGH])
 def test_damping_takes_energy_and_says_how_much(comm: MPI.Intracomm, effects: dict[str, Any]) -> None:
-    model = build(make_scene(effects=effects, motion=HOLD, time={"end": 3.0}), comm)
+    model = build(make_scene(effects=effects, motion=HOLD, time={"end": 3.0}), comm=comm)
     rng = np.random.default_rng(2)
     z, v = rng.standard_normal((2, model.system.layout.n_e))
     run = run_from(model, 0.1 * z, v)
@@ -249,7 +249,7 @@ def test_reaction_vanishes_for_a_heavy_hand(comm: MPI.Intracomm) -> None:
     for mass in (1e2, 1e4, 1e6):
         runs = []
         for reaction in (False, True):
-            model = build(make_scene(hand={"mass": mass}, effects={"reaction": reaction}), comm)
+            model = build(make_scene(hand={"mass": mass}, effects={"reaction": reaction}), comm=comm)
             runs.append(simulate(model, force=lambda n, t, q, v, m=mass: m * wave(n, t, q, v) / 20))
         gaps.append(np.abs(runs[1].q_s - runs[0].q_s).max() / np.abs(runs[0].q_s).max())
     assert 1e-4 < gaps[0] < 1  # about tissue over hand mass, 2e-2: no rounding
@@ -260,7 +260,7 @@ def test_equal_layers_are_a_uniform_body(comm: MPI.Intracomm) -> None:
     same = {"material": {"lambda": 50.0, "mu": 50.0, "rho": 1.0}}
     layers = {name: {"box": layer["box"]} | same for name, layer in LAYERS.items()}
     runs = [
-        simulate(build(make_scene(tissue={"layers": chosen}, effects=GRAVITY | RAYLEIGH), comm))
+        simulate(build(make_scene(tissue={"layers": chosen}, effects=GRAVITY | RAYLEIGH), comm=comm))
         for chosen in ({}, layers)
     ]
     assert close(runs[1].outputs, runs[0].outputs) < 1e-11  # condition times rounding of sums in another order
@@ -269,7 +269,7 @@ def test_equal_layers_are_a_uniform_body(comm: MPI.Intracomm) -> None:
 
 def test_rotation_without_torque_is_no_rotation(comm: MPI.Intracomm) -> None:
     """A prescribed motion with zero angles moves the tissue as a hand that cannot turn."""
-    plain, turning = (build(make_scene(effects={"rotation": on}), comm) for on in (False, True))
+    plain, turning = (build(make_scene(effects={"rotation": on}), comm=comm) for on in (False, True))
     a, b = simulate(plain), simulate(turning)
     assert close(b.q_s[:, :2], a.q_s) == 0
     assert np.abs(b.q_s[:, 2]).max() == 0
@@ -280,13 +280,13 @@ def test_rotation_without_torque_is_no_rotation(comm: MPI.Intracomm) -> None:
 
 
 def test_thickness_scales_forces_and_not_motion(comm: MPI.Intracomm) -> None:
-    thin, thick = (build(make_scene(tissue={"thickness": t}, effects=VISCOUS), comm) for t in (1.0, 3.0))
+    thin, thick = (build(make_scene(tissue={"thickness": t}, effects=VISCOUS), comm=comm) for t in (1.0, 3.0))
     assert close(simulate(thick).outputs, simulate(thin).outputs) < 1e-11  # condition times rounding
     np.testing.assert_allclose(thick.system.M_rigid, 3 * thin.system.M_rigid, rtol=0, atol=1e-12)  # rounding of sums
 
 
 def test_start_at_rest_is_zero(comm: MPI.Intracomm) -> None:
-    model = build(make_scene(effects=GRAVITY), comm)
+    model = build(make_scene(effects=GRAVITY), comm=comm)
     run = simulate(model)
     x = absolute(model, run.snapshots.q_s, run.snapshots.v_s, run.snapshots.Z)[:, 0]
     np.testing.assert_array_equal(x, at_rest(model))

@@ -38,7 +38,7 @@ def make_model(comm: MPI.Intracomm, d: int, order: int, **extra: Any) -> Model:
             "time": {"steps": 2, "end": 1.0},
         }
     )
-    return build(scene, comm)
+    return build(scene, comm=comm)
 
 
 def hand_of(d: int) -> np.ndarray:

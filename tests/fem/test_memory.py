@@ -39,7 +39,7 @@ def nothing_built(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_no_machine_holds_is_refused_before_the_mesh(comm: MPI.Intracomm, key: str, table: dict[str, Any]) -> None:
     with pytest.raises(ResourceError) as caught:
-        build(make_scene(table), comm)
+        build(make_scene(table), comm=comm)
     text = str(caught.value)
     assert text.startswith(f"{key} = ")
     assert len(text) < 400
@@ -51,7 +51,7 @@ def test_what_no_machine_holds_is_refused_before_the_mesh(comm: MPI.Intracomm, k
 def test_what_the_sentence_advises_fits(comm: MPI.Intracomm) -> None:
     big = make_scene(tissue={"cells": [3000, 6000]}, output={"memory": 0.5})
     with pytest.raises(ResourceError) as caught:
-        build(big, comm)
+        build(big, comm=comm)
     assert "where 512 MiB may be taken" in str(caught.value)
     text = str(caught.value).split("take about tissue.cells = ")[1].split(" or less")[0]
     cells = [int(n) for n in text.strip("[]").split(", ")]
@@ -64,9 +64,9 @@ def test_what_the_sentence_advises_fits(comm: MPI.Intracomm) -> None:
 
 def test_steps_count_only_for_a_run(comm: MPI.Intracomm) -> None:
     scene = make_scene(time={"steps": 10**12})
-    assert build(scene, comm, run=False).system.layout.n_e > 0
+    assert build(scene, comm=comm, run=False).system.layout.n_e > 0
     with pytest.raises(ResourceError, match=r"take about time\.steps = \d+ or less"):
-        build(scene, comm)
+        build(scene, comm=comm)
 
 
 @pytest.mark.parametrize(("table", "d"), [({}, 2), (CUBE, 3)])

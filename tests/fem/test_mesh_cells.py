@@ -127,7 +127,7 @@ def test_squares_and_cubes_are_the_mesh_cut_by_hand(mpi_tmp_path: Path, dimensio
             "time": {"steps": 2},
         }
     )
-    system = build(scene, COMM).system
+    system = build(scene, comm=COMM).system
     mesh = (skfem.MeshTri if dimension == 2 else skfem.MeshTet)(points.T.copy(), kuhn.T.copy())
     element = skfem.ElementTriP1() if dimension == 2 else skfem.ElementTetP1()
     basis = skfem.Basis(mesh, skfem.ElementVector(element))

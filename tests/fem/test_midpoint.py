@@ -87,7 +87,7 @@ def monolithic(model: Model, held: Any = held_by_paper) -> tuple[FirstOrder, Arr
 @pytest.mark.parametrize("reaction", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_run_equals_the_first_order_system(comm: MPI.Intracomm, name: str, reaction: bool, rotation: bool) -> None:
-    model = build(make_scene(*CASES[name], {"effects": {"reaction": reaction, "rotation": rotation}}), comm)
+    model = build(make_scene(*CASES[name], {"effects": {"reaction": reaction, "rotation": rotation}}), comm=comm)
     run = simulate(model, force=wave)
     full, X = monolithic(model)
     assert same_everywhere(comm, np.hstack([run.q_s, run.v_s, run.outputs @ np.eye(2, run.q_s.shape[1])]))
@@ -100,7 +100,7 @@ def test_run_equals_the_first_order_system(comm: MPI.Intracomm, name: str, react
 def test_run_in_3d_equals_the_first_order_system(comm: MPI.Intracomm, reaction: bool) -> None:
     effects = {"reaction": reaction, "rotation": True, "gravity": {"g": [0.5, 0.2, -9.0]}} | RAYLEIGH
     scene = make_scene(CUBE, hand={"inertia": [1.0, 2.0, 3.0]}, effects=effects, time={"start": "equilibrium"})
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     run = simulate(model, force=wave)
     full, X = monolithic(model, held_on_top)
     for mine, theirs in zip(parts(full, states(model, run)), parts(full, X), strict=True):
@@ -110,7 +110,7 @@ def test_run_in_3d_equals_the_first_order_system(comm: MPI.Intracomm, reaction: 
 @pytest.mark.parametrize("reaction", [False, True])
 def test_force_profile_of_the_scene(comm: MPI.Intracomm, reaction: bool) -> None:
     effects = GRAVITY | RAYLEIGH | {"reaction": reaction}
-    model = build(make_scene(motion={"drive": "force"}, effects=effects), comm)
+    model = build(make_scene(motion={"drive": "force"}, effects=effects), comm=comm)
     run = simulate(model)
     full = first_order(reference(model))
     u = force_values(model.scene, 2, model.system.M_hand)
@@ -124,7 +124,7 @@ def test_prescribed_motion_deforms_the_tissue_as_its_mean_force_does(
     comm: MPI.Intracomm, damping: dict[str, Any]
 ) -> None:
     """The hand follows the profile itself; the tissue sees the mean acceleration of each step."""
-    model = build(make_scene(effects=damping), comm)
+    model = build(make_scene(effects=damping), comm=comm)
     run = simulate(model)
     ref = reference(model)
     full, table = first_order(ref), motion_table(model.scene, 2)
@@ -140,7 +140,7 @@ def test_prescribed_motion_deforms_the_tissue_as_its_mean_force_does(
 @pytest.mark.parametrize("reaction", [False, True])
 def test_run_equals_petsc_theta(comm: MPI.Intracomm, reaction: bool) -> None:
     scene = make_scene(TINY, effects=RAYLEIGH | {"reaction": reaction}, time={"steps": 40})
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     run = simulate(model, force=wave)
     full, dt, n = first_order(reference(model)), 3.0 / 40, 2 * (model.system.layout.n_s + model.system.layout.n_e)
     zero = np.zeros(full.n_s)
@@ -190,7 +190,7 @@ def test_order_two_under_a_moving_hand(comm: MPI.Intracomm, damping: dict[str, A
     """The quintic is a polynomial, so the exact deformation at the end of the motion is one matrix exponential."""
     steps, errors = [160, 320, 640, 1280], []
     for n in steps:
-        model = build(make_scene(TINY, effects=damping, time={"steps": n}, motion={"duration": 1.5}), comm)
+        model = build(make_scene(TINY, effects=damping, time={"steps": n}, motion={"duration": 1.5}), comm=comm)
         run = simulate(model)
         if n == steps[0]:
             ref = reference(model)
@@ -214,7 +214,7 @@ def test_order_two_of_free_vibration(comm: MPI.Intracomm, damping: dict[str, Any
         scene = make_scene(
             TINY, effects=damping, motion={"profile": "hold", "target": None}, time={"steps": n, "end": end}
         )
-        model = build(scene, comm)
+        model = build(scene, comm=comm)
         layout = model.system.layout
         K, M = (gather_matrix(layout, A).toarray() for A in (model.system.K_ee, model.system.M_ee))
         squares, modes = scipy.linalg.eigh(K, M, subset_by_index=(0, 3))
@@ -232,7 +232,7 @@ def test_order_two_of_free_vibration(comm: MPI.Intracomm, damping: dict[str, Any
 
 def test_midpoint_is_not_the_trapezoid_rule(comm: MPI.Intracomm) -> None:
     """Both are the same for constant loads; on a changing one only the midpoint value reproduces the run."""
-    model = build(make_scene(time={"steps": 20}), comm)
+    model = build(make_scene(time={"steps": 20}), comm=comm)
     full, X = monolithic(model)
     t, zero = np.linspace(0, 3, 21), np.zeros(2)
     ends = np.array([wave(0, s, zero, zero) for s in t])
@@ -249,7 +249,7 @@ def random_state(n: int, seed: int = 3) -> tuple[Array, Array]:
 
 def test_time_reversal_returns_to_the_start(comm: MPI.Intracomm) -> None:
     """N steps, velocities turned, the loads in reverse order, N steps: back at the start."""
-    model = build(make_scene(effects=GRAVITY), comm)
+    model = build(make_scene(effects=GRAVITY), comm=comm)
     system, layout = model.system, model.system.layout
     loads = np.random.default_rng(1).standard_normal((200, 2))
     z, v = random_state(layout.n_e)
@@ -280,7 +280,7 @@ def long_steps(comm: MPI.Intracomm) -> int:
 
 
 def test_energy_of_free_vibration_does_not_drift(comm: MPI.Intracomm) -> None:
-    model = build(make_scene(TINY), comm)
+    model = build(make_scene(TINY), comm=comm)
     layout = model.system.layout
     z, v = random_state(layout.n_e)
     midpoint = TissueMidpoint(model.system, 0.01, "cholesky")
@@ -308,7 +308,7 @@ def test_energy_under_gravity_does_not_drift(comm: MPI.Intracomm) -> None:
         time={"steps": steps, "end": 0.01 * steps},
         output={"every": steps // 50},
     )
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     run = simulate(model)
     load = gather_rows(model.system.layout, model.system.G) @ [0.0, -9.0]
     z = gather_states(model.system.layout, run.snapshots.Z)[: model.system.layout.n_e]
@@ -322,7 +322,7 @@ def test_force_that_a_prescribed_motion_takes(comm: MPI.Intracomm, damping: dict
     """The hand's row of the dense system; without gravity its impulse is the momentum of hand and tissue."""
     weight = {} if not damping else GRAVITY
     effects = damping | weight | {"reaction": True, "rotation": True}
-    model = build(make_scene(effects=effects, motion={"target": [5.0, 3.0, 0.2]}), comm)
+    model = build(make_scene(effects=effects, motion={"target": [5.0, 3.0, 0.2]}), comm=comm)
     run = simulate(model)
     ref = reference(model)
     full, n_s = first_order(ref), 3
@@ -340,7 +340,7 @@ def test_force_that_a_prescribed_motion_takes(comm: MPI.Intracomm, damping: dict
 def test_an_applied_force_is_kept(comm: MPI.Intracomm, reaction: bool) -> None:
     """Two-way it is also what the hand's motion takes."""
     effects = DRAGGED | GRAVITY | {"reaction": reaction}
-    model = build(make_scene(motion={"drive": "force"}, effects=effects), comm)
+    model = build(make_scene(motion={"drive": "force"}, effects=effects), comm=comm)
     run = Run(model, RunOptions())
     ts = make_ts(run)
     run.start()
@@ -368,7 +368,7 @@ def test_total_momentum_changes_by_the_impulse(
     comm: MPI.Intracomm, changes: list[dict[str, Any]], force: Callable[..., Array]
 ) -> None:
     """Hand and tissue together, linear and (linearised) angular, from the velocities of all nodes."""
-    model = build(make_scene(*changes, effects={"reaction": True, "rotation": True}), comm)
+    model = build(make_scene(*changes, effects={"reaction": True, "rotation": True}), comm=comm)
     layout, n_s = model.system.layout, model.system.layout.n_s
     ref = reference(model, held_on_top if layout.dimension == 3 else held_by_paper)
     z, v = random_state(layout.n_e)

@@ -30,12 +30,14 @@ def outputs(*entries: dict[str, Any]) -> dict[str, Any]:
     ],
 )
 def test_the_node_that_is_taken_is_named(comm: MPI.Intracomm, point: list[float], place: str) -> None:
-    (output,) = make_outputs(make_scene(outputs({"kind": "node", "point": point})), build(make_scene(), comm).system)
+    (output,) = make_outputs(
+        make_scene(outputs({"kind": "node", "point": point})), build(make_scene(), comm=comm).system
+    )
     assert output.place == place
 
 
 def test_a_result_says_where_its_outputs_are(comm: MPI.Intracomm) -> None:
-    model = build(make_scene(time={"steps": 3}), comm)
+    model = build(make_scene(time={"steps": 3}), comm=comm)
     assert simulate_result(model, simulate(model))["output_places"] == {
         "tip": "node (0, 0), the free one farthest from the hand"
     }
@@ -59,7 +61,7 @@ def test_nodes_of_a_region_that_the_hand_holds_count(
 ) -> None:
     """The mean of all nodes of the box, from the absolute displacements of the tissue and of the hand."""
     scene = make_scene(tables, outputs({"kind": "region", "box": box, "name": "part"}), time={"steps": 40})
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     (output,) = make_outputs(scene, model.system)
     assert output.place == f"mean of {count} nodes" + (f", {held} of them held by the hand" if held else "")
     run = simulate(model)

@@ -64,7 +64,7 @@ CASES: dict[str, list[dict[str, Any]]] = {
 def both(comm: MPI.Intracomm, *changes: dict[str, Any], **tables: Any) -> tuple[Model, Model]:
     """The scene on all ranks together, and on this rank alone."""
     scene = make_scene(*changes, **tables)
-    return build(scene, comm), build(scene, MPI.COMM_SELF)
+    return build(scene, comm=comm), build(scene, comm=MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -84,7 +84,7 @@ def test_assembly_has_the_same_bits_every_time(comm: MPI.Intracomm) -> None:
     """Nodes where three ranks meet get three contributions, whose order of arrival differs from run to run."""
     found = set()
     for _ in range(6):
-        system = build(make_scene({"tissue": {"cells": [20, 40]}}), comm).system
+        system = build(make_scene({"tissue": {"cells": [20, 40]}}), comm=comm).system
         found.add(b"".join(A.getValuesCSR()[2].tobytes() for A in (system.K_ee, system.M_ee)))
     assert max(comm.allgather(len(found))) == 1
 
@@ -125,7 +125,7 @@ def test_work_is_counted_once_where_the_factor_is_spread(
 ) -> None:
     effects = {"reaction": reaction, "damping": {"kind": "kelvin-voigt", "beta": 0.01}}
     motion = {"motion": {"drive": "force"}} if reaction else {}
-    run = simulate(build(make_scene(motion, effects=effects, time=time), comm))
+    run = simulate(build(make_scene(motion, effects=effects, time=time), comm=comm))
     assert run.energy_drift < 1e-12  # the bound the issue asks for
 
 
@@ -137,8 +137,8 @@ def test_solvers_agree(comm: MPI.Intracomm, solver: str, changes: list[dict[str,
         make_scene(*changes, effects=effects, time={"solver": name, "rtol": 1e-13, "steps": 30})
         for name in (solver, "cholesky")
     ]
-    a = simulate(build(scenes[0], comm), force=wave)
-    model = build(scenes[1], MPI.COMM_SELF)
+    a = simulate(build(scenes[0], comm=comm), force=wave)
+    model = build(scenes[1], comm=MPI.COMM_SELF)
     b = simulate(model, force=wave)
     assert a.solver[0] == solver
     assert max(a.residuals) < 1e-12  # ten times the recursive residual of cg; rounding of a direct solve
@@ -147,7 +147,7 @@ def test_solvers_agree(comm: MPI.Intracomm, solver: str, changes: list[dict[str,
 
 
 def test_reproducible_overrules_what_the_size_says(comm: MPI.Intracomm) -> None:
-    layout = build(make_scene(), comm).system.layout
+    layout = build(make_scene(), comm=comm).system.layout
     several = comm.size > 1
     assert factor_on_every_rank(layout, "mumps", "auto") == several
     assert factor_on_every_rank(layout, "mumps", True) == several
@@ -159,7 +159,7 @@ def test_reproducible_overrules_what_the_size_says(comm: MPI.Intracomm) -> None:
 
 
 def test_layout_covers_every_unknown_once(comm: MPI.Intracomm) -> None:
-    layout = build(make_scene(), comm).system.layout
+    layout = build(make_scene(), comm=comm).system.layout
     ranges = comm.allgather((layout.start, layout.n_local))
     assert [start for start, _ in ranges] == np.cumsum([0, *(n for _, n in ranges)])[:-1].tolist()
     assert sum(n for _, n in ranges) == layout.n_e == 2 * len(all_nodes(layout))
@@ -172,7 +172,7 @@ def test_layout_covers_every_unknown_once(comm: MPI.Intracomm) -> None:
 
 def test_nearest_node_is_the_same_for_ties(comm: MPI.Intracomm) -> None:
     """The point lies midway between four nodes: every rank count takes the one with the smallest coordinates."""
-    layout = build(make_scene(), comm).system.layout
+    layout = build(make_scene(), comm=comm).system.layout
     rank, first, where = layout.nearest_node(np.array([0.375, 0.375]))
     np.testing.assert_allclose(where, [0.25, 0.25], rtol=0, atol=1e-12)  # a node of the mesh, to rounding
     assert same_everywhere(comm, np.array([rank, first]))
@@ -182,7 +182,7 @@ def test_nearest_node_is_the_same_for_ties(comm: MPI.Intracomm) -> None:
 
 def test_outputs_are_displacements_of_the_named_nodes(comm: MPI.Intracomm) -> None:
     """Recomputed from the gathered snapshots: absolute displacement of the tip, mean of the region, hand."""
-    model = build(make_scene(control=OUTPUTS), comm)
+    model = build(make_scene(control=OUTPUTS), comm=comm)
     run, layout = simulate(model), model.system.layout
     nodes = all_nodes(layout)
     nodes = nodes[node_order(nodes)]

@@ -16,7 +16,7 @@ from tests.helpers.models import Array, make_scene
 
 def model_of(comm: MPI.Intracomm, order: int, cells: tuple[int, ...] = (3, 7)) -> Model:
     tissue: dict[str, Any] = {"cells": list(cells), "order": order}
-    return build(make_scene({"tissue": tissue}), comm)
+    return build(make_scene({"tissue": tissue}), comm=comm)
 
 
 def field(order: int, X: Array) -> Array:

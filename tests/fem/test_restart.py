@@ -35,7 +35,7 @@ def run(folder: Path, *, target: tuple[float, float] = (5.0, 3.0), output: Any =
     scene = make_scene(
         tissue={"cells": [3, 6]}, time={"steps": 12}, motion={"target": list(target)}, output=output or {}
     )
-    return simulate(build(scene, MPI.COMM_WORLD), RunOptions(folder, **how))
+    return simulate(build(scene, comm=MPI.COMM_WORLD), RunOptions(folder, **how))
 
 
 def stopped(folder: Path, step: int, **how: Any) -> None:
@@ -181,14 +181,14 @@ def test_a_mesh_that_changed_in_its_second_file_does_not_go_on(comm: MPI.Intraco
     named, kept = (mpi_tmp_path / "block.xdmf").read_bytes(), Cache(mpi_tmp_path / "cache", comm, scene)
     assert kept.get("point", {}, lambda: {"value": 1}) == {"value": 1}
     with pytest.raises(Interrupted):
-        simulate(build(scene, comm), RunOptions(mpi_tmp_path, until=6))
+        simulate(build(scene, comm=comm), RunOptions(mpi_tmp_path, until=6))
     again = mesh_scene(comm, mpi_tmp_path, 0.0)
-    assert simulate(build(again, comm), RunOptions(mpi_tmp_path, resume=True)).steps_timed == 6
+    assert simulate(build(again, comm=comm), RunOptions(mpi_tmp_path, resume=True)).steps_timed == 6
     assert Cache(mpi_tmp_path / "cache", comm, again).get("point", {}, lambda: {"value": 2}) == {"value": 1}
     other = mesh_scene(comm, mpi_tmp_path, 0.5)
     assert (mpi_tmp_path / "block.xdmf").read_bytes() == named
     with pytest.raises(CheckpointError, match="a file that the scene names is not what it was"):
-        simulate(build(other, comm), RunOptions(mpi_tmp_path, resume=True))
+        simulate(build(other, comm=comm), RunOptions(mpi_tmp_path, resume=True))
     assert Cache(mpi_tmp_path / "cache", comm, other).get("point", {}, lambda: {"value": 2}) == {"value": 2}
 
 
@@ -208,7 +208,7 @@ def test_fields_without_room_leave_a_restart_file(
     if kind == "vtx" and not dolfinx.has_adios2:
         pytest.skip("this DOLFINx has no ADIOS2")
     scene = make_scene(tissue={"cells": [3, 6]}, time={"steps": 12}, output={"fields": kind, "frames": 6})
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     frames = Frames(model, mpi_tmp_path, pictures=False)
     free = iter([2**30, 2**30, 2**30, 100])
     monkeypatch.setattr("softgrasp.fem.disk.shutil.disk_usage", lambda path: SimpleNamespace(free=next(free)))
@@ -217,7 +217,7 @@ def test_fields_without_room_leave_a_restart_file(
         simulate(model, options)
     assert all(path.exists() for path in frames.close())
     rest = simulate(model, RunOptions(mpi_tmp_path, resume=True))
-    assert np.array_equal(rest.final, simulate(build(scene, comm)).final)
+    assert np.array_equal(rest.final, simulate(build(scene, comm=comm)).final)
 
 
 @pytest.mark.parametrize("output", [{"fields": "xdmf"}, {"fields": "none", "snapshots": "hdf5"}])
@@ -225,7 +225,7 @@ def test_a_limit_on_files_is_one_sentence(
     comm: MPI.Intracomm, mpi_tmp_path: Path, small_files: Callable[[int], None], output: dict[str, str]
 ) -> None:
     scene = make_scene(tissue={"cells": [3, 6]}, time={"steps": 12}, output=output)
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     frames = Frames(model, mpi_tmp_path, pictures=False)
     small_files(2**18)  # less than the libraries may add at the end
     with pytest.raises(ResourceError, match=r"no file may pass 262144 bytes here; raise the limit"):

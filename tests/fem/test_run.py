@@ -29,7 +29,7 @@ SCENES = Path(__file__).parents[2] / "demos" / "scenes"
 
 def small(comm: MPI.Intracomm, *overrides: str, scene: str = "paper_forward") -> Model:
     changes = ["tissue.cells=[4,8]", "time.steps=40", "time.end=3.0", *overrides]
-    return build(load_scene(SCENES / f"{scene}.toml", changes), comm)
+    return build(load_scene(SCENES / f"{scene}.toml", changes), comm=comm)
 
 
 @pytest.mark.parametrize("snapshots", ["memory", "hdf5", "none"])
@@ -73,7 +73,7 @@ def test_restart_with_layered_damping_is_bitwise(
     comm: MPI.Intracomm, mpi_tmp_path: Path, extra: tuple[str, ...]
 ) -> None:
     def model() -> Model:
-        return build(load_scene(SCENES / "layers_2d.toml", ["tissue.cells=[8,5]", "time.steps=40", *extra]), comm)
+        return build(load_scene(SCENES / "layers_2d.toml", ["tissue.cells=[8,5]", "time.steps=40", *extra]), comm=comm)
 
     assert model().system.damping.matrix is not None
     whole = simulate(model())

@@ -99,7 +99,7 @@ def test_patch(comm: MPI.Intracomm, size: list[float], cells: list[int], order: 
 
 def manufactured_error(comm: MPI.Intracomm, n: int, order: int) -> float:
     """L2 error for u = (sin pi x sin pi y, x (1 - x) sin 2 pi y) on the unit square, zero on its boundary."""
-    model = build(clamped([1.0, 1.0], [n, n], order), comm)
+    model = build(clamped([1.0, 1.0], [n, n], order), comm=comm)
     V, layout = model.space.V, model.system.layout
     x, pi = ufl.SpatialCoordinate(V.mesh), ufl.pi
     u = ufl.as_vector((ufl.sin(pi * x[0]) * ufl.sin(pi * x[1]), x[0] * (1 - x[0]) * ufl.sin(2 * pi * x[1])))
@@ -139,7 +139,7 @@ def test_ten_lowest_frequencies_converge(comm: MPI.Intracomm) -> None:
     sizes = [10, 20, 40, 80]
 
     def omega(n: int, order: int) -> Array:
-        system = build(clamped([1.0, 0.7], [n, 7 * n // 10], order), comm).system
+        system = build(clamped([1.0, 0.7], [n, 7 * n // 10], order), comm=comm).system
         return np.sqrt(lowest(system.K_ee, system.M_ee, system.layout, 10))
 
     fine = omega(60, 2)  # its own error is of order h^4: three digits below that of the finest P1 mesh
@@ -194,7 +194,7 @@ def tip(comm: MPI.Intracomm, nu: float, order: int, cells: list[int]) -> float:
     """Static deflection under gravity of the upper corner of a beam held at its left end."""
     material = {"young": 100.0, "poisson": nu, "rho": 1.0}
     tissue = {"size": [1.0, 0.25], "cells": cells, "order": order, "material": material}
-    system = build(make_scene(tissue=tissue, contact={"sides": ["left"], "box": None}), comm).system
+    system = build(make_scene(tissue=tissue, contact={"sides": ["left"], "box": None}), comm=comm).system
     K = gather_matrix(system.layout, system.K_ee).tocsc()
     z = scipy.sparse.linalg.spsolve(K, gather_rows(system.layout, system.G) @ [0.0, -1.0])
     nodes = np.concatenate(comm.allgather(system.layout.nodes))

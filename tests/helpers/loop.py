@@ -93,7 +93,7 @@ def setup(case: str) -> Setup:
     control: dict[str, Any] = {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}
     if "rotation" in CASES[case]:
         control["outputs"].append({"kind": "hand"})
-    model = build(make_scene(effects=CASES[case], control=control), MPI.COMM_WORLD)
+    model = build(make_scene(effects=CASES[case], control=control), comm=MPI.COMM_WORLD)
     problem = make_problem(model)
     system, layout = model.system, model.system.layout
     M, K = (gather_matrix(layout, a).toarray() for a in (system.M_ee, system.K_ee))

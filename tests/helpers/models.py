@@ -411,7 +411,7 @@ def graded_model(scene: Scene, comm: MPI.Intracomm) -> Model:
         x[:, axis] = size[axis] * _crowded(x[:, axis] / size[axis], ends)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("softgrasp.fem.model.build.make_mesh", lambda *_: tissue)
-        return build(scene, comm)
+        return build(scene, comm=comm)
 
 
 def _crowded(s: Array, ends: list[float]) -> Array:

@@ -30,7 +30,7 @@ def numbers(folder: Path) -> dict[str, list[float]]:
     """Fewest unknowns of a rank, then what every number of ranks must give alike. Collective."""
     comm = MPI.COMM_WORLD
     scene = load_scene(shipped_scenes()["paper_lqr"], CHANGES)
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     frames = Frames(model, folder)
     run = simulate(model, RunOptions(folder, frame=frames, begin=frames.begin))
     frames.close()

@@ -30,7 +30,7 @@ TINY = {"tissue": {"cells": [2, 4]}, "time": {"steps": 30}}
 
 def model_of(comm: MPI.Intracomm, *changes: dict[str, Any]) -> Model:
     """A small block whose hand is driven by a force."""
-    return build(make_scene(TINY, FORCED, *changes), comm)
+    return build(make_scene(TINY, FORCED, *changes), comm=comm)
 
 
 def joined(

@@ -40,7 +40,7 @@ CASES: dict[str, tuple[dict[str, Any], ...]] = {
 
 @cache
 def problem_of(name: str) -> RiccatiProblem:
-    return make_problem(build(make_scene(*CASES[name]), MPI.COMM_WORLD))
+    return make_problem(build(make_scene(*CASES[name]), comm=MPI.COMM_WORLD))
 
 
 @cache
@@ -50,7 +50,7 @@ def oracle(name: str) -> RiccatiSolution:
 
 @cache
 def paper(*changes: str) -> RiccatiProblem:
-    return make_problem(build(load_scene(SCENE, ["tissue.cells=[5,10]", *changes]), MPI.COMM_WORLD))
+    return make_problem(build(load_scene(SCENE, ["tissue.cells=[5,10]", *changes]), comm=MPI.COMM_WORLD))
 
 
 def gain(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:

@@ -48,7 +48,7 @@ def case(two_way: bool = False) -> Case:
     tissue = {"cells": [5, 10], "material": {"lambda": 50.0, "mu": 30.0, "rho": 1.3}}
     effects = {"reaction": two_way}
     scene = make_scene(tissue=tissue, effects=effects, time={"steps": 156}, output={"every": 4})
-    model = build(scene, MPI.COMM_WORLD)
+    model = build(scene, comm=MPI.COMM_WORLD)
     assert model.system.layout.n_e > 80
     run = simulate(model)
     assert run.snapshots is not None

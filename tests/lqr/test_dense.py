@@ -265,7 +265,7 @@ PLANTS: list[tuple[str, list[dict], Callable]] = [
 
 
 def make(*changes: dict) -> tuple:
-    model = build(make_scene({"tissue": {"cells": [2, 4]}}, *changes), MPI.COMM_WORLD)
+    model = build(make_scene({"tissue": {"cells": [2, 4]}}, *changes), comm=MPI.COMM_WORLD)
     return model, make_problem(model)
 
 
@@ -381,7 +381,7 @@ def test_unreachable_undamped_mode_is_named() -> None:
     """Without damping a mode that the output does not see cannot be stabilised."""
     model, _ = make()
     hand = {"outputs": [{"kind": "hand"}]}
-    problem = make_problem(build(make_scene({"tissue": {"cells": [2, 4]}, "control": hand}), MPI.COMM_WORLD))
+    problem = make_problem(build(make_scene({"tissue": {"cells": [2, 4]}, "control": hand}), comm=MPI.COMM_WORLD))
     assert model.system.layout.n_e == problem.layout.n_e
     with pytest.raises(ControlError, match="modes cannot be stabilised in double precision, mode 1 "):
         DenseRiccati().solve(problem)

@@ -29,7 +29,7 @@ def damped(beta: float) -> dict:
 
 
 def make(*changes: dict) -> RiccatiProblem:
-    return make_problem(build(make_scene(SMALL, *changes), MPI.COMM_WORLD))
+    return make_problem(build(make_scene(SMALL, *changes), comm=MPI.COMM_WORLD))
 
 
 def sentences(d: Diagnosis, kind: str) -> list[str]:

@@ -38,7 +38,7 @@ EFFECTS: dict[str, Any] = {
 
 def make_model(**tables: Any) -> Model:
     scene = make_scene(effects=EFFECTS, control={"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}, **tables)
-    return build(scene, MPI.COMM_WORLD)
+    return build(scene, comm=MPI.COMM_WORLD)
 
 
 def make_problem(model: Model) -> RiccatiProblem:
@@ -216,7 +216,7 @@ def test_hash_knows_the_mesh_only(problem: RiccatiProblem) -> None:
     ours = layout_hash(problem.layout)
     soft = make_model(tissue={"material": {"lambda": 10.0, "mu": 5.0, "rho": 1.0}})
     wide = make_model(tissue={"size": [1.0, 2.0 + 1e-6]})
-    alone = build(soft.scene, MPI.COMM_SELF)
+    alone = build(soft.scene, comm=MPI.COMM_SELF)
     assert len(ours) == 64
     assert layout_hash(soft.system.layout) == ours
     assert layout_hash(alone.system.layout) == ours  # whatever the number of ranks

@@ -78,7 +78,7 @@ def test_a_factor_that_fails_ahead_says_so_when_it_is_wanted() -> None:
 def test_solutions_do_not_depend_on_the_threads(
     comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch, announced: int
 ) -> None:
-    system = build(make_scene(effects={"damping": {"kind": "kelvin-voigt", "beta": 0.01}}), comm).system
+    system = build(make_scene(effects={"damping": {"kind": "kelvin-voigt", "beta": 0.01}}), comm=comm).system
     F = np.random.default_rng(0).standard_normal((system.layout.n_local, 3))
     alone = GatheredTissue(system)
     assert alone.ahead is None

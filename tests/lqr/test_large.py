@@ -106,7 +106,7 @@ def test_inputs_stay_bitwise_the_same() -> None:
 def test_same_result_on_every_rank_count() -> None:
     """A rank by itself solves the same scene; the parallel gain is the same."""
     problem = problem_of("one_way")
-    alone = make_problem(build(make_scene(*CASES["one_way"]), MPI.COMM_SELF))
+    alone = make_problem(build(make_scene(*CASES["one_way"]), comm=MPI.COMM_SELF))
     reference = gain(alone, NewtonADI().solve(alone))
     for method in (NewtonADI(), NewtonADI(tissue="distributed"), RADI(), RADI(tissue="distributed")):
         found = method.solve(problem)
@@ -147,7 +147,7 @@ def test_numbers_that_are_not_finite_stop_the_first_step(monkeypatch: pytest.Mon
 
 
 def test_undamped_is_refused_with_the_way_out() -> None:
-    problem = make_problem(build(make_scene({"control": NODE}), MPI.COMM_WORLD))
+    problem = make_problem(build(make_scene({"control": NODE}), comm=MPI.COMM_WORLD))
     for method in (NewtonADI(), RADI(), StructuredGalerkin()):
         with pytest.raises(ControlError, match=r"effects\.damping\.beta"):
             method.solve(problem)
@@ -266,7 +266,7 @@ def test_choice_names_its_reason() -> None:
     small, paper_like = problem_of("one_way"), paper()
     assert choose(small).method == "dense"
     assert choose(paper_like).method == "newton_adi"
-    layers = make_problem(build(make_scene(*CASES["layers"], tissue={"cells": [6, 12]}), MPI.COMM_WORLD))
+    layers = make_problem(build(make_scene(*CASES["layers"], tissue={"cells": [6, 12]}), comm=MPI.COMM_WORLD))
     assert choose(layers).method == "radi"
     assert "(chosen: asked for)" in solve(small, "galerkin").method
     with pytest.raises(SolverError, match="unknown"):

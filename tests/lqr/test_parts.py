@@ -207,7 +207,7 @@ def test_symmetric_sparse_copy_is_the_matrix() -> None:
 @pytest.mark.serial
 def test_factors_of_a_helper_thread_are_freed() -> None:
     """SciPy frees the memory of a factor only in the thread that made it; forty of them hold 500 MB."""
-    system = build(load_scene(SCENE, ["tissue.cells=[40,80]"]), MPI.COMM_SELF).system
+    system = build(load_scene(SCENE, ["tissue.cells=[40,80]"]), comm=MPI.COMM_SELF).system
     tissue = GatheredTissue(system)
     F = np.ones((system.layout.n_local, 1))
     shifts = [complex(-1.0 - 0.1 * i, 2.0 + i) for i in range(44)]

@@ -42,7 +42,7 @@ TARGET = np.array([5.0, 3.0])
 
 @cache
 def plant(two_way: bool = False) -> tuple[Model, RiccatiProblem, RiccatiSolution]:
-    model = build(make_scene(DAMPED, {"effects": {"reaction": two_way}}), MPI.COMM_WORLD)
+    model = build(make_scene(DAMPED, {"effects": {"reaction": two_way}}), comm=MPI.COMM_WORLD)
     problem = make_problem(model)
     return model, problem, DenseRiccati().solve(problem)
 
@@ -372,7 +372,7 @@ def test_retuning_over_a_box() -> None:
 @pytest.mark.slow
 def test_bases_of_the_papers_scene_equal_the_dense_definition() -> None:
     """2n = 880, the size of the paper."""
-    model = build(make_scene(DAMPED, {"tissue": {"cells": [10, 20]}}), MPI.COMM_WORLD)
+    model = build(make_scene(DAMPED, {"tissue": {"cells": [10, 20]}}), comm=MPI.COMM_WORLD)
     problem = make_problem(model)
     solution = DenseRiccati().solve(problem)
     Z = to_absolute(problem, solution).Z

@@ -45,7 +45,7 @@ def spread(problem: RiccatiProblem, Z: Array) -> Candidate:
 @pytest.mark.parametrize("name", list(CASES))
 def test_residual_of_any_z_is_the_dense_one(name: str) -> None:
     """Also of a Z that is no solution: the number, not only its smallness."""
-    problem = make_problem(build(make_scene(CONTROL, *CASES[name], tissue={"cells": [3, 6]}), MPI.COMM_WORLD))
+    problem = make_problem(build(make_scene(CONTROL, *CASES[name], tissue={"cells": [3, 6]}), comm=MPI.COMM_WORLD))
     space = problem.layout.comm.bcast(relative_space(problem))
     rng = np.random.default_rng(1)
     for rank in (1, 5):
@@ -57,7 +57,7 @@ def test_residual_of_any_z_is_the_dense_one(name: str) -> None:
 
 
 def test_residual_sees_a_small_error() -> None:
-    problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), MPI.COMM_WORLD))
+    problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), comm=MPI.COMM_WORLD))
     found = DenseRiccati().solve(problem)
     assert residual(problem, found) < 1e-9  # rounding times |A||X|
     worse = Candidate(found.Z_s * (1 + 1e-6), found.Z_z, found.Z_v)
@@ -65,7 +65,7 @@ def test_residual_sees_a_small_error() -> None:
 
 
 def test_residual_leaves_its_input_alone() -> None:
-    problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), MPI.COMM_WORLD))
+    problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), comm=MPI.COMM_WORLD))
     found = DenseRiccati().solve(problem)
     copies = [x.copy() for x in (found.Z_s, found.Z_z, found.Z_v)]
     residual(problem, found)

@@ -35,12 +35,12 @@ LAYERED: dict[str, Any] = {**KELVIN, "tissue": {"layers": LAYERS}}
 
 
 def shipped(name: str, *changes: str) -> RiccatiProblem:
-    model, _ = with_control(build(load_scene(SCENES / name, list(changes)), MPI.COMM_WORLD))
+    model, _ = with_control(build(load_scene(SCENES / name, list(changes)), comm=MPI.COMM_WORLD))
     return make_problem(model)
 
 
 def small(*changes: dict[str, Any]) -> RiccatiProblem:
-    return make_problem(build(make_scene(CONTROL, *changes), MPI.COMM_WORLD))
+    return make_problem(build(make_scene(CONTROL, *changes), comm=MPI.COMM_WORLD))
 
 
 def gain(problem: RiccatiProblem) -> Block:

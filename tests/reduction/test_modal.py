@@ -112,7 +112,7 @@ def test_batch_of_prescribed_hands_is_its_runs(comm: MPI.Intracomm, damped: bool
 def test_new_parameter_is_fast(comm: MPI.Intracomm) -> None:
     """N = 14, 600 steps, small matrices to outputs, 0.36 ms: no more than a few runs of the same model again."""
     scene = make_scene(TINY, {"output": {"snapshots": "memory"}, "time": {"steps": 600}})
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     full, dt = simulate(model), step_of(model)
     rom = project(make_basis("craig_bampton", states_of(model.system), 14), model.system)
     materials = tuple(replace(m, lam=77.0, mu=60.0) for m in model.system.materials)

@@ -352,7 +352,7 @@ def test_inputs_are_left_alone(comm: MPI.Intracomm) -> None:
 
 
 def test_three_dimensions(comm: MPI.Intracomm) -> None:
-    model = build(make_scene(CUBE, FORCED, {"time": {"steps": 12}, "effects": {"rotation": True}}), comm)
+    model = build(make_scene(CUBE, FORCED, {"time": {"steps": 12}, "effects": {"rotation": True}}), comm=comm)
     for kind in (("qv", "absolute", True), ("qp", "relative", True)):
         full, small_run, rom = full_and_reduced(model, whole_basis(model.system.layout, *kind))
         z, _ = rom.reconstruct(rom.at(), small_run.x.T, small_run.v_s.T)

@@ -67,7 +67,7 @@ def test_blocks_of_steps_are_the_plain_rule(comm: MPI.Intracomm, steps: int) -> 
 def test_a_prescribed_hand_is_the_force_that_carries_it(comm: MPI.Intracomm) -> None:
     """u_n = M_hand (v_{n+1} - v_n) / dt reproduces the hand; the table's own positions differ by O(dt^2)."""
     scene = make_scene(TINY, DAMPED, {"output": {"snapshots": "memory"}})
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     full, dt = simulate(model), step_of(model)
     u = np.diff(full.v_s, axis=0) / dt @ model.system.M_hand.T
     for kind in KINDS:
@@ -242,7 +242,7 @@ def test_online_speed(comm: MPI.Intracomm) -> None:
 def test_file_keeps_everything(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     model = model_of(comm, DAMPED, {"effects": {"gravity": {"g": [1.0, -9.0]}}})
     layout = model.system.layout
-    alone = build(model.scene, MPI.COMM_SELF).system.layout
+    alone = build(model.scene, comm=MPI.COMM_SELF).system.layout
     for kind in KINDS:
         coordinates, frame, fixed = kind
         rom = reduced(model, symplectic_basis(layout, 3, frame, fixed, coordinates))

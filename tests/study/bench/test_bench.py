@@ -53,13 +53,13 @@ def test_size_1000_is_the_paper_and_others_come_near(comm: MPI.Intracomm) -> Non
     scene = bench_worker.bench_scene(comm, 2, [15, 30], 600)
     assert scene.time_end == 3.0
     for d, size in ((2, 3000), (3, 3000)):
-        n_e = build(bench_worker.bench_scene(comm, d, bench_worker.cells_for(d, size), 1), comm).system.layout.n_e
+        n_e = build(bench_worker.bench_scene(comm, d, bench_worker.cells_for(d, size), 1), comm=comm).system.layout.n_e
         assert abs(n_e / size - 1) < 0.15  # one more cell a side adds up to 30 % in 3D at this size
 
 
 @pytest.mark.serial
 def test_all_methods_end_in_the_same_state(comm: MPI.Intracomm) -> None:
-    model = build(bench_worker.bench_scene(comm, 2, [4, 8], 60, "memory"), comm)
+    model = build(bench_worker.bench_scene(comm, 2, [4, 8], 60, "memory"), comm=comm)
     system = model.system
     n = system.layout.n_e
     run = simulate(model)

@@ -183,7 +183,7 @@ def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
     poles = np.linalg.eigvals(np.linalg.solve(small.E, small.A + small.B @ controller.K))
     assert exported.closed_loop.poles().real.max() == pytest.approx(poles.real.max(), rel=1e-9)  # one matrix, twice
     assert result["controller"]["sampled_radius"] < 1
-    model = build(load_scene(SCENES / "paper_lqr.toml", SMALL), MPI.COMM_WORLD)
+    model = build(load_scene(SCENES / "paper_lqr.toml", SMALL), comm=MPI.COMM_WORLD)
     gain, target = load_gain(out / "gain.npz", model.system.layout)
     assert np.allclose(gain.K_s[:, :2], result["gain_translation"], rtol=0, atol=1e-14)  # the same numbers
     assert target.q_s.tolist() == [5.0, 3.0]
@@ -303,7 +303,7 @@ def test_forces_and_torques_have_limits_of_their_own() -> None:
         ({"limit_torque": 0.25}, [np.inf, np.inf, 0.25]),
     ):
         scene = make_scene(effects={"rotation": True}, control={"outputs": outputs, "loop": given})
-        assert (actuation(build(scene, MPI.COMM_WORLD)).bound(3) == bound).all()
+        assert (actuation(build(scene, comm=MPI.COMM_WORLD)).bound(3) == bound).all()
 
 
 @pytest.mark.parametrize("method", ["auto", "modal"])
@@ -326,7 +326,7 @@ def test_a_scene_without_control_watches_tip_and_turning_hand() -> None:
     effects = {"damping": {"kind": "kelvin-voigt", "beta": 0.02}}
     for turning, kinds in ((False, ["node"]), (True, ["node", "hand"])):
         scene = make_scene(effects={**effects, "rotation": turning}, motion={"target": [1.0, 0.5]})
-        model, note = with_control(build(scene, MPI.COMM_WORLD))
+        model, note = with_control(build(scene, comm=MPI.COMM_WORLD))
         assert "no [control] table" in note
         control = model.scene.control
         assert control is not None

@@ -118,10 +118,10 @@ def test_locking_is_measured_and_not_only_suspected(comm: MPI.Intracomm) -> None
     assert study_effects(make_scene(QUICK, hold, start), comm).elements is None  # nu = 1/4
     elements = study_effects(make_scene(QUICK, hold, start, soft), comm).elements
     assert elements is not None
-    point = make_outputs(make_scene(), build(make_scene(), comm).system)[0].point
+    point = make_outputs(make_scene(), build(make_scene(), comm=comm).system)[0].point
     at = {"control": {"outputs": [{"kind": "node", "point": list(point)}]}}
     a, b = (
-        simulate(build(make_scene(QUICK, hold, start, soft, at, {"tissue": {"order": n}}), comm)).outputs[0]
+        simulate(build(make_scene(QUICK, hold, start, soft, at, {"tissue": {"order": n}}), comm=comm)).outputs[0]
         for n in (1, 2)
     )
     expected = np.linalg.norm(a - b) / max(np.linalg.norm(a), np.linalg.norm(b))
@@ -162,7 +162,7 @@ def test_damping_for_control_is_not_called_wasted(comm: MPI.Intracomm) -> None:
 
 def largest_change(comm: MPI.Intracomm, *tables: dict[str, Any]) -> float:
     """The largest relative change of the outputs between two scenes, by numpy alone."""
-    a, b = (simulate(build(make_scene(QUICK, FORCE, table), comm)).outputs for table in tables)
+    a, b = (simulate(build(make_scene(QUICK, FORCE, table), comm=comm)).outputs for table in tables)
     return float(np.linalg.norm(a - b, axis=1).max() / max(np.linalg.norm(y, axis=1).max() for y in (a, b)))
 
 
@@ -244,7 +244,8 @@ def test_an_effect_may_need_two_partners_and_a_force() -> None:
 def test_change_is_what_two_runs_differ_by(comm: MPI.Intracomm) -> None:
     _, by = found(comm, CONTROL, effects={"gravity": {"g": [0.0, -3.0]}})
     with_, without = (
-        simulate(build(make_scene(QUICK, CONTROL, effects={"gravity": g}), comm)) for g in ({"g": [0.0, -3.0]}, False)
+        simulate(build(make_scene(QUICK, CONTROL, effects={"gravity": g}), comm=comm))
+        for g in ({"g": [0.0, -3.0]}, False)
     )
     difference = np.linalg.norm(with_.outputs - without.outputs, axis=1).max()
     scale = max(np.linalg.norm(run.outputs, axis=1).max() for run in (with_, without))
@@ -271,8 +272,8 @@ def test_strength_below_which_gravity_does_not_show(comm: MPI.Intracomm) -> None
 
 def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None:
     outputs = {"control": {"outputs": [{"kind": "hand"}, {"kind": "node", "point": [0.5, 0.0]}]}}
-    plain = build(make_scene(outputs), comm)
-    turning = build(make_scene(outputs, effects={"rotation": True}, motion={"target": [5.0, 3.0, 0.3]}), comm)
+    plain = build(make_scene(outputs), comm=comm)
+    turning = build(make_scene(outputs, effects={"rotation": True}, motion={"target": [5.0, 3.0, 0.3]}), comm=comm)
     a, b = simulate(plain), simulate(turning)
     assert b.outputs.shape[1] == a.outputs.shape[1] + 1
     node = np.linalg.norm(b.outputs[:, 3:] - a.outputs[:, 2:], axis=1).max()
@@ -282,7 +283,7 @@ def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None
 
 def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:
     """A run taken back to its start gives the state of a fresh one."""
-    model = build(make_scene(effects=ALL_ON, motion={"drive": "force"}), comm)
+    model = build(make_scene(effects=ALL_ON, motion={"drive": "force"}), comm=comm)
     stepper = Stepper(model)
     stepper.seconds_per_step(2 * 60 + 17)
     stepper.rewind()
@@ -294,13 +295,13 @@ def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:
 
 
 def test_memory_counts_what_each_effect_holds(comm: MPI.Intracomm) -> None:
-    bare = measured(build(make_scene(), comm))
+    bare = measured(build(make_scene(), comm=comm))
     n_e = bare.model.system.layout.n_e
     for effects, tables, new in (
         ({"damping": {"kind": "kelvin-voigt", "beta": 0.01}}, {}, {"step.k_old": 8 * n_e}),
         ({"reaction": True}, FORCE, {"step.Y": 16 * n_e}),
     ):
-        case = measured(build(make_scene(tables, effects=effects), comm))
+        case = measured(build(make_scene(tables, effects=effects), comm=comm))
         # on ranks that all step the whole tissue, each holds it
         assert [case.bytes[name] / size for name, size in new.items()] in ([1], [comm.size])
         assert not set(new) & set(bare.bytes)
@@ -365,12 +366,12 @@ def test_table_of_petsc_is_read_over_all_stages() -> None:
 
 def test_proof_sees_every_effect_that_is_on(comm: MPI.Intracomm) -> None:
     """Each part of the proof fails for a scene in which the effect is on after all."""
-    bare = measured(build(make_scene(FORCE), comm))
+    bare = measured(build(make_scene(FORCE), comm=comm))
     for name in ("gravity", "damping", "reaction", "rotation", "layers"):
         tables: dict[str, Any] = {"effects": {name: ALL_ON[name]}} if name in ALL_ON else {"tissue": {"layers": {}}}
         if name == "layers":
             tables = {"tissue": {"layers": {"core": LAYERS["core"]}}}
-        on = measured(build(make_scene(FORCE, tables), comm))
+        on = measured(build(make_scene(FORCE, tables), comm=comm))
         assert nothing_of(name, bare)
         assert not nothing_of(name, on), name
         proof = prove_off(name, bare, on)

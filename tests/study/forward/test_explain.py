@@ -149,7 +149,7 @@ def test_large_strain_and_angle(comm: MPI.Intracomm) -> None:
 
 def test_a_run_that_stores_nothing_warns_of_a_strain_seen_on_the_way(comm: MPI.Intracomm) -> None:
     still = scene_of(motion={"target": [1e-3, 0.0]}, output={"snapshots": "none"})
-    model = build(still, comm)
+    model = build(still, comm=comm)
     run = simulate(model)
     assert run.snapshots is None
     assert run_warnings(model, run) == []
@@ -161,7 +161,7 @@ def test_a_run_that_stores_nothing_warns_of_a_strain_seen_on_the_way(comm: MPI.I
 
 def test_a_run_warns_of_what_explain_warns_of(comm: MPI.Intracomm) -> None:
     few = scene_of(1, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, time={"steps": 6})
-    model = build(few, comm)
+    model = build(few, comm=comm)
     found = run_warnings(model, simulate(model))
     told = explain(few, comm).warnings
     assert told[0] in found  # locking, word by word
@@ -169,12 +169,12 @@ def test_a_run_warns_of_what_explain_warns_of(comm: MPI.Intracomm) -> None:
     assert coarse.split(": use")[1] == next(w for w in told if "coarse" in w).split(": use")[1]  # as many steps
     assert "of the body at t =" in strained
     gentle = {"motion": {"target": [1e-3, 0.0], "duration": 2.0}, "time": {"steps": 400}}
-    model = build(scene_of(2, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, **gentle), comm)
+    model = build(scene_of(2, {"young": 100.0, "poisson": 0.499, "rho": 1.0}, **gentle), comm=comm)
     assert run_warnings(model, simulate(model)) == []
 
 
 def test_slowest_period_and_gradient(comm: MPI.Intracomm) -> None:
-    model = build(scene_of(2, contact={"sides": ["top"]}), comm)
+    model = build(scene_of(2, contact={"sides": ["top"]}), comm=comm)
     layout = model.system.layout
     omega, Phi = lowest_modes(model.system, 3)
     moving = Phi @ np.array([[1.0, 0.0, 0.0, -1.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]])
@@ -193,7 +193,7 @@ def test_typical_gradient_leaves_out_a_hundredth_of_the_body(comm: MPI.Intracomm
     """z_x = y^2 / 2 has the slope of the middle of each row of cells; a row is one in 200 of the body."""
     rows = 200
     tissue = {"size": [0.02, 2.0], "cells": [1, rows], "material": {"lambda": 50.0, "mu": 50.0, "rho": 1.0}}
-    model = build(scene_of(tissue=tissue, contact={"sides": ["bottom"]}), comm)
+    model = build(scene_of(tissue=tissue, contact={"sides": ["bottom"]}), comm=comm)
     z = np.zeros(model.system.layout.n_local)
     z[::2] = model.system.layout.nodes[:, 1] ** 2 / 2
     steep = gradient(model, z)
@@ -217,7 +217,7 @@ def test_factor_estimate(comm: MPI.Intracomm, cells: list[int]) -> None:
     d = len(cells)
     tissue = {"size": [1.0, 2.0, 2.0][:d], "cells": cells, "material": {"lambda": 50.0, "mu": 50.0, "rho": 1.0}}
     scene = scene_of(tissue=tissue, contact={"sides": ["left"]}, motion={"profile": "hold"})
-    system = build(scene, comm).system
+    system = build(scene, comm=comm).system
     name, _ = choose_solver(system.layout)
     solver = make_solver(midpoint_matrix(system, 0.01), name, system.layout, "softgrasp_test_")
     factor = solver.ksp.getPC().getFactorMatrix()

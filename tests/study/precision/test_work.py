@@ -92,7 +92,7 @@ def again(folder: Path) -> WorkStudy:
 
 def tip(comm: MPI.Intracomm, setting: Setting, model: Model | None = None) -> Array:
     """Outputs against the hand by the plain simulation; the point is a node of meshes with even cells across."""
-    run = simulate(model or build(variant(make_scene(SMALL), setting), comm))
+    run = simulate(model or build(variant(make_scene(SMALL), setting), comm=comm))
     return np.asarray(run.outputs - run.outputs_rigid)
 
 
@@ -355,7 +355,7 @@ def test_every_question_has_slopes(result: dict[str, Any]) -> None:
 
 def test_places_are_the_nodes_of_the_plain_run_where_there_are_any(comm: MPI.Intracomm) -> None:
     setting, scene = Setting((4, 8), 2, 24), make_scene(SMALL)
-    model = build(variant(scene, setting), comm)
+    model = build(variant(scene, setting), comm=comm)
     run = run_probed(model, make_probe(model.space, find_places(scene, model).points, False))
     # sums of a few shape functions: rounding
     np.testing.assert_allclose(run.own, tip(comm, setting), rtol=0, atol=1e-12)
@@ -363,7 +363,7 @@ def test_places_are_the_nodes_of_the_plain_run_where_there_are_any(comm: MPI.Int
 
 def test_a_scene_that_sees_its_hand_only_is_measured_at_the_farthest_node(comm: MPI.Intracomm) -> None:
     scene = make_scene(SMALL, {"control": {"outputs": [{"kind": "hand", "name": "hand"}]}})
-    places = find_places(scene, build(scene, comm))
+    places = find_places(scene, build(scene, comm=comm))
     assert [p.shape for p in places.points] == [(1, 2)]
     assert places.points[0][0, 1] == 0.0  # the lower edge; the hand holds the upper part
 

@@ -69,7 +69,7 @@ def result(folder: Path) -> dict[str, Any]:
 
 
 def the_problem(comm: MPI.Intracomm) -> RiccatiProblem:
-    return make_problem(build(make_scene(SMALL), comm))
+    return make_problem(build(make_scene(SMALL), comm=comm))
 
 
 def asked(comm: MPI.Intracomm, cache: Path, changes: dict[str, Any], names: str = ALL) -> WorkStudy:
@@ -277,7 +277,7 @@ def test_large_scenes_are_asked_by_name_only(
     comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wp_riccati, "LARGE", {2: 10, 3: 10})
-    model, store = build(make_scene(SMALL), comm), Cache(mpi_tmp_path, comm, make_scene(SMALL))
+    model, store = build(make_scene(SMALL), comm=comm), Cache(mpi_tmp_path, comm, make_scene(SMALL))
     runs = [wp_riccati.ControlRuns(model, store, Guard(comm), names) for names in ((), ("riccati",))]
     assert "--question" in runs[0].refused()
     assert runs[1].refused() == ""

@@ -78,11 +78,11 @@ def _few_samples() -> Iterator[None]:
 
 def outputs(comm: MPI.Intracomm, scene: Scene, setting: Setting, graded: bool = False) -> Array:
     """Outputs against the hand at the places of the scene's own mesh, (steps + 1, p)."""
-    own = build(variant(scene, own_setting(scene)), comm)
+    own = build(variant(scene, own_setting(scene)), comm=comm)
     # the hand turns about one point on every mesh
     reference = own.system.layout.reference.tolist() if scene.effects.rotation else None
     changed = variant(scene, setting, reference=reference)
-    model = graded_model(changed, comm) if graded else build(changed, comm)
+    model = graded_model(changed, comm) if graded else build(changed, comm=comm)
     return run_probed(model, make_probe(model.space, find_places(scene, own).points, scene.effects.rotation)).own
 
 

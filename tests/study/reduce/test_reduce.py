@@ -39,7 +39,7 @@ SMALL = ["tissue.cells=[5,10]", "time.steps=120"]
 
 
 def made(scene: Any, comm: MPI.Intracomm = MPI.COMM_WORLD) -> Reference:
-    model = build(scene, comm)
+    model = build(scene, comm=comm)
     return reference(model, simulate(model))
 
 
@@ -433,11 +433,11 @@ def test_size_without_an_equilibrium_is_refused_alone() -> None:
 
 def test_default_box_follows_the_material() -> None:
     soft = {"tissue": {"cells": [2, 4], "material": {"lambda": 6e4, "mu": 1.5e4, "rho": 1e3}}, "time": {"steps": 10}}
-    model = build(make_scene(soft), MPI.COMM_SELF)
+    model = build(make_scene(soft), comm=MPI.COMM_SELF)
     assert outside(model) == ""
     assert grid_of(model)[0] == pytest.approx((3.6e4, 6e3))
     assert grid_of(model)[-1] == pytest.approx((6e5, 1.5e5))
-    own = build(make_scene(soft, {"reduction": {"mu_range": [20.0, 500.0]}}), MPI.COMM_SELF)
+    own = build(make_scene(soft, {"reduction": {"mu_range": [20.0, 500.0]}}), comm=MPI.COMM_SELF)
     assert "mu = 1.5e+04 Pa" in outside(own)
 
 
