@@ -14,6 +14,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SceneError
 
 if TYPE_CHECKING:
+    from softgrasp.fem.mesh.bisect import Whole
     from softgrasp.fem.mesh.parts import Parts
     from softgrasp.fem.scene.scene import Scene
 
@@ -32,6 +33,9 @@ class TissueMesh:
         parts: what is known of these parts, or None.
         facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
         cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
+        contact: facets of the contact zone that a refined mesh inherits; None: they are selected on this mesh.
+        layers: number of the layer of each cell that a refined mesh inherits, -1 for none; None likewise.
+        whole: a bisected mesh on rank 0, to bisect it further; None elsewhere and on other meshes.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -43,6 +47,9 @@ class TissueMesh:
     parts: Parts | None = None
     facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
     cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    contact: dolfinx.mesh.MeshTags | None = None
+    layers: dolfinx.mesh.MeshTags | None = None
+    whole: Whole | None = None
 
 
 def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:

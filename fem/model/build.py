@@ -14,7 +14,7 @@ from mpi4py import MPI
 from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
-from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.make import TissueMesh, make_mesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.system import (
@@ -78,15 +78,28 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
-def build(scene: Scene, comm: MPI.Intracomm) -> Model:
+def _scene_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
+    if scene.tissue.refine is None:
+        return make_mesh(comm, scene)
+    from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it
+
+    return refined_mesh(comm, scene)
+
+
+def build(scene: Scene, comm: MPI.Intracomm, mesh: TissueMesh | None = None) -> Model:
     """Mesh, assemble and couple. Collective.
+
+    Args:
+        scene: the scene.
+        comm: communicator.
+        mesh: on which; None makes that of the scene.
 
     Raises:
         SceneError, MeshError: with one sentence that names the key or the file.
     """
     watch, inventory = Stopwatch(comm), Inventory()
     with watch.stage("mesh"):
-        mesh = make_mesh(comm, scene)
+        mesh = mesh or _scene_mesh(comm, scene)
     with watch.stage("assembly"):
         space = discretise(mesh, scene)
         layers = assemble(space, scene, inventory)
