@@ -26,6 +26,7 @@ from softgrasp.fem.system import (
 )
 
 if TYPE_CHECKING:
+    from softgrasp.fem.model.mesh_estimate import MeshEstimate
     from softgrasp.fem.scene.scene import Scene
 
 
@@ -56,6 +57,7 @@ class Model:
         system: the operators.
         inventory: compiled forms and allocated operators.
         watch: seconds of mesh and assembly.
+        accuracy: estimate of the error of the mesh, where the scene has a tolerance.
     """
 
     scene: Scene
@@ -63,6 +65,7 @@ class Model:
     system: BlockSystem
     inventory: Inventory
     watch: Stopwatch
+    accuracy: MeshEstimate | None = None
 
 
 def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:

@@ -1,0 +1,85 @@
+"""A mesh that reaches `tissue.refine.tolerance`: graded a priori, estimated, and refined where the outputs need it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+from softgrasp.fem.accuracy.estimate import estimate, next_order, reduced
+from softgrasp.fem.accuracy.marking import marked_cells
+from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.mesh.bisect import Whole, bisect, distribute
+from softgrasp.fem.mesh.make import TissueMesh
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.mesh_estimate import MeshEstimate
+from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
+
+if TYPE_CHECKING:
+    from softgrasp.fem.accuracy.small import Small
+    from softgrasp.fem.scene.scene import Scene
+    from softgrasp.fem.scene.tissue import Refine
+
+ACCEPTED = 0.6  # estimate over tolerance: estimates are 0.5 to 0.9 of the error
+
+
+def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
+    """Build a scene on a mesh of its tolerance, with the estimate of what it reached; others as they are. Collective.
+
+    Raises:
+        SceneError: the time step leaves more than the tolerance, or the scene cannot be built.
+        MeshError, SolverError: see :func:`fem.model.build.build`.
+    """
+    model, refine = build(scene, comm), scene.tissue.refine
+    if refine is None or refine.tolerance is None:
+        return model
+    passes, aim = 0, refine.tolerance
+    while True:
+        small = reduced(model)
+        result = estimate(model, small)
+        if passes == 0:
+            _check_steps(scene, refine.tolerance, result.time_error)
+        reached = result.estimate <= ACCEPTED * refine.tolerance
+        obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
+        mesh: TissueMesh | None = None
+        if not reached and passes < refine.passes:
+            aim *= 0.9 * ACCEPTED * refine.tolerance / result.estimate
+            mesh = _finer(model, small, refine, aim)
+            if mesh is None:
+                obstacle = f"tissue.refine.most = {refine.most} unknowns allow no finer mesh"
+        if mesh is None:
+            return replace(model, accuracy=_final(result, refine, passes, obstacle))
+        model, passes = build(scene, comm, mesh), passes + 1
+
+
+def _final(result: MeshEstimate, refine: Refine, passes: int, obstacle: str) -> MeshEstimate:
+    return replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
+
+
+def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
+    if error > tolerance:
+        steps = int(scene.time.steps * (2 * error / tolerance) ** 0.5) + 1
+        raise SceneError(
+            f"tissue.refine.tolerance = {tolerance:g} is below the error {error:.1e} that time.steps = "
+            f"{scene.time.steps} leave on any mesh: use at least {steps} steps or a larger tolerance."
+        )
+
+
+def _finer(model: Model, small: Small, refine: Refine, aim: float) -> TissueMesh | None:
+    """The next mesh, or None if it has too many unknowns. Collective."""
+    comm, scene = model.system.layout.comm, model.scene
+    if by_lines(scene):
+        mesh = refined_mesh(comm, scene, aim)
+        cells = [m.mesh.topology.index_map(m.dimension).size_global for m in (mesh, model.space.mesh)]
+        return mesh if cells[0] > cells[1] else None
+    marked = marked_cells(small, next_order(model))
+    whole: Whole | None = None
+    with agree(comm):
+        if model.space.mesh.whole is not None and marked is not None:
+            whole = bisect(model.space.mesh.whole, marked)
+            if unknowns(whole, scene.tissue.order) > refine.most:
+                whole = None
+    if not comm.bcast(whole is not None):
+        return None
+    return distribute(comm, whole, model.space.mesh.dimension)
