@@ -44,8 +44,9 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
         mesh: TissueMesh | None = None
         if not reached and passes < refine.passes:
-            aim *= 0.9 * ACCEPTED * refine.tolerance / result.estimate
-            mesh = _finer(model, small, refine, aim)
+            factor = 0.9 * ACCEPTED * refine.tolerance / result.estimate
+            aim *= factor
+            mesh = _finer(model, small, refine, aim, factor)
             if mesh is None:
                 obstacle = f"tissue.refine.most = {refine.most} unknowns allow no finer mesh"
         if mesh is None:
@@ -66,14 +67,14 @@ def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
         )
 
 
-def _finer(model: Model, small: Small, refine: Refine, aim: float) -> TissueMesh | None:
+def _finer(model: Model, small: Small, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
     """The next mesh, or None if it has too many unknowns. Collective."""
     comm, scene = model.system.layout.comm, model.scene
     if by_lines(scene):
         mesh = refined_mesh(comm, scene, aim)
         cells = [m.mesh.topology.index_map(m.dimension).size_global for m in (mesh, model.space.mesh)]
         return mesh if cells[0] > cells[1] else None
-    marked = marked_cells(small, next_order(model))
+    marked = marked_cells(small, next_order(model), factor)
     whole: Whole | None = None
     with agree(comm):
         if model.space.mesh.whole is not None and marked is not None:

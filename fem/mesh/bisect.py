@@ -147,9 +147,7 @@ def distribute(comm: MPI.Intracomm, whole: Whole | None, dimension: int) -> Tiss
     source, cell_names, facet_names, facet_sets, cell_sets = comm.bcast(facts)
     known: Parts | None = comm.bcast(None if parts is None else parts[1])
     shape = {2: "triangle", 3: "tetrahedron"}[d]
-    mesh = dolfinx.mesh.create_mesh(
-        comm, cells, ufl.Mesh(basix.ufl.element("Lagrange", shape, 1, shape=(d,))), points
-    )
+    mesh = dolfinx.mesh.create_mesh(comm, cells, ufl.Mesh(basix.ufl.element("Lagrange", shape, 1, shape=(d,))), points)
     nothing = np.zeros(0, dtype=np.int32)
     on_cells = {name: _spread(mesh, d, cells, whole.cells[name] if whole else nothing) for name in cell_names}
     on_facets = {

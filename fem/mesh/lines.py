@@ -78,9 +78,7 @@ def even_cells(axis: Axis, h: float) -> int:
     return sum(int(np.ceil((b - a) / h - SAME)) for a, b in zip(axis.cuts[:-1], axis.cuts[1:], strict=True))
 
 
-def box_of_lines(
-    comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: float, radius: float
-) -> TissueMesh:
+def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: float, radius: float) -> TissueMesh:
     """The structured box with lines at all cuts that crowd towards the ends; mu = 1: even between cuts. Collective.
 
     Args:

@@ -115,7 +115,9 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
     d = points.shape[1]
     facets = np.sort(np.concatenate([np.delete(cells, i, axis=1) for i in range(d + 1)]), axis=1)
     owner = np.tile(np.arange(len(cells)), d + 1)
-    unique, first, inverse, count = np.unique(facets, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    unique, first, inverse, count = np.unique(
+        facets, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
     inverse = inverse.ravel()
     outside = count == 1
     least, largest = np.full(len(unique), len(layers) + 1), np.full(len(unique), -2)

@@ -14,7 +14,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
 from softgrasp.fem.errors import agree
-from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.scene.file import load_scene_collective, resolved_toml
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import write_json, write_scene
@@ -88,7 +89,7 @@ class Session:
         Raises:
             SoftgraspError: the scene cannot be built.
         """
-        model = build(scene, self.comm)
+        model = build_to_tolerance(scene, self.comm)
         layout = model.system.layout
         sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
         self.console.print(sizes)
