@@ -2,9 +2,9 @@
 
     delta y(t) = y'(t) - y_h(t)
 
-is the difference of two small models (:mod:`fem.accuracy.small`) under the scene's own motion, start, damping and coupling:
-one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh where the mesh has no
-grading of its own. Both share the time step, whose error cancels.
+is the difference of two small models (:mod:`fem.accuracy.small`) under the scene's own motion, start, damping and
+coupling: one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh where the
+mesh has no grading of its own. Both share the time step, whose error cancels.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+import dolfinx.mesh
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.small import Small, run_small, small_model, static_solves
+from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.model.mesh_estimate import MeshEstimate
-from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.tissue import Refine
 
@@ -136,18 +137,13 @@ def zone_shift(model: Model) -> float:
     mesh, box, comm = model.space.mesh, model.scene.contact.box, model.system.layout.comm
     if box is None:
         return 0.0
-    import dolfinx.mesh
-
     facets = contact_facets(mesh, model.scene.contact)
     mesh.mesh.topology.create_connectivity(mesh.dimension - 1, mesh.dimension)
     nodes = dolfinx.mesh.entities_to_geometry(mesh.mesh, mesh.dimension - 1, facets).ravel()
-    x, body = mesh.mesh.geometry.x[nodes, : mesh.dimension], mesh.mesh.geometry.x[:, : mesh.dimension]
-    result = 0.0
-    for sign, corner in zip((1.0, -1.0), box, strict=True):
-        ends, all_ends = (
-            np.array(comm.allreduce((sign * part).min(axis=0, initial=np.inf), MPI.MIN)) for part in (x, body)
-        )
-        wanted = sign * np.asarray(corner)
-        inner = wanted > all_ends + 1e-9 * np.abs(wanted).max(initial=1e-300)
-        result = max(result, float(np.abs(ends - wanted)[inner].max(initial=0.0)))
-    return result
+    x = mesh.mesh.geometry.x[:, : mesh.dimension]
+    held, body = bounding_box(comm, x[nodes]), bounding_box(comm, x)
+    slack = 1e-9 * (body[1] - body[0])
+    low, high = (np.asarray(corner) for corner in box)
+    below = np.where(low > body[0] + slack, np.abs(held[0] - low), 0.0)
+    above = np.where(high < body[1] - slack, np.abs(held[1] - high), 0.0)
+    return float(max(below.max(), above.max()))

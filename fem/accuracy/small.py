@@ -2,9 +2,9 @@
 
     V = span{X, K^-1 M X, (K^-1 M)^2 X, ..},   X = K_ee^-1 [G, C'],
 
-matches the moments of C (K + s^2 M)^-1 G about s = 0 [B02], twice as many as it has blocks because both sides are in X. What
-is driven slower than the first neglected frequency it follows to the accuracy of the static solves, which is what the
-difference between two meshes needs.
+matches the moments of C (K + s^2 M)^-1 G about s = 0 [B02], twice as many as it has blocks because both sides are in X.
+What is driven slower than the first neglected frequency it follows to the accuracy of the static solves, which is what
+the difference between two meshes needs.
 """
 
 from __future__ import annotations

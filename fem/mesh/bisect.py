@@ -62,13 +62,14 @@ class Whole:
     @property
     def simplices(self) -> Integers:
         """Nodes of the cells, (n_cells, d + 1)."""
-        return cell_nodes(self.mesh).astype(np.int64)
+        return np.asarray(cell_nodes(self.mesh), dtype=np.int64)
 
     def facet_nodes(self, name: str) -> Integers:
         """Nodes of the marked facets, (n, d)."""
         indices = self.facets[name].indices
         self.mesh.topology.create_connectivity(self.dimension - 1, self.dimension)
-        return dolfinx.mesh.entities_to_geometry(self.mesh, self.dimension - 1, indices).astype(np.int64)
+        nodes = dolfinx.mesh.entities_to_geometry(self.mesh, self.dimension - 1, indices)
+        return np.asarray(nodes, dtype=np.int64)
 
 
 def bisect(whole: Whole, marked: Ints) -> Whole:

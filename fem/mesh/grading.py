@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +47,7 @@ class SizeField:
 
 
 def graded_line(cuts: Sequence[float], ends: Sequence[float], n: int, mu: float, radius: float) -> Floats:
-    """n + 1 coordinates with a line at every cut, whose distances fall as min(1, r / R)^(1 - mu) towards the ends.
+    """N + 1 coordinates with a line at every cut, whose distances fall as min(1, r / R)^(1 - mu) towards the ends.
 
     Each stretch between cuts takes its share of the n cells by int dx / h(x) and places them so that all are equal in
     this measure; no distance falls below 1 / `STEEPEST` of the largest size.
@@ -59,7 +60,7 @@ def graded_line(cuts: Sequence[float], ends: Sequence[float], n: int, mu: float,
         radius: R [m].
     """
     measures, places = [], []
-    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+    for a, b in pairwise(cuts):
         half = (b - a) / 2
         t = half * np.linspace(0.0, 1.0, SAMPLES + 1) ** 3  # dense where h is small
         x = np.concatenate([a + t, (b - t)[-2::-1]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,7 +76,7 @@ def box_axes(scene: Scene) -> tuple[Axis, ...]:
 
 def even_cells(axis: Axis, h: float) -> int:
     """Number of cells no longer than h between the cuts. Not collective."""
-    return sum(int(np.ceil((b - a) / h - SAME)) for a, b in zip(axis.cuts[:-1], axis.cuts[1:], strict=True))
+    return sum(int(np.ceil((b - a) / h - SAME)) for a, b in pairwise(axis.cuts))
 
 
 def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: float, radius: float) -> TissueMesh:

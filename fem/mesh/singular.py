@@ -18,6 +18,7 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
 
+KINDS: tuple[Kind, ...] = ("re-entrant", "contact end", "held corner")  # by the number of sides held
 REGULAR = 0.9  # exponents above cost no order of P1 outputs that a mesh of practical size would show
 STRAIGHT = 1e-6  # [rad]; angles of a flat boundary are off by rounding only
 
@@ -29,7 +30,7 @@ class Ends:
     Attributes:
         at: coordinates of the points, (n, 1, 2), or of both ends of the edges, (n, 2, 3) [m].
         angle: angle of the body there, (n,) [rad].
-        alpha: real part of the exponent, (n,) [1]; 0.5 is assumed at ends of layers, where it depends on both materials.
+        alpha: real part of the exponent, (n,) [1]; 1/2 is assumed at ends of layers, where both materials decide.
         kind: what the end is, n words.
     """
 
@@ -115,9 +116,7 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
     d = points.shape[1]
     facets = np.sort(np.concatenate([np.delete(cells, i, axis=1) for i in range(d + 1)]), axis=1)
     owner = np.tile(np.arange(len(cells)), d + 1)
-    unique, first, inverse, count = np.unique(
-        facets, axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
+    unique, inverse, count = np.unique(facets, axis=0, return_inverse=True, return_counts=True)
     inverse = inverse.ravel()
     outside = count == 1
     least, largest = np.full(len(unique), len(layers) + 1), np.full(len(unique), -2)
@@ -132,11 +131,13 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
     ratio = np.zeros(len(ridges))
     for corner in combinations(range(d + 1), d - 1):
         np.maximum.at(ratio, _find(ridges, np.sort(cells[:, list(corner)], axis=1)), nu)
-    chosen, alphas, kinds = [], [], []
+    chosen: list[int] = []
+    alphas: list[float] = []
+    kinds: list[Kind] = []
     boundary = on["held"] + on["free"] > 0
     odd = boundary & ((on["held"] > 0) | (np.abs(angle - np.pi) > STRAIGHT))
     cache: dict[tuple[int, int, int], float] = {}
-    for i in np.flatnonzero(odd):
+    for i in np.flatnonzero(odd).tolist():
         sides = 1 if on["held"][i] and on["free"][i] else 0 if on["free"][i] else 2
         key = (round(angle[i] * 1e4), round(ratio[i] * 1e6), sides)
         if key not in cache:
@@ -144,8 +145,8 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
         if cache[key] < REGULAR:
             chosen.append(i)
             alphas.append(cache[key])
-            kinds.append(("re-entrant", "contact end", "held corner")[sides])
-    for i in np.flatnonzero(_layer_ends(points, unique[between], ridges, on["inner"], boundary, d)):
+            kinds.append(KINDS[sides])
+    for i in np.flatnonzero(_layer_ends(points, unique[between], ridges, on["inner"], boundary, d)).tolist():
         if i not in chosen:
             chosen.append(i)
             alphas.append(0.5)

@@ -102,10 +102,10 @@ def _lined(comm: MPI.Intracomm, scene: Scene, refine: Refine, goal: float | None
             if lattice(cells, p) <= refine.most:
                 break
             if across <= 1:
-                _too_large(refine, lattice(cells, p))
+                raise _too_large(refine, lattice(cells, p))
             across = max(across / 1.1, 1.0)
     elif lattice(cells, p) > refine.most:
-        _too_large(refine, lattice(cells, p))
+        raise _too_large(refine, lattice(cells, p))
     return box_of_lines(comm, scene, cells, mu, short / 2)
 
 
@@ -115,12 +115,12 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
     while True:
         whole = _base(scene, refine, aim)
         if unknowns(whole, order) > refine.most and (aim is None or aim > 1):
-            _too_large(refine, unknowns(whole, order))
+            raise _too_large(refine, unknowns(whole, order))
         whole = graded(whole, scene, refine, aim)
         if unknowns(whole, order) <= refine.most:
             break
         if aim is None:
-            _too_large(refine, unknowns(whole, order))
+            raise _too_large(refine, unknowns(whole, order))
         aim *= SHRINK
     return whole if refine.contact == "inherit" else _forget(whole)
 
@@ -177,8 +177,9 @@ def _forget(whole: Whole) -> Whole:
 def ends_of(whole: Whole, scene: Scene) -> Ends:
     """Singular ends of a marked mesh. Not collective."""
     layers = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
-    nu = np.array([m.nu for m in layers])[whole.cells["layers"] + 1]
-    return singular_ends(whole.points, whole.simplices, whole.facet_nodes("contact"), whole.cells["layers"], nu)
+    number = whole.cells["layers"].astype(np.int64)
+    nu = np.array([m.nu for m in layers])[number + 1]
+    return singular_ends(whole.points, whole.simplices, whole.facet_nodes("contact"), number, nu)
 
 
 def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Whole:
@@ -224,8 +225,8 @@ def lattice(cells: list[int], order: int) -> int:
     return len(cells) * int(np.prod([order * n + 1 for n in cells]))
 
 
-def _too_large(refine: Refine, count: int) -> None:
-    raise SceneError(
+def _too_large(refine: Refine, count: int) -> SceneError:
+    return SceneError(
         f"tissue.refine.most = {refine.most} unknowns are fewer than the {count} of the coarsest mesh that "
         "[tissue.refine] allows; raise it, or take larger cells or a lower tissue.order."
     )

@@ -124,8 +124,8 @@ class Refine(Model):
     )
     grading: Literal["auto", "off"] | Annotated[float, Field(gt=0, le=1)] = Field(
         "auto",
-        description="mu of the cell size h0 (r / R)^(1 - mu) at the distance r from a singular end [no unit]: a number, "
-        "'auto' by the element order, or 'off' for cells that only meet the ends",
+        description="mu of the cell size h0 (r / R)^(1 - mu) at the distance r from a singular end [no unit]: a "
+        "number, 'auto' by the element order, or 'off' for cells that only meet the ends",
     )
     method: Literal["auto", "bisect", "lines"] = Field(
         "auto",

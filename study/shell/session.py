@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
-from softgrasp.fem.errors import agree
 from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.errors import agree
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.scene.file import load_scene_collective, resolved_toml
 from softgrasp.fem.scene.scene import Scene

@@ -16,6 +16,7 @@ import ufl
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.bisect import Whole, bisect, distribute
 from softgrasp.fem.mesh.make import TissueMesh, make_mesh, structured_mesh
 from softgrasp.fem.model.assembly import cells_of_layers
@@ -53,11 +54,7 @@ def zone_of(tissue: TissueMesh, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     tissue.mesh.topology.create_connectivity(tissue.dimension - 1, tissue.dimension)
     nodes = dolfinx.mesh.entities_to_geometry(tissue.mesh, tissue.dimension - 1, facets).ravel()
     x = tissue.mesh.geometry.x[nodes, : tissue.dimension]
-    comm = tissue.mesh.comm
-    return (
-        np.array(comm.allreduce(x.min(axis=0, initial=np.inf), MPI.MIN)),
-        np.array(comm.allreduce(x.max(axis=0, initial=-np.inf), MPI.MAX)),
-    )
+    return bounding_box(tissue.mesh.comm, x)
 
 
 @pytest.mark.parametrize(
