@@ -5,25 +5,28 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.estimate import estimate, next_order, reduced
 from softgrasp.fem.accuracy.marking import marked_cells
+from softgrasp.fem.accuracy.small import run_small
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.bisect import Whole, bisect, distribute
 from softgrasp.fem.mesh.make import TissueMesh
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.mesh_estimate import MeshEstimate
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
+from softgrasp.fem.petsc import Array
 
 if TYPE_CHECKING:
     from softgrasp.fem.accuracy.small import Small
     from softgrasp.fem.scene.scene import Scene
     from softgrasp.fem.scene.tissue import Refine
 
-# Estimate over tolerance that is let pass: estimates are 0.6 to 0.9 of the error on meshes graded a priori, and 0.85 to
-# 1.1 of it where a pass has refined.
-ACCEPTED, ACCEPTED_PASSED = 0.6, 0.8
+# Estimate over tolerance that is let pass. Estimates are 0.5 to 1 of the error: where they lie is known after a pass,
+# when the corrected outputs of the new mesh tell the error of the old one.
+ACCEPTED, MOST_ACCEPTED = 0.5, 0.8
 
 
 def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
@@ -36,17 +39,23 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
     model, refine = build(scene, comm), scene.tissue.refine
     if refine is None or refine.tolerance is None:
         return model
-    passes, aim = 0, refine.tolerance
+    passes, aim, accepted = 0, refine.tolerance, ACCEPTED
+    last: tuple[Array, Array] | None = None
     while True:
         small = reduced(model)
         result = estimate(model, small)
+        outputs = run_small(small).deformation
+        if last is not None:
+            y, delta = last
+            accepted = _effectivity(delta, outputs + result.delta - y)
+        last = outputs, result.delta
         if passes == 0:
             _check_steps(scene, refine.tolerance, result.time_error)
-        reached = result.estimate <= (ACCEPTED_PASSED if passes else ACCEPTED) * refine.tolerance
+        reached = result.estimate <= accepted * refine.tolerance
         obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
         mesh: TissueMesh | None = None
         if not reached and passes < refine.passes:
-            factor = 0.9 * ACCEPTED_PASSED * refine.tolerance / result.estimate
+            factor = 0.9 * accepted * refine.tolerance / result.estimate
             aim *= factor
             mesh = _finer(model, small, refine, aim, factor)
             if mesh is None:
@@ -54,6 +63,12 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         if mesh is None:
             return replace(model, accuracy=_final(result, refine, passes, obstacle))
         model, passes = build(scene, comm, mesh), passes + 1
+
+
+def _effectivity(delta: Array, error: Array) -> float:
+    """Estimate over error of the mesh before, where the new mesh tells both, within what has been seen."""
+    sizes = [float(np.linalg.norm(part, axis=1).max()) for part in (delta, error)]
+    return float(np.clip(sizes[0] / max(sizes[1], 1e-300), ACCEPTED, MOST_ACCEPTED))
 
 
 def _final(result: MeshEstimate, refine: Refine, passes: int, obstacle: str) -> MeshEstimate:

@@ -19,7 +19,7 @@ Integers = npt.NDArray[np.int64]
 Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
 
 KINDS: tuple[Kind, ...] = ("re-entrant", "contact end", "held corner")  # by the number of sides held
-REGULAR = 0.9  # exponents above cost no order of P1 outputs that a mesh of practical size would show
+REGULAR = 0.8  # exponents above cost no order that a mesh of practical size would show: 2 alpha is nearly that of P1
 STRAIGHT = 1e-6  # [rad]; angles of a flat boundary are off by rounding only
 
 

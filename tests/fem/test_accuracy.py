@@ -18,7 +18,7 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import Trajectory, simulate
 from softgrasp.fem.scene.scene import Scene
-from tests.fem.test_refined import l_scene
+from tests.fem.test_refined import fingerprint, l_scene
 from tests.helpers.models import CUBE, LAYERS, make_scene
 
 TIP = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]}}
@@ -177,3 +177,11 @@ def test_orders_of_graded_and_even_meshes(comm: MPI.Intracomm, order: int, least
     graded = [point(build(with_refine(make_scene(TIP, steps), order, t), comm)) for t in tolerances]
     assert order_of(even) == pytest.approx(1.0, abs=0.05), even
     assert order_of(graded) >= least, graded
+
+
+def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
+    scene = with_refine(make_scene(TIP, {"time": {"steps": 300}}), 1, 5e-2)
+    model, alone = (build_to_tolerance(scene, c) for c in (comm, MPI.COMM_SELF))
+    assert alone.accuracy is not None
+    assert alone.accuracy.passes > 0
+    assert fingerprint(model.space.mesh) == fingerprint(alone.space.mesh)
