@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # Estimate over tolerance that is let pass. Estimates are 0.5 to 1 of the error: where they lie is known after a pass,
 # when the corrected outputs of the new mesh tell the error of the old one.
 ACCEPTED, MOST_ACCEPTED = 0.5, 0.8
+LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 
 
 def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
@@ -88,9 +89,7 @@ def _finer(model: Model, small: Small, refine: Refine, aim: float, factor: float
     """The next mesh, or None if it has too many unknowns. Collective."""
     comm, scene = model.system.layout.comm, model.scene
     if by_lines(scene):
-        mesh = refined_mesh(comm, scene, aim)
-        cells = [m.mesh.topology.index_map(m.dimension).size_global for m in (mesh, model.space.mesh)]
-        return mesh if cells[0] > cells[1] else None
+        return _more_lines(model, aim)
     marked = marked_cells(small, next_order(model), factor)
     whole: Whole | None = None
     with agree(comm):
@@ -101,3 +100,15 @@ def _finer(model: Model, small: Small, refine: Refine, aim: float, factor: float
     if not comm.bcast(whole is not None):
         return None
     return distribute(comm, whole, model.space.mesh.dimension)
+
+
+def _more_lines(model: Model, aim: float) -> TissueMesh | None:
+    """The first box with more lines for an aim that falls, or None if it has too many unknowns. Collective."""
+    comm, scene, d = model.system.layout.comm, model.scene, model.space.mesh.dimension
+    cells = model.space.mesh.mesh.topology.index_map(d).size_global
+    for _ in range(LINE_TRIES):
+        mesh = refined_mesh(comm, scene, aim)
+        if mesh.mesh.topology.index_map(d).size_global > cells:
+            return mesh
+        aim *= LINE_STEP
+    return None

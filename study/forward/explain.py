@@ -17,6 +17,7 @@ from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
 from softgrasp.study.forward.cautions import SMALL_STRAIN, coarse, locking, poisson_ratios, turned
+from softgrasp.study.forward.explain_mesh import MeshReport, mesh_lines, mesh_report
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import plain
 
@@ -90,6 +91,8 @@ class Explanation:
         idle: effects that are on and do not matter.
         warnings: one sentence each.
         snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
+        mesh: singular ends, and the error they leave.
+        dimension: 2 or 3.
     """
 
     name: str
@@ -104,6 +107,8 @@ class Explanation:
     warnings: tuple[str, ...]
     snapshot_columns: int
     snapshot_bytes: int
+    mesh: MeshReport
+    dimension: int
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None. Not collective."""
@@ -187,6 +192,8 @@ def explain_model(model: Model) -> Explanation:
         warnings=tuple(_warnings(scene, poisson, omega, dt, d, reports)),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
+        mesh=mesh_report(model),
+        dimension=d,
     )
 
 
@@ -242,6 +249,9 @@ def render(result: Explanation, console: Console) -> None:
     line(f"n_s = {s.n_s}, n_e = {s.n_e}, states 2n = {s.states}")
     line(f"{s.cells} cells, {s.nodes} nodes, {s.nonzeros} non-zeros in K_ee, {s.ranks} rank(s)")
     line("nu = " + ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items()))
+    title("Mesh")
+    for text in mesh_lines(result.mesh, result.dimension):
+        line(text)
     title("Solver")
     line(f"{result.solver.name}: {result.solver.reason}")
     if result.solver.factor_bytes:

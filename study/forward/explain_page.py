@@ -9,6 +9,7 @@ from softgrasp.fem.effects import Gate
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.explain import Explanation, remarks, size_text, verdict
+from softgrasp.study.forward.explain_mesh import mesh_lines
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import command_line, origin
 from softgrasp.study.report.page import EQUATION, Section, equation_text, write_report
@@ -64,6 +65,7 @@ def _sections(found: Explanation) -> list[Section]:
         Section("Look at", text="\n\n".join(remarks(found)) or "Nothing stands out."),
         Section(EQUATION, code=equation_text(found.equation)),
         Section("Sizes", rows=sizes),
+        Section("Mesh", text="\n\n".join(mesh_lines(found.mesh, found.dimension))),
         Section(
             "Effects", header=("effect", "verdict", "gate", "number", "matters from", "what it says"), rows=effects
         ),
