@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # Estimate over tolerance that is let pass. Estimates are 0.5 to 1 of the error: where they lie is known after a pass,
 # when the corrected outputs of the new mesh tell the error of the old one.
 ACCEPTED, MOST_ACCEPTED = 0.5, 0.8
+GUESSED = 0.7  # what the first pass aims at: too many cells cost more than a second pass
 LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 
 
@@ -47,8 +48,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         result = estimate(model, small)
         outputs = run_small(small).deformation
         if last is not None:
-            y, delta = last
-            accepted = _effectivity(delta, outputs + result.delta - y)
+            accepted = _effectivity(last[1], outputs + result.delta - last[0], result.delta)
         last = outputs, result.delta
         if passes == 0:
             _check_steps(scene, refine.tolerance, result.time_error)
@@ -56,7 +56,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
         mesh: TissueMesh | None = None
         if not reached and passes < refine.passes:
-            factor = 0.9 * accepted * refine.tolerance / result.estimate
+            factor = 0.9 * (accepted if passes else GUESSED) * refine.tolerance / result.estimate
             aim *= factor
             mesh = _finer(model, small, refine, aim, factor)
             if mesh is None:
@@ -66,10 +66,16 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         model, passes = build(scene, comm, mesh), passes + 1
 
 
-def _effectivity(delta: Array, error: Array) -> float:
-    """Estimate over error of the mesh before, where the new mesh tells both, within what has been seen."""
-    sizes = [float(np.linalg.norm(part, axis=1).max()) for part in (delta, error)]
-    return float(np.clip(sizes[0] / max(sizes[1], 1e-300), ACCEPTED, MOST_ACCEPTED))
+def _effectivity(old: Array, error: Array, new: Array) -> float:
+    """Estimate over error, e, from the estimates on two meshes, within what has been seen.
+
+    The corrected outputs of the new mesh still miss the share 1 - e of its error, so that they show m = old / error =
+    e / (1 - (1 - e) r) with r = new / old; solved for e.
+    """
+    a, b, c = (float(np.linalg.norm(part, axis=1).max()) for part in (old, error, new))
+    m, r = a / max(b, 1e-300), c / max(a, 1e-300)
+    value = m * (1 - r) / (1 - m * r) if m < 1 and r < 1 else 1.0
+    return float(np.clip(value, ACCEPTED, MOST_ACCEPTED))
 
 
 def _final(result: MeshEstimate, refine: Refine, passes: int, obstacle: str) -> MeshEstimate:

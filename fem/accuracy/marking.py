@@ -27,7 +27,7 @@ MODES = 4  # 4 and 10 modes gave the same estimate to one percent on the paper's
 INSTANTS = 100
 DIGITS = 7  # of the largest eta_T that count: solves carry more, and cells that mirror each other stay together
 GAIN = 1.2  # eta_T of the marked cells over what bisection takes away: it splits their neighbours too
-LEAST, LARGEST = 0.2, 0.8  # share of the sum of eta_T that the marked cells hold [D96]
+LEAST, LARGEST = 0.15, 0.8  # share of the sum of eta_T that the marked cells hold [D96]
 
 
 def marked_cells(small: Small, finer: Model, factor: float) -> npt.NDArray[np.int32] | None:
@@ -51,7 +51,7 @@ def marked_cells(small: Small, finer: Model, factor: float) -> npt.NDArray[np.in
     largest = np.sort(values)[::-1]
     total = np.cumsum(largest)
     least = largest[min(int(np.searchsorted(total, share * total[-1])), len(total) - 1)]
-    return np.sort(cells[values >= least]).astype(np.int32)
+    return np.asarray(np.sort(cells[values >= least]), dtype=np.int32)
 
 
 def indicators(small: Small, finer: Model) -> Array:
