@@ -166,27 +166,18 @@ def _locate(model: Model, corners: Array, point: Array) -> tuple[np.ndarray, Arr
         best = float(lam[cell].min())
         inside = np.clip(lam[cell], 0, None)
         inside /= inside.sum()
-        answer = (*_shape(model, cell, corners[cell], inside), inside @ corners[cell])
+        answer = (*_shape(model, cell, inside), inside @ corners[cell])
     root = int(np.argmax(comm.allgather(best)))
     nodes, values, where = comm.bcast(answer, root=root)
     return np.asarray(nodes), np.asarray(values), np.asarray(where)
 
 
-def _shape(model: Model, cell: int, corners: Array, lam: Array) -> tuple[np.ndarray, Array]:
-    """Global nodes of a cell and their shape functions at barycentric coordinates lam (P1 or P2). Not collective."""
-    V, d = model.space.V, model.space.mesh.dimension
+def _shape(model: Model, cell: int, lam: Array) -> tuple[np.ndarray, Array]:
+    """Global nodes of a cell and their shape functions at barycentric coordinates lam. Not collective."""
+    V = model.space.V
     local = V.dofmap.cell_dofs(cell)
     nodes = V.dofmap.index_map.local_to_global(np.asarray(local, dtype=np.int32))
-    values = np.empty(len(local))
-    for k, x in enumerate(V.tabulate_dof_coordinates()[local][:, :d]):
-        at = barycentric(corners[None], x)[0]
-        on = np.flatnonzero(at > 0.25)  # 1 at a corner, 1/2 and 1/2 at the middle of an edge
-        if len(on) == 1:
-            one = lam[on[0]]
-            values[k] = one if model.scene.tissue.order == 1 else one * (2 * one - 1)
-        else:
-            values[k] = 4 * lam[on[0]] * lam[on[1]]
-    return nodes, values
+    return nodes, np.asarray(V.element.basix_element.tabulate(0, lam[None, 1:])[0, 0, :, 0])
 
 
 class ProbedRun(Run):

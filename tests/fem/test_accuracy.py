@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
+import skfem
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.adapt import build_to_tolerance
@@ -18,8 +20,9 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import Trajectory, simulate
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.modes import lowest_modes
 from tests.fem.test_refined import fingerprint, l_scene
-from tests.helpers.models import CUBE, LAYERS, make_scene
+from tests.helpers.models import CUBE, LAYERS, _k_lambda, _k_mu, _mass, held_by_paper, make_scene
 
 TIP = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]}}
 DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
@@ -185,3 +188,26 @@ def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
     assert alone.accuracy is not None
     assert alone.accuracy.passes > 0
     assert fingerprint(model.space.mesh) == fingerprint(alone.space.mesh)
+
+
+def test_cubic_elements_are_those_of_scikit_fem() -> None:
+    """Frequencies on one mesh: the same space, whatever its nodes."""
+    scene = make_scene({"tissue": {"order": 3, "cells": [2, 4]}})
+    omega, _ = lowest_modes(build(scene, MPI.COMM_SELF).system, 6)
+    mesh = skfem.MeshTri.init_tensor(np.linspace(0, 1, 3), np.linspace(0, 2, 5))
+    # the diagonals of DOLFINx, from the lower left to the upper right
+    corners = np.array([[i, j] for i in range(2) for j in range(4)])
+    nodes = {(x, y): k for k, (x, y) in enumerate(np.round(mesh.p.T * 2).astype(int).tolist())}
+    cells = []
+    for i, j in corners.tolist():
+        a, b, c, e = (nodes[p] for p in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)))
+        cells += [[a, b, c], [a, e, c]]
+    mesh = skfem.MeshTri(mesh.p, np.array(cells).T)
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTriP3()))
+    K = 50.0 * _k_mu.assemble(basis) + 50.0 * _k_lambda.assemble(basis)
+    held = basis.get_dofs(mesh.facets_satisfying(held_by_paper, boundaries_only=True)).flatten()
+    free = np.setdiff1d(np.arange(basis.N), held)
+    squares = scipy.linalg.eigh(
+        K.toarray()[np.ix_(free, free)], _mass.assemble(basis).toarray()[np.ix_(free, free)], eigvals_only=True
+    )
+    np.testing.assert_allclose(omega, np.sqrt(squares[:6]), rtol=1e-8)  # tolerance of the modes

@@ -281,7 +281,7 @@ def test_places_are_the_nodes_of_the_plain_run_where_there_are_any(comm: MPI.Int
     np.testing.assert_allclose(found.y, tip(comm, setting)[:, 1:], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [1, 2, 3])
 def test_probe_is_exact_for_polynomials_of_its_order(comm: MPI.Intracomm, order: int) -> None:
     model = build(variant(make_scene(SMALL), Setting((3, 7), order, 4)), comm)
     point = np.array([0.437, 0.519])  # no node, far from the contact zone
