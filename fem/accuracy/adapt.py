@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 # Estimate over tolerance that is let pass. Estimates are 0.5 to 1 of the error: where they lie is known after a pass,
 # when the corrected outputs of the new mesh tell the error of the old one.
 ACCEPTED, MOST_ACCEPTED = 0.5, 0.8
-GUESSED = 0.7  # what the first pass aims at: too many cells cost more than a second pass
+GUESSED = 0.7  # what a pass aims at, at least: too many cells cost more than another pass
 LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 
 
@@ -38,6 +39,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         SceneError: the time step leaves more than the tolerance, or the scene cannot be built.
         MeshError, SolverError: see :func:`fem.model.build.build`.
     """
+    begin = time.perf_counter()
     model, refine = build(scene, comm), scene.tissue.refine
     if refine is None or refine.tolerance is None:
         return model
@@ -56,12 +58,14 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
         mesh: TissueMesh | None = None
         if not reached and passes < refine.passes:
-            factor = 0.9 * (accepted if passes else GUESSED) * refine.tolerance / result.estimate
+            factor = 0.9 * max(accepted, GUESSED) * refine.tolerance / result.estimate
             aim *= factor
             mesh = _finer(model, small, refine, aim, factor)
             if mesh is None:
                 obstacle = f"tissue.refine.most = {refine.most} unknowns allow no finer mesh"
         if mesh is None:
+            spent = comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+            model.watch.seconds["mesh"] = spent - model.watch.seconds["assembly"]  # with all passes and estimates
             return replace(model, accuracy=_final(result, refine, passes, obstacle))
         model, passes = build(scene, comm, mesh), passes + 1
 

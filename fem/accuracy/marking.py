@@ -1,7 +1,7 @@
 """Which cells the error of the outputs comes from.
 
 With e_j the differences of static solutions on the finer space and on the mesh, for the loads of the hand's motion (G),
-of the lowest modes (M phi_k) and of the outputs (C'), a cell T owes
+of the lowest modes (M phi_k) and of the outputs (C'), a cell T owes [BR01]
 
     eta_T = max_t |k_T(e_C, e(t))| + sum_k |C phi_k| |xi_k| omega_k^3 end k_T(e_k, e_k) / 2,
 

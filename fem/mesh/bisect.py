@@ -73,7 +73,7 @@ class Whole:
 
 
 def bisect(whole: Whole, marked: Ints) -> Whole:
-    """Split the marked cells, and others until no node hangs, through their longest edges [P97]. Not collective.
+    """Split the marked cells, and others until no node hangs, through their longest edges [PC00]. Not collective.
 
     Args:
         whole: the mesh.
