@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 BOUNDS = {1: 1.5, 2: 2.2, 3: 3.0}
 GRADED_BOUND = 1.5
 SHARE = 0.2  # of the estimate that a graded mesh may leave by its own tolerance
-COMPARED = (1e-2, 1e-3, 1e-4)  # tolerances of graded meshes to compare with
+COMPARED = (1e-2, 1e-3)  # tolerances of graded meshes to compare with
 COMPARED_3D = 3e-2
 MOST_COMPARED = {2: 60_000, 3: 60_000}  # unknowns of the mesh to compare with
 
@@ -63,7 +63,7 @@ def estimate(model: Model, coarse: Small | None = None) -> MeshEstimate:
             finer = run_small(other)
             relative, delta = difference(small, other, finer.deformation, run.deformation)
             offer = (goal, other.model.system.layout.n_e)
-            if relative > goal / SHARE:
+            if relative > goal / SHARE or relative == 0:
                 break
         bound = bound if relative > goal / SHARE else bound + goal / max(relative, 1e-300)
     steps = model.scene.time.steps

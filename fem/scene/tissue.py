@@ -167,7 +167,7 @@ class Tissue(Model):
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
     layers: dict[str, Layer] = Field(default_factory=dict, description="parts with another material, by name [no unit]")
     refine: Dropped[Refine] = Field(
-        None, description="graded cells {tolerance, grading, method, contact, passes, most}; off unless given"
+        None, description="graded cells {tolerance, grading, method, contact, passes, most} [no unit]; off unless given"
     )
 
     @model_validator(mode="after")

@@ -12,13 +12,14 @@ import skfem
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.adapt import build_to_tolerance
-from softgrasp.fem.accuracy.estimate import estimate, next_order, reduced
+from softgrasp.fem.accuracy.estimate import difference, estimate, next_order, reduced
 from softgrasp.fem.accuracy.marking import cell_products, indicators, prolong
 from softgrasp.fem.accuracy.small import run_small, small_model, static_solves
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import Trajectory, simulate
+from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from tests.fem.test_refined import fingerprint, l_scene
@@ -211,3 +212,40 @@ def test_cubic_elements_are_those_of_scikit_fem() -> None:
         K.toarray()[np.ix_(free, free)], _mass.assemble(basis).toarray()[np.ix_(free, free)], eigvals_only=True
     )
     np.testing.assert_allclose(omega, np.sqrt(squares[:6]), rtol=1e-8)  # tolerance of the modes
+
+
+@pytest.mark.slow
+def test_lines_of_a_box_against_even_ones(comm: MPI.Intracomm) -> None:
+    """Static outputs C K^-1 G of block_3d at nu = 0.3 on 6 x 6 x 12 quadratic cells, against 9 x 9 x 18 graded ones."""
+    base = ["tissue.order=2", "tissue.material={young=1e5,poisson=0.3,rho=1070.0}"]
+
+    def statics(*changes: str) -> np.ndarray:
+        small = reduced(build(load_scene("block_3d", [*base, *changes]), comm))
+        return (small.C @ small.G)[:3]  # the tip, against translations and rotations; V' K V = 1
+
+    fine = statics("tissue.cells=[9,9,18]", "tissue.refine={}")
+    even, lines = (statics("tissue.cells=[6,6,12]", *more) for more in ([], ["tissue.refine={}"]))
+    errors = [float(np.linalg.norm(part - fine) / np.linalg.norm(fine)) for part in (even, lines)]
+    assert errors[0] > 0.03
+    assert errors[1] <= 0.02, errors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["franka_muscle", "layers_2d", "block_3d"])
+def test_estimates_of_the_scenes_that_ship(comm: MPI.Intracomm, name: str) -> None:
+    """As they ship, against graded meshes of five to fifty times their unknowns."""
+    fine = {
+        "block_3d": ["tissue.order=2", "tissue.cells=[9,9,18]", "tissue.refine={}"],
+    }.get(name, ["tissue.order=3", "tissue.refine={tolerance=1e-4}"])
+    small = reduced(build(load_scene(name), comm))
+    other = reduced(build(load_scene(name, fine), comm))
+    true, _ = difference(small, other, run_small(other).deformation, run_small(small).deformation)
+    result = estimate(small.model, small)
+    assert 0.4 <= result.estimate / true <= 1.1
+    assert result.bound >= true
+
+
+def test_body_at_rest_has_no_error(comm: MPI.Intracomm) -> None:
+    hold = {"motion": {"profile": "hold", "target": None}}
+    result = estimate(build(make_scene(hold), comm))
+    assert (result.estimate, result.bound, result.time_error) == (0.0, 0.0, 0.0)

@@ -69,7 +69,9 @@ def test_mesh_is_the_same_on_any_ranks(comm: MPI.Intracomm, change: Any, refine:
     assert len(set(comm.allgather(together))) == 1
 
 
-@pytest.mark.parametrize("refine", [ROUGH, {}, {"method": "bisect"}, {"grading": "off"}], ids=str)
+@pytest.mark.parametrize(
+    "refine", [ROUGH, {**ROUGH, "contact": "select"}, {}, {"method": "bisect"}, {"grading": "off"}], ids=str
+)
 def test_zone_ends_where_the_scene_says(comm: MPI.Intracomm, refine: Any) -> None:
     """On 5 x 11 cells no line meets y = 1.5: facets by their midpoints alone hold from 1.4545."""
     scene = refined({"tissue": {"cells": [5, 11]}}, **refine)
