@@ -13,9 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance
 from softgrasp.fem.errors import agree
-from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.file import load_scene_collective, resolved_toml
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import write_json, write_scene
@@ -89,7 +88,12 @@ class Session:
         Raises:
             SoftgraspError: the scene cannot be built.
         """
-        model = build_to_tolerance(scene, self.comm)
+        if scene.tissue.refine is None:
+            model = build(scene, self.comm)
+        else:
+            from softgrasp.fem.accuracy.adapt import build_to_tolerance  # only scenes with graded cells pay for it
+
+            model = build_to_tolerance(scene, self.comm)
         layout = model.system.layout
         sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
         self.console.print(sizes)
