@@ -59,14 +59,14 @@ def mesh_report(model: Model) -> MeshReport:
     for kind, alpha in zip(ends.kind, ends.alpha, strict=True) if ends is not None else ():
         key = (kind, round(float(alpha), 3))
         reports[key] = reports.get(key, 0) + 1
-    found = tuple(EndReport(k, n, a) for (k, a), n in sorted(reports.items(), key=lambda item: item[0][1]))
+    kinds = tuple(EndReport(k, n, a) for (k, a), n in sorted(reports.items(), key=lambda item: item[0][1]))
     graded = refine is not None and refine.grading != "off"
     full = 2.0 * scene.tissue.order
-    order = full if graded else min([full, *(2 * end.alpha for end in found)])
+    order = full if graded else min([full, *(2 * end.alpha for end in kinds)])
     judged, _ = judge(model, 0.0, False)
     if judged is None:
-        return MeshReport(found, order, graded, None, None, None, None)
-    return MeshReport(found, order, graded, judged.estimate, judged.bound, judged.time_error, judged.shift)
+        return MeshReport(kinds, order, graded, None, None, None, None)
+    return MeshReport(kinds, order, graded, judged.estimate, judged.bound, judged.time_error, judged.shift)
 
 
 def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
