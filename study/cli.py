@@ -130,6 +130,9 @@ def simulate(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
     no_pictures: NoPictures = False,
     until: Annotated[int | None, typer.Option(help="stop after this step and leave a checkpoint", min=1)] = None,
+    certify: Annotated[
+        bool, typer.Option("--certify", help="estimate the error of mesh and time step, whatever it costs")
+    ] = False,
 ) -> None:
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
     from softgrasp.study.forward.run import run_simulate
@@ -143,6 +146,7 @@ def simulate(
         resume=resume,
         until=until,
         pictures=not no_pictures,
+        certify=certify,
     )
 
 

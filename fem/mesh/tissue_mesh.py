@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
 
 from softgrasp.fem.mesh.parts import Parts
+
+if TYPE_CHECKING:
+    from softgrasp.fem.mesh.bisect import Whole
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,9 @@ class TissueMesh:
         cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
         notes: what of the file deserves a warning, one sentence each, on all ranks.
         digest: SHA-256 of what was read from the file, on all ranks; empty without one.
+        contact: facets of the contact zone that a refined mesh inherits; None: they are selected on this mesh.
+        layers: number of the layer of each cell that a refined mesh inherits, -1 for none; None likewise.
+        whole: a bisected mesh on rank 0, to bisect it further; None elsewhere and on other meshes.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -40,6 +47,9 @@ class TissueMesh:
     cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     digest: str = ""
+    contact: dolfinx.mesh.MeshTags | None = None
+    layers: dolfinx.mesh.MeshTags | None = None
+    whole: Whole | None = None
 
 
 def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:

@@ -197,8 +197,12 @@ def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
     owned = mesh.mesh.topology.index_map(mesh.dimension).size_local
     label = np.full(owned, -1)
     names = list(scene.tissue.layers)
-    for i, name in enumerate(names):
-        label[cells_in(mesh, scene.tissue.layers[name])] = i
+    if mesh.layers is not None:
+        here = mesh.layers.indices < owned
+        label[mesh.layers.indices[here]] = mesh.layers.values[here]
+    else:
+        for i, name in enumerate(names):
+            label[cells_in(mesh, scene.tissue.layers[name])] = i
     counts = total(mesh.mesh.comm, np.array([float((label == i).sum()) for i in range(-1, len(names))]))
     empty = [n for n, c in zip(names, counts[1:], strict=True) if c == 0]
     if empty:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -16,6 +17,7 @@ from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
@@ -28,6 +30,9 @@ from softgrasp.fem.system import (
     coupling,
     tissue_matrices,
 )
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.mesh_estimate import MeshEstimate
 
 
 @dataclass
@@ -57,6 +62,7 @@ class Model:
         system: the operators.
         inventory: compiled forms and allocated operators.
         watch: seconds of mesh and assembly.
+        accuracy: estimate of the error of the mesh, where the scene has a tolerance.
     """
 
     scene: Scene
@@ -64,6 +70,7 @@ class Model:
     system: BlockSystem
     inventory: Inventory
     watch: Stopwatch
+    accuracy: MeshEstimate | None = None
 
     @property
     def states(self) -> int:
@@ -107,11 +114,20 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
+def _scene_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
+    if scene.tissue.refine is None:
+        return make_mesh(comm, scene)
+    from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it
+
+    return refined_mesh(comm, scene)
+
+
 def build(
     scene: Scene | str | Path,
     overrides: Sequence[str] = (),
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     *,
+    mesh: TissueMesh | None = None,
     run: bool = True,
 ) -> Model:
     """Mesh, assemble and couple: M q'' + D q' + K q = f + B_u u with q = [q_s; q_e]. Collective.
@@ -120,6 +136,7 @@ def build(
         scene: a scene, the path of its file, or the name of one that ships.
         overrides: "section.key=value" each, as after ``--set``; for a file or a name.
         comm: ranks.
+        mesh: on which; None makes that of the scene.
         run: its steps will be taken, so their tables must fit too.
 
     Raises:
@@ -132,11 +149,11 @@ def build(
     elif overrides:
         raise SceneError(f"overrides {list(overrides)} need the file or the name of a scene; change the scene itself")
     watch, inventory = Stopwatch(comm), Inventory()
-    boxed = scene.tissue.cells
+    boxed = scene.tissue.cells if mesh is None and scene.tissue.refine is None else None
     if boxed:
         check_memory(scene, comm, run, len(boxed), simplices(boxed))
     with watch.stage("mesh"):
-        mesh = make_mesh(comm, scene)
+        mesh = mesh or _scene_mesh(comm, scene)
     if not boxed:
         d = mesh.dimension
         check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)

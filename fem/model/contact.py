@@ -30,7 +30,8 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     """Owned exterior facets in the contact zone, sorted.
 
     A facet belongs to the zone if its midpoint lies on one of ``contact.sides`` (planes of the bounding box)
-    and inside ``contact.box``; or if it carries ``contact.facet_tag``. What is not given does not restrict.
+    and inside ``contact.box``; or if it carries ``contact.facet_tag``. What is not given does not restrict. A bisected
+    mesh has inherited its zone.
 
     Collective.
 
@@ -40,6 +41,8 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     mesh, fdim = tissue.mesh, tissue.dimension - 1
     mesh.topology.create_connectivity(fdim, fdim + 1)
     facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology))
+    if tissue.contact is not None:
+        return np.asarray(facets[np.isin(facets, tissue.contact.indices)], dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(mesh, fdim, facets)[:, : tissue.dimension]
     low, high = bounding_box(tissue)
     tolerance = BOX_TOLERANCE * float(np.max(high - low))

@@ -15,6 +15,7 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Box = Annotated[list[list[float]], Field(min_length=2, max_length=2)]
 Label = Annotated[str, Field(max_length=80, pattern=r"^[^$\\\n]*$")]  # what figures draw, where $ begins a formula
+ROUNDING = 1e-9  # static solves on graded meshes lose up to seven of sixteen digits
 Side = Literal["x-", "x+", "y-", "y+", "z-", "z+", "left", "right", "bottom", "top", "front", "back"]
 
 
@@ -146,6 +147,41 @@ class Layer(Model):
         return self
 
 
+class Refine(Model):
+    """Cells that shrink towards the singular ends of contact zone, layers and boundary."""
+
+    tolerance: Annotated[float, Field(gt=0, lt=1)] | None = Field(
+        None,
+        description="largest error of the outputs against the hand over the largest of them that the mesh may leave "
+        "[1]; chooses the cells of a box itself; default: only grade the given cells",
+    )
+    grading: Literal["auto", "off"] | Annotated[float, Field(gt=0, le=1)] = Field(
+        "auto",
+        description="mu of the cell size h0 (r / R)^(1 - mu) at the distance r from a singular end [no unit]: a "
+        "number, 'auto' by the element order, or 'off' for cells that only meet the ends",
+    )
+    method: Literal["auto", "bisect", "lines"] = Field(
+        "auto",
+        description="how cells shrink [no unit]: bisected, or by moved lines of a box; auto: lines in 3D boxes and "
+        "where there is no tolerance, else bisect",
+    )
+    contact: Literal["inherit", "select"] = Field(
+        "inherit",
+        description="contact zone of a bisected mesh [no unit]: the parts of the facets held before, or those selected "
+        "again by their midpoints; layers alike",
+    )
+    passes: Annotated[int, Field(ge=0)] = Field(3, description="refinements after the first estimate, at most [1]")
+    most: Annotated[int, Field(ge=1)] = Field(200_000, description="tissue unknowns, at most [1]")
+
+    @model_validator(mode="after")
+    def _check(self) -> Refine:
+        if self.tolerance is not None and self.tolerance < ROUNDING:
+            raise ValueError(f"tolerance is {self.tolerance}; below {ROUNDING:g} rounding decides, take a larger one")
+        if self.tolerance is not None and self.grading == "off":
+            raise ValueError("grading is 'off'; a tolerance needs graded cells, drop one of them")
+        return self
+
+
 class Tissue(Model):
     """Geometry, material and element order of the tissue."""
 
@@ -170,10 +206,13 @@ class Tissue(Model):
     read_limit: Dropped[Positive] = Field(
         None, description="longest processor time for reading the mesh file [s]; default 10, and 1 more a megabyte"
     )
-    order: Literal[1, 2] = Field(1, description="polynomial order of the displacement [1]")
+    order: Literal[1, 2, 3] = Field(1, description="polynomial order of the displacement [1]")
     thickness: Positive = Field(1.0, description="thickness out of the plane [m], 2D only")
     material: Material = Field(description="library name, {lambda, mu, rho} or {young, poisson, rho} [Pa, kg/m3]")
     layers: dict[str, Layer] = Field(default_factory=dict, description="parts with another material, by name [no unit]")
+    refine: Dropped[Refine] = Field(
+        None, description="graded cells {tolerance, grading, method, contact, passes, most} [no unit]; off unless given"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Tissue:
@@ -181,6 +220,8 @@ class Tissue(Model):
             raise ValueError("layers.tissue takes the name of the cells that no layer claims; give it another name")
         if self.mesh is not None:
             given = [key for key in ("size", "cells", "origin") if getattr(self, key) is not None]
+            if self.refine is not None and self.refine.method == "lines":
+                raise ValueError("refine.method is 'lines'; a mesh file has no lines to move, take 'bisect'")
             if given:
                 drop = " ".join(f"--set tissue.{key}=false" for key in given)
                 raise ValueError(f"{' and '.join(given)} cannot go with tissue.mesh; drop them, or mesh ({drop})")

@@ -21,6 +21,7 @@ from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
 from softgrasp.study.forward.cautions import coarse, locking, poisson_ratios, turned
+from softgrasp.study.forward.explain_mesh import MeshReport, mesh_lines, mesh_report
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import plain
 
@@ -97,6 +98,8 @@ class Explanation:
         outputs: name and place of each output.
         memory: estimated need of mesh, factor and steps.
         snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
+        mesh: singular ends, and the error they leave.
+        dimension: 2 or 3.
     """
 
     name: str
@@ -114,6 +117,8 @@ class Explanation:
     memory: Need
     snapshot_columns: int
     snapshot_bytes: int
+    mesh: MeshReport
+    dimension: int
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None. Not collective."""
@@ -187,6 +192,8 @@ def explain_model(model: Model) -> Explanation:
         memory=need(scene, d, topology.index_map(d).size_global, layout.comm, run=True),
         snapshot_columns=columns,
         snapshot_bytes=16 * layout.n_e * columns,
+        mesh=mesh_report(model),
+        dimension=d,
     )
 
 
@@ -245,6 +252,9 @@ def render(result: Explanation, console: Console) -> None:
     for output, place in result.outputs.items():
         line(f"output {output}: {place}")
     line("nu = " + ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items()))
+    title("Mesh")
+    for text in mesh_lines(result.mesh, result.dimension):
+        line(text)
     title("Solver")
     line(f"{result.solver.name}: {result.solver.reason}")
     if result.solver.factor_bytes:

@@ -9,6 +9,7 @@ from softgrasp.fem.effects import Gate
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.explain import Explanation, remarks, sag_rows, size_text, verdict
+from softgrasp.study.forward.explain_mesh import mesh_lines
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import command_line, origin
 from softgrasp.study.report.page import EQUATION, Section, equation_text, write_report
@@ -68,6 +69,7 @@ def _sections(found: Explanation) -> list[Section]:
         Section(EQUATION, code=equation_text(found.equation)),
         Section("Sizes", rows=sizes),
         Section("At rest under its weight, the hand held still", rows=sag_rows(found)),
+        Section("Mesh", text="\n\n".join(mesh_lines(found.mesh, found.dimension))),
         Section(
             "Effects", header=("effect", "verdict", "gate", "number", "matters from", "what it says"), rows=effects
         ),

@@ -19,6 +19,7 @@ from softgrasp.fem.model.outputs import unit
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.forward import accuracy
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import force_unit, simulate_result, write_results
 from softgrasp.study.pictures.frames import Frames
@@ -40,6 +41,7 @@ def run_simulate(
     resume: bool = False,
     until: int | None = None,
     pictures: bool = True,
+    certify: bool = False,
 ) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective.
 
@@ -77,12 +79,16 @@ def run_simulate(
             raise
     files = frames.close()
     result = simulate_result(model, run)
+    judged, unknown = accuracy.judge(model, run.seconds["steps"], certify)
+    result |= accuracy.keys(judged, run)
     warnings = run_warnings(model, run, frames.most[1:])
-    result["warnings"] = [*model.space.mesh.notes, *warnings]
+    result["warnings"] = [*model.space.mesh.notes, *warnings, *accuracy.warnings(judged), *unknown]
     if comm.rank == 0:
         begin = time.perf_counter()
         files = write_results(out, model, run, result) + files + frames.draw(out, run)
-        rows = result_rows(result)
+        if pictures and judged is not None:
+            files += accuracy.draw(out / "mesh_error.png", run, judged)
+        rows = [*result_rows(result), *accuracy.rows(judged)]
         files.append(_report(out, scene, result, rows, path, overrides))
         result["time"]["pictures"] = time.perf_counter() - begin
         show(console, rows)
@@ -133,6 +139,7 @@ def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: P
     captions = {
         "move.png": "The body at some instants of the move.",
         "move.gif": "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed.",
+        "mesh_error.png": "Outputs relative to the hand on this mesh and corrected, with the band of the error bound.",
         "traces.png": "Hand and outputs against time; below, the outputs relative to the hand.",
     }
     figures = [(out / name, text) for name, text in captions.items() if (out / name).exists()]

@@ -90,7 +90,12 @@ class Session:
         Raises:
             SoftgraspError: the scene cannot be built.
         """
-        model = build(scene, comm=self.comm)
+        if scene.tissue.refine is None:
+            model = build(scene, comm=self.comm)
+        else:
+            from softgrasp.fem.accuracy.adapt import build_to_tolerance  # only scenes with graded cells pay for it
+
+            model = build_to_tolerance(scene, self.comm)
         layout = model.system.layout
         sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
         self.console.print(sizes)

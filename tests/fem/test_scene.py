@@ -64,7 +64,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
         ["tissue.material={mu=1.0, rho=1.0}"],
         "tissue.material.lambda is missing; give first Lame constant",
     ),
-    (PAPER, ["tissue.order=3"], "tissue.order is 3; it must be 1 or 2"),
+    (PAPER, ["tissue.order=4"], "tissue.order is 4; it must be 1, 2 or 3"),
     (PAPER, ["tissue.repair=1"], "tissue.repair is 1; it must be true or false"),
     (PAPER, ["hand.mass='heavy'"], 'hand.mass is "heavy"; it must be a number'),
     (PAPER, ["time.steps=1.5"], "time.steps is 1.5; it must be an integer"),

@@ -24,6 +24,7 @@ from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.study.forward.cautions import inexact, run_warnings, slowest
 from softgrasp.study.forward.explain import Explanation, explain, render, run_explain
 from softgrasp.study.report.equation import equation
+from tests.helpers.models import make_scene
 
 FORCE = {"target": [1.0, 0.0], "drive": "force"}
 RAYLEIGH = {"kind": "rayleigh", "alpha": 0.1, "beta": 0.01}
@@ -118,9 +119,25 @@ def test_locking(comm: MPI.Intracomm, order: int, locks: bool) -> None:
     assert any("P1 locks" in w and "tissue.order = 2" in w for w in result.warnings) == locks
 
 
-def test_no_locking_warning_at_049(comm: MPI.Intracomm) -> None:
-    result = explain(scene_of(1, {"young": 100.0, "poisson": 0.49, "rho": 1.0}), comm)
+def test_locking_is_warned_of_with_a_number_above_045(comm: MPI.Intracomm) -> None:
+    result = explain(scene_of(1, {"young": 100.0, "poisson": 0.45, "rho": 1.0}), comm)
     assert not any("locks" in w for w in result.warnings)
+    result = explain(scene_of(1, {"young": 100.0, "poisson": 0.49, "rho": 1.0}), comm)
+    assert any("P1 locks, its error grows with lambda / mu = 49;" in w for w in result.warnings)
+
+
+def test_singular_ends_and_the_error_they_leave(comm: MPI.Intracomm) -> None:
+    """The paper's block has 1/2 at the lower ends of the zone and 0.745 at its corners; more cells, less error."""
+    coarse, fine = (explain(make_scene({"tissue": {"cells": [n, 2 * n]}}), comm).mesh for n in (4, 16))
+    assert [(e.kind, e.count, e.alpha) for e in coarse.ends] == [("contact end", 2, 0.5), ("contact end", 2, 0.745)]
+    assert coarse.order == pytest.approx(1.0)
+    assert not coarse.graded
+    ratio = coarse.estimate / fine.estimate
+    assert 2.5 < ratio < 4.5  # order one, from a mesh that is too coarse to show it exactly
+    graded = explain(make_scene({"tissue": {"order": 2, "refine": {"tolerance": 0.03}}}), comm).mesh
+    assert graded.order == pytest.approx(4.0)
+    assert graded.estimate < fine.estimate / 2
+    assert [e.count for e in graded.ends] == [2, 2]
 
 
 def test_missing_idle_and_coarse(comm: MPI.Intracomm) -> None:

@@ -368,6 +368,23 @@ def test_a_scene_that_sees_its_hand_only_is_measured_at_the_farthest_node(comm: 
     assert places.points[0][0, 1] == 0.0  # the lower edge; the hand holds the upper part
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_probe_is_exact_for_polynomials_of_its_order(comm: MPI.Intracomm, order: int) -> None:
+    model = build(variant(make_scene(SMALL), Setting((3, 7), order, 4)), comm=comm)
+    point = np.array([0.437, 0.519])  # no node, far from the contact zone
+    probe = make_probe(model.space, (point[None, :],), False)
+    x, y = model.system.layout.nodes.T
+
+    def f(x: Any, y: Any) -> Any:
+        linear = 0.3 + 1.7 * x - 0.6 * y
+        return linear if order == 1 else linear + 2.1 * x * y - 0.9 * y**2 + x**2
+
+    field = np.column_stack([f(x, y), -f(x, y)]).ravel()
+    value = probe.of_rows(comm, field[:, None])[:, 0]
+    # rounding of a dozen terms
+    np.testing.assert_allclose(value, [f(*point), -f(*point)], rtol=0, atol=1e-12)
+
+
 def test_outputs_that_move_with_the_hand_have_no_error(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     held = {"outputs": [{"kind": "node", "point": [0.0, 1.75], "name": "held"}]}
     with pytest.raises(SceneError, match=r"^control\.outputs: no output moves against the hand"):

@@ -1,0 +1,1 @@
+"""How far the outputs of a run are from those of an infinitely fine mesh, and meshes that reach a tolerance."""

@@ -1,0 +1,124 @@
+"""A mesh that reaches `tissue.refine.tolerance`: graded a priori, estimated, and refined where the outputs need it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.accuracy.estimate import estimate, next_order, reduced
+from softgrasp.fem.accuracy.marking import marked_cells
+from softgrasp.fem.accuracy.small import run_small
+from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.mesh.bisect import Whole, bisect, distribute
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.mesh_estimate import MeshEstimate
+from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
+from softgrasp.fem.petsc import Array
+
+if TYPE_CHECKING:
+    from softgrasp.fem.accuracy.small import Small
+    from softgrasp.fem.scene.scene import Scene
+    from softgrasp.fem.scene.tissue import Refine
+
+# Estimate over tolerance that is let pass. Estimates are 0.5 to 1 of the error: where they lie is known after a pass,
+# when the corrected outputs of the new mesh tell the error of the old one.
+ACCEPTED, MOST_ACCEPTED = 0.5, 0.8
+GUESSED = 0.7  # what a pass aims at, at least: too many cells cost more than another pass
+LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
+
+
+def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
+    """Build a scene on a mesh of its tolerance, with the estimate of what it reached; others as they are. Collective.
+
+    Raises:
+        SceneError: the time step leaves more than the tolerance, or the scene cannot be built.
+        MeshError, SolverError: see :func:`fem.model.build.build`.
+    """
+    begin = time.perf_counter()
+    model, refine = build(scene, comm=comm), scene.tissue.refine
+    if refine is None or refine.tolerance is None:
+        return model
+    passes, aim, accepted = 0, refine.tolerance, ACCEPTED
+    last: tuple[Array, Array] | None = None
+    while True:
+        small = reduced(model)
+        result = estimate(model, small)
+        outputs = run_small(small).deformation
+        if last is not None:
+            accepted = _effectivity(last[1], outputs + result.delta - last[0], result.delta)
+        last = outputs, result.delta
+        if passes == 0:
+            _check_steps(scene, refine.tolerance, result.time_error)
+        reached = result.estimate <= accepted * refine.tolerance
+        obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
+        mesh: TissueMesh | None = None
+        if not reached and passes < refine.passes:
+            factor = 0.9 * max(accepted, GUESSED) * refine.tolerance / result.estimate
+            aim *= factor
+            mesh = _finer(model, small, refine, aim, factor)
+            if mesh is None:
+                obstacle = f"tissue.refine.most = {refine.most} unknowns allow no finer mesh"
+        if mesh is None:
+            spent = comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+            model.watch.seconds["mesh"] = spent - model.watch.seconds["assembly"]  # with all passes and estimates
+            return replace(model, accuracy=_final(result, refine, passes, obstacle))
+        model, passes = build(scene, comm=comm, mesh=mesh), passes + 1
+
+
+def _effectivity(old: Array, error: Array, new: Array) -> float:
+    """Estimate over error, e, from the estimates on two meshes, within what has been seen.
+
+    The corrected outputs of the new mesh still miss the share 1 - e of its error, so that they show m = old / error =
+    e / (1 - (1 - e) r) with r = new / old; solved for e.
+    """
+    a, b, c = (float(np.linalg.norm(part, axis=1).max()) for part in (old, error, new))
+    m, r = a / max(b, 1e-300), c / max(a, 1e-300)
+    value = m * (1 - r) / (1 - m * r) if m < 1 and r < 1 else 1.0
+    return float(np.clip(value, ACCEPTED, MOST_ACCEPTED))
+
+
+def _final(result: MeshEstimate, refine: Refine, passes: int, obstacle: str) -> MeshEstimate:
+    return replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
+
+
+def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
+    if error > tolerance:
+        steps = int(scene.time.steps * (2 * error / tolerance) ** 0.5) + 1
+        raise SceneError(
+            f"tissue.refine.tolerance = {tolerance:g} is below the error {error:.1e} that time.steps = "
+            f"{scene.time.steps} leave on any mesh: use at least {steps} steps or a larger tolerance."
+        )
+
+
+def _finer(model: Model, small: Small, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
+    """The next mesh, or None if it has too many unknowns. Collective."""
+    comm, scene = model.system.layout.comm, model.scene
+    if by_lines(scene):
+        return _more_lines(model, aim)
+    marked = marked_cells(small, next_order(model), factor)
+    whole: Whole | None = None
+    with agree(comm):
+        if model.space.mesh.whole is not None and marked is not None:
+            whole = bisect(model.space.mesh.whole, marked)
+            if unknowns(whole, scene.tissue.order) > refine.most:
+                whole = None
+    if not comm.bcast(whole is not None):
+        return None
+    return distribute(comm, whole, model.space.mesh.dimension)
+
+
+def _more_lines(model: Model, aim: float) -> TissueMesh | None:
+    """The first box with more lines for an aim that falls, or None if it has too many unknowns. Collective."""
+    comm, scene, d = model.system.layout.comm, model.scene, model.space.mesh.dimension
+    cells = model.space.mesh.mesh.topology.index_map(d).size_global
+    for _ in range(LINE_TRIES):
+        mesh = refined_mesh(comm, scene, aim)
+        if mesh.mesh.topology.index_map(d).size_global > cells:
+            return mesh
+        aim *= LINE_STEP
+    return None

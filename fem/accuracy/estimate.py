@@ -1,0 +1,149 @@
+"""Error of the outputs of a whole run from static solves on its mesh and on a finer space.
+
+    delta y(t) = y'(t) - y_h(t)
+
+is the difference of two small models (:mod:`fem.accuracy.small`) under the scene's own motion, start, damping and
+coupling: one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh where the
+mesh has no grading of its own. Both share the time step, whose error cancels.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import dolfinx.mesh
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.accuracy.small import Small, run_small, small_model, static_solves
+from softgrasp.fem.layout import bounding_box
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.contact import contact_facets
+from softgrasp.fem.model.mesh_estimate import MeshEstimate
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.tissue import Refine
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+
+# Error over estimate is at most 1 / (1 - q) when the finer space leaves the share q of the error: 0.28 from P1 to P2
+# and 0.51 from P2 to P3 on uniform meshes with exponents of 1/2, where both converge with order 1.
+BOUNDS = {1: 1.5, 2: 2.2, 3: 3.0}
+GRADED_BOUND = 1.5
+SHARE = 0.2  # of the estimate that a graded mesh may leave by its own tolerance
+COMPARED = (1e-2, 1e-3)  # tolerances of graded meshes to compare with
+COMPARED_3D = 3e-2
+MOST_COMPARED = {2: 60_000, 3: 60_000}  # unknowns of the mesh to compare with
+
+
+def estimate(model: Model, coarse: Small | None = None) -> MeshEstimate:
+    """Estimate the error that the mesh leaves in the outputs of the scene's run. Collective.
+
+    Args:
+        model: the model.
+        coarse: its small model, if there is one.
+
+    Raises:
+        SolverError: a static solve fails.
+        SceneError, MeshError: the graded mesh to compare with cannot be made.
+    """
+    begin = time.perf_counter()
+    small = coarse or reduced(model)
+    run = run_small(small)
+    if model.scene.tissue.refine is not None:
+        other = reduced(next_order(model))
+        by, bound, offer = "order", BOUNDS[min(model.scene.tissue.order, 3)], None
+        finer = run_small(other)
+        relative, delta = difference(small, other, finer.deformation, run.deformation)
+    else:
+        by, bound = "graded", GRADED_BOUND
+        for goal in COMPARED if small.model.system.layout.dimension == 2 else (COMPARED_3D,):
+            other = reduced(build(comparison(model.scene, goal), comm=model.system.layout.comm))
+            finer = run_small(other)
+            relative, delta = difference(small, other, finer.deformation, run.deformation)
+            offer = (goal, other.model.system.layout.n_e)
+            if relative > goal / SHARE or relative == 0:
+                break
+        bound = bound if relative > goal / SHARE else bound + goal / max(relative, 1e-300)
+    steps = model.scene.time.steps
+    halved = run_small(small, 2 * steps).deformation[::2]
+    late, _ = difference(small, small, halved, run.deformation)
+    delta = delta + finer.rigid - run.rigid
+    omega = small.modes[0][:2] / other.modes[0][:2] - 1
+    comm = model.system.layout.comm
+    return MeshEstimate(
+        estimate=relative,
+        bound=bound * relative,
+        delta=delta,
+        omega=tuple(float(x) for x in omega),
+        time_error=late * 4 / 3,
+        shift=zone_shift(model),
+        n_e=model.system.layout.n_e,
+        finer=other.model.system.layout.n_e,
+        by=by,
+        offer=offer,
+        seconds=comm.allreduce(time.perf_counter() - begin, MPI.MAX),
+    )
+
+
+def reduced(model: Model) -> Small:
+    """The small model of a model. Collective."""
+    solve, free = static_solves(model)
+    try:
+        return small_model(model, solve)
+    finally:
+        free()
+
+
+def difference(small: Small, other: Small, finer: Array, coarse: Array) -> tuple[float, Array]:
+    """Largest difference of two runs over the largest deformation [1], and the difference (steps + 1, p).
+
+    Outputs that are the hand's count only where there are no others. Not collective.
+    """
+    tissue = np.abs(small.C).max(axis=1) + np.abs(other.C).max(axis=1) > 0
+    if not tissue.any():
+        tissue[:] = True
+    delta = finer - coarse
+    scale = np.linalg.norm(finer[:, tissue], axis=1).max()
+    largest = np.linalg.norm(delta[:, tissue], axis=1).max()
+    return float(largest / scale) if scale > 0 else 0.0, delta
+
+
+def next_order(model: Model) -> Model:
+    """The same cells with elements of the next order. Collective."""
+    tissue = model.scene.tissue.model_copy(update={"order": model.scene.tissue.order + 1})
+    return build(_with(model.scene, tissue), comm=model.system.layout.comm, mesh=model.space.mesh)
+
+
+def comparison(scene: Scene, tolerance: float) -> Scene:
+    """The scene on a graded mesh of quadratic elements or better. Not collective."""
+    tissue = scene.tissue
+    refine = Refine(tolerance=tolerance, most=MOST_COMPARED[scene.dimension or 3])
+    return _with(scene, tissue.model_copy(update={"order": max(2, tissue.order), "refine": refine}))
+
+
+def _with(scene: Scene, tissue: object) -> Scene:
+    result = scene.model_copy(update={"tissue": tissue})
+    result._directory = scene._directory
+    return result
+
+
+def zone_shift(model: Model) -> float:
+    """Largest distance of the ends of the zone held from the faces of ``contact.box`` inside the body [m]. Collective.
+
+    Facets count by their midpoints, so that a zone may end half a cell beyond or short of the box.
+    """
+    mesh, box, comm = model.space.mesh, model.scene.contact.box, model.system.layout.comm
+    if box is None:
+        return 0.0
+    facets = contact_facets(mesh, model.scene.contact)
+    mesh.mesh.topology.create_connectivity(mesh.dimension - 1, mesh.dimension)
+    nodes = dolfinx.mesh.entities_to_geometry(mesh.mesh, mesh.dimension - 1, facets).ravel()
+    x = mesh.mesh.geometry.x[:, : mesh.dimension]
+    held, body = bounding_box(comm, x[nodes]), bounding_box(comm, x)
+    slack = 1e-9 * (body[1] - body[0])
+    low, high = (np.asarray(corner) for corner in box)
+    below = np.where(low > body[0] + slack, np.abs(held[0] - low), 0.0)
+    above = np.where(high < body[1] - slack, np.abs(held[1] - high), 0.0)
+    return float(max(below.max(), above.max()))

@@ -1,0 +1,224 @@
+"""A small model from static solves that follows the outputs of a scene's own run.
+
+    V = span{X, K^-1 M X, (K^-1 M)^2 X, ..},   X = K_ee^-1 [G, C'],
+
+matches the moments of C (K + s^2 M)^-1 G about s = 0 [B02], twice as many as it has blocks because both sides are in X.
+What is driven slower than the first neglected frequency it follows to the accuracy of the static solves, which is what
+the difference between two meshes needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs import Output, make_outputs
+from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.run.motion import HandTable, driven_table, force_values, motion_table
+from softgrasp.fem.solve.solvers import choose_solver, make_solver
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+
+BLOCKS = 4
+DROPPED = 1e-12  # of the largest squared length in a block: directions that are rounding only
+PREFIX = "softgrasp_accuracy_"
+
+Solve = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Small:
+    """M xi'' + D xi' + K xi = G c, z = V xi, of a model; small arrays on every rank.
+
+    Attributes:
+        V: basis, local rows (n_local, N), with V' K V = 1.
+        M, D: projected mass and damping (N, N).
+        G: coupling (N, n_s).
+        C: outputs of the tissue against the hand (p, N).
+        C_s: their rigid part (p, n_s).
+        X: static solutions K_ee^-1 [G, C'], local rows (n_local, n_s + p); columns of outputs that are none are zero.
+        model: whose it is.
+    """
+
+    V: Array
+    M: Array
+    D: Array
+    G: Array
+    C: Array
+    C_s: Array
+    X: Array
+    model: Model
+
+    @property
+    def modes(self) -> tuple[Array, Array]:
+        """Ritz frequencies omega (N,), ascending [1/s], and modes (N, N) with Phi' M Phi = 1."""
+        squares, Phi = scipy.linalg.eigh(np.eye(len(self.M)), self.M)
+        return np.sqrt(squares), Phi
+
+
+def output_columns(outputs: tuple[Output, ...], n_local: int) -> Array:
+    """C' of all outputs, local rows (n_local, p). Not collective."""
+    columns = []
+    for output in outputs:
+        for c in range(output.size):
+            column = np.zeros(n_local)
+            if len(output.dofs):
+                column[output.dofs[:, c]] = output.weight
+            columns.append(column)
+    return np.asfortranarray(np.array(columns).T.reshape(n_local, -1))
+
+
+def static_solves(model: Model) -> tuple[Solve, Callable[[], None]]:
+    """What applies K_ee^-1 to columns, factored once, and what frees it. Collective."""
+    system, time = model.system, model.scene.time
+    name, _ = choose_solver(system.layout, "auto", few=True)
+    solver = make_solver(system.K_ee.copy(), name, system.layout, PREFIX, min(time.rtol, 1e-10), reproducible=False)
+    r, w = system.K_ee.createVecs()
+
+    def solve(F: Array) -> Array:
+        X = np.empty(F.shape, order="F")
+        for j in range(F.shape[1]):
+            r.array_w[:] = F[:, j]
+            solver.solve(r, w)
+            X[:, j] = w.array_r
+        return X
+
+    def free() -> None:
+        for used in (solver, r, w):
+            used.destroy()
+
+    return solve, free
+
+
+def small_model(model: Model, solve: Solve, blocks: int = BLOCKS) -> Small:
+    """Project a model. Collective.
+
+    Args:
+        model: the model.
+        solve: applies K_ee^-1, from :func:`static_solves`.
+        blocks: static solves of each column.
+    """
+    system, comm = model.system, model.system.layout.comm
+    outputs = make_outputs(model.scene, system)
+    C = output_columns(outputs, system.layout.n_local)
+    X = solve(np.hstack([system.G, C]))
+    V, last = np.zeros((len(X), 0)), X
+    for k in range(blocks):
+        if k:
+            last = solve(times_columns(system.M_ee, last))
+        for _ in range(2):  # once is not enough where blocks are nearly dependent
+            last = last - V @ total(comm, V.T @ times_columns(system.K_ee, last)) if V.shape[1] else last
+            gram = total(comm, last.T @ times_columns(system.K_ee, last))
+            scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+            squares, Q = np.linalg.eigh((gram + gram.T) / 2 / np.outer(scale, scale))
+            kept = squares > DROPPED
+            last = last @ comm.bcast((Q[:, kept] / np.sqrt(squares[kept])) / scale[:, None])
+        V = np.hstack([V, last])
+    damping = system.damping
+    M = total(comm, V.T @ times_columns(system.M_ee, V))
+    D = damping.alpha * M + damping.beta * np.eye(len(M))
+    if damping.matrix is not None:
+        D = damping.alpha * M + total(comm, V.T @ times_columns(damping.matrix, V))
+    C_s = np.vstack([o.C_s for o in outputs])
+    pair = total(comm, V.T @ np.hstack([system.G, C]))
+    n_s = system.layout.n_s
+    return Small(V, (M + M.T) / 2, (D + D.T) / 2, pair[:, :n_s], pair[:, n_s:].T, C_s, X, model)
+
+
+@dataclass(frozen=True)
+class SmallRun:
+    """A run of a small model.
+
+    Attributes:
+        deformation: outputs against the hand, (steps + 1, p).
+        rigid: their rigid part, (steps + 1, p).
+        loads: c of each step, (steps, n_s).
+        accelerations: xi'' at the middle of each step, (steps, N).
+    """
+
+    deformation: Array
+    rigid: Array
+    loads: Array
+    accelerations: Array
+
+
+def run_small(small: Small, steps: int | None = None) -> SmallRun:
+    """Run the scene's motion or force with the midpoint rule, as the full model does. Not collective.
+
+    Args:
+        small: the model.
+        steps: instead of the scene's.
+
+    Raises:
+        SceneError: a CSV file of the motion does not fit.
+    """
+    system, scene = small.model.system, small.model.scene
+    n = steps or scene.time.steps
+    scene = scene.model_copy(update={"time": scene.time.model_copy(update={"steps": n})})
+    scene._directory = small.model.scene._directory
+    dt, n_s = scene.time_end / n, system.layout.n_s
+    g = np.zeros(n_s) if system.gravity is None else system.gravity
+    z = small.G @ g if scene.time.start == "equilibrium" else np.zeros(len(small.M))  # V' K V = 1
+    if scene.motion.drive == "force" and system.two_way:
+        return _driven(small, scene, z, dt)
+    table = _table(small, scene, dt)
+    alpha = system.damping.alpha if system.damping.in_space else 0.0
+    loads = g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
+    s = 2 / dt
+    inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
+    A, B = inverse @ (s * small.M), -inverse
+    responses = loads @ (inverse @ small.G).T
+    v, Z, a = np.zeros_like(z), np.empty((n + 1, len(z))), np.empty((n, len(z)))
+    Z[0] = z
+    for i in range(n):
+        w = A @ v + B @ Z[i] + responses[i]
+        a[i] = s * (s * w - v)
+        Z[i + 1] = Z[i] + 2 * w
+        v = 2 * s * w - v
+    return SmallRun(Z @ small.C.T, table.q @ small.C_s.T, loads, a)
+
+
+def _table(small: Small, scene: Scene, dt: float) -> HandTable:
+    """The hand's motion where it does not feel the tissue."""
+    system = small.model.system
+    n_s = system.layout.n_s
+    if scene.motion.drive == "motion":
+        return motion_table(scene, n_s)
+    zero = np.zeros(n_s)
+    weight = system.M_hand @ system.gravity if system.hand_weight and system.gravity is not None else zero
+    return driven_table(system.M_hand, force_values(scene, n_s, system.M_hand) + weight, dt, zero, zero)
+
+
+def _driven(small: Small, scene: Scene, z: Array, dt: float) -> SmallRun:
+    """Hand and tissue together, as in :class:`fem.run.drive.ForceDrive`."""
+    system, s, n_s = small.model.system, 2 / dt, small.G.shape[1]
+    u = force_values(scene, n_s, system.M_hand)
+    g = np.zeros(n_s) if system.gravity is None else system.gravity
+    u = u + (system.M_hand @ g if system.hand_weight else 0.0)
+    alpha = system.damping.alpha if system.damping.in_space else 0.0
+    kappa, theta = 1 + alpha * dt / 2, s * s + alpha * s
+    inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
+    Y = inverse @ small.G
+    hand = np.linalg.inv(system.M_hand + kappa * (system.M_rigid - theta * small.G.T @ Y))
+    n = len(u)
+    q, vs, v = np.zeros((n + 1, n_s)), np.zeros(n_s), np.zeros_like(z)
+    Z, loads, a = np.empty((n + 1, len(z))), np.empty((n, n_s)), np.empty((n, len(z)))
+    Z[0] = z
+    for i in range(n):
+        c0 = alpha * vs - g
+        x = inverse @ (s * (small.M @ v) - Z[i])
+        pull = small.G.T @ (theta * (x - Y @ c0) - s * v)
+        push = hand @ (u[i] - system.M_rigid @ c0 - pull)
+        loads[i] = -(kappa * push + c0)
+        w = x + Y @ loads[i]
+        a[i] = s * (s * w - v)
+        Z[i + 1], v = Z[i] + 2 * w, 2 * s * w - v
+        q[i + 1] = q[i] + dt * (vs + dt * push / 2)
+        vs = vs + dt * push
+    return SmallRun(Z @ small.C.T, q @ small.C_s.T, loads, a)

@@ -1,0 +1,189 @@
+"""Local bisection of a simplex mesh on rank 0; contact zone, tags and layers pass to the children.
+
+DOLFINx bisects distributed meshes too, but passes tags on only where no cell is shared by ranks, and keeps children on
+the rank of their parent. On rank 0 the mesh is the same for every rank count and is spread evenly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import basix.ufl
+import dolfinx.io
+import dolfinx.mesh
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx.graph import adjacencylist
+from mpi4py import MPI
+
+from softgrasp.fem.errors import MeshError
+from softgrasp.fem.mesh.check import FLAT, counted, longest_edges, place_text, signed_volumes
+from softgrasp.fem.mesh.parts import Parts, find_parts
+from softgrasp.fem.mesh.seams import sort_facets
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Ints = npt.NDArray[np.int32]
+
+MOST_LEVELS = 60  # each halves the longest edge at most; 2^-30 of a body is below any useful cell
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A simplex mesh on one rank with what its cells and facets carry.
+
+    Attributes:
+        mesh: on MPI.COMM_SELF.
+        source: its name, for messages.
+        cells: marks by name, one a cell: "tags", "layers".
+        facets: marks by name: "tags", "contact".
+        facet_sets, cell_sets: see :class:`TissueMesh`.
+    """
+
+    mesh: dolfinx.mesh.Mesh
+    source: str
+    cells: dict[str, Ints]
+    facets: dict[str, dolfinx.mesh.MeshTags]
+    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return int(self.mesh.topology.dim)
+
+    @property
+    def points(self) -> Floats:
+        """Coordinates, (n_points, d) [m]."""
+        return np.asarray(self.mesh.geometry.x[:, : self.dimension])
+
+    @property
+    def simplices(self) -> Integers:
+        """Nodes of the cells, (n_cells, d + 1)."""
+        return np.asarray(cell_nodes(self.mesh), dtype=np.int64)
+
+    def facet_nodes(self, name: str) -> Integers:
+        """Nodes of the marked facets, (n, d)."""
+        indices = self.facets[name].indices
+        self.mesh.topology.create_connectivity(self.dimension - 1, self.dimension)
+        nodes = dolfinx.mesh.entities_to_geometry(self.mesh, self.dimension - 1, indices)
+        return np.asarray(nodes, dtype=np.int64)
+
+
+def bisect(whole: Whole, marked: Ints) -> Whole:
+    """Split the marked cells, and others until no node hangs, through their longest edges [PC00]. Not collective.
+
+    Args:
+        whole: the mesh.
+        marked: numbers of the cells to split, in the order of ``whole.simplices``.
+
+    Raises:
+        MeshError: a child would be flat to rounding.
+    """
+    mesh, d = whole.mesh, whole.dimension
+    for a, b in ((d, 1), (1, d), (d - 1, d), (d, d - 1)):
+        mesh.topology.create_connectivity(a, b)
+    edges = dolfinx.mesh.compute_incident_entities(mesh.topology, np.sort(marked).astype(np.int32), d, 1)
+    option = dolfinx.mesh.RefinementOption.parent_cell_and_facet
+    fine, parent, parent_facet = dolfinx.mesh.refine(mesh, edges, option=option)
+    for a, b in ((d - 1, d), (d, d - 1)):
+        fine.topology.create_connectivity(a, b)
+    facets = {
+        name: dolfinx.mesh.transfer_meshtag(tags, fine, parent, parent_facet) for name, tags in whole.facets.items()
+    }
+    above = parent[fine.topology.original_cell_index]  # DOLFINx numbers parents in the order before its own reordering
+    result = replace(whole, mesh=fine, cells={k: v[above] for k, v in whole.cells.items()}, facets=facets)
+    points, cells = result.points, result.simplices
+    quality = np.abs(signed_volumes(points, cells)) / longest_edges(points, cells) ** d
+    if (flat := quality <= FLAT).any():
+        place = place_text(points[cells[int(np.argmin(quality))]].mean(axis=0))
+        raise MeshError(
+            f"{whole.source} cannot be bisected further: {counted(int(flat.sum()), 'cell')} would be flat, the worst "
+            f"around {place}; remesh the body there or take a larger tissue.refine.tolerance."
+        )
+    return result
+
+
+def bisect_to(whole: Whole, size: Callable[[Floats], Floats], slack: float, most: int) -> Whole:
+    """Bisect until no cell is larger than its size by a factor. Not collective.
+
+    Args:
+        whole: the mesh.
+        size: sizes [m] at points (n, d).
+        slack: the factor.
+        most: cells; bisection ends when there are more.
+
+    Raises:
+        MeshError: see :func:`bisect`.
+    """
+    for _ in range(MOST_LEVELS):
+        points, cells = whole.points, whole.simplices
+        large = longest_edges(points, cells) > slack * size(points[cells].mean(axis=1))
+        if not large.any() or len(cells) > most:
+            break
+        whole = bisect(whole, np.flatnonzero(large).astype(np.int32))
+    return whole
+
+
+def distribute(comm: MPI.Intracomm, whole: Whole | None, dimension: int) -> TissueMesh:
+    """Spread a mesh from rank 0 over the ranks, with all it carries. Collective.
+
+    ``mesh.topology.original_cell_index`` of the result counts the cells as ``whole.simplices`` does.
+
+    Args:
+        comm: communicator.
+        whole: on rank 0, None elsewhere.
+        dimension: 2 or 3, on all ranks.
+    """
+    d = dimension
+    points, cells = np.zeros((0, d)), np.zeros((0, d + 1), dtype=np.int64)
+    facts: tuple[str, list[str], list[str], dict[int | str, tuple[int, ...]], dict[int | str, tuple[int, ...]]] | None
+    facts, parts = None, None
+    if whole is not None:
+        points, cells = whole.points.copy(), whole.simplices
+        facts = whole.source, sorted(whole.cells), sorted(whole.facets), whole.facet_sets, whole.cell_sets
+        parts = find_parts(points, cells, sort_facets(cells), whole.source)
+    source, cell_names, facet_names, facet_sets, cell_sets = comm.bcast(facts)
+    known: Parts | None = comm.bcast(None if parts is None else parts[1])
+    shape = {2: "triangle", 3: "tetrahedron"}[d]
+    mesh = dolfinx.mesh.create_mesh(comm, cells, ufl.Mesh(basix.ufl.element("Lagrange", shape, 1, shape=(d,))), points)
+    nothing = np.zeros(0, dtype=np.int32)
+    on_cells = {name: _spread(mesh, d, cells, whole.cells[name] if whole else nothing) for name in cell_names}
+    on_facets = {
+        name: _spread(
+            mesh,
+            d - 1,
+            whole.facet_nodes(name) if whole else np.zeros((0, d), dtype=np.int64),
+            whole.facets[name].values if whole else nothing,
+        )
+        for name in facet_names
+    }
+    return TissueMesh(
+        mesh=mesh,
+        dimension=d,
+        facet_tags=on_facets.get("tags"),
+        cell_tags=on_cells.get("tags"),
+        source=source,
+        part_tags=None if known is None else _spread(mesh, d, cells, nothing if parts is None else parts[0]),
+        parts=known,
+        facet_sets=facet_sets,
+        cell_sets=cell_sets,
+        contact=on_facets.get("contact"),
+        layers=on_cells.get("layers"),
+        whole=whole,
+    )
+
+
+def _spread(mesh: dolfinx.mesh.Mesh, dimension: int, entities: Integers, values: Ints) -> dolfinx.mesh.MeshTags:
+    """Mesh tags from entities by their nodes, given on rank 0. Collective."""
+    mesh.topology.create_entities(dimension)
+    mesh.topology.create_connectivity(dimension, 0)
+    mesh.topology.create_connectivity(dimension, mesh.topology.dim)
+    local, here = dolfinx.io.distribute_entity_data(
+        mesh, dimension, np.ascontiguousarray(entities), np.ascontiguousarray(values, dtype=np.int32)
+    )
+    nodes = adjacencylist(np.ascontiguousarray(local, dtype=np.int32))
+    return dolfinx.mesh.meshtags_from_entities(mesh, dimension, nodes, here.astype(np.int32))

@@ -1,0 +1,205 @@
+"""Where the displacement of the tissue is singular, and how strongly (numpy only, not collective).
+
+Near a corner of the boundary u ~ r^alpha; a mesh of uniform cells h then leaves an error of the outputs of the order
+h^(2 alpha), whatever the polynomial order of the elements.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import brentq
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
+
+KINDS: tuple[Kind, ...] = ("re-entrant", "contact end", "held corner")  # by the number of sides held
+REGULAR = 0.8  # exponents above cost no order that a mesh of practical size would show: 2 alpha is nearly that of P1
+STRAIGHT = 1e-6  # [rad]; angles of a flat boundary are off by rounding only
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Singular points (2D) or edges (3D) of a body.
+
+    Attributes:
+        at: coordinates of the points, (n, 1, 2), or of both ends of the edges, (n, 2, 3) [m].
+        angle: angle of the body there, (n,) [rad].
+        alpha: real part of the exponent, (n,) [1]; 1/2 is assumed at ends of layers, where both materials decide.
+        kind: what the end is, n words.
+    """
+
+    at: Floats
+    angle: Floats
+    alpha: Floats
+    kind: tuple[Kind, ...]
+
+    def distance(self, x: Floats) -> Floats:
+        """Distance of points (n, d) from the nearest end [m], inf if there is none."""
+        nearest = np.full(len(x), np.inf)
+        for end in self.at:
+            a = end[0]
+            r = x - a
+            if len(end) == 2:
+                edge = end[1] - a
+                r = r - np.outer(np.clip(r @ edge / (edge @ edge), 0.0, 1.0), edge)
+            np.minimum(nearest, np.einsum("ij,ij->i", r, r), out=nearest)
+        return np.sqrt(nearest)
+
+
+def exponent(angle: float, nu: float, held: int) -> float:
+    """Real part of the smallest exponent alpha > 0 of u ~ r^alpha at a corner in plane strain [W52].
+
+    With kappa = 3 - 4 nu,
+
+        sin^2(alpha w) = alpha^2 sin^2 w                                         both sides free,
+        sin^2(alpha w) = ((kappa + 1)^2 - 4 alpha^2 sin^2 w) / (4 kappa)         one side held,
+        sin^2(alpha w) = alpha^2 sin^2 w / kappa^2                               both sides held.
+
+    Args:
+        angle: angle w of the body [rad], 0 < w <= 2 pi.
+        nu: Poisson's ratio [1].
+        held: how many of the two sides are held, 0 to 2.
+
+    Returns:
+        alpha, at most 1 (beyond which nothing is singular).
+    """
+    kappa, s = 3 - 4 * nu, np.sin(angle)
+    if held == 1:
+        return _mixed(angle, kappa, s)
+    factor = 1.0 if held == 0 else 1 / kappa
+    best = 1.0
+    for sign in (1.0, -1.0):
+
+        def gap(a: float, sign: float = sign) -> float:
+            return float(np.sin(a * angle) - sign * factor * a * s)
+
+        grid = np.linspace(0.05, 1 - 1e-9, 400)
+        values = [gap(a) for a in grid]
+        for i in range(len(grid) - 1):
+            if values[i] * values[i + 1] < 0:
+                best = min(best, float(brentq(gap, grid[i], grid[i + 1])))
+                break
+    return best
+
+
+def _mixed(angle: float, kappa: float, s: float) -> float:
+    """Smallest root with one side held, by Newton from a grid of complex starts."""
+
+    def gap(z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
+        return np.asarray(np.sin(z * angle) ** 2 - ((kappa + 1) ** 2 - 4 * z**2 * s**2) / (4 * kappa))
+
+    z = (np.linspace(0.2, 1.1, 19)[:, None] + 1j * np.array([0.0, 0.05, 0.1, 0.2, 0.4])).ravel()
+    for _ in range(60):
+        slope = angle * np.sin(2 * z * angle) + 2 * z * s**2 / kappa
+        z = z - gap(z) / np.where(np.abs(slope) > 1e-12, slope, 1e-12)
+        z = np.where(np.isfinite(z) & (np.abs(z) < 10), z, 10.0)
+    real = z.real[(np.abs(gap(z)) < 1e-9) & (z.real > 0.02) & (np.abs(z) < 9)]
+    return float(min(real.min(initial=1.0), 1.0))
+
+
+def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integers, nu: Floats) -> Ends:
+    """Ends of the contact zone, re-entrant corners or edges, and corners of layer interfaces.
+
+    Args:
+        points: shape (n_points, d) [m].
+        cells: simplices, shape (n_cells, d + 1).
+        held: contact facets, shape (n, d).
+        layers: number of the layer of each cell, shape (n_cells,).
+        nu: Poisson's ratio of each cell [1], shape (n_cells,).
+    """
+    d = points.shape[1]
+    facets = np.sort(np.concatenate([np.delete(cells, i, axis=1) for i in range(d + 1)]), axis=1)
+    owner = np.tile(np.arange(len(cells)), d + 1)
+    unique, inverse, count = np.unique(facets, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.ravel()
+    outside = count == 1
+    least, largest = np.full(len(unique), len(layers) + 1), np.full(len(unique), -2)
+    np.minimum.at(least, inverse, layers[owner])
+    np.maximum.at(largest, inverse, layers[owner])
+    between = ~outside & (least != largest)
+    code = np.array([len(points) ** k for k in range(d)], dtype=np.int64)
+    clamped = outside & np.isin(unique @ code, np.sort(held, axis=1) @ code)
+    ridges, angle = _angles(points, cells)
+    on = {name: _per_ridge(unique[mask], ridges, d) for name, mask in
+          (("held", clamped), ("free", outside & ~clamped), ("inner", between))}  # fmt: skip
+    ratio = np.zeros(len(ridges))
+    for corner in combinations(range(d + 1), d - 1):
+        np.maximum.at(ratio, _find(ridges, np.sort(cells[:, list(corner)], axis=1)), nu)
+    chosen: list[int] = []
+    alphas: list[float] = []
+    kinds: list[Kind] = []
+    boundary = on["held"] + on["free"] > 0
+    odd = boundary & ((on["held"] > 0) | (np.abs(angle - np.pi) > STRAIGHT))
+    cache: dict[tuple[int, int, int], float] = {}
+    for i in np.flatnonzero(odd).tolist():
+        sides = 1 if on["held"][i] and on["free"][i] else 0 if on["free"][i] else 2
+        key = (round(angle[i] * 1e4), round(ratio[i] * 1e6), sides)
+        if key not in cache:
+            cache[key] = exponent(min(angle[i], 2 * np.pi), ratio[i], sides)
+        if cache[key] < REGULAR:
+            chosen.append(i)
+            alphas.append(cache[key])
+            kinds.append(KINDS[sides])
+    for i in np.flatnonzero(_layer_ends(points, unique[between], ridges, on["inner"], boundary, d)).tolist():
+        if i not in chosen:
+            chosen.append(i)
+            alphas.append(0.5)
+            kinds.append("layer end")
+    index = np.array(chosen, dtype=np.int64)
+    return Ends(points[ridges[index]].reshape(-1, d - 1, d), angle[index], np.array(alphas), tuple(kinds))
+
+
+def _find(ridges: Integers, rows: Integers) -> Integers:
+    """Places of sorted rows among the sorted unique ridges."""
+    n = int(ridges.max(initial=0)) + 1
+    code = np.array([n**k for k in reversed(range(ridges.shape[1]))], dtype=np.int64)
+    return np.searchsorted(ridges @ code, rows @ code)
+
+
+def _angles(points: Floats, cells: Integers) -> tuple[Integers, Floats]:
+    """All vertices (2D) or edges (3D), and the sum of the angles of the cells there."""
+    d = points.shape[1]
+    rows, values = [], []
+    for corner in combinations(range(d + 1), d - 1):
+        others = [i for i in range(d + 1) if i not in corner]
+        a, b = (points[cells[:, i]] - points[cells[:, corner[0]]] for i in others)
+        if d == 3:  # dihedral angle: both arms at right angles to the edge
+            edge = points[cells[:, corner[1]]] - points[cells[:, corner[0]]]
+            edge = edge / np.linalg.norm(edge, axis=1)[:, None]
+            a, b = (v - np.einsum("ij,ij->i", v, edge)[:, None] * edge for v in (a, b))
+        cosine = np.einsum("ij,ij->i", a, b) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+        rows.append(np.sort(cells[:, list(corner)], axis=1))
+        values.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    ridges, inverse = np.unique(np.concatenate(rows), axis=0, return_inverse=True)
+    return ridges, np.bincount(inverse.ravel(), weights=np.concatenate(values), minlength=len(ridges))
+
+
+def _per_ridge(facets: Integers, ridges: Integers, d: int) -> Integers:
+    """How many of the facets (sorted rows) meet at each ridge."""
+    count = np.zeros(len(ridges), dtype=np.int64)
+    for corner in combinations(range(d), d - 1):
+        np.add.at(count, _find(ridges, facets[:, list(corner)]), 1)
+    return count
+
+
+def _layer_ends(
+    points: Floats, facets: Integers, ridges: Integers, inner: Integers, boundary: npt.NDArray[np.bool_], d: int
+) -> npt.NDArray[np.bool_]:
+    """Where interfaces of layers reach the boundary, branch, or turn."""
+    normals = np.zeros((len(ridges), d, d))  # sum of n n' of the facets at a ridge: of rank 1 where they are level
+    if len(facets):
+        edges = points[facets[:, 1:]] - points[facets[:, :1]]
+        normal = np.cross(edges[:, 0], edges[:, 1]) if d == 3 else np.stack([-edges[:, 0, 1], edges[:, 0, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        for corner in combinations(range(d), d - 1):
+            np.add.at(normals, _find(ridges, facets[:, list(corner)]), normal[:, :, None] * normal[:, None, :])
+    turned = np.zeros(len(ridges), dtype=np.bool_)
+    two = inner == 2
+    turned[two] = np.linalg.eigvalsh(normals[two])[:, -2] > STRAIGHT
+    return ((inner > 0) & boundary) | (inner > 2) | turned

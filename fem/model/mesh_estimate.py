@@ -1,0 +1,50 @@
+"""What is known of the error that the mesh leaves in the outputs of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array
+
+
+@dataclass(frozen=True)
+class MeshEstimate:
+    """Error of the deformation: outputs against the hand, over the largest of them.
+
+    Attributes:
+        estimate: largest |delta y| over the run, relative [1].
+        bound: what the error has not exceeded wherever it could be checked, relative [1].
+        delta: estimate of y - y_h at the time steps, (steps + 1, p) [m, rad]; y_h + delta is the corrected output.
+        omega: relative errors of the two lowest frequencies that the run can see, omega_h / omega - 1 [1].
+        time_error: error of the time steps, relative like ``estimate`` [1].
+        shift: largest distance of the ends of the zone held from ``contact.box`` [m].
+        n_e: tissue unknowns of the mesh judged.
+        finer: tissue unknowns of the mesh it was compared with.
+        by: "order" (elements of the next order on the same cells) or "graded" (another mesh, which meets the zone).
+        tolerance: of the scene, or None.
+        passes: refinements after the first estimate.
+        obstacle: why the tolerance was not reached, or "".
+        offer: tolerance and unknowns of a graded mesh that does better, or None.
+        seconds: what the estimate took, the slowest rank.
+    """
+
+    estimate: float
+    bound: float
+    delta: Array = field(repr=False)
+    omega: tuple[float, ...]
+    time_error: float
+    shift: float
+    n_e: int
+    finer: int
+    by: str
+    tolerance: float | None = None
+    passes: int = 0
+    obstacle: str = ""
+    offer: tuple[float, int] | None = None
+    seconds: float = 0.0
+
+    def corrected(self, outputs: Array) -> Array:
+        """Outputs y_h + delta y (steps + 1, p) [m, rad]. Not collective."""
+        return np.asarray(outputs + self.delta)

@@ -1,0 +1,261 @@
+"""The mesh that `[tissue.refine]` describes: graded before any solve, the same for every rank count.
+
+    h(r) = max(floor, h0 min(1, r / R)^(1 - mu)),  R = half the shortest side of the body,
+
+with r the distance from the nearest end of the contact zone, re-entrant corner or corner of a layer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import dolfinx.mesh
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from softgrasp.fem.errors import SceneError, agree
+from softgrasp.fem.mesh.bisect import Whole, bisect_to, distribute
+from softgrasp.fem.mesh.check import longest_edges
+from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField
+from softgrasp.fem.mesh.lines import box_axes, box_of_lines, even_cells
+from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.singular import Ends, singular_ends
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.contact import contact_facets
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+    from softgrasp.fem.scene.tissue import Refine
+
+# Measured on the scenes that ship: cells across the shortest side that leave 1e-2 of the deformation away from the
+# ends, and the power of the tolerance with which they grow: 1 / (2 p), as outputs converge with twice the order.
+ACROSS = {2: {1: 32.0, 2: 3.75, 3: 3.0}, 3: {1: 12.0, 2: 4.0, 3: 3.0}}
+LINES_ACROSS = {2: {1: 24.0, 2: 8.0, 3: 5.0}, 3: {1: 16.0, 2: 6.0, 3: 4.0}}
+# Smallest cell over tolerance times shortest side: what an end costs is about proportional to it.
+FLOOR = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 2.0, 2: 6.0, 3: 8.0}}
+DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a tolerance: edges in 3D fill a body quickly
+SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What an a-priori mesh aims at: cells across the shortest side, grading, and smallest cell over that side."""
+
+    across: float
+    mu: float
+    floor: float
+
+
+def aims(refine: Refine, order: int, d: int, tolerance: float) -> Sizes:
+    """A-priori sizes for a tolerance of the deformation. Not collective."""
+    p = min(order, 3)
+    mu = refine.grading if isinstance(refine.grading, float) else BISECTION[p]
+    across = ACROSS[d][p] * (1e-2 / tolerance) ** (1 / (2 * p))
+    return Sizes(across, mu, FLOOR[d][p] * tolerance)
+
+
+def by_lines(scene: Scene) -> bool:
+    """Whether the scene's graded mesh is a box with moved lines. Not collective."""
+    refine, tissue = scene.tissue.refine, scene.tissue
+    if refine is None or tissue.size is None or refine.method == "bisect":
+        return False
+    return refine.method == "lines" or len(tissue.size) == 3 or refine.tolerance is None
+
+
+def refined_mesh(comm: MPI.Intracomm, scene: Scene, tolerance: float | None = None) -> TissueMesh:
+    """The a-priori mesh of a scene with `[tissue.refine]`. Collective; rank 0 bisects.
+
+    Args:
+        comm: communicator.
+        scene: the scene.
+        tolerance: instead of the scene's.
+
+    Raises:
+        SceneError: even the coarsest mesh has more than ``tissue.refine.most`` unknowns.
+        MeshError: the mesh file is wrong, or its cells cannot be bisected.
+    """
+    refine = scene.tissue.refine
+    if refine is None:
+        return make_mesh(comm, scene)
+    goal = tolerance or refine.tolerance
+    if by_lines(scene):
+        return _lined(comm, scene, refine, goal)
+    whole: Whole | None = None
+    with agree(comm):
+        if comm.rank == 0:
+            whole = _bisected(scene, refine, goal)
+    return distribute(comm, whole, comm.bcast(None if whole is None else whole.dimension))
+
+
+def _lined(comm: MPI.Intracomm, scene: Scene, refine: Refine, goal: float | None) -> TissueMesh:
+    size, p = scene.tissue.size or [], min(scene.tissue.order, 3)
+    d, short = len(size), min(size)
+    mu = LINES[p] if refine.grading == "auto" else 1.0 if refine.grading == "off" else refine.grading
+    cells = list(scene.tissue.cells or [])
+    if goal is not None:
+        across = LINES_ACROSS[d][p] * (1e-2 / goal) ** (1 / (2 * p))
+        while True:
+            cells = [even_cells(axis, short / across) for axis in box_axes(scene)]
+            if lattice(cells, p) <= refine.most:
+                break
+            if across <= 1:
+                raise _too_large(refine, lattice(cells, p))
+            across = max(across / 1.1, 1.0)
+    elif lattice(cells, p) > refine.most:
+        raise _too_large(refine, lattice(cells, p))
+    return box_of_lines(comm, scene, cells, mu, short / 2)
+
+
+def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
+    """The bisected mesh, on one rank. Not collective."""
+    order, aim = scene.tissue.order, goal
+    while True:
+        whole = _base(scene, refine, aim)
+        if unknowns(whole, order) > refine.most and (aim is None or aim > 1):
+            raise _too_large(refine, unknowns(whole, order))
+        whole = graded(whole, scene, refine, aim)
+        if unknowns(whole, order) <= refine.most:
+            break
+        if aim is None:
+            raise _too_large(refine, unknowns(whole, order))
+        aim *= SHRINK
+    return whole if refine.contact == "inherit" else _forget(whole)
+
+
+def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
+    """The mesh to bisect with contact zone and layers marked. Not collective."""
+    size = scene.tissue.size
+    if size is None:
+        tissue = make_mesh(MPI.COMM_SELF, scene)
+    else:
+        cells = list(scene.tissue.cells or [])
+        if aim is not None:
+            h = min(size) / aims(refine, scene.tissue.order, len(size), aim).across
+            cells = [even_cells(axis, h) for axis in box_axes(scene)]
+        tissue = box_of_lines(MPI.COMM_SELF, scene, cells, 1.0, min(size) / 2)
+    return marked(tissue, scene)
+
+
+def marked(tissue: TissueMesh, scene: Scene) -> Whole:
+    """A mesh on one rank with its contact zone, layers and tags as marks. Not collective."""
+    facets = contact_facets(tissue, scene.contact)
+    n = tissue.mesh.topology.index_map(tissue.dimension).size_local
+    layers = np.full(n, -1, dtype=np.int32)
+    if scene.tissue.layers:
+        names = list(scene.tissue.layers)
+        for name, cells in cells_of_layers(tissue, scene).items():
+            layers[cells] = names.index(name) if name in names else -1
+    on_cells = {"layers": layers}
+    if tissue.cell_tags is not None:
+        tags = np.zeros(n, dtype=np.int32)
+        tags[tissue.cell_tags.indices] = tissue.cell_tags.values
+        on_cells["tags"] = tags
+    contact = dolfinx.mesh.meshtags(
+        tissue.mesh, tissue.dimension - 1, np.sort(facets), np.ones(len(facets), dtype=np.int32)
+    )
+    on_facets = {"contact": contact}
+    if tissue.facet_tags is not None:
+        on_facets["tags"] = tissue.facet_tags
+    return Whole(tissue.mesh, tissue.source, on_cells, on_facets, tissue.facet_sets, tissue.cell_sets)
+
+
+def _forget(whole: Whole) -> Whole:
+    """The mesh without the contact zone and layers it has inherited: they are selected again. Not collective."""
+    return Whole(
+        whole.mesh,
+        whole.source,
+        {k: v for k, v in whole.cells.items() if k != "layers"},
+        {k: v for k, v in whole.facets.items() if k != "contact"},
+        whole.facet_sets,
+        whole.cell_sets,
+    )
+
+
+def ends_of(whole: Whole, scene: Scene) -> Ends:
+    """Singular ends of a marked mesh. Not collective."""
+    layers = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
+    number = whole.cells["layers"].astype(np.int64)
+    nu = np.array([m.nu for m in layers])[number + 1]
+    return singular_ends(whole.points, whole.simplices, whole.facet_nodes("contact"), number, nu)
+
+
+def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Whole:
+    """Bisect until the cells have their a-priori sizes. Not collective."""
+    points, d = whole.points, whole.dimension
+    if refine.grading == "off":
+        return whole
+    short = float(np.ptp(points, axis=0).min())
+    if aim is None:
+        edges = longest_edges(points, whole.simplices)
+        p = min(scene.tissue.order, 3)
+        mu = BISECTION[p] if refine.grading == "auto" else refine.grading
+        h0 = float(np.median(edges))
+        sizes = SizeField(ends_of(whole, scene), h0, max(short / 2, h0), mu, DEEPEST[d] * h0)
+    else:
+        plan = aims(refine, scene.tissue.order, d, aim)
+        h0 = np.sqrt(d) * short / plan.across
+        sizes = SizeField(ends_of(whole, scene), h0, short / 2, plan.mu, plan.floor * short)
+    return bisect_to(whole, sizes, SLACK, refine.most)
+
+
+def unknowns(whole: Whole, order: int) -> int:
+    """Displacement unknowns of a mesh, the hand's contact zone included. Not collective."""
+    cells, d = np.sort(whole.simplices, axis=1), whole.dimension
+    count = len(whole.points)
+    if order > 1:
+        pairs = np.concatenate([cells[:, list(pair)] for pair in combinations(range(d + 1), 2)])
+        count += (order - 1) * len(np.unique(pairs[:, 0] * len(whole.points) + pairs[:, 1]))
+    if order > 2:
+        faces = len(cells) if d == 2 else (4 * len(cells) + _outer(cells)) // 2
+        count += faces
+    return d * count
+
+
+def _outer(cells: npt.NDArray[np.int64]) -> int:
+    facets = np.concatenate([np.delete(cells, i, axis=1) for i in range(4)])
+    _, count = np.unique(facets, axis=0, return_counts=True)
+    return int((count == 1).sum())
+
+
+def lattice(cells: list[int], order: int) -> int:
+    """Displacement unknowns of a structured box. Not collective."""
+    return len(cells) * int(np.prod([order * n + 1 for n in cells]))
+
+
+def _too_large(refine: Refine, count: int) -> SceneError:
+    return SceneError(
+        f"tissue.refine.most = {refine.most} unknowns are fewer than the {count} of the coarsest mesh that "
+        "[tissue.refine] allows; raise it, or take larger cells or a lower tissue.order."
+    )
+
+
+def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
+    """Singular ends of a scene's body, on all ranks; rank 0 looks at the whole mesh. Collective.
+
+    Args:
+        comm: communicator.
+        tissue: the mesh of the scene.
+        scene: the scene.
+
+    Raises:
+        MeshError: the mesh file cannot be read again.
+    """
+    ends: Ends | None = None
+    with agree(comm):
+        if comm.rank == 0:
+            known = tissue.whole is not None and "contact" in tissue.whole.facets
+            whole = tissue.whole if known else marked(_even(scene), scene)
+            ends = ends_of(whole, scene) if whole is not None else None
+    result: Ends = comm.bcast(ends)
+    return result
+
+
+def _even(scene: Scene) -> TissueMesh:
+    """The scene's mesh without grading, on one rank; a box meets the ends where the graded one does. Not collective."""
+    if scene.tissue.refine is None or scene.tissue.size is None:
+        return make_mesh(MPI.COMM_SELF, scene)
+    return box_of_lines(MPI.COMM_SELF, scene, scene.tissue.cells or [], 1.0, min(scene.tissue.size) / 2)

@@ -1,0 +1,138 @@
+"""How far a result is from that of an infinitely fine mesh and step: as numbers, sentences and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from softgrasp.fem.accuracy.estimate import estimate
+from softgrasp.fem.errors import SoftgraspError
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+    from softgrasp.fem.model.mesh_estimate import MeshEstimate
+    from softgrasp.fem.run.simulate import Trajectory
+
+CHEAP = 1.0  # [s]; what costs less is done unasked
+# Seconds of an estimate, measured on one core: graded meshes to compare with (by dimension, and in 3D dearer for mesh
+# files, whose edges are bisected), and static solves on the mesh itself.
+BASE = {2: 0.3, 3: 0.9}
+BASE_FILE = {2: 0.3, 3: 3.5}
+PER_UNKNOWN = {2: 1.5e-5, 3: 4e-5}
+
+
+def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | None, list[str]]:
+    """The estimate of a model's mesh where it is there, cheap or asked for, and why it is not. Collective.
+
+    Args:
+        model: the model.
+        seconds: what its run took, equal on all ranks.
+        certify: estimate whatever it costs.
+
+    Raises:
+        SoftgraspError: the estimate fails and ``certify`` asks for it.
+    """
+    if model.accuracy is not None:
+        return model.accuracy, []
+    d, n_e = model.system.layout.dimension, model.system.layout.n_e
+    base = BASE if model.scene.tissue.size is not None else BASE_FILE
+    if not certify and base[d] + PER_UNKNOWN[d] * n_e > max(CHEAP, seconds):
+        return None, []
+    try:
+        return estimate(model), []
+    except SoftgraspError as error:
+        if certify:
+            raise
+        return None, [f"The error of the mesh could not be estimated: {error}"]
+
+
+def keys(result: MeshEstimate | None, run: Trajectory) -> dict[str, Any]:
+    """What result.json holds of it: ``mesh_error`` and ``time_error``. Not collective."""
+    if result is None:
+        return {}
+    return {
+        "mesh_error": {
+            "estimate": result.estimate,
+            "bound": result.bound,
+            "corrected": result.corrected(run.outputs)[-1].tolist(),
+            "omega": list(result.omega),
+            "passes": result.passes,
+            "n_e": result.n_e,
+            "compared_with": {"by": result.by, "n_e": result.finer},
+            "zone_shift": result.shift,
+            "tolerance": result.tolerance,
+            "reached": result.tolerance is None or not result.obstacle,
+            "seconds": result.seconds,
+        },
+        "time_error": result.time_error,
+    }
+
+
+def rows(result: MeshEstimate | None) -> list[tuple[str, str]]:
+    """Lines of the short table. Not collective."""
+    if result is None:
+        return []
+    better = ""
+    if result.offer is not None and result.estimate > result.offer[0]:
+        goal, n_e = result.offer
+        better = f"; {percent(goal)} at n_e = {n_e} with tissue.refine.tolerance = {goal:g}, tissue.order = 2"
+    return [
+        ("deformation", f"about {percent(result.estimate)} off on this mesh (bound {percent(result.bound)}){better}"),
+        ("", f"about {percent(result.time_error)} off by the time step"),
+    ]
+
+
+def warnings(result: MeshEstimate | None) -> list[str]:
+    """What the estimate warns of. Not collective."""
+    if result is None:
+        return []
+    texts = []
+    if result.obstacle:
+        texts.append(
+            f"tissue.refine.tolerance = {result.tolerance:g} is not reached: the error of the deformation is about "
+            f"{percent(result.estimate)} at n_e = {result.n_e}, since {result.obstacle}."
+        )
+    if result.shift > 0:
+        texts.append(
+            f"The contact zone ends {result.shift:.3g} m off contact.box, because its facets count by their midpoints; "
+            "[tissue.refine] makes mesh lines meet it."
+        )
+    return texts
+
+
+def percent(share: float) -> str:
+    """A share as a percentage of two digits. Not collective."""
+    return f"{100 * share:.2g} %" if np.isfinite(share) and share < 9.95 else f"{100 * share:.0f} %"
+
+
+def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, Path]:
+    """Outputs against the hand, y and y + delta y, with the band of the bound; PNG and PDF. Not collective."""
+    import matplotlib.pyplot as plt
+
+    from softgrasp.study.pictures.style import COLUMN, CYCLE, length_unit, paper_style, save
+
+    relative = run.outputs - run.outputs_rigid
+    shown = [i for i in range(relative.shape[1]) if np.abs(relative[:, i]).max() > 0][:6]
+    corrected = relative + result.delta
+    band = result.bound * np.linalg.norm(corrected, axis=1).max()
+    factor, unit = length_unit(float(np.abs(relative).max(initial=0.0)))
+    with paper_style():
+        figure, ax = plt.subplots(figsize=(COLUMN, 2.4), layout="constrained")
+        for k, i in enumerate(shown):
+            color = CYCLE[k % len(CYCLE)]
+            ax.fill_between(
+                run.times,
+                factor * (relative[:, i] - band),
+                factor * (relative[:, i] + band),
+                color=color,
+                alpha=0.15,
+                lw=0,
+            )
+            ax.plot(run.times, factor * relative[:, i], color=color, label=f"{run.output_names[i]} of this mesh")
+            ax.plot(run.times, factor * corrected[:, i], color=color, ls="--", label=f"{run.output_names[i]} corrected")
+        ax.set_xlabel("time [s]")
+        ax.set_ylabel(f"relative to hand [{unit}]")
+        figure.legend(loc="outside upper center", ncols=2)
+        return save(figure, out_png)

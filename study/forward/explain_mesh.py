@@ -1,0 +1,87 @@
+"""What the mesh of a scene leaves to be wrong, before any run: singular ends, expected order, size of the error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from softgrasp.fem.model.refined import scene_ends
+from softgrasp.study.forward.accuracy import judge, percent
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+
+LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
+
+
+@dataclass(frozen=True)
+class EndReport:
+    """Singular ends of one kind: how many points (2D) or edges (3D), and the smallest exponent alpha [1]."""
+
+    kind: str
+    count: int
+    alpha: float
+
+
+@dataclass(frozen=True)
+class MeshReport:
+    """What is known of the mesh's error before a run.
+
+    Attributes:
+        ends: singular ends by kind and exponent, the strongest first.
+        order: expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1].
+        graded: whether cells shrink towards the ends.
+        estimate, bound: relative error of the deformation [1]; None where the estimate costs more than a second.
+        time_error: that of the time steps [1].
+        shift: of the ends of the zone against contact.box [m].
+    """
+
+    ends: tuple[EndReport, ...]
+    order: float
+    graded: bool
+    estimate: float | None
+    bound: float | None
+    time_error: float | None
+    shift: float | None
+
+
+def mesh_report(model: Model) -> MeshReport:
+    """Look for singular ends and estimate the error. Collective.
+
+    Raises:
+        MeshError: the mesh file changed since the model was built.
+    """
+    comm, scene, tissue = model.system.layout.comm, model.scene, model.space.mesh
+    refine = scene.tissue.refine
+    small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE
+    ends = scene_ends(comm, tissue, scene) if small else None
+    reports: dict[tuple[str, float], int] = {}
+    for kind, alpha in zip(ends.kind, ends.alpha, strict=True) if ends is not None else ():
+        key = (kind, round(float(alpha), 3))
+        reports[key] = reports.get(key, 0) + 1
+    kinds = tuple(EndReport(k, n, a) for (k, a), n in sorted(reports.items(), key=lambda item: item[0][1]))
+    graded = refine is not None and refine.grading != "off"
+    full = 2.0 * scene.tissue.order
+    order = full if graded else min([full, *(2 * end.alpha for end in kinds)])
+    judged, _ = judge(model, 0.0, False)
+    if judged is None:
+        return MeshReport(kinds, order, graded, None, None, None, None)
+    return MeshReport(kinds, order, graded, judged.estimate, judged.bound, judged.time_error, judged.shift)
+
+
+def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
+    """The report in sentences. Not collective."""
+    place = "points" if dimension == 2 else "edges"
+    lines = [f"{e.count} {place} of kind '{e.kind}': u ~ r^{e.alpha:.3g}" for e in report.ends[:6]]
+    if len(report.ends) > len(lines):
+        lines.append(f"and {len(report.ends) - len(lines)} more kinds of ends with larger exponents")
+    if report.graded:
+        lines.append(f"graded cells: outputs converge with order {report.order:g} in n_e^(1/{dimension})")
+    elif report.ends:
+        lines.append(f"even cells: outputs converge with order {report.order:.2g} in h, whatever tissue.order")
+    if report.estimate is not None and report.bound is not None and report.time_error is not None:
+        lines.append(f"deformation about {percent(report.estimate)} off on this mesh (bound {percent(report.bound)})")
+        lines.append(f"and about {percent(report.time_error)} by the time step")
+    else:
+        lines.append("error of the mesh not estimated, it would take more than a second: simulate --certify does it")
+    return lines

@@ -1,0 +1,251 @@
+"""Estimates of the error of the mesh against runs on much finer meshes, and meshes that reach a tolerance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg
+import skfem
+from mpi4py import MPI
+
+from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.accuracy.estimate import difference, estimate, next_order, reduced
+from softgrasp.fem.accuracy.marking import cell_products, indicators, prolong
+from softgrasp.fem.accuracy.small import run_small, small_model, static_solves
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import times_columns, total
+from softgrasp.fem.run.simulate import Trajectory, simulate
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.solve.modes import lowest_modes
+from tests.fem.test_refined import fingerprint, l_scene
+from tests.helpers.models import CUBE, LAYERS, _k_lambda, _k_mu, _mass, held_by_paper, make_scene
+
+TIP = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]}}
+DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
+WEIGHT = {"effects": {"gravity": {"g": [0.0, -9.81]}}, "time": {"start": "equilibrium"}}
+FORCED = {
+    "effects": {
+        "reaction": True, "rotation": True, "gravity": {"g": [0.0, -1.0], "hand_weight": True},
+        "damping": {"kind": "rayleigh", "alpha": 0.2, "beta": 0.01, "drag": "space"},
+    },
+    "motion": {"drive": "force"},
+}  # fmt: skip
+LAYERED = {"tissue": {"layers": LAYERS}, **DAMPED}
+
+
+def with_refine(scene: Scene, order: int, tolerance: float) -> Scene:
+    data = scene.model_dump(by_alias=True, exclude_none=True)
+    data["tissue"] |= {"order": order, "refine": {"tolerance": tolerance, "method": "bisect"}}
+    return Scene.model_validate(data)
+
+
+def deformation(run: Trajectory) -> np.ndarray:
+    return run.outputs - run.outputs_rigid
+
+
+def error(y: np.ndarray, fine: np.ndarray) -> float:
+    return float(np.linalg.norm(y - fine, axis=1).max() / np.linalg.norm(fine, axis=1).max())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{}, DAMPED, WEIGHT, FORCED, LAYERED, {**CUBE, "effects": {"rotation": True}}],
+    ids=["undamped", "damped", "weight", "forced", "layered", "3D"],
+)
+def test_small_model_follows_the_run(comm: MPI.Intracomm, change: Any) -> None:
+    model = build(make_scene(change), comm=comm)
+    solve, free = static_solves(model)
+    small = run_small(small_model(model, solve))
+    free()
+    run = simulate(model)
+    # what modes beyond the moments answer to the jumps of the jerk
+    assert error(small.deformation + small.rigid - run.outputs_rigid, deformation(run)) < 2e-3
+    assert np.abs(small.rigid - run.outputs_rigid).max() < 1e-4
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("change", [{}, WEIGHT, LAYERED, FORCED], ids=["plain", "weight", "layers", "forced"])
+def test_estimate_tells_the_error_of_an_even_mesh(comm: MPI.Intracomm, change: Any, order: int) -> None:
+    scene = make_scene(change, TIP, {"tissue": {"order": order}})
+    model = build(scene, comm=comm)
+    run, fine = simulate(model), simulate(build(with_refine(scene, 2, 3e-3), comm=comm))
+    true, result = error(deformation(run), deformation(fine)), estimate(model)
+    assert true > 0.05
+    assert 0.8 <= result.estimate / true <= 1.1  # both meshes to compare with leave about a percent
+    assert result.bound >= true
+    corrected = result.corrected(run.outputs) - fine.outputs_rigid
+    assert error(corrected, deformation(fine)) < 0.6 * true
+    assert result.shift == pytest.approx(0.0)  # lines of 4 x 8 cells meet y = 1.5
+
+
+def test_shift_of_the_zone_is_part_of_the_error(comm: MPI.Intracomm) -> None:
+    model = build(make_scene(TIP, {"tissue": {"cells": [5, 11]}}), comm=comm)
+    result = estimate(model)
+    assert result.shift == pytest.approx(1.5 - 16 / 11)
+    fine = simulate(build(with_refine(model.scene, 2, 3e-3), comm=comm))
+    assert result.estimate / error(deformation(simulate(model)), deformation(fine)) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("tolerance", [3e-2, 3e-3])
+def test_tolerance_is_reached_and_estimated(comm: MPI.Intracomm, tolerance: float) -> None:
+    steps = {"time": {"steps": 300}}
+    fine = simulate(build(with_refine(make_scene(TIP, steps), 3, 2e-4), comm=comm))
+    model = build_to_tolerance(with_refine(make_scene(TIP, steps), 2, tolerance), comm)
+    result, run = model.accuracy, simulate(model)
+    assert result is not None
+    assert result.obstacle == ""
+    true = error(deformation(run), deformation(fine))
+    assert true <= tolerance
+    assert 0.4 <= result.estimate / true <= 1.1
+    assert true <= result.bound
+    assert error(result.corrected(run.outputs) - fine.outputs_rigid, deformation(fine)) <= 0.6 * true
+    assert run.energy_drift < 1e-12
+
+
+def test_mesh_file_reaches_its_tolerance(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    steps = {"steps": 150}
+    scenes = [l_scene(mpi_tmp_path, comm, order=o, refine={"tolerance": t}) for o, t in ((2, 2e-2), (3, 1e-3))]
+    scenes = [s.model_copy(update={"time": s.time.model_copy(update=steps)}) for s in scenes]
+    model, fine = build_to_tolerance(scenes[0], comm), simulate(build(scenes[1], comm=comm))
+    true = error(deformation(simulate(model)), deformation(fine))
+    assert model.accuracy is not None
+    assert true <= 2e-2
+    assert 0.4 <= model.accuracy.estimate / true <= 1.1
+    assert true <= model.accuracy.bound
+
+
+def test_passes_end_at_most_and_say_so(comm: MPI.Intracomm) -> None:
+    data = make_scene(TIP, {"time": {"steps": 300}}).model_dump(by_alias=True, exclude_none=True)
+    data["tissue"] |= {"order": 1, "refine": {"tolerance": 1e-2, "most": 1500}}
+    model = build_to_tolerance(Scene.model_validate(data), comm)
+    assert model.system.layout.n_e <= 1500
+    assert model.accuracy is not None
+    assert model.accuracy.obstacle == "tissue.refine.most = 1500 unknowns allow no finer mesh"
+    data["tissue"]["refine"] = {"tolerance": 1e-3, "passes": 0}
+    model = build_to_tolerance(Scene.model_validate(data | {"time": {"steps": 1200}}), comm)
+    assert model.accuracy is not None
+    assert model.accuracy.obstacle == "tissue.refine.passes = 0 are used up"
+
+
+def test_tolerance_below_the_steps_is_refused(comm: MPI.Intracomm) -> None:
+    with pytest.raises(SceneError, match=r"is below the error .* that time.steps = 60 leave on any mesh: use at least"):
+        build_to_tolerance(with_refine(make_scene(TIP), 2, 1e-3), comm)
+
+
+def test_time_error_is_that_of_the_steps(comm: MPI.Intracomm) -> None:
+    """Against sixteen times as many steps on the same mesh."""
+    coarse, fine = (build(make_scene(TIP, {"time": {"steps": n}}), comm=comm) for n in (60, 960))
+    true = error(deformation(simulate(coarse)), deformation(simulate(fine))[::16])
+    assert estimate(coarse).time_error == pytest.approx(true, rel=0.15)
+
+
+def test_cells_share_the_difference_of_the_energies(comm: MPI.Intracomm) -> None:
+    """sum_T k_T(e_i, e_j) = x'_i K' x'_j - x_i K x_j for static solutions on nested spaces."""
+    model = build(make_scene(LAYERED, TIP), comm=comm)
+    finer, small = next_order(model), reduced(model)
+    up = reduced(finer)
+    e = up.X - prolong(model, finer, small.X)
+    E = total(comm, cell_products(finer, e).sum(axis=0))
+    energies = [total(comm, s.X.T @ times_columns(s.model.system.K_ee, s.X)) for s in (up, small)]
+    difference = energies[0] - energies[1]
+    assert np.abs(E - difference).max() < 1e-9 * np.abs(energies[0]).max()  # solves to 1e-12, one digit cancels
+    assert (indicators(small, finer) >= 0).all()
+
+
+def order_of(models: list[tuple[int, float]]) -> float:
+    """Slope against n_e^(1/2)."""
+    n, e = np.log(np.array(models)).T
+    return float(-np.polyfit(n / 2, e, 1)[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("order", "least"), [(1, 1.8), (2, 3.5)])
+def test_orders_of_graded_and_even_meshes(comm: MPI.Intracomm, order: int, least: float) -> None:
+    """Even meshes converge with 2 alpha = 1 whatever the order, graded ones with that of the elements."""
+    steps = {"time": {"steps": 300}}
+    fine = run_small(reduced(build(with_refine(make_scene(TIP, steps), 3, 5e-6), comm=comm))).deformation
+
+    def point(model: Model) -> tuple[int, float]:
+        return model.system.layout.n_e, error(run_small(reduced(model)).deformation, fine)
+
+    even = [
+        point(build(make_scene(TIP, steps, {"tissue": {"cells": [n, 2 * n], "order": order}}), comm=comm))
+        for n in ((16, 32, 64) if order == 1 else (8, 16, 32))
+    ]
+    tolerances = (3e-2, 1e-2, 3e-3) if order == 1 else (1e-2, 1e-3, 1e-4)
+    graded = [point(build(with_refine(make_scene(TIP, steps), order, t), comm=comm)) for t in tolerances]
+    assert order_of(even) == pytest.approx(1.0, abs=0.05), even
+    assert order_of(graded) >= least, graded
+
+
+def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
+    scene = with_refine(make_scene(TIP, {"time": {"steps": 300}}), 1, 5e-2)
+    model, alone = (build_to_tolerance(scene, c) for c in (comm, MPI.COMM_SELF))
+    assert alone.accuracy is not None
+    assert alone.accuracy.passes > 0
+    assert fingerprint(model.space.mesh) == fingerprint(alone.space.mesh)
+
+
+def test_cubic_elements_are_those_of_scikit_fem() -> None:
+    """Frequencies on one mesh: the same space, whatever its nodes."""
+    scene = make_scene({"tissue": {"order": 3, "cells": [2, 4]}})
+    omega, _ = lowest_modes(build(scene, comm=MPI.COMM_SELF).system, 6)
+    mesh = skfem.MeshTri.init_tensor(np.linspace(0, 1, 3), np.linspace(0, 2, 5))
+    # the diagonals of DOLFINx, from the lower left to the upper right
+    corners = np.array([[i, j] for i in range(2) for j in range(4)])
+    nodes = {(x, y): k for k, (x, y) in enumerate(np.round(mesh.p.T * 2).astype(int).tolist())}
+    cells = []
+    for i, j in corners.tolist():
+        a, b, c, e = (nodes[p] for p in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)))
+        cells += [[a, b, c], [a, e, c]]
+    mesh = skfem.MeshTri(mesh.p, np.array(cells).T)
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTriP3()))
+    K = 50.0 * _k_mu.assemble(basis) + 50.0 * _k_lambda.assemble(basis)
+    held = basis.get_dofs(mesh.facets_satisfying(held_by_paper, boundaries_only=True)).flatten()
+    free = np.setdiff1d(np.arange(basis.N), held)
+    squares = scipy.linalg.eigh(
+        K.toarray()[np.ix_(free, free)], _mass.assemble(basis).toarray()[np.ix_(free, free)], eigvals_only=True
+    )
+    np.testing.assert_allclose(omega, np.sqrt(squares[:6]), rtol=1e-8)  # tolerance of the modes
+
+
+@pytest.mark.slow
+def test_lines_of_a_box_against_even_ones(comm: MPI.Intracomm) -> None:
+    """Static outputs C K^-1 G of block_3d at nu = 0.3 on 6 x 6 x 12 quadratic cells, against 9 x 9 x 18 graded ones."""
+    base = ["tissue.order=2", "tissue.material={young=1e5,poisson=0.3,rho=1070.0}"]
+
+    def statics(*changes: str) -> np.ndarray:
+        small = reduced(build(load_scene("block_3d", [*base, *changes]), comm=comm))
+        return (small.C @ small.G)[:3]  # the tip, against translations and rotations; V' K V = 1
+
+    fine = statics("tissue.cells=[9,9,18]", "tissue.refine={}")
+    even, lines = (statics("tissue.cells=[6,6,12]", *more) for more in ([], ["tissue.refine={}"]))
+    errors = [float(np.linalg.norm(part - fine) / np.linalg.norm(fine)) for part in (even, lines)]
+    assert errors[0] > 0.03
+    assert errors[1] <= 0.02, errors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["franka_muscle", "layers_2d", "block_3d"])
+def test_estimates_of_the_scenes_that_ship(comm: MPI.Intracomm, name: str) -> None:
+    """As they ship, against graded meshes of five to fifty times their unknowns."""
+    fine = {
+        "block_3d": ["tissue.order=2", "tissue.cells=[9,9,18]", "tissue.refine={}"],
+    }.get(name, ["tissue.order=3", "tissue.refine={tolerance=1e-4}"])
+    small = reduced(build(load_scene(name), comm=comm))
+    other = reduced(build(load_scene(name, fine), comm=comm))
+    true, _ = difference(small, other, run_small(other).deformation, run_small(small).deformation)
+    result = estimate(small.model, small)
+    assert 0.4 <= result.estimate / true <= 1.1
+    assert result.bound >= true
+
+
+def test_body_at_rest_has_no_error(comm: MPI.Intracomm) -> None:
+    hold = {"motion": {"profile": "hold", "target": None}}
+    result = estimate(build(make_scene(hold), comm=comm))
+    assert (result.estimate, result.bound, result.time_error) == (0.0, 0.0, 0.0)
