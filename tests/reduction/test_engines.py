@@ -18,6 +18,7 @@ from softgrasp.reduction.truncation import Columns, Part, Truncation, allocate, 
 from softgrasp.study.bench import bases as bench_bases
 from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.bases import known_matrix, parse_shapes, reach, spectrum_of
+from softgrasp.study.shell.processes import IN_MPI_JOB
 from tests.helpers.models import Array, close, same_everywhere
 
 EPS = np.finfo(float).eps
@@ -372,7 +373,7 @@ def test_benchmark_prints_one_table_and_fails_with_its_workers(
     monkeypatch.setattr(
         bench_bases, "launch", lambda n, m, k, repeats: {"rows": n, "columns": m, "ranks": k, "error": "no"}
     )
-    for variable in bench_bases.IN_MPI_JOB:
+    for variable in IN_MPI_JOB:
         monkeypatch.delenv(variable, raising=False)
     folder = mpi_tmp_path / str(MPI.COMM_WORLD.rank)
     done = CliRunner().invoke(app, ["bases", "--sizes", "40x8", "--ranks", "1", "--out", str(folder)])

@@ -268,8 +268,10 @@ def test_interrupted_study_goes_on_to_the_same_errors(
 def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: dict[str, Any], tmp_path: Path) -> None:
     """The real command, with the limits of these tests, is killed in the middle, without a chance to clean up."""
     file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
-    limits = f"wp_meshes.UNKNOWNS, wp_forward.MESHES = {UNKNOWNS}, {MESHES}"
-    code = f"from study import wp_forward, wp_meshes; {limits}; from softgrasp.study.cli import main; main()"
+    limits = f"meshes.UNKNOWNS, forward.MESHES = {UNKNOWNS}, {MESHES}"
+    code = (
+        f"from softgrasp.study.precision import forward, meshes; {limits}; from softgrasp.study.cli import main; main()"
+    )
     command = [sys.executable, "-c", code, "study", str(file), "--out", str(tmp_path), "--question", "forward"]
     with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL) as process:
         while len(list(cache.glob("run-*.json"))) < 8 and process.poll() is None:
