@@ -1,0 +1,36 @@
+"""What `import softgrasp` gives: names that load nothing before they are used, and examples that run."""
+
+from __future__ import annotations
+
+import doctest
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import softgrasp as sg
+
+pytestmark = pytest.mark.serial
+ROOT = Path(__file__).parents[1]
+
+
+def test_import_loads_neither_mpi_nor_dolfinx() -> None:
+    code = "import sys, softgrasp as sg; dir(sg); sg.Scene; print({'mpi4py.MPI', 'dolfinx', 'petsc4py'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == "set()", done.stderr
+
+
+def test_an_unknown_name_says_what_there_is() -> None:
+    with pytest.raises(AttributeError, match="'simulat'; it has ClosedLoop, .*simulate"):
+        sg.simulat  # noqa: B018
+
+
+@pytest.mark.parametrize("name", sg.__all__)
+def test_every_name_has_an_example_that_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    value = getattr(sg, name)
+    (example,) = [e for e in doctest.DocTestFinder(recurse=False).find(value, name) if e.examples]
+    result = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example)
+    assert result.attempted > 1
+    assert result.failed == 0
