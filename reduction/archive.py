@@ -25,7 +25,7 @@ PLAIN = (
 )  # fmt: skip
 
 
-def save_model(model: ReducedModel, path: Path) -> None:
+def save(model: ReducedModel, path: Path) -> None:
     """Write a model; every rank adds its rows of the lift in turn. Collective when the model holds a lift.
 
     Raises:
@@ -88,11 +88,11 @@ def _write_rows(lift: Lift, path: Path) -> None:
                 file[f"lift/{key}"][layout.start + at : layout.start + at + len(rows)] = rows
 
 
-def load_model(path: Path, layout: BlockLayout | None = None, scene_hash: str | None = None) -> ReducedModel:
+def load(path: Path, layout: BlockLayout | None = None, scene_hash: str | None = None) -> ReducedModel:
     """Read a model. Collective over ``layout.comm``; without a layout each caller reads for itself.
 
     Args:
-        path: file of :func:`save_model`.
+        path: file of :func:`save`.
         layout: where the lift goes, by node coordinates: any rank count; None leaves the lift out (online use).
         scene_hash: refuse a model of another scene.
 
