@@ -238,4 +238,4 @@ def show(console: Console, study: ReductionStudy) -> None:
 
 def _print(console: Console, table: Table) -> None:
     """A table without its title; a narrow terminal breaks the first column and the last."""
-    console.print(Table(table.header, table.rows).terminal(wrap=(0, len(table.header) - 1)))
+    console.print(Table(table.header, table.rows).terminal(wrap=(0, len(table.header) - 1), width=console.width))
