@@ -14,7 +14,7 @@ from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
-from softgrasp.reduction.small import Operators, Parameters, Parts
+from softgrasp.reduction.operators import Operators, Parameters, Parts
 from softgrasp.reduction.spectrum import Spectrum, spectrum
 
 
@@ -117,8 +117,8 @@ class SmallModel:
         self.check_independent()
         inner, op = self.inner, self.operators
         Q = op.energy if inner.start else op.total
-        found = spectrum(op.E[inner, inner], op.A[inner, inner], Q[inner, inner], self.structured)
-        return replace(found, zeros=self.N - len(found.eigenvalues))
+        result = spectrum(op.E[inner, inner], op.A[inner, inner], Q[inner, inner], self.structured)
+        return replace(result, zeros=self.N - len(result.eigenvalues))
 
     def check_independent(self) -> None:
         """Refuse a singular E, which LAPACK need not notice. Not collective.

@@ -109,9 +109,9 @@ class Propagator:
 def _coordinates(model: SmallModel, driven: bool) -> Coordinates:
     """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
     apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
-    found = None if apart or not model.structured else _whole(model)
-    if found is not None:
-        return found
+    whole = None if apart or not model.structured else _whole(model)
+    if whole is not None:
+        return whole
     tissue = _tissue(model, apart) if model.fixed_solid else None
     if driven and tissue is not None:
         return tissue

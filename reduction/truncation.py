@@ -120,10 +120,10 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
         raise BasisError(f"N = {N} does not fit; it must be {least}{more}", name)
     want, ranks = free // width, [part.rank for part in parts]
     if want > sum(ranks):
-        found = " + ".join([*(str(width * r) for r in ranks), *([f"{hand} of the hand"] if hand else [])])
+        carried = " + ".join([*(str(width * r) for r in ranks), *([f"{hand} of the hand"] if hand else [])])
         most = hand + width * sum(ranks)
         raise BasisError(
-            f"N = {N} is more than the snapshots carry above rounding ({found}); ask for N <= {most}", name, most
+            f"N = {N} is more than the snapshots carry above rounding ({carried}); ask for N <= {most}", name, most
         )
     counts = [0] * len(parts)
     for _ in range(want):

@@ -103,8 +103,8 @@ def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     return chosen + [f for f in stable[:1] if f[0] not in first]
 
 
-def _error(found: tuple[Sweep, int]) -> float:
-    return found[0].points[found[1]].error_deformation
+def _error(chosen: tuple[Sweep, int]) -> float:
+    return chosen[0].points[chosen[1]].error_deformation
 
 
 def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views | None:
@@ -135,10 +135,9 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views |
 
 def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
-    found = [(s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None]
-    found.sort(key=_error)
-    old = [f for f in found if f[0].method.key in PAPER_METHODS][:1]
-    new = [f for f in found if f[0].method.key not in PAPER_METHODS]
+    fixed = sorted(((s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None), key=_error)
+    old = [f for f in fixed if f[0].method.key in PAPER_METHODS][:1]
+    new = [f for f in fixed if f[0].method.key not in PAPER_METHODS]
     new = ([f for f in new if not f[0].method.snapshots] or new)[:1]
     return old + new
 
@@ -275,8 +274,8 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
 
 def _palette(image: Any) -> Any:
     """The 256 colours of a picture, its paper pure white."""
-    found = image.quantize(256)
-    colours = np.reshape(found.getpalette(), (-1, 3))
+    palette = image.quantize(256)
+    colours = np.reshape(palette.getpalette(), (-1, 3))
     colours[colours.sum(axis=1).argmax()] = 255
-    found.putpalette(colours.ravel().tolist())
-    return found
+    palette.putpalette(colours.ravel().tolist())
+    return palette

@@ -183,8 +183,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
         },
         "memory_peak_mb": peak_memory_mb(model.system.layout.comm),
     }
-    written: dict[str, Any] = plain(result)
-    return written
+    return dict(plain(result))
 
 
 def _about(s: Sweep) -> dict[str, Any]:
