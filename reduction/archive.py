@@ -19,18 +19,35 @@ from softgrasp.reduction.model import Lift, ModelError, Outputs, ReducedModel
 
 FORMAT = "softgrasp reduced model 1"
 ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns
-PLAIN = (
+KEYS = (
     "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
     "hand_weight", "two_way", "scene_hash", "seconds",
 )  # fmt: skip
 
 
-def save_model(model: ReducedModel, path: Path) -> None:
-    """Write a model; every rank adds its rows of the lift in turn. Collective when the model holds a lift.
+def save(model: ReducedModel, path: str | Path) -> None:
+    """Write a reduced model to one HDF5 file, atomically. Collective when the model holds a lift.
+
+    The file holds the small matrices in full precision, the outputs, and the lift (2 or 3 arrays of n_e x N) beside the
+    coordinates of the nodes it belongs to; every rank adds its rows in turn.
+
+    >>> import tempfile, softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> rom = sg.reduce(model, sg.simulate(model), "psd_fixed", N=14)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sg.save(rom, f"{folder}/rom.h5")
+    ...     online = sg.load(f"{folder}/rom.h5")  # no mesh, no full model
+    >>> online.N, online.at().stable
+    (14, True)
+
+    Args:
+        model: reduced model.
+        path: of the file; folders are created.
 
     Raises:
         OSError: the file cannot be written.
     """
+    path = Path(path)
     lift = model.lift
     comm = None if lift is None else lift.layout.comm
     partial = path.with_name(path.name + ".part")
@@ -54,7 +71,7 @@ def save_model(model: ReducedModel, path: Path) -> None:
 def _write_small(model: ReducedModel, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     lift = model.lift
-    data: dict[str, Any] = {key: getattr(model, key) for key in PLAIN}
+    data: dict[str, Any] = {key: getattr(model, key) for key in KEYS}
     data["materials"] = [asdict(m) for m in model.materials]
     data["names"] = list(model.outputs.names)
     with h5py.File(path, "w") as file:
@@ -73,8 +90,8 @@ def _write_small(model: ReducedModel, path: Path) -> None:
 
 
 def _lift_arrays(lift: Lift) -> dict[str, Array]:
-    found = {"L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
-    return {key: part for key, part in found.items() if part is not None}
+    arrays = {"L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
+    return {key: array for key, array in arrays.items() if array is not None}
 
 
 def _write_rows(lift: Lift, path: Path) -> None:
@@ -88,17 +105,18 @@ def _write_rows(lift: Lift, path: Path) -> None:
                 file[f"lift/{key}"][layout.start + at : layout.start + at + len(rows)] = rows
 
 
-def load_model(path: Path, layout: BlockLayout | None = None, scene_hash: str | None = None) -> ReducedModel:
-    """Read a model. Collective over ``layout.comm``; without a layout each caller reads for itself.
+def load(path: str | Path, layout: BlockLayout | None = None, scene_hash: str | None = None) -> ReducedModel:
+    """Read a reduced model. Collective over ``layout.comm``; without a layout each caller reads for itself.
 
     Args:
-        path: file of :func:`save_model`.
+        path: file of :func:`save`.
         layout: where the lift goes, by node coordinates: any rank count; None leaves the lift out (online use).
         scene_hash: refuse a model of another scene.
 
     Raises:
         ModelError: the file is missing, damaged, of another scene or of another mesh.
     """
+    path = Path(path)
     if layout is None:
         return _read(path, None, scene_hash)
     with agree(layout.comm):
@@ -160,6 +178,6 @@ def _pick(dataset: h5py.Dataset, rows: np.ndarray) -> Array:
     slab = rows // ROWS
     for s in np.unique(slab):
         block = dataset[s * ROWS : (s + 1) * ROWS]
-        mine = np.flatnonzero(slab == s)
-        result[mine] = block[rows[mine] - s * ROWS]
+        inside = np.flatnonzero(slab == s)
+        result[inside] = block[rows[inside] - s * ROWS]
     return result

@@ -5,12 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 
 Coordinates = Literal["qv", "qp"]
 Frame = Literal["absolute", "relative"]
 Structure = Literal["none", "symplectic", "second_order"]
+
+
+class ReductionError(SoftgraspError):
+    """A basis or a reduced model cannot be made.
+
+    Attributes:
+        reason: the message without the name of the basis.
+    """
+
+    def __init__(self, reason: str, basis: str = "") -> None:
+        super().__init__(f"{basis}: {reason}" if basis else reason)
+        self.reason = reason
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.basis import Basis
 from softgrasp.reduction.galerkin import symmetric
-from softgrasp.reduction.small import Operators, Parameters, Parts
+from softgrasp.reduction.operators import Operators, Parameters, Parts
 
 MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inherits it
 

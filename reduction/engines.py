@@ -134,8 +134,8 @@ def _tsqr(comm: MPI.Intracomm, X: Array, rows: int) -> tuple[Array, Array]:
             f"SLEPc BV: QR of {rows} x {m} snapshots failed ({error}); check memory, or use engine = 'svd'"
         ) from error
     finally:
-        for thing in (bv, A, small):
-            thing.destroy()
+        for each in (bv, A, small):
+            each.destroy()
     return Q, np.asarray(comm.bcast(R) if comm.size > 1 else R)
 
 
@@ -168,8 +168,8 @@ def _svd(comm: MPI.Intracomm, X: Array, rows: int, k: int | None) -> tuple[Array
     except (PETSc.Error, SystemError) as error:
         raise SolverError(f"SLEPc SVD failed on {rows} x {m} snapshots ({error}); use engine = 'tsqr'") from error
     finally:
-        for thing in (svd, A, u, v):
-            thing.destroy()
+        for each in (svd, A, u, v):
+            each.destroy()
     return Q, total(comm, Q.T @ X)
 
 

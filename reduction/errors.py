@@ -237,17 +237,6 @@ def with_hand(small: SmallModel) -> Array:
     return np.vstack([np.eye(small.N), small.operators.S_q, small.operators.S_v])
 
 
-def trajectory_errors(
-    model: ReducedModel, small: SmallModel, run: ReducedTrajectory, system: BlockSystem, snapshots: Snapshots
-) -> ModelErrors:
-    """Errors of a run of one model against snapshots at the same parameter. Collective.
-
-    Raises:
-        ModelError: the run is shorter than the snapshots, or the model holds no lift.
-    """
-    return Comparison(model, small, system, snapshots, full_energy(system, snapshots)).errors(model, small, run)
-
-
 def column_blocks(m: int) -> Iterator[slice]:
     """Slices of at most :data:`BLOCK` columns."""
     for first in range(0, m, BLOCK):

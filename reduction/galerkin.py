@@ -16,7 +16,7 @@ import numpy as np
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import BlockSystem, LayerMaterial, coupling
 from softgrasp.reduction.basis import Basis
-from softgrasp.reduction.small import Operators, Parameters, Parts
+from softgrasp.reduction.operators import Operators, Parameters, Parts
 
 
 def relative_rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array]:

@@ -11,14 +11,14 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.basis import Coordinates, Frame, Structure
+from softgrasp.reduction.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
-from softgrasp.reduction.small import Operators, Parameters, Parts
+from softgrasp.reduction.operators import Operators, Parameters, Parts
 from softgrasp.reduction.spectrum import Spectrum, spectrum
 
 
-class ModelError(SoftgraspError):
+class ModelError(ReductionError):
     """A reduced model cannot be made, or is asked for what it does not hold."""
 
 
@@ -117,8 +117,8 @@ class SmallModel:
         self.check_independent()
         inner, op = self.inner, self.operators
         Q = op.energy if inner.start else op.total
-        found = spectrum(op.E[inner, inner], op.A[inner, inner], Q[inner, inner], self.structured)
-        return replace(found, zeros=self.N - len(found.eigenvalues))
+        result = spectrum(op.E[inner, inner], op.A[inner, inner], Q[inner, inner], self.structured)
+        return replace(result, zeros=self.N - len(result.eigenvalues))
 
     def check_independent(self) -> None:
         """Refuse a singular E, which LAPACK need not notice. Not collective.
@@ -127,10 +127,10 @@ class SmallModel:
             ModelError: E is singular to rounding, as with linearly dependent columns.
         """
         if not np.isfinite(self.operators.E).all():
-            raise ModelError(f"{self.name}: the reduced matrices are not finite; check basis and materials")
+            raise ModelError("the reduced matrices are not finite; check basis and materials", self.name)
         if singular(self.operators.E):
             raise ModelError(
-                f"{self.name}: the reduced E is singular; its basis vectors are linearly dependent, take fewer"
+                "the reduced E is singular; its basis vectors are linearly dependent, take fewer", self.name
             )
 
     @property
@@ -162,13 +162,13 @@ class SmallModel:
                 more than one.
         """
         if not self.fixed_solid:
-            raise ModelError(f"{self.name}: an equilibrium needs a basis with fixed solid modes")
+            raise ModelError("an equilibrium needs a basis with fixed solid modes", self.name)
         k = 2 * self.n_s
         x = np.zeros(self.N)
         if self.f.any():
             A = self.operators.A[k:, k:]
             if singular(A):  # as with more displacements than velocities in the basis
-                raise ModelError(f"{self.name}: the basis has no single equilibrium under gravity; take another N")
+                raise ModelError("the basis has no single equilibrium under gravity; take another N", self.name)
             x[k:] = -np.linalg.solve(A, self.f[k:])
         return x
 
@@ -290,7 +290,7 @@ class ReducedModel:
         """
         lift = self.lift
         if lift is None:
-            raise ModelError(f"{self.name}: the model holds no lift; load it with the layout of its mesh")
+            raise ModelError("the model holds no lift; load it with the layout of its mesh", self.name)
         z, v_z = lift.L_q @ x, lift.L_v @ x
         if small.scale != 1.0:
             v_z /= small.scale

@@ -86,8 +86,8 @@ class Propagator:
             implicit = (self.E - dt / 2 * self.A) @ X
             matrix = np.linalg.solve(implicit, np.hstack([(self.E + dt / 2 * self.A) @ X, dt * self.loads]))
         except np.linalg.LinAlgError as error:
-            name = self.model.name
-            raise ModelError(f"{name}: E - dt/2 A is singular at dt = {dt:g} s; take another step") from error
+            reason = f"E - dt/2 A is singular at dt = {dt:g} s; take another step"
+            raise ModelError(reason, self.model.name) from error
         matrix[:, : self.size] = self._exact(matrix[:, : self.size], 1)
         return np.ascontiguousarray(matrix)
 
@@ -109,9 +109,9 @@ class Propagator:
 def _coordinates(model: SmallModel, driven: bool) -> Coordinates:
     """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
     apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
-    found = None if apart or not model.structured else _whole(model)
-    if found is not None:
-        return found
+    whole = None if apart or not model.structured else _whole(model)
+    if whole is not None:
+        return whole
     tissue = _tissue(model, apart) if model.fixed_solid else None
     if driven and tissue is not None:
         return tissue
@@ -175,7 +175,7 @@ def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator
     """
     op, k = model.operators, 2 * model.n_s
     if driven and not model.fixed_solid:
-        raise ModelError(f"{model.name}: the hand is inside the basis, so it cannot be prescribed; give a force")
+        raise ModelError("the hand is inside the basis, so it cannot be prescribed; give a force", model.name)
     model.check_independent()
     at, tissue = _coordinates(model, driven), slice(k, model.N)
     E, A, n_s = op.E, op.A, model.n_s

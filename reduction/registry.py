@@ -49,6 +49,11 @@ class Method:
     snapshots: bool = True
     inner: InnerName = "euclidean"
 
+    @property
+    def short_title(self) -> str:
+        """Title for a legend, a narrow column or a sentence."""
+        return self.title.replace(", fixed solid modes", ", fixed")
+
 
 def _methods() -> dict[str, Method]:
     table: list[tuple[str, str, dict[str, str], Callable[[Request], tuple[Part, ...]], bool]] = [
@@ -162,8 +167,9 @@ def make_bases(
     n_s = states.layout.n_s
     if method.pairs and not method.fixed and method.frame == "relative" and states.system.two_way:
         raise BasisError(
-            f"{name}: with two-way coupling M_ee v_z is no canonical momentum beside that of the hand; "
-            f"use {name.replace('_relative', '')} or a basis with fixed solid modes"
+            "with two-way coupling M_ee v_z is no canonical momentum beside that of the hand; "
+            f"use {name.replace('_relative', '')} or a basis with fixed solid modes",
+            name,
         )
     blocks = states.blocks(method.coordinates, method.frame) if method.snapshots else _no_blocks(states)
     clock.append(time.perf_counter())
@@ -220,3 +226,17 @@ def _cut(whole: Basis, columns: Sequence[tuple[Columns, ...]], counts: tuple[int
         split=tuple((2 if whole.pairs else 1) * k for k in counts),
         seconds=dict(whole.seconds),
     )
+
+
+def impossible_sizes(method: Method, n_s: int, sizes: Sequence[int]) -> dict[int, str]:
+    """The N among ``sizes`` that this method cannot have whatever the snapshots are, each with the reason."""
+    step = 2 if method.pairs else 1
+    hand = 2 * n_s if method.fixed else 0
+    least = hand + step
+    reasons = {N: f"the {hand} columns of the hand count; ask for N >= {least}" for N in sizes if least > N}
+    return reasons | {N: "only even N exist for this basis" for N in sizes if N % step}
+
+
+def possible_sizes(method: Method, n_s: int, sizes: Sequence[int]) -> list[int]:
+    """The N among ``sizes`` that this method can have, ascending; the hand's 2 n_s columns count."""
+    return sorted(set(sizes) - impossible_sizes(method, n_s, sizes).keys())

@@ -1,8 +1,9 @@
-"""The full run that reduced runs are compared with, and how reduced runs repeat it."""
+"""The full run that reduced runs are compared with, how a reduced model repeats it, and how far it is from it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,45 +15,61 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Trajectory
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction import online
 from softgrasp.reduction.engines import factor
-from softgrasp.reduction.errors import full_energy, shown_rows, state_rows, with_hand
+from softgrasp.reduction.errors import Comparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
+from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.propagator import Propagator, propagator
 
 REST = 1e-9  # of the largest displacement: a solve for an equilibrium leaves 1e-12, a motion of use far more
 
 
 @dataclass(frozen=True)
-class Reference:
-    """The full run that reduced runs are compared with.
+class FullRun:
+    """A full run with its states in memory; made by :func:`full_run`.
 
     Attributes:
-        model: the scene.
-        trajectory: the full run.
-        snapshots: its states.
-        energy: tissue energy of every snapshot [J].
-        force: u on the hand that gives its motion, (steps, n_s) [N, N m].
-        hand: q_s and v_s at every step, (steps + 1, n_s).
+        model: the scene, at the materials of the run.
+        trajectory: hand and outputs.
+        snapshots: states.
     """
 
     model: Model
     trajectory: Trajectory
     snapshots: Snapshots
-    energy: Array
-    force: Array
-    hand: tuple[Array, Array]
 
     @property
     def dt(self) -> float:
         """Time step [s]."""
         return float(self.trajectory.times[1] - self.trajectory.times[0])
 
+    @property
+    def hand(self) -> tuple[Array, Array]:
+        """q_s and v_s at every step, (steps + 1, n_s) each [m, rad; m/s, rad/s]."""
+        return self.trajectory.q_s, self.trajectory.v_s
 
-def reference(model: Model, trajectory: Trajectory) -> Reference:
-    """Bundle a full run with what the comparison needs. Collective.
+    @cached_property
+    def energy(self) -> Array:
+        """Tissue energy (z' K z + v_z' M v_z) / 2 of every snapshot, (m,) [J]. Collective at the first use."""
+        return full_energy(self.model.system, self.snapshots)
+
+    @cached_property
+    def force(self) -> Array:
+        """Force on the hand that gives its motion, (steps, n_s) [N, N m]. Collective at the first use."""
+        return hand_force(self.model.system, self.trajectory, self.snapshots)
+
+
+def full_run(model: Model, trajectory: Trajectory) -> FullRun:
+    """A run of ``simulate`` as bases are built from it and reduced runs are compared with it. Collective.
+
+    Args:
+        model: at the materials of the run.
+        trajectory: of a scene with ``output.snapshots = "memory"``.
 
     Raises:
-        SceneError: the run kept no snapshots in memory, or the body is at rest in all of them.
+        SceneError: the run kept no snapshots in memory, or too few of them for the force on the hand, or the body is at
+            rest in all of them.
     """
     snapshots = trajectory.snapshots
     if snapshots is None:
@@ -62,9 +79,9 @@ def reference(model: Model, trajectory: Trajectory) -> Reference:
             f"hand and tissue of scene {model.scene.name} stay at rest for the whole run, so there is no motion to "
             "reduce; give a motion.target away from the start, or another time.start"
         )
-    force = hand_force(model.system, trajectory, snapshots)
-    hand = (trajectory.q_s, trajectory.v_s)
-    return Reference(model, trajectory, snapshots, full_energy(model.system, snapshots), force, hand)
+    if model.system.two_way and len(snapshots.steps) != len(trajectory.times):
+        raise SceneError("output.every must be 1 with effects.reaction; the force on the hand needs every state")
+    return FullRun(model, trajectory, snapshots)
 
 
 def at_rest(snapshots: Snapshots) -> bool:
@@ -82,10 +99,7 @@ def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots
     """Force on the hand that gives the motion of the full run under the midpoint rule, (steps, n_s). Collective.
 
     u = M_hand a [+ M_rigid (a + alpha v - g) + G'(v_z' + alpha v_z)] - M_hand g when the hand weighs, at the midpoints;
-    [...] two-way only, alpha only when damping drags in space.
-
-    Raises:
-        SceneError: two-way coupling needs every state of the run.
+    [...] two-way only, with every state of the run; alpha only when damping drags in space.
     """
     v, dt = trajectory.v_s, trajectory.times[1] - trajectory.times[0]
     a = np.diff(v, axis=0) / dt
@@ -94,8 +108,6 @@ def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots
     if system.hand_weight:
         u -= system.M_hand @ g
     if system.two_way:
-        if len(snapshots.steps) != len(trajectory.times):
-            raise SceneError("output.every must be 1 with effects.reaction; the force on the hand needs every state")
         alpha = system.damping.alpha if system.damping.in_space else 0.0
         momentum = total(system.layout.comm, system.G.T @ snapshots.Z[system.layout.n_local :]).T
         u += (a + alpha * (v[1:] + v[:-1]) / 2 - g) @ system.M_rigid.T
@@ -103,27 +115,94 @@ def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots
     return np.asarray(u)
 
 
-def prepare(
-    model: ReducedModel, small: SmallModel, against: Reference, system: BlockSystem
-) -> tuple[Propagator, dict[str, Any]]:
-    """Propagator and keywords of :func:`reduction.online.run` that repeat the full run. Collective.
+def replay(
+    rom: ReducedModel, model: Model, run: Trajectory | FullRun, *, allow_unstable: bool = False
+) -> ReducedTrajectory:
+    """Run a reduced model under the hand of a full run, from its start. Collective.
 
-    The hand moves as it did where the basis keeps it apart, else it feels the force that gave its motion.
+    The hand moves as it did where the basis keeps it apart (fixed solid modes), else it feels the force that gave its
+    motion. The materials are those of ``model``: a model with others replays a new parameter, and nothing of full order
+    is solved.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce(model, run, "psd_fixed", N=14)
+    >>> sg.replay(rom, model, run).x.shape  # steps + 1, N
+    (101, 14)
+
+    Args:
+        rom: reduced model.
+        model: gives the materials.
+        run: the full run; a :class:`FullRun` is at materials of its own, a trajectory at those of ``model`` or, without
+            effects.reaction, at any.
+        allow_unstable: run a model with growing modes all the same.
+
+    Raises:
+        SceneError: see :func:`full_run`.
+        UnstableModelError: the reduced model has growing modes there and ``allow_unstable`` is not set.
+        ModelError: the reduced model cannot represent the materials, or it has no run or no equilibrium to start in.
     """
-    drive: dict[str, Any]
-    if small.fixed_solid:
-        step, drive = propagator(small, against.dt, driven=True), {"hand": against.hand}
-    else:
-        step, drive = propagator(small, against.dt), {"force": against.force}
-    if against.model.scene.time.start == "equilibrium":
-        drive["x0"] = small.equilibrium() if small.fixed_solid else nearest_state(model, small, against, system)
+    step, drive = replay_inputs(rom, rom.at(model.system.materials), _full(model, run))
+    return online.run(step, allow_unstable=allow_unstable, **drive)
+
+
+def errors(rom: ReducedModel, reduced_run: ReducedTrajectory, model: Model, run: Trajectory | FullRun) -> ModelErrors:
+    """|X - X_r|_F / |X|_F over the snapshots X of a full run, and the error of the energy. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce(model, run, "psd_fixed", N=40)
+    >>> sg.errors(rom, sg.replay(rom, model, run), model, run).error_deformation < 0.01
+    True
+
+    Args:
+        rom: reduced model, with its lift.
+        reduced_run: its run on the time grid of the full one, at the materials of ``model``.
+        model: scene at the materials of both runs.
+        run: the full run.
+
+    Raises:
+        SceneError: see :func:`full_run`.
+        ModelError: the reduced run is shorter than the full one, or the model was loaded without its lift.
+    """
+    comparison = comparison_of(rom, _full(model, run))
+    return comparison.errors(rom, comparison.small, reduced_run)
+
+
+def _full(model: Model, run: Trajectory | FullRun) -> FullRun:
+    return run if isinstance(run, FullRun) else full_run(model, run)
+
+
+def comparison_of(rom: ReducedModel, full: FullRun) -> Comparison:
+    """What errors of this model and of smaller ones of its family are computed from, at the materials of the run."""
+    system = full.model.system
+    return Comparison(rom, rom.at(system.materials), system, full.snapshots, full.energy)
+
+
+def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[Propagator, dict[str, Any]]:
+    """Propagator, and keywords of :func:`reduction.online.run`, that repeat a full run. Collective.
+
+    Args:
+        rom: reduced model.
+        small: the same at the materials of the run that is to be made.
+        full: run to repeat.
+
+    Raises:
+        ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.
+    """
+    drive: dict[str, Any] = {"hand": full.hand} if small.fixed_solid else {"force": full.force}
+    step = propagator(small, full.dt, driven=small.fixed_solid)
+    if full.model.scene.time.start == "equilibrium":
+        drive["x0"] = small.equilibrium() if small.fixed_solid else nearest_state(rom, small, full)
     return step, drive
 
 
-def nearest_state(model: ReducedModel, small: SmallModel, against: Reference, system: BlockSystem) -> Array:
+def nearest_state(rom: ReducedModel, small: SmallModel, full: FullRun) -> Array:
     """State x that shows the first snapshot best, min_x |V x - X_0|, (N,). Collective."""
-    n, snapshots, first = system.layout.n_local, against.snapshots, slice(0, 1)
-    Z, q_s, v_s = snapshots.Z[:, first], snapshots.q_s[:, first], snapshots.v_s[:, first]
-    found = factor(system.layout.comm, shown_rows("velocities", model, small, system) @ with_hand(small))
-    start = total(system.layout.comm, found.Q.T @ state_rows("velocities", system, Z[:n], Z[n:], q_s, v_s))
-    return np.asarray(np.linalg.lstsq(found.scale * found.R, start[:, 0], rcond=None)[0])
+    system, snapshots, first = full.model.system, full.snapshots, slice(0, 1)
+    n, Z, q_s, v_s = system.layout.n_local, snapshots.Z[:, first], snapshots.q_s[:, first], snapshots.v_s[:, first]
+    V = factor(system.layout.comm, shown_rows("velocities", rom, small, system) @ with_hand(small))
+    start = total(system.layout.comm, V.Q.T @ state_rows("velocities", system, Z[:n], Z[n:], q_s, v_s))
+    return np.asarray(np.linalg.lstsq(V.scale * V.R, start[:, 0], rcond=None)[0])

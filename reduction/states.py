@@ -6,23 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgrasp.fem.errors import SoftgraspError, agree
+from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import Coordinates, Frame
+from softgrasp.reduction.basis import Coordinates, Frame, ReductionError
 
 
-class BasisError(SoftgraspError):
+class BasisError(ReductionError):
     """A basis cannot be built from what is given.
 
     Attributes:
         most: largest N there is, where more was asked for.
     """
 
-    def __init__(self, message: str, most: int | None = None) -> None:
-        super().__init__(message)
+    def __init__(self, reason: str, basis: str = "", most: int | None = None) -> None:
+        super().__init__(reason, basis)
         self.most = most
 
 

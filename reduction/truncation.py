@@ -117,13 +117,13 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
     if free < width or free % width:
         least = f"the {hand} columns of the hand plus " if hand else ""
         more = "an even number, at least 2" if width == 2 else "at least 1"
-        raise BasisError(f"{name}: N = {N} does not fit; it must be {least}{more}")
+        raise BasisError(f"N = {N} does not fit; it must be {least}{more}", name)
     want, ranks = free // width, [part.rank for part in parts]
     if want > sum(ranks):
-        found = " + ".join([*(str(width * r) for r in ranks), *([f"{hand} of the hand"] if hand else [])])
+        carried = " + ".join([*(str(width * r) for r in ranks), *([f"{hand} of the hand"] if hand else [])])
         most = hand + width * sum(ranks)
         raise BasisError(
-            f"{name}: N = {N} is more than the snapshots carry above rounding ({found}); ask for N <= {most}", most
+            f"N = {N} is more than the snapshots carry above rounding ({carried}); ask for N <= {most}", name, most
         )
     counts = [0] * len(parts)
     for _ in range(want):
@@ -146,10 +146,11 @@ def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, na
         k = needed(part.sigma, part.total, rule.share)
         if k is None or k > part.rank:
             raise BasisError(
-                f"{name}: the {part.title} cannot be kept to {rule.share:.1e} of its energy with the {part.rank} "
-                "singular values above rounding; ask for a larger tol, or for N"
+                f"the {part.title} cannot be kept to {rule.share:.1e} of its energy with the {part.rank} "
+                "singular values above rounding; ask for a larger tol, or for N",
+                name,
             )
         counts.append(k)
     if not any(counts):
-        raise BasisError(f"{name}: the snapshots of the {' and of the '.join(p.title for p in parts)} are zero")
+        raise BasisError(f"the snapshots of the {' and of the '.join(p.title for p in parts)} are zero", name)
     return tuple(min(max(counts), part.rank) for part in parts)

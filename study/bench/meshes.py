@@ -20,8 +20,9 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.registry import METHODS, find_method
-from softgrasp.reduction.replay import reference
-from softgrasp.study.reduce.sweep import Point, sweep
+from softgrasp.reduction.replay import full_run
+from softgrasp.study.reduce.result import Point
+from softgrasp.study.reduce.sweep import sweep
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
 from softgrasp.study.report.tables import Table
@@ -48,7 +49,7 @@ class MeshRow:
         time_offline: basis and projection.
         time_setup, time_online: of the reduced model.
         N: its dimension.
-        error, error_deformation: see :class:`study.reduce.sweep.Point`.
+        error, error_deformation: see :class:`study.reduce.result.Point`.
         stable: of the reduced model.
     """
 
@@ -92,9 +93,10 @@ def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
     model = build(scene, comm=comm)
     run = simulate(model)
     steps = scene.time.steps
-    swept = sweep(scene.reduction.methods[0], reference(model, run), scene.reduction)
+    swept = sweep(scene.reduction.methods[0], full_run(model, run), scene.reduction)
     if not swept.points:
-        reason = next(iter(swept.refused.values()), f"reduction.N = {scene.reduction.N} fits no basis of this method")
+        refused = [f"N = {N}: {reason}" for N, reason in swept.refused.items()]
+        reason = next(iter(refused), f"reduction.N = {scene.reduction.N} fits no basis of this method")
         raise SoftgraspError(f"{scene.reduction.methods[0]}: {reason}")
     point: Point = swept.points[0]
     return MeshRow(

@@ -19,8 +19,8 @@ from softgrasp.lqr.reduced.retune import BoxPoint, Materials, Retuner, over_box
 from softgrasp.lqr.reduced.riccati import GainReport, ReducedRiccati, factor_error, gain_error, reduce_riccati
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality
+from softgrasp.reduction.parameters import box_materials, outside
 from softgrasp.study.control.solve import WHOLE_SPECTRUM, Design, worth
-from softgrasp.study.reduce.box import box_materials, outside
 
 TITLES = {
     "pod": "POD of P",

@@ -28,7 +28,7 @@ from softgrasp.study.precision.tables import (
     reduced_rows,
     slope_rows,
 )
-from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.files import plain, write_json, write_scene
 from softgrasp.study.report.origin import command_line, made_with, origin, peak_memory_mb

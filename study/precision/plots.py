@@ -16,7 +16,7 @@ from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, WI
 from softgrasp.study.precision.fit import Slope, pareto, usable
 from softgrasp.study.precision.points import WorkPoint
 from softgrasp.study.reduce.plots import LOOKS, SPARE
-from softgrasp.study.reduce.tables import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))

@@ -22,15 +22,15 @@ from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper, prepared, run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator
-from softgrasp.reduction.registry import METHODS
-from softgrasp.reduction.replay import Reference as FullRun
-from softgrasp.reduction.replay import prepare, reference
+from softgrasp.reduction.registry import METHODS, possible_sizes
+from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs
 from softgrasp.reduction.states import States
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import Row, Setting, WorkPoint, number, scene_setting
 from softgrasp.study.precision.reference import Reference
-from softgrasp.study.reduce.sweep import Point, bases_of, chosen_methods, comparison_of, measure, sizes_for
+from softgrasp.study.reduce.result import Point
+from softgrasp.study.reduce.sweep import bases_of, chosen_methods, measure
 
 CALLS = 2_000  # single steps of a reduced model that are timed
 ENGINE_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
@@ -61,7 +61,7 @@ class ReducedRuns:
                 self.runs.variant(self.setting, "memory"), model.space, model.system, model.inventory, Stopwatch(comm)
             )
             probe = make_probe(fresh.space, self.runs.places.points, self.scene.effects.rotation)
-            self._made = (reference(fresh, simulate(fresh)), probe, fresh)
+            self._made = (full_run(fresh, simulate(fresh)), probe, fresh)
         return self._made
 
     def rows(self, name: str, sizes: Sequence[int]) -> list[Row]:
@@ -76,7 +76,7 @@ class ReducedRuns:
             against, probe, model = self.full()
             states = States(model.system, ((model.system, against.snapshots),))
             refused: dict[int, str] = {}
-            found = sizes_for(METHODS[name], model.system.layout.n_s, wanted.N)
+            found = possible_sizes(METHODS[name], model.system.layout.n_s, wanted.N)
             bases, _ = bases_of(name, states, found, wanted, refused)
             outputs, key = make_outputs(model.scene, model.system), scene_hash(model.scene)
             models = [project(basis, model.system, outputs, key) for basis in bases]
@@ -115,13 +115,13 @@ class ReducedRuns:
 def _measured(model: ReducedModel, point: Point, against: FullRun, probe: Probe) -> Row:
     """Errors and times of one reduced model with its outputs at the places, and quantiles of single steps. Collective.
 
-    Keys: those of :class:`study.reduce.sweep.Point`, times and values of its outputs, p50, p99 and max of a step.
+    Keys: those of :class:`study.reduce.result.Point`, times and values of its outputs, p50, p99 and max of a step.
     """
     system = against.model.system
     comm = system.layout.comm
     small = model.at()
     with np.errstate(all="ignore"):  # an unstable model may overflow, and is marked
-        step, drive = prepare(model, small, against, system)
+        step, drive = replay_inputs(model, small, against)
         found = run(step, allow_unstable=True, **drive)
         lift = model.lift
         C = probe.of_rows(comm, lift.L_q) if lift is not None else np.zeros((len(probe.weights), small.N))

@@ -4,269 +4,111 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.errors import Comparison
-from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.online import run
+from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import Method
-from softgrasp.reduction.replay import Reference, prepare, reference
+from softgrasp.reduction.replay import FullRun, comparison_of, replay
 from softgrasp.reduction.states import States
-from softgrasp.study.reduce.sweep import COMPARED, LARGER, Point, Swept, bases_of, nearest
-from softgrasp.study.report.files import plain
+from softgrasp.study.reduce.result import COMPARED, LARGER, Box, BoxErrors, BoxPoint, Sweep, TestedModel, nearest
+from softgrasp.study.reduce.sweep import bases_of
 
-GRID = 3  # test values of each constant, from corner to corner of the box
 METHODS_TESTED = 4
-LAMBDA_SHARES, MU_SHARES = (0.6, 10.0), (0.4, 10.0)  # of the scene's own constants: the paper's box around its 50, 50
 
 
-@dataclass(frozen=True)
-class Case:
-    """One reduced model that is tested.
-
-    Attributes:
-        method: of its basis.
-        N: its dimension.
-        several: whether runs at several parameters trained it.
-        model: itself.
-    """
-
-    method: Method
-    N: int
-    several: bool
-    model: ReducedModel
-
-    @property
-    def family(self) -> tuple[str, bool]:
-        """Cases of one family have nested bases."""
-        return self.method.key, self.several
-
-
-@dataclass(frozen=True)
-class BoxPoint:
-    """One parameter with the deformation error of every case there.
-
-    Attributes:
-        lam, mu: of the first layer [Pa].
-        trained: a run at this parameter trained some of the bases, so that it is no test.
-        errors: one for each case.
-    """
-
-    lam: float
-    mu: float
-    trained: bool
-    errors: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Box:
-    """All tests at other parameters.
-
-    Attributes:
-        cases: models.
-        own: errors at the scene's own parameter.
-        points: errors over the box.
-        trained_at: [lambda, mu] of the runs that trained the cases with ``several``, the scene's own first [Pa].
-        none: why there are no tests; empty when there are.
-    """
-
-    cases: tuple[Case, ...] = ()
-    own: tuple[float, ...] = ()
-    points: tuple[BoxPoint, ...] = ()
-    trained_at: tuple[tuple[float, float], ...] = ()
-    none: str = ""
-
-
-def best_methods(swept: Sequence[Swept]) -> list[Swept]:
+def best_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
     """The methods with the least deformation error of a stable model at the N that is compared."""
-    found = [(_deformation(s.points[i]), k, s) for k, s in enumerate(swept) if (i := nearest(s.points)) is not None]
-    return [s for _, _, s in sorted(found)[:METHODS_TESTED]]
+
+    def error(s: Sweep, i: int) -> float:
+        value = s.points[i].error_deformation
+        return value if np.isfinite(value) else np.inf
+
+    order = [(error(s, i), k, s) for k, s in enumerate(sweeps) if (i := nearest(s.points)) is not None]
+    return [s for _, _, s in sorted(order)[:METHODS_TESTED]]
 
 
-def _deformation(point: Point) -> float:
-    return point.error_deformation if np.isfinite(point.error_deformation) else np.inf
-
-
-def box_of(model: Model) -> tuple[list[float], list[float]]:
-    """Ranges of lambda and mu of the first layer [Pa]: the scene's, or shares of its own constants. Not collective."""
-    ranges, first = model.scene.reduction, model.system.materials[0]
-    lam, mu = ranges.lambda_range, ranges.mu_range
-    return lam or [share * first.lam for share in LAMBDA_SHARES], mu or [share * first.mu for share in MU_SHARES]
-
-
-def outside(model: Model) -> str:
-    """Why the scene's own constants lie outside the box, so that errors there say nothing; empty when inside."""
-    first, box = model.system.materials[0], box_of(model)
-    for key, value, (low, high) in zip(("lambda", "mu"), (first.lam, first.mu), box, strict=True):
-        if value <= 0:
-            return f"{key} = {value:.4g} Pa of the scene is not positive, and the box is logarithmic"
-        if not low <= value <= high:
-            return (
-                f"{key} = {value:.4g} Pa of the scene lies outside reduction.{key}_range = [{low:g}, {high:g}]; "
-                "set that key to test other parameters"
-            )
-    return ""
-
-
-def grid_of(model: Model) -> list[tuple[float, float]]:
-    """Lame constants on a grid of the scene's box, logarithmically."""
-    lam, mu = (np.geomspace(low, high, GRID).tolist() for low, high in box_of(model))
-    return [(a, b) for a in lam for b in mu]
-
-
-def training_of(model: Model) -> list[tuple[float, float]]:
-    """Lame constants of the runs that train bases beside the scene's own."""
-    train = model.scene.reduction.train
-    if train == "corners":
-        lam, mu = box_of(model)
-        return [(a, b) for a in lam for b in mu]
-    return [(a, b) for a, b in train]
-
-
-def materials_at(model: Model, lam: float, mu: float) -> tuple[LayerMaterial, ...]:
-    """Materials with these constants in the first layer; the others keep their ratios to it."""
-    first = model.system.materials[0]
-    return tuple(replace(m, lam=m.lam * lam / first.lam, mu=m.mu * mu / first.mu) for m in model.system.materials)
-
-
-def box_materials(model: Model) -> list[tuple[LayerMaterial, ...]]:
-    """Materials at every parameter of the grid."""
-    return [materials_at(model, lam, mu) for lam, mu in grid_of(model)]
-
-
-def full_run(model: Model, lam: float, mu: float) -> Reference:
-    """The full run at other constants. Collective."""
-    system = model.system.with_materials(materials_at(model, lam, mu))
-    there = replace(model, system=system, watch=Stopwatch(system.layout.comm))
-    return reference(there, simulate(there))
-
-
-def thinned(snapshots: Snapshots, count: int) -> Snapshots:
-    """About ``count`` of the snapshots, evenly spread, first and last among them. Not collective."""
-    m = snapshots.Z.shape[1]
-    pick = np.unique(np.linspace(0, m - 1, min(count, m)).round().astype(int))
-    return replace(
-        snapshots,
-        steps=snapshots.steps[pick],
-        times=snapshots.times[pick],
-        q_s=snapshots.q_s[:, pick],
-        v_s=snapshots.v_s[:, pick],
-        Z=np.asfortranarray(snapshots.Z[:, pick]),
-    )
-
-
-def training_states(against: Reference, parameters: Sequence[tuple[float, float]]) -> States:
-    """Snapshots of the scene's own run and of runs at these, altogether as many as the own run has. Collective."""
-    system, count = against.model.system, -(-against.snapshots.Z.shape[1] // (1 + len(parameters)))
-    runs = [(system, thinned(against.snapshots, count))]
-    for lam, mu in parameters:
-        there = full_run(against.model, lam, mu)
-        runs.append((there.model.system, thinned(there.snapshots, count)))
-    return States(system, tuple(runs))
-
-
-def cases_of(against: Reference, swept: Sequence[Swept], states: States | None) -> list[Case]:
+def box_models(full: FullRun, sweeps: Sequence[Sweep], states: States | None) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
-    full, cases = against.model, []
-    outputs = make_outputs(full.scene, full.system)
-    for s in best_methods(swept):
-        found = {nearest(s.points, N) for N in (COMPARED, LARGER)}
-        points = [(s.points[i], s.models[i]) for i in sorted(i for i in found if i is not None)]
-        cases += [Case(s.method, point.N, False, model) for point, model in points]
+    scene, system, models = full.model.scene, full.model.system, []
+    outputs = make_outputs(scene, system)
+    for s in best_methods(sweeps):
+        numbers = {nearest(s.points, N) for N in (COMPARED, LARGER)}
+        own = [s.models[i] for i in sorted(i for i in numbers if i is not None)]
+        models += [TestedModel(s.method, False, model) for model in own]
         if states is None or not s.method.snapshots:
             continue
-        sizes = [point.N for point, _ in points]
-        bases, _ = bases_of(s.method.key, states, sizes, full.scene.reduction, {})
-        for basis, (point, _) in zip(bases, points, strict=False):
-            cases.append(Case(s.method, point.N, True, project(basis, full.system, outputs)))
-    return cases
+        bases, _ = bases_of(s.method.key, states, [model.N for model in own], scene.reduction, {})
+        models += [TestedModel(s.method, True, project(b, system, outputs)) for b, _ in zip(bases, own, strict=False)]
+    return models
 
 
-def errors_at(here: Reference, cases: Sequence[Case]) -> tuple[float, ...]:
-    """Deformation errors of all cases at the parameter of one full run, without any new projection. Collective."""
-    system, errors = here.model.system, []
-    largest: dict[tuple[str, bool], Case] = {}
-    for case in sorted(cases, key=lambda c: c.model.N):
-        largest[case.family] = case
-    found = {
-        family: Comparison(case.model, case.model.at(system.materials), system, here.snapshots, here.energy)
-        for family, case in largest.items()
-    }
-    for case in cases:
+def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]:
+    """Deformation errors of all models at the parameter of one full run, without any new projection. Collective."""
+    largest = {m.family: m.model for m in sorted(models, key=lambda m: m.model.N)}
+    comparisons = {family: comparison_of(model, full) for family, model in largest.items()}
+    errors = []
+    for m in models:
         with np.errstate(all="ignore"):  # may be unstable away from the training parameter
-            small = case.model.at(system.materials)
-            step, drive = prepare(case.model, small, here, system)
-            trajectory = run(step, allow_unstable=True, **drive)
-            errors.append(found[case.family].state_error("deformation", case.model, small, trajectory))
+            reduced = replay(m.model, full.model, full, allow_unstable=True)
+            small = m.model.at(full.model.system.materials)
+            errors.append(comparisons[m.family].state_error("deformation", m.model, small, reduced))
     return tuple(errors)
 
 
-def measure_box(against: Reference, swept: Sequence[Swept], progress: Callable[[int, int], None] | None = None) -> Box:
+def measure_box(full: FullRun, sweeps: Sequence[Sweep], progress: Callable[[int, int], None] | None = None) -> Box:
     """Train, and test over the box. Collective.
 
     Raises:
         SolverError: a full run failed, or a factorisation did.
         ResourceError: the snapshots do not fit.
     """
-    model = against.model
-    reason = outside(model) or ("" if best_methods(swept) else "no method has a stable model")
+    scene = full.model
+    reason = outside(scene) or ("" if best_methods(sweeps) else "no method has a stable model")
     if reason:
         return Box(none=reason)
-    first, training, grid = model.system.materials[0], training_of(model), grid_of(model)
-    states = training_states(against, training) if training else None
-    cases = cases_of(against, swept, states)
+    first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
+    models = box_models(full, sweeps, training_states(full, training) if training else None)
     trained_at = ((first.lam, first.mu), *training)
     points = []
     for k, (lam, mu) in enumerate(grid):
         if progress is not None:
             progress(k, len(grid))
         trained = any(np.allclose((lam, mu), place) for place in trained_at)
-        points.append(BoxPoint(lam, mu, trained, errors_at(full_run(model, lam, mu), cases)))
-    return Box(tuple(cases), errors_at(against, cases), tuple(points), trained_at if training else ())
+        points.append(BoxPoint(lam, mu, trained, errors_at(run_at(scene, lam, mu), models)))
+    return Box(
+        models=tuple(models),
+        points=tuple(points),
+        summary=summary(models, errors_at(full, models), points, len(trained_at)),
+        trained_at=trained_at if training else (),
+        ranges=box_of(scene),
+    )
 
 
-def summary(box: Box) -> list[dict[str, Any]]:
-    """Error at the scene's own parameter, and median and largest over the parameters that trained no basis."""
-    tests = [p for p in box.points if not p.trained] or box.points
+def summary(
+    models: Sequence[TestedModel], own: Sequence[float], points: Sequence[BoxPoint], runs: int
+) -> tuple[BoxErrors, ...]:
+    """Error at the scene's own parameter, and median and largest over the parameters that trained no basis.
+
+    Args:
+        models: tested.
+        own: errors at the scene's own parameter.
+        points: errors over the box.
+        runs: that trained the models with ``several``.
+    """
+    tests = [p for p in points if not p.trained] or points
     rows = []
-    for i, case in enumerate(box.cases if tests else ()):
+    for i, m in enumerate(models if tests else ()):
         errors = [p.errors[i] for p in tests]
         rows.append(
-            {
-                "method": case.method.key,
-                "N": case.N,
-                "runs": len(box.trained_at) if case.several else int(case.method.snapshots),
-                "own": box.own[i],
-                "median": statistics.median(errors),
-                "largest": max(errors, key=lambda e: (not np.isfinite(e), e)),
-            }
+            BoxErrors(
+                method=m.method.key,
+                N=m.model.N,
+                runs=runs if m.several else int(m.method.snapshots),
+                own=own[i],
+                median=statistics.median(errors),
+                largest=max(errors, key=lambda e: (not np.isfinite(e), e)),
+            )
         )
-    return rows
-
-
-def box_result(box: Box) -> dict[str, Any]:
-    """For result.json."""
-    keys = [{"method": c.method.key, "N": c.N, "several": c.several} for c in box.cases]
-    return {
-        "reason_for_none": box.none,
-        "trained_at": [list(place) for place in box.trained_at],
-        "summary": plain(summary(box)),
-        "points": [
-            {
-                "lambda": p.lam,
-                "mu": p.mu,
-                "trained": p.trained,
-                "errors": [key | {"error_deformation": plain(e)} for key, e in zip(keys, p.errors, strict=True)],
-            }
-            for p in box.points
-        ],
-    }
+    return tuple(rows)

@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from softgrasp.reduction.registry import PAPER_METHODS, PAPER_PLAIN
-from softgrasp.study.reduce.sweep import COMPARED, Point, Swept
+from softgrasp.study.reduce.result import COMPARED, Point, Sweep
 
 MEASURES = (
     ("error_deformation", "the deformation"),
@@ -17,52 +17,47 @@ MEASURES = (
 )
 
 
-def title_of(swept: Swept) -> str:
-    """Title of a method, short enough for a sentence."""
-    return swept.method.title.replace(", fixed solid modes", ", fixed")
-
-
-def leader(swept: Sequence[Swept], N: int, key: str, stable: bool = True) -> tuple[Swept, Point] | None:
+def leader(sweeps: Sequence[Sweep], N: int, key: str, stable: bool = True) -> tuple[Sweep, Point] | None:
     """Method with the least value at exactly N, among stable models or all; None without any. Not collective."""
     models = [
         (getattr(p, key), k, s, p)
-        for k, s in enumerate(swept)
+        for k, s in enumerate(sweeps)
         for p in s.points
         if p.N == N and np.isfinite(getattr(p, key)) and (p.stable or not stable)
     ]
     return min(models)[2:] if models else None
 
 
-def sizes_of(swept: Sequence[Swept]) -> list[int]:
+def sizes_of(sweeps: Sequence[Sweep]) -> list[int]:
     """All N of any method, ascending. Not collective."""
-    return sorted({p.N for s in swept for p in s.points})
+    return sorted({p.N for s in sweeps for p in s.points})
 
 
-def compared_size(swept: Sequence[Swept]) -> int | None:
+def compared_size(sweeps: Sequence[Sweep]) -> int | None:
     """The N nearest to the one compared, the smaller of two. Not collective."""
-    return min(sizes_of(swept), key=lambda N: (abs(N - COMPARED), N), default=None)
+    return min(sizes_of(sweeps), key=lambda N: (abs(N - COMPARED), N), default=None)
 
 
-def leaders(swept: Sequence[Swept], key: str) -> list[tuple[Swept, list[Point]]]:
+def leaders(sweeps: Sequence[Sweep], key: str) -> list[tuple[Sweep, list[Point]]]:
     """Best stable methods in the order of N, with their points in a row. Not collective."""
-    best = [b for N in sizes_of(swept) if (b := leader(swept, N, key)) is not None]
+    best = [b for N in sizes_of(sweeps) if (b := leader(sweeps, N, key)) is not None]
     groups = [list(group) for _, group in groupby(best, key=lambda b: b[0].method.key)]
     return [(group[0][0], [p for _, p in group]) for group in groups]
 
 
-def findings(swept: Sequence[Swept]) -> list[str]:
+def findings(sweeps: Sequence[Sweep]) -> tuple[str, ...]:
     """Who is best at which N in which measure, what structure buys, and whether the paper's ranking holds.
 
     Not collective.
     """
-    shown = [s for s in swept if s.points]
-    return [*_best(shown), *_stability(shown), *_structure(shown), *_paper(shown)] if shown else []
+    shown = [s for s in sweeps if s.points]
+    return (*_best(shown), *_stability(shown), *_structure(shown), *_paper(shown)) if shown else ()
 
 
-def _best(swept: Sequence[Swept]) -> Iterator[str]:
+def _best(sweeps: Sequence[Sweep]) -> Iterator[str]:
     seen: dict[tuple[tuple[str, int], ...], str] = {}
     for key, name in MEASURES:
-        rows = leaders(swept, key)
+        rows = leaders(sweeps, key)
         if not rows:
             continue
         order = tuple((s.method.key, p.N) for s, points in rows for p in points)
@@ -70,7 +65,10 @@ def _best(swept: Sequence[Swept]) -> Iterator[str]:
             yield f"In {name} the same methods lead as in {seen[order]}."
             continue
         seen[order] = name
-        texts = [f"{title_of(s)} at N = {_span([p.N for p in points])} ({_value(points, key)})" for s, points in rows]
+        texts = [
+            f"{s.method.short_title} at N = {_span([p.N for p in points])} ({_value(points, key)})"
+            for s, points in rows
+        ]
         yield f"Least error of {name} among stable models: {'; '.join(texts)}."
 
 
@@ -85,11 +83,11 @@ def _value(points: Sequence[Point], key: str) -> str:
     return value if len(points) == 1 else f"{value} at N = {p.N}"
 
 
-def _stability(swept: Sequence[Swept]) -> Iterator[str]:
+def _stability(sweeps: Sequence[Sweep]) -> Iterator[str]:
     for keeps, label in ((True, "that keep the structure"), (False, "that do not")):
-        group = [s for s in swept if s.method.preserving == keeps]
+        group = [s for s in sweeps if s.method.preserving == keeps]
         total = sum(len(s.points) for s in group)
-        bad = [(title_of(s), [p.N for p in s.points if not p.stable]) for s in group]
+        bad = [(s.method.short_title, [p.N for p in s.points if not p.stable]) for s in group]
         count = sum(len(sizes) for _, sizes in bad)
         if not total:
             continue
@@ -97,10 +95,10 @@ def _stability(swept: Sequence[Swept]) -> Iterator[str]:
         yield f"Unstable models among the {total} {label}: " + (f"{count} ({where})." if count else "none.")
 
 
-def _structure(swept: Sequence[Swept]) -> Iterator[str]:
-    N = compared_size(swept)
+def _structure(sweeps: Sequence[Sweep]) -> Iterator[str]:
+    N = compared_size(sweeps)
     groups = {
-        keeps: [(s, p) for s in swept if s.method.preserving == keeps for p in s.points if p.N == N and p.stable]
+        keeps: [(s, p) for s in sweeps if s.method.preserving == keeps for p in s.points if p.N == N and p.stable]
         for keeps in (True, False)
     }
     if N is None or not all(groups.values()):
@@ -116,25 +114,26 @@ def _structure(swept: Sequence[Swept]) -> Iterator[str]:
     ratio = max(p.error_deformation, tiny) / max(q.error_deformation, tiny)
     verdict = f"structure {'costs' if ratio > 1 else 'gains'} a factor of {max(ratio, 1 / ratio):.1f}"
     yield (
-        f"Least error of the deformation at N = {N}: {p.error_deformation:.1e} with structure ({title_of(kept)}), "
-        f"{q.error_deformation:.1e} without ({title_of(lost)}, stable at this N), so {verdict} here."
+        f"Least error of the deformation at N = {N}: {p.error_deformation:.1e} with structure "
+        f"({kept.method.short_title}), {q.error_deformation:.1e} without "
+        f"({lost.method.short_title}, stable at this N), so {verdict} here."
     )
 
 
-def _paper(swept: Sequence[Swept]) -> Iterator[str]:
+def _paper(sweeps: Sequence[Sweep]) -> Iterator[str]:
     """The paper's two statements on its six methods, in its own error, at every N where both sides have a model."""
-    six = [s for s in swept if s.method.key in PAPER_METHODS]
-    plain = [s for s in six if s.method.key in PAPER_PLAIN]
+    six = [s for s in sweeps if s.method.key in PAPER_METHODS]
+    others = [s for s in six if s.method.key in PAPER_PLAIN]
     yield from _statement(
         "PSD, and all with fixed solid modes, which it calls structure-preserving, are better than the other POD bases",
-        [s for s in six if s.method.key not in PAPER_PLAIN], plain, "for the former", "for the latter",
+        [s for s in six if s.method.key not in PAPER_PLAIN], others, "for the former", "for the latter",
     )  # fmt: skip
     psd = [s for s in six if s.method.key == "psd"]
     others = [s for s in six if s.method.key != "psd"]
     yield from _statement("PSD without fixed solid modes is the best", psd, others, "for it", "for the best other")
 
 
-def _statement(text: str, left: Sequence[Swept], right: Sequence[Swept], one: str, other: str) -> Iterator[str]:
+def _statement(text: str, left: Sequence[Sweep], right: Sequence[Sweep], one: str, other: str) -> Iterator[str]:
     pairs = [
         (N, a, b)
         for N in sizes_of([*left, *right])
@@ -153,7 +152,8 @@ def _statement(text: str, left: Sequence[Swept], right: Sequence[Swept], one: st
     )  # fmt: skip
     yield (
         f"The paper: among its six methods, {text}. Here, in its own error of the state, {verdict}; at N = {N}: "
-        f"{p.error:.1e} {one} ({title_of(s)}{_grows(p)}), {q.error:.1e} {other} ({title_of(t)}{_grows(q)})."
+        f"{p.error:.1e} {one} ({s.method.short_title}{_grows(p)}), {q.error:.1e} {other} "
+        f"({t.method.short_title}{_grows(q)})."
     )
 
 

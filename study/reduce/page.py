@@ -1,34 +1,25 @@
-"""Files of ``softgrasp reduce``: result.json, points.csv, scene.toml, figures and report.html."""
+"""Page of ``softgrasp reduce``."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.reduce.box import box_of
+from softgrasp.study.reduce.result import ReductionStudy
 from softgrasp.study.reduce.tables import (
-    BOX_HEADER,
-    ERROR_HEADER,
     N_NOTE,
-    TIME_HEADER,
     box_note,
-    box_rows,
+    box_point_tables,
+    box_table,
     error_note,
-    error_rows,
+    error_table,
     inner_note,
-    refused_rows,
-    time_rows,
-    write_csv,
+    refused_table,
+    time_table,
 )
-from softgrasp.study.report.files import write_json, write_scene
-from softgrasp.study.report.origin import command_line, made_with
-from softgrasp.study.report.page import Section, write_report
-
-if TYPE_CHECKING:
-    from softgrasp.study.reduce.pictures import Views
-    from softgrasp.study.reduce.run import Reduced
+from softgrasp.study.report.origin import made_with, origin
+from softgrasp.study.report.page import Section
 
 CAPTIONS = {
     "errors.png": "Relative errors of the paper's six methods against N, all columns of V counted. First the "
@@ -49,81 +40,46 @@ CAPTIONS = {
 }
 
 
-def draw_all(out: Path, found: Reduced, views: Views | None) -> list[Path]:
-    """All figures. Rank 0 only."""
-    from softgrasp.study.reduce.pictures import figure_compare, figure_modes, gif_compare
-    from softgrasp.study.reduce.plots import beyond_paper, figure_errors, figure_sigma, figure_times, of_paper
+def sections(study: ReductionStudy, seconds: Mapping[str, float], files: Sequence[Path]) -> list[Section]:
+    """Parts of the page. Rank 0 only.
 
-    files: list[Path] = []
-    shown = [s for s in found.swept if s.points]
-    if of_paper(shown):
-        files += figure_errors(of_paper(shown), out / "errors.png")
-    if any(s not in of_paper(shown) for s in shown):
-        files += figure_errors(beyond_paper(shown), out / "errors_beyond.png")
-    if shown:
-        files += figure_times(shown, found.times.steps, out / "times.png")
-        files += figure_sigma(shown, out / "sigma.png") or ()
-    if views is not None and views.modes:
-        files += figure_modes(views, out / "modes.png")
-    if views is not None and views.reduced:
-        files += figure_compare(views, out / "compare.png")
-        files.append(gif_compare(views, out / "compare.gif"))
-    return files
-
-
-def write_all(
-    out: Path, path: Path, overrides: list[str], scene: Scene, found: Reduced, result: dict[str, Any], files: list[Path]
-) -> list[Path]:
-    """Numbers and report beside the figures that are there. Rank 0 only."""
-    table = write_csv(out / "points.csv", found.swept)
-    drawn = {file.name for file in files}
-    report = write_report(
-        out / "report.html",
-        title=f"{scene.name}: reduced models",
-        subtitle=scene.description,
-        sections=sections(found, result, [(out / name, text) for name, text in CAPTIONS.items() if name in drawn]),
-        scene=resolved_toml(scene),
-        reproduce=command_line("reduce", path, overrides, result["ranks"]),
+    Args:
+        study: the result.
+        seconds: of every stage.
+        files: figures that are drawn.
+    """
+    scene, layout = study.full.model.scene, study.full.model.system.layout
+    energy, drawn = scene.reduction.energy, {file.name: file for file in files}
+    text = (
+        f"{N_NOTE}\n\n{error_note(energy)} Each method is built from the snapshots of one run and repeats it, driven "
+        f"by the same hand. {inner_note(study.sweeps)}"
     )
-    return [write_json(out / "result.json", result), table, write_scene(out, scene), *files, report]
-
-
-def sections(found: Reduced, result: dict[str, Any], figures: list[tuple[Path, str]]) -> list[Section]:
-    """Parts of the page."""
-    share = f"{100 * result['reduction']['energy']:g} %"
-    explained = (
-        f"{N_NOTE}\n\n{error_note(share)} Each method is built from the snapshots of one run and repeats it, driven by "
-        f"the same hand. {inner_note(found.swept)}"
-    )
-    header = (ERROR_HEADER[0], share, *ERROR_HEADER[2:])
     parts = [
-        Section("Errors", text=explained, header=header, rows=error_rows(found.swept)),
-        Section("What holds", text="\n\n".join(result["findings"])),
-        Section("", figures=figures),
-        Section("Times", text="\n\n".join(result["speed_notes"]), header=TIME_HEADER, rows=time_rows(found.speeds)),
+        error_table(study.sweeps, energy).section(text),
+        Section("What holds", text="\n\n".join(study.findings)),
+        Section("", figures=[(drawn[name], caption) for name, caption in CAPTIONS.items() if name in drawn]),
+        time_table(study.speeds).section("\n\n".join(study.speed_notes)),
     ]
-    if refused := refused_rows(found.swept):
-        parts.append(Section("Refused", header=("N", "method", "reason"), rows=refused))
-    parts += box_sections(found)
-    about = [(key, result[key]) for key in ("n_s", "n_e", "states", "steps")]
-    about += [*made_with(result), *((f"time {key}", f"{value:.3g} s") for key, value in result["time"].items())]
-    return [*parts, Section("Made with", rows=about)]
+    refused = refused_table(study.sweeps)
+    if refused.rows:
+        parts.append(refused.section())
+    about: list[tuple[str, Any]] = [
+        ("n_s", layout.n_s),
+        ("n_e", layout.n_e),
+        ("states", layout.states),
+        ("steps", scene.time.steps),
+    ]
+    about += made_with(origin(scene, layout.comm.size))
+    about += [(f"time {key}", f"{value:.3g} s") for key, value in seconds.items()]
+    return [*parts, *box_sections(study), Section("Made with", rows=about)]
 
 
-def box_sections(found: Reduced) -> list[Section]:
+def box_sections(study: ReductionStudy) -> list[Section]:
     """Errors at other parameters: a summary, and one table for each N with a column for each basis."""
-    title, box = "Other parameters", found.box
+    box = study.box
     if box.none:
-        return [Section(title, f"No tests at other parameters: {box.none}.")]
-    text = box_note(box, *box_of(found.against.model))
+        return [Section("Other parameters", f"No tests at other parameters: {box.none}.")]
+    text = box_note(box)
     text += " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
-    parts = [Section(title, text, header=BOX_HEADER, rows=box_rows(box))]
-    for N in sorted({case.N for case in box.cases}):
-        shown = [i for i, case in enumerate(box.cases) if case.N == N]
-        names = [box.cases[i].method.title + (", several runs" if box.cases[i].several else "") for i in shown]
-        rows = [
-            (f"{p.lam:.4g}", f"{p.mu:.4g}", "trained" if p.trained else "test", *(p.errors[i] for i in shown))
-            for p in box.points
-        ]
-        parts.append(Section("", f"All parameters, N = {N}.", header=("lambda [Pa]", "mu [Pa]", "", *names), rows=rows))
-    return parts
+    points = [table.section(f"All parameters, N = {N}.") for N, table in box_point_tables(box)]
+    return [box_table(box).section(text), *points]

@@ -18,14 +18,14 @@ from PIL import Image
 from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.online import run
 from softgrasp.reduction.registry import PAPER_METHODS
-from softgrasp.reduction.replay import Reference, prepare
+from softgrasp.reduction.replay import FullRun, replay
 from softgrasp.study.pictures.animation import speed_up
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
-from softgrasp.study.reduce.sweep import Swept, nearest
+from softgrasp.study.reduce.plots import figure_errors, figure_sigma, figure_times, further_methods, of_paper
+from softgrasp.study.reduce.result import ReductionStudy, Sweep, nearest
 
 MODES = 4  # a method
 FRAMES = 30
@@ -75,58 +75,74 @@ class Views:
     modes: tuple[tuple[str, Array], ...]
 
 
-def compared(swept: Sequence[Swept]) -> list[tuple[Swept, int]]:
+def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
+    """All figures. Rank 0 only."""
+    files: list[Path] = []
+    shown = [s for s in study.sweeps if s.points]
+    if of_paper(shown):
+        files += figure_errors(of_paper(shown), out / "errors.png")
+    if any(s not in of_paper(shown) for s in shown):
+        files += figure_errors(further_methods(shown), out / "errors_beyond.png")
+    if shown:
+        files += figure_times(shown, study.times.steps, out / "times.png")
+        files += figure_sigma(shown, out / "sigma.png") or ()
+    if views is not None and views.modes:
+        files += figure_modes(views, out / "modes.png")
+    if views is not None and views.reduced:
+        files += figure_compare(views, out / "compare.png")
+        files.append(gif_compare(views, out / "compare.gif"))
+    return files
+
+
+def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     """First of the paper's methods and best of all at the N compared."""
-    first = [s for s in swept if s.method.key in PAPER_METHODS and s.points][:1]
+    first = [s for s in sweeps if s.method.key in PAPER_METHODS and s.points][:1]
     chosen = [(s, i) for s in first if (i := nearest(s.points, stable=False)) is not None]
-    stable = [(s, i) for s in swept if (i := nearest(s.points)) is not None]
+    stable = [(s, i) for s in sweeps if (i := nearest(s.points)) is not None]
     stable.sort(key=_error)
     return chosen + [f for f in stable[:1] if f[0] not in first]
 
 
-def _error(found: tuple[Swept, int]) -> float:
-    return found[0].points[found[1]].error_deformation
+def _error(chosen: tuple[Sweep, int]) -> float:
+    return chosen[0].points[chosen[1]].error_deformation
 
 
-def gather_views(model: Model, against: Reference, swept: Sequence[Swept]) -> Views | None:
+def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views | None:
     """Bring to rank 0 what the pictures need; None on other ranks and for very large bodies. Collective."""
     if model.space.mesh.mesh.geometry.index_map().size_global > MANY_VERTICES:
         return None
     picture = gather_picture(model)
-    snapshots, n = against.snapshots, model.system.layout.n_local
+    snapshots, n = run.snapshots, model.system.layout.n_local
     chosen = np.unique(np.linspace(0, len(snapshots.steps) - 1, FRAMES + 1).round().astype(int))
     steps = snapshots.steps[chosen]
     full = vertex_displacement(model, snapshots.Z[:n, chosen], snapshots.q_s[:, chosen])
     views = []
-    for s, i in compared(swept):
+    for s, i in compared(sweeps):
         point, reduced = s.points[i], s.models[i]
         with np.errstate(all="ignore"):  # an unstable model may overflow
-            small = reduced.at()
-            step, drive = prepare(reduced, small, against, model.system)
-            found = run(step, allow_unstable=True, **drive)
-            z, _ = reduced.reconstruct(small, found.x[steps].T, found.v_s[steps].T)
-        states = vertex_displacement(model, np.nan_to_num(z), found.q_s[steps].T)
+            motion = replay(reduced, model, run, allow_unstable=True)
+            z, _ = reduced.reconstruct(reduced.at(), motion.x[steps].T, motion.v_s[steps].T)
+        states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
         if states is not None:
             views.append(View(f"{s.method.title}, $N$ = {point.N}", point.stable, point.error_deformation, states))
-    modes = [(s.method.title, _modes(model, s, i)) for s, i in modes_of(swept)]
+    modes = [(s.method.title, _modes(model, s, i)) for s, i in modes_of(sweeps)]
     if picture is None or full is None:
         return None
-    table = np.column_stack([against.trajectory.times, against.trajectory.q_s])
+    table = np.column_stack([run.trajectory.times, run.trajectory.q_s])
     shown = tuple((title, shapes) for title, shapes in modes if shapes is not None and len(shapes))
     return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
 
 
-def modes_of(swept: Sequence[Swept]) -> list[tuple[Swept, int]]:
+def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
-    found = [(s, i) for s in swept if s.method.fixed and (i := nearest(s.points)) is not None]
-    found.sort(key=_error)
-    old = [f for f in found if f[0].method.key in PAPER_METHODS][:1]
-    new = [f for f in found if f[0].method.key not in PAPER_METHODS]
+    fixed = sorted(((s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None), key=_error)
+    old = [f for f in fixed if f[0].method.key in PAPER_METHODS][:1]
+    new = [f for f in fixed if f[0].method.key not in PAPER_METHODS]
     new = ([f for f in new if not f[0].method.snapshots] or new)[:1]
     return old + new
 
 
-def _modes(model: Model, s: Swept, i: int) -> Array | None:
+def _modes(model: Model, s: Sweep, i: int) -> Array | None:
     """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
     layout = model.system.layout
     lift = s.models[i].lift
@@ -258,8 +274,8 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
 
 def _palette(image: Any) -> Any:
     """The 256 colours of a picture, its paper pure white."""
-    found = image.quantize(256)
-    colours = np.reshape(found.getpalette(), (-1, 3))
+    palette = image.quantize(256)
+    colours = np.reshape(palette.getpalette(), (-1, 3))
     colours[colours.sum(axis=1).argmax()] = 255
-    found.putpalette(colours.ravel().tolist())
-    return found
+    palette.putpalette(colours.ravel().tolist())
+    return palette

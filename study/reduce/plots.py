@@ -25,7 +25,7 @@ from softgrasp.study.pictures.style import (
     paper_style,
     save,
 )
-from softgrasp.study.reduce.sweep import Point, Swept, nearest
+from softgrasp.study.reduce.result import Point, Sweep, nearest
 
 TOP = 1.0  # errors above are drawn at the upper edge
 NARROW = 16.0  # largest over least time below which an axis has numbers between the powers of ten
@@ -56,32 +56,32 @@ QUANTITIES = (
 )
 
 
-def looks(swept: Sequence[Swept]) -> dict[str, tuple[str, str, str]]:
+def looks(sweeps: Sequence[Sweep]) -> dict[str, tuple[str, str, str]]:
     """Colour, dashes and marker of every method; those without a place of their own share one colour."""
-    others = [s.method.key for s in swept if s.method.key not in LOOKS]
+    others = [s.method.key for s in sweeps if s.method.key not in LOOKS]
     return {**LOOKS, **{key: SPARE[i % len(SPARE)] for i, key in enumerate(others)}}
 
 
-def of_paper(swept: Sequence[Swept]) -> list[Swept]:
+def of_paper(sweeps: Sequence[Sweep]) -> list[Sweep]:
     """The paper's six, as far as they ran."""
-    return [s for s in swept if s.method.key in PAPER_METHODS and s.points]
+    return [s for s in sweeps if s.method.key in PAPER_METHODS and s.points]
 
 
-def beyond_paper(swept: Sequence[Swept]) -> list[Swept]:
+def further_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
     """The others, after the best of the paper's at the N compared."""
-    old = [(s.points[i], s) for s in of_paper(swept) if (i := nearest(s.points)) is not None]
+    old = [(s.points[i], s) for s in of_paper(sweeps) if (i := nearest(s.points)) is not None]
     first = min(old, key=lambda f: f[0].error_deformation, default=None)
-    return ([] if first is None else [first[1]]) + [s for s in swept if s.method.key not in PAPER_METHODS and s.points]
+    return ([] if first is None else [first[1]]) + [s for s in sweeps if s.method.key not in PAPER_METHODS and s.points]
 
 
-def figure_errors(swept: Sequence[Swept], out_png: Path) -> tuple[Path, Path]:
+def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, Path]:
     """Four errors against N with the floor of the projection and the unstable points; PNG and PDF."""
-    look = looks(swept)
+    look = looks(sweeps)
     with paper_style():
         figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.4), sharex=True)
         clipped = False
         for ax, (key, floor, label) in zip(grid.flat, QUANTITIES, strict=True):
-            for s in swept:
+            for s in sweeps:
                 N = [p.N for p in s.points]
                 if floor:
                     ax.plot(N, _values(s.points, floor), color=look[s.method.key][0], ls=":", lw=0.7, zorder=1)
@@ -91,19 +91,19 @@ def figure_errors(swept: Sequence[Swept], out_png: Path) -> tuple[Path, Path]:
             ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=STEPS))
         for ax in grid[1]:
             ax.set_xlabel("$N$")
-        _legend(figure, _entries(swept, look, clipped))
+        _legend(figure, _entries(sweeps, look, clipped))
         return save(figure, out_png)
 
 
-def figure_times(swept: Sequence[Swept], full: float, out_png: Path) -> tuple[Path, Path]:
+def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[Path, Path]:
     """Errors against online time, and against offline plus online time, with the unstable points; PNG and PDF.
 
     Args:
-        swept: methods.
+        sweeps: methods.
         full: seconds of the steps of a full run.
         out_png: name of the picture; the PDF gets its stem.
     """
-    look = looks(swept)
+    look = looks(sweeps)
     with paper_style():
         figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.4), sharex="col")
         clipped = False
@@ -111,7 +111,7 @@ def figure_times(swept: Sequence[Swept], full: float, out_png: Path) -> tuple[Pa
             row[0].set_ylabel(label)
             for ax, offline in zip(row, (False, True), strict=True):
                 unit = 1.0 if offline else 1e3
-                for s in swept:
+                for s in sweeps:
                     times = [unit * (p.time_online + offline * p.time_offline) for p in s.points]
                     ax.plot(times, _values(s.points, key), **_marks(look[s.method.key]))
                     _crosses(ax, s, times, key)
@@ -123,9 +123,9 @@ def figure_times(swept: Sequence[Swept], full: float, out_png: Path) -> tuple[Pa
             _time_axis(ax)
         grid[1, 0].set_xlabel("online time of a run [ms]")
         grid[1, 1].set_xlabel("offline + online time [s]")
-        entries = [Line2D([], [], label=_name(s), **_marks(look[s.method.key])) for s in swept if s.points]
+        entries = [Line2D([], [], label=s.method.short_title, **_marks(look[s.method.key])) for s in sweeps if s.points]
         entries.append(Line2D([], [], label="full run, prefactored", **FULL))
-        _legend(figure, [*entries, *_remarks(swept, clipped)])
+        _legend(figure, [*entries, *_remarks(sweeps, clipped)])
         return save(figure, out_png)
 
 
@@ -136,17 +136,12 @@ def _marks(look: tuple[str, str, str]) -> dict[str, Any]:
     return {"ls": "", "marker": marker, "ms": 3.6, "mew": 0.8, "color": colour, "fillstyle": fill}
 
 
-def _name(s: Swept) -> str:
-    """Title of a method, short enough for a legend."""
-    return s.method.title.replace(", fixed solid modes", ", fixed")
-
-
-def figure_sigma(swept: Sequence[Swept], out_png: Path) -> tuple[Path, Path] | None:
+def figure_sigma(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, Path] | None:
     """Singular values over the first, a line for each part of a decomposition; PNG and PDF, None without any."""
-    look = looks(swept)
+    look = looks(sweeps)
     groups = [
         [s for s in part if any(len(v) for v in s.sigma)]
-        for part in (of_paper(swept), [s for s in swept if s.method.key not in PAPER_METHODS])
+        for part in (of_paper(sweeps), [s for s in sweeps if s.method.key not in PAPER_METHODS])
     ]
     groups = [g for g in groups if g]
     if not groups:
@@ -162,7 +157,7 @@ def figure_sigma(swept: Sequence[Swept], out_png: Path) -> tuple[Path, Path] | N
                 for j, values in enumerate(v for v in s.sigma if len(v) and v[0] > 0):
                     shown = np.maximum(values[:SHOWN_VALUES] / values[0], LOWEST)
                     wide = 1.2 if j == 0 else 0.7
-                    label = _name(s) if j == 0 else None
+                    label = s.method.short_title if j == 0 else None
                     ax.plot(np.arange(1, len(shown) + 1), shown, color=colour, ls=dashes, lw=wide, label=label)
             ax.set_yscale("log")
             ax.set_xlabel("number")
@@ -177,7 +172,7 @@ def _values(points: Sequence[Point], key: str) -> np.ndarray:
     return np.where(np.isfinite(values), np.minimum(values, TOP), TOP)
 
 
-def _curve(ax: Any, s: Swept, N: list[int], key: str, look: tuple[str, str, str]) -> bool:
+def _curve(ax: Any, s: Sweep, N: list[int], key: str, look: tuple[str, str, str]) -> bool:
     """One method; whether a value had to be drawn at the edge."""
     colour, dashes, marker = look
     shown = _values(s.points, key)
@@ -186,13 +181,13 @@ def _curve(ax: Any, s: Swept, N: list[int], key: str, look: tuple[str, str, str]
     return _clipped(s, key)
 
 
-def _crosses(ax: Any, s: Swept, at: Sequence[float], key: str) -> None:
+def _crosses(ax: Any, s: Sweep, at: Sequence[float], key: str) -> None:
     """Marks of the unstable models among the points at these abscissae."""
     bad = [i for i, p in enumerate(s.points) if not p.stable]
     ax.plot([at[i] for i in bad], _values(s.points, key)[bad], **CROSS, zorder=4, clip_on=False)
 
 
-def _clipped(s: Swept, key: str) -> bool:
+def _clipped(s: Sweep, key: str) -> bool:
     """Whether a value has to be drawn at the edge."""
     return not all(getattr(p, key) <= TOP for p in s.points)
 
@@ -215,20 +210,22 @@ def _time_axis(ax: Any) -> None:
     ax.xaxis.set_minor_formatter(FuncFormatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in shown else ""))
 
 
-def _entries(swept: Sequence[Swept], look: dict[str, tuple[str, str, str]], clipped: bool) -> list[Line2D]:
+def _entries(sweeps: Sequence[Sweep], look: dict[str, tuple[str, str, str]], clipped: bool) -> list[Line2D]:
     """Legend of the errors against N."""
     entries = []
-    for s in swept:
+    for s in sweeps:
         colour, dashes, marker = look[s.method.key]
-        entries.append(Line2D([], [], color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, label=_name(s)))
+        entries.append(
+            Line2D([], [], color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, label=s.method.short_title)
+        )
     entries.append(Line2D([], [], color="#777777", ls=":", lw=0.9, label="projection error, the floor"))
-    return [*entries, *_remarks(swept, clipped)]
+    return [*entries, *_remarks(sweeps, clipped)]
 
 
-def _remarks(swept: Sequence[Swept], clipped: bool) -> list[Line2D]:
+def _remarks(sweeps: Sequence[Sweep], clipped: bool) -> list[Line2D]:
     """What a legend says of unstable models and of errors beyond the frame, where there are any."""
     entries = []
-    if any(not p.stable for s in swept for p in s.points):
+    if any(not p.stable for s in sweeps for p in s.points):
         entries.append(Line2D([], [], **CROSS, label="unstable model"))
     if clipped:
         entries.append(Line2D([], [], ls="", label=f"errors above {TOP:g} are drawn at {TOP:g}"))

@@ -2,72 +2,42 @@
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mpi4py import MPI
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import MofNCompleteColumn, Progress
-from rich.table import Table
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.archive import save_model
-from softgrasp.reduction.replay import Reference, reference
+from softgrasp.reduction.archive import save
+from softgrasp.reduction.replay import full_run
 from softgrasp.study.forward.result import simulate_result
-from softgrasp.study.reduce.box import Box, box_of, box_result, measure_box
+from softgrasp.study.reduce.box import measure_box
 from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.page import draw_all, write_all
-from softgrasp.study.reduce.sweep import Swept, best, chosen_methods, sweep
+from softgrasp.study.reduce.page import sections
+from softgrasp.study.reduce.result import Box, ReductionStudy, Sweep, best
+from softgrasp.study.reduce.sweep import chosen_methods, sweep
 from softgrasp.study.reduce.tables import (
-    BOX_HEADER,
-    ERROR_HEADER,
     N_NOTE,
-    TIME_HEADER,
-    FullTimes,
-    Speed,
     box_note,
-    box_rows,
+    box_table,
     error_note,
-    error_rows,
+    error_table,
     inner_note,
-    refused_rows,
-    speed_dicts,
-    speed_notes,
-    speed_of,
-    time_rows,
+    point_table,
+    refused_table,
+    time_table,
 )
+from softgrasp.study.reduce.times import full_times, speed_notes, speed_of
+from softgrasp.study.report.files import plain
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
-
-FULL_REPEATS = 3  # behind the median of the full run
-PATIENCE = 2.0  # seconds of a full run above which one is enough
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """All that ``softgrasp reduce`` found.
-
-    Attributes:
-        against: the full run.
-        swept: every method.
-        times: of the full model.
-        speeds: every method with a model against the full model.
-        box: errors at other parameters.
-    """
-
-    against: Reference
-    swept: tuple[Swept, ...]
-    times: FullTimes
-    speeds: tuple[Speed, ...]
-    box: Box
+from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.session import Page, Session, list_files
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
@@ -90,24 +60,6 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
     return chosen_methods(scene.reduction)
 
 
-def full_times(model: Model, first: Trajectory) -> FullTimes:
-    """Median seconds of the full run, of several when it is short. Collective."""
-    steps, factor = [_whole(first)], [first.seconds["factor"]]
-    comm = model.system.layout.comm
-    repeats = comm.bcast(FULL_REPEATS if steps[0] < PATIENCE else 1)
-    for _ in range(repeats - 1):
-        again = simulate(replace(model, watch=Stopwatch(comm)))
-        steps.append(_whole(again))
-        factor.append(again.seconds["factor"])
-    return FullTimes(statistics.median(steps), statistics.median(factor))
-
-
-def _whole(run: Trajectory) -> float:
-    """Seconds of all steps; the first is not among those measured, since it sets up the solver."""
-    n = len(run.times) - 1
-    return run.seconds["steps"] / max(n - 1, 1) * n
-
-
 def run_reduce(
     path: Path,
     out: Path,
@@ -122,36 +74,34 @@ def run_reduce(
     Raises:
         SoftgraspError: with one sentence.
     """
-    begin = time.perf_counter()
-    comm = MPI.COMM_WORLD
-    scene = open_scene(path, overrides, console)
+    session = Session("reduce", path, overrides, out, console, quiet, pictures)
+    scene = session.scene()
     names = check_scene(scene)
-    model = open_model(scene, console)
-    watch = Stopwatch(comm)
-    with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
-        run, found = reduce_model(model, names, bar, watch)
+    model = session.model(scene)
+    watch = Stopwatch(session.comm)
+    with session.progress(MofNCompleteColumn()) as bar:
+        study = reduce_model(model, names, bar, watch)
     with watch.stage("models"):
-        files = save_models(out, found.swept)
+        models = save_models(out, study.sweeps)
     views = None
     if pictures:
-        from softgrasp.study.reduce.pictures import gather_views  # brings Matplotlib
+        from softgrasp.study.reduce.pictures import draw, gather_views  # brings Matplotlib
 
-        views = gather_views(model, found.against, found.swept)
-    result = reduce_result(model, run, found, watch)
-    if comm.rank == 0:
-        drawing = time.perf_counter()
-        out.mkdir(parents=True, exist_ok=True)
-        drawn = draw_all(out, found, views) if pictures else []
-        now = time.perf_counter()
-        result["time"] |= {"pictures": now - drawing, "total": now - begin}
-        files = [*write_all(out, path, overrides, scene, found, result, drawn), *files]
-        show(console, found, result)
-        list_files(console, files)
-    comm.Barrier()
+        views = gather_views(model, study.full, study.sweeps)
+    result = reduce_result(study, watch)
+
+    def page() -> Page:
+        files = draw(out, study, views) if pictures else []
+        parts = sections(study, result["time"], files)
+        return Page(f"{scene.name}: reduced models", parts, {"points.csv": point_table(study)}, [*files, *models])
+
+    files = session.write(scene, result, page)
+    show(console, study)
+    list_files(console, files)
     return result
 
 
-def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopwatch) -> tuple[Trajectory, Reduced]:
+def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopwatch) -> ReductionStudy:
     """Full run, every method, errors over the box. Collective.
 
     Args:
@@ -172,109 +122,119 @@ def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopw
 
     with watch.stage("full"):
         run = simulate(model, RunOptions(progress=stepped))
-        against = reference(model, run)
+        full = full_run(model, run)
         times = full_times(model, run)
     bar.remove_task(task)
     size = len(scene.reduction.N)
     task = bar.add_task("bases", total=size * len(names))
-    swept = []
+    sweeps: list[Sweep] = []
     with watch.stage("sweep"):
-        for k, name in enumerate(names):
+        for name in names:
 
-            def reduced(key: str, done: int, of: int, k: int = k) -> None:
-                bar.update(task, completed=size * k + size * done // of, description=key)
+            def reduced(key: str, done: int, of: int) -> None:
+                bar.update(task, completed=size * len(sweeps) + size * done // of, description=key)
 
-            swept.append(sweep(name, against, scene.reduction, reduced))
-            bar.update(task, completed=size * (k + 1))
+            sweeps.append(sweep(name, full, scene.reduction, reduced))
+            bar.update(task, completed=size * len(sweeps))
     bar.remove_task(task)
     task = bar.add_task("other parameters", total=None)
     with watch.stage("box"):
-        box = measure_box(against, swept, lambda done, of: bar.update(task, completed=done, total=of))
+        box = measure_box(full, sweeps, lambda done, of: bar.update(task, completed=done, total=of))
     bar.remove_task(task)
-    speeds = tuple(s for s in (speed_of(each, times) for each in swept) if s is not None)
-    return run, Reduced(against, tuple(swept), times, speeds, box)
+    speeds = tuple(speed for s in sweeps if (speed := speed_of(s, times)) is not None)
+    notes = speed_notes(model.system.layout.n_e, scene.time.steps, times, speeds)
+    return ReductionStudy(full, tuple(sweeps), times, speeds, box, findings(sweeps), notes)
 
 
-def save_models(out: Path, swept: Sequence[Swept]) -> list[Path]:
+def save_models(out: Path, sweeps: Sequence[Sweep]) -> list[Path]:
     """Write the best stable model of every method into ``out/models``. Collective."""
     files = []
-    for s in swept:
+    for s in sweeps:
         i = best(s.points)
         if i is not None:
             files.append(out / "models" / f"{s.method.key}.h5")
-            save_model(s.models[i], files[-1])
+            save(s.models[i], files[-1])
     return files
 
 
-def reduce_result(model: Model, run: Trajectory, found: Reduced, watch: Stopwatch) -> dict[str, Any]:
+def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
-    whole = simulate_result(model, run)
+    model = study.full.model
+    whole = simulate_result(model, study.full.trajectory)
     kept = (
         "scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver",
     )  # fmt: skip
-    scene = model.scene.reduction
-    return {
+    result = {
         "command": "reduce",
         **{key: whole[key] for key in kept},
-        "reduction": scene.model_dump(mode="json"),
+        "reduction": model.scene.reduction.model_dump(mode="json"),
         "N_means": N_NOTE,
-        "methods": {s.method.key: s.as_rows() for s in found.swept},
-        "about": {
-            s.method.key: {
-                "title": s.method.title,
-                "paper": s.method.paper,
-                "structure_preserving": s.method.preserving,
-                "inner": s.inner,
-                "N_energy": s.kept,
-                "N_refused": s.refused,
-            }
-            for s in found.swept
-        },
-        "findings": findings(found.swept),
-        "speed": speed_dicts(found.speeds),
-        "speed_notes": speed_notes(whole["n_e"], whole["steps"], found.times, found.speeds),
-        "box": box_result(found.box),
+        "methods": {s.method.key: [asdict(p) for p in s.points] for s in study.sweeps},
+        "about": {s.method.key: _about(s) for s in study.sweeps},
+        "findings": study.findings,
+        "speed": [asdict(speed) for speed in study.speeds],
+        "speed_notes": study.speed_notes,
+        "box": _box_result(study.box),
         "time": {
             **{key: whole["time"][key] for key in ("mesh", "assembly", "factor", "steps", "per_step")},
-            "full_steps_median": found.times.steps,
-            "full_factor_median": found.times.factor,
+            "full_steps_median": study.times.steps,
+            "full_factor_median": study.times.factor,
             **watch.seconds,
         },
         "memory_peak_mb": peak_memory_mb(model.system.layout.comm),
     }
+    return dict(plain(result))
 
 
-def show(console: Console, found: Reduced, result: dict[str, Any]) -> None:
+def _about(s: Sweep) -> dict[str, Any]:
+    return {
+        "title": s.method.title,
+        "paper": s.method.paper,
+        "structure_preserving": s.method.preserving,
+        "inner": s.inner,
+        "N_energy": s.N_energy,
+        "N_refused": {N: f"N = {N}: {reason}" for N, reason in s.refused.items()},
+    }
+
+
+def _box_result(box: Box) -> dict[str, Any]:
+    models = [{"method": m.method.key, "N": m.model.N, "several": m.several} for m in box.models]
+    return {
+        "reason_for_none": box.none,
+        "trained_at": box.trained_at,
+        "summary": [asdict(e) for e in box.summary],
+        "points": [
+            {
+                "lambda": p.lam,
+                "mu": p.mu,
+                "trained": p.trained,
+                "errors": [m | {"error_deformation": e} for m, e in zip(models, p.errors, strict=True)],
+            }
+            for p in box.points
+        ],
+    }
+
+
+def show(console: Console, study: ReductionStudy) -> None:
     """Print the tables."""
-    share = f"{100 * result['reduction']['energy']:g} %"
-    _print(console, (ERROR_HEADER[0], share, *ERROR_HEADER[2:]), error_rows(found.swept))
-    note = f"{error_note(share)} fixed: with fixed solid modes. {N_NOTE} {inner_note(found.swept)}"
+    energy, box = study.full.model.scene.reduction.energy, study.box
+    _print(console, error_table(study.sweeps, energy, narrow=True))
+    note = f"{error_note(energy)} fixed: with fixed solid modes. {N_NOTE} {inner_note(study.sweeps)}"
     console.print(note, style="dim", markup=False)
-    for sentence in result["findings"]:
+    for sentence in study.findings:
         console.print(sentence, markup=False)
-    for sizes, titles, reason in refused_rows(found.swept):
-        console.print(_narrow(f"N = {sizes} refused for {titles}: {reason}."), markup=False)
-    _print(console, TIME_HEADER, time_rows(found.speeds))
-    for note in result["speed_notes"]:
+    for sizes, titles, reason in refused_table(study.sweeps, narrow=True).rows:
+        console.print(f"N = {sizes} refused for {titles}: {reason}.", markup=False)
+    _print(console, time_table(study.speeds, narrow=True))
+    for note in study.speed_notes:
         console.print(note)
-    if found.box.none:
-        console.print(f"no errors at other parameters: {found.box.none}")
+    if box.none:
+        console.print(f"no errors at other parameters: {box.none}")
     else:
-        console.print(box_note(found.box, *box_of(found.against.model)), markup=False)
-        _print(console, BOX_HEADER, box_rows(found.box))
+        console.print(box_note(box), markup=False)
+        _print(console, box_table(box, narrow=True))
 
 
-def _print(console: Console, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """One table; a narrow terminal breaks the first column and the last."""
-    table = Table(box=None, padding=(0, 1, 0, 0))
-    last = len(header) - 1
-    for i, name in enumerate(header):
-        table.add_column(escape(name), no_wrap=0 < i < last, min_width={0: 13, last: 8}.get(i))
-    for row in rows:
-        table.add_row(*(escape(_narrow(cell)) for cell in row))
-    console.print(table)
-
-
-def _narrow(text: str) -> str:
-    """Titles as a terminal shows them."""
-    return text.replace(", fixed solid modes", ", fixed")
+def _print(console: Console, table: Table) -> None:
+    """A table without its title; a narrow terminal breaks the first column and the last."""
+    console.print(Table(table.header, table.rows).terminal(wrap=(0, len(table.header) - 1), width=console.width))

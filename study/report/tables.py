@@ -52,21 +52,27 @@ class Table:
         lines = [self.header, ["---"] * len(self.header), *([shown(cell) for cell in row] for row in self.rows)]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
-    def terminal(self, *, wrap: Sequence[int] = ()) -> rich.table.Table:
+    def terminal(self, *, wrap: Sequence[int] = (), width: int = 80) -> rich.table.Table:
         """The table for a terminal: numbers to the right.
 
         Args:
-            wrap: columns that a narrow terminal may break into lines.
+            wrap: columns that may break between words, the first of them first.
+            width: of the terminal.
         """
-        table = rich.table.Table(box=None, pad_edge=False, title=self.title or None, title_justify="left")
+        table = rich.table.Table(box=None, padding=(0, 1, 0, 0), title=self.title or None, title_justify="left")
+        columns = [[name, *(shown(row[i]) for row in self.rows)] for i, name in enumerate(self.header)]
+        widths = [max(map(len, cells)) for cells in columns]
+        for i in wrap:
+            words = [self.header[i], *(word for cell in columns[i] for word in cell.split())]
+            excess = sum(widths) + len(widths) - width
+            widths[i] -= max(0, min(excess, widths[i] - max(map(len, words))))
         for i, name in enumerate(self.header):
             right = bool(self.rows) and all(number(row[i]) for row in self.rows)
-            free = i in wrap
             table.add_column(
                 escape(name),
                 justify="right" if right else "left",
-                no_wrap=not free,
-                overflow="fold" if free else "ellipsis",
+                no_wrap=i not in wrap,
+                width=widths[i] if i in wrap else None,
             )
         for row in self.rows:
             table.add_row(*(escape(shown(cell)) for cell in row))

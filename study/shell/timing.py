@@ -42,3 +42,13 @@ def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict
 def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:
     """Median of each list. Not collective."""
     return {name: float(statistics.median(values)) for name, values in samples.items()}
+
+
+def median_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -> float:
+    """Median seconds of a short call, on the slowest rank; nothing between the calls. Collective."""
+    seconds = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - begin)
+    return float(comm.allreduce(statistics.median(seconds), MPI.MAX))

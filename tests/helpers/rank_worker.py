@@ -16,7 +16,7 @@ from softgrasp.fem.fields.probe import make_probe
 from softgrasp.fem.model.build import Stopwatch, build
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
-from softgrasp.reduction.replay import reference
+from softgrasp.reduction.replay import full_run
 from softgrasp.study.control.solve import design
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.pictures.frames import Frames
@@ -34,7 +34,7 @@ def numbers(folder: Path) -> dict[str, list[float]]:
     frames = Frames(model, folder)
     run = simulate(model, RunOptions(folder, frame=frames, begin=frames.begin))
     frames.close()
-    swept = [sweep(name, reference(model, run), scene.reduction) for name in ("componentwise_pod", "psd")]
+    swept = [sweep(name, full_run(model, run), scene.reduction) for name in ("componentwise_pod", "psd")]
     solved = design(model, Stopwatch(comm))
     places = find_places(scene, model)
     make_probe(model.space, places.points, scene.effects.rotation)

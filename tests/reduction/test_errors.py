@@ -11,7 +11,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.errors import Comparison, full_energy, trajectory_errors
+from softgrasp.reduction.errors import Comparison, full_energy
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import run
 from tests.helpers.models import Array, gather_matrix, gather_rows, gather_states
@@ -89,10 +89,10 @@ def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
     snapshots: Any = simulate(model).snapshots
     rom = reduced(model, whole_basis(model.system.layout, "qp", "absolute", True))
     small = rom.at()
-    errors = trajectory_errors(rom, small, run(small, step_of(model), force_of(model)), model.system, snapshots)
+    comparison = Comparison(rom, small, model.system, snapshots, full_energy(model.system, snapshots))
+    errors = comparison.errors(rom, small, run(small, step_of(model), force_of(model)))
     # rounding of 30 steps in other coordinates
     assert max(errors.error, errors.error_canonical, errors.error_deformation, errors.error_energy) < 1e-9
-    comparison = Comparison(rom, small, model.system, snapshots, full_energy(model.system, snapshots))
     assert comparison.floor("velocities", rom, small) < 1e-13  # the whole space leaves rounding
     with pytest.raises(ModelError, match="reach step 30"):
         comparison.errors(rom, small, run(small, 0.1, np.zeros((5, 2))))

@@ -14,7 +14,7 @@ from mpi4py import MPI
 import softgrasp.reduction.online
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.archive import load_model, save_model
+from softgrasp.reduction.archive import load, save
 from softgrasp.reduction.modal import rotation
 from softgrasp.reduction.model import ModelError, SmallModel
 from softgrasp.reduction.online import Stepper, run, run_batch
@@ -247,9 +247,9 @@ def test_file_keeps_everything(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
         coordinates, frame, fixed = kind
         rom = reduced(model, symplectic_basis(layout, 3, frame, fixed, coordinates))
         path = mpi_tmp_path / f"{coordinates}{frame}{fixed}.h5"
-        save_model(rom, path)
-        again = load_model(path, layout, "hash")
-        online = load_model(path)
+        save(rom, path)
+        again = load(path, layout, "hash")
+        online = load(path)
         for other in (again, online):
             assert other.materials == rom.materials
             assert other.seconds == rom.seconds
@@ -262,27 +262,27 @@ def test_file_keeps_everything(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
         for mine, theirs in zip((z, v), again.reconstruct(again.at(), x), strict=True):
             assert (mine == theirs).all()
         # another number of ranks: every rank holds the whole mesh
-        z_alone, _ = (lambda m: m.reconstruct(m.at(), x))(load_model(path, alone))
+        z_alone, _ = (lambda m: m.reconstruct(m.at(), x))(load(path, alone))
         assert close(gather_rows(alone, z_alone), gather_rows(layout, z)) < 1e-15  # the same numbers
 
 
 def test_files_that_do_not_fit_are_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     model = model_of(comm)
     path = mpi_tmp_path / "model.h5"
-    save_model(reduced(model, symplectic_basis(model.system.layout, 3, "relative", True)), path)
+    save(reduced(model, symplectic_basis(model.system.layout, 3, "relative", True)), path)
     with pytest.raises(ModelError, match="another scene"):
-        load_model(path, scene_hash="other")
+        load(path, scene_hash="other")
     with pytest.raises(ModelError, match="mesh of"):
-        load_model(path, model_of(comm, {"tissue": {"cells": [3, 6]}}).system.layout)
+        load(path, model_of(comm, {"tissue": {"cells": [3, 6]}}).system.layout)
     with pytest.raises(ModelError, match="another mesh"):
-        load_model(path, model_of(comm, {"tissue": {"size": [1.0, 1.9]}}).system.layout)
+        load(path, model_of(comm, {"tissue": {"size": [1.0, 1.9]}}).system.layout)
     with pytest.raises(ModelError, match="cannot be read"):
-        load_model(mpi_tmp_path / "none.h5", model.system.layout)
+        load(mpi_tmp_path / "none.h5", model.system.layout)
     bad = mpi_tmp_path / f"bad{comm.rank}.h5"
     bad.write_bytes(b"not a file")
     with pytest.raises(ModelError, match="cannot be read"):
-        load_model(bad)
+        load(bad)
     bare = mpi_tmp_path / f"bare{comm.rank}.h5"
-    save_model(load_model(path), bare)
+    save(load(path), bare)
     with pytest.raises(ModelError, match="no lift"):
-        load_model(bare, model.system.layout)
+        load(bare, model.system.layout)

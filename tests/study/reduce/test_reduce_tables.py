@@ -15,15 +15,16 @@ from rich.console import Console
 from softgrasp.reduction.registry import METHODS, PAPER_METHODS
 from softgrasp.study.bench.meshes import MeshRow, break_even, exponent, run_mesh_study
 from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.sweep import BEYOND, Point, Swept, best, chosen_methods, nearest, noted
-from softgrasp.study.reduce.tables import ERROR_HEADER, error_rows, least_size, stability
+from softgrasp.study.reduce.result import Point, Sweep, best, kept_points, nearest
+from softgrasp.study.reduce.sweep import FURTHER, chosen_methods
+from softgrasp.study.reduce.tables import error_table, least_size, stability
 from tests.helpers.models import make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
 
 
 def test_scene_chooses_methods() -> None:
-    assert chosen_methods(make_scene().reduction) == (*PAPER_METHODS, *BEYOND)
+    assert chosen_methods(make_scene().reduction) == (*PAPER_METHODS, *FURTHER)
     assert chosen_methods(make_scene(reduction={"methods": ["psd_qv"]}).reduction) == ("psd_qv",)
 
 
@@ -36,15 +37,15 @@ def test_choice_of_points() -> None:
     assert nearest(points) == 1
     assert nearest(points, stable=False) == 2
     assert best(points) == 4
-    assert noted(points) == {1, 2, 3, 4}  # nearest to 14, all and stable, nearest to 30, best
+    assert kept_points(points) == {1, 2, 3, 4}  # nearest to 14, all and stable, nearest to 30, best
     assert least_size(points, 1e-2) == 12
     assert least_size(points, 1e-6) is None  # an unstable model does not count
     assert stability(points) == "not 14"
     assert nearest([]) is None
 
 
-def swept_of(key: str, *points: Point) -> Swept:
-    return Swept(METHODS[key], points, {}, ())
+def swept_of(key: str, *points: Point) -> Sweep:
+    return Sweep(METHODS[key], points, {}, ())
 
 
 def test_findings_name_the_best_of_every_measure_and_the_unstable() -> None:
@@ -71,13 +72,14 @@ def test_findings_name_the_best_of_every_measure_and_the_unstable() -> None:
     alone = findings([swept_of("craig_bampton", point(8, 1e-2), point(10, 2e-2))])
     assert len(alone) == 4  # no other to compare structure with, and none of the paper's
     assert "Craig-Bampton at N = 8 to 10 (2.0e-02 at N = 10)" in alone[0]
-    assert findings([]) == []
+    assert findings([]) == ()
 
 
 def test_table_shows_the_deformation_first_and_the_split() -> None:
     split = replace(point(14, 1e-2), N_tissue=10, split=(5, 5))
-    (row,) = error_rows([swept_of("componentwise_pod_fixed", point(6, 0.2), split, point(30, 1e-3, stable=False))])
-    assert dict(zip(ERROR_HEADER, row, strict=True)) == {
+    sweep = swept_of("componentwise_pod_fixed", point(6, 0.2), split, point(30, 1e-3, stable=False))
+    table = error_table([sweep], 0.999)
+    assert dict(zip(table.header, *table.rows, strict=True)) == {
         "method": "componentwise POD, fixed solid modes", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": "1.0e-02",
         "state": "2.0e-02", "energy": "2.0e-02", "1e-1": "14", "1e-2": "14", "1e-3": "-", "stable N": "not 30",
     }  # fmt: skip

@@ -1,0 +1,61 @@
+"""A reduced model of a scene from one full run: basis, then projection with the outputs of the scene."""
+
+from __future__ import annotations
+
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.run.simulate import Trajectory
+from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.engines import EngineName
+from softgrasp.reduction.inner import InnerName
+from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.projection import project
+from softgrasp.reduction.registry import make_basis
+from softgrasp.reduction.replay import FullRun, full_run
+from softgrasp.reduction.states import States
+from softgrasp.reduction.truncation import Truncation
+
+
+def reduce(
+    model: Model,
+    run: Trajectory | FullRun,
+    method: str = "psd_fixed",
+    N: int | Truncation | None = 14,
+    *,
+    inner: InnerName | None = None,
+    engine: EngineName = "tsqr",
+) -> ReducedModel:
+    """Reduced model E x' = A x + B u + F g, y = C x of a scene, from the snapshots of a full run. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> rom = sg.reduce(model, sg.simulate(model), "psd_fixed", N=14)
+    >>> rom.N, rom.split, rom.at().stable
+    (14, (10,), True)
+
+    Args:
+        model: scene; the reduced model is affine in its materials, see :meth:`reduction.model.ReducedModel.at`.
+        run: a run of it with the snapshots in memory.
+        method: key of :data:`reduction.registry.METHODS`; "psd_fixed" is the paper's PSD with fixed solid modes
+            [SBRH21].
+        N: columns of V, the hand's included; or a rule; None keeps 99.9 % of the energy, as the paper does.
+        inner, engine: see :func:`reduction.registry.make_basis`.
+
+    Raises:
+        SceneError: the run kept no snapshots, or the body is at rest in all of them.
+        BasisError: the method is unknown, or it has no basis of N columns.
+        SolverError: a factorisation failed.
+    """
+    full = run if isinstance(run, FullRun) else full_run(model, run)
+    states = States(model.system, ((full.model.system, full.snapshots),))
+    return project_scene(make_basis(method, states, N, inner, engine), model)
+
+
+def project_scene(basis: Basis, model: Model) -> ReducedModel:
+    """Projection of a scene with its outputs, see :func:`reduction.projection.project`. Collective.
+
+    Raises:
+        SolverError: the mass matrix cannot be factored.
+    """
+    return project(basis, model.system, make_outputs(model.scene, model.system), scene_hash(model.scene))

@@ -1,0 +1,90 @@
+"""Seconds of the reduced models beside those of the full one, and beside the paper's."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import replace
+
+from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.run.simulate import Trajectory, simulate
+from softgrasp.study.reduce.result import FullTimes, Speed, Sweep, nearest
+
+FULL_REPEATS = 3  # behind the median of the full run
+PATIENCE = 2.0  # seconds of a full run above which one is enough
+PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
+LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
+
+
+def full_times(model: Model, first: Trajectory) -> FullTimes:
+    """Median seconds of the full run, of several when it is short. Collective."""
+    comm, runs = model.system.layout.comm, [first]
+    repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
+    runs += [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
+    return FullTimes(
+        statistics.median(steps_seconds(run) for run in runs),
+        statistics.median(run.seconds["factor"] for run in runs),
+    )
+
+
+def steps_seconds(run: Trajectory) -> float:
+    """Seconds of all steps; the first is not among those measured, since it sets up the solver."""
+    n = len(run.times) - 1
+    return run.seconds["steps"] / max(n - 1, 1) * n
+
+
+def speed_of(sweep: Sweep, full: FullTimes) -> Speed | None:
+    """Compare times; None for a method without points."""
+    i = nearest(sweep.points)
+    i = nearest(sweep.points, stable=False) if i is None else i
+    if i is None:
+        return None
+    p = sweep.points[i]
+    whole, new = full.factor + full.steps, p.time_setup + p.time_online
+    return Speed(
+        method=sweep.method.key,
+        title=sweep.method.title,
+        N=p.N,
+        N_tissue=p.N_tissue,
+        stable=p.stable,
+        time_offline=p.time_offline,
+        time_setup=p.time_setup,
+        time_online=p.time_online,
+        speedup_same_model=full.steps / p.time_online,
+        speedup_new_parameter=whole / new,
+        break_even_runs=p.time_offline / (whole - new) if whole > new else None,
+    )
+
+
+def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) -> tuple[str, ...]:
+    """What the speed-up is measured against, the mesh that pays, and the paper's figure beside ours."""
+    against = (
+        f"Full model, prefactored: {steps} steps in {1e3 * full.steps:.1f} ms; its factorisation takes "
+        f"{1e3 * full.factor:.1f} ms. new: a new parameter, small matrices, test of stability and propagator with the "
+        "run. x again: steps of the full model over a run of the same small model again, all made beforehand on both "
+        "sides. x new: factorisation and steps over new. Break-even runs = offline / (full - new), at new parameters; "
+        "the full run that gives the snapshots is one more."
+    )
+    stable = [s for s in speeds if s.stable]
+    chosen = next((s for s in stable if s.method == "psd"), None) or next(iter(stable), None)
+    if chosen is None:
+        return (against,)
+    # tissue unknowns at which a full run would take as long as a reduced one, at this mesh's time per unknown
+    mesh, model = n_e * chosen.time_online / full.steps, f"{chosen.title}, N = {chosen.N}"
+    if mesh < LEAST_MESH:
+        pays = (
+            f"none, the reduced run ({model}) is faster on every mesh (by its time per unknown from n_e = {mesh:.0f})"
+        )
+    else:
+        pays = (
+            f"at this mesh's time per unknown a full run of n_e = {mesh:.0f} takes as long as the reduced one ({model})"
+        )
+    return (
+        against,
+        f"Break-even mesh: {pays}. The reduced time does not grow with the mesh, see "
+        "python -m softgrasp.study.bench meshes.",
+        f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
+        f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
+        f"{1e3 * (full.factor + full.steps):.1f} ms against {1e3 * (chosen.time_setup + chosen.time_online):.2f} ms, "
+        f"a speed-up of {chosen.speedup_new_parameter:.0f} for a new parameter ({model}).",
+    )
