@@ -71,7 +71,7 @@ def output_columns(outputs: tuple[Output, ...], n_local: int) -> Array:
             if len(output.dofs):
                 column[output.dofs[:, c]] = output.weight
             columns.append(column)
-    return np.asfortranarray(np.array(columns).T.reshape(n_local, -1))
+    return np.asfortranarray(np.array(columns).reshape(len(columns), n_local).T)
 
 
 def static_solves(model: Model) -> tuple[Solve, Callable[[], None]]:
