@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -15,7 +15,9 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
 from softgrasp.lqr.dense.care import care as care
 from softgrasp.lqr.dense.poles import check_poles, closed_loop_rates
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 DENSE_MODES = 600  # a tenth of a second; SLEPc on several ranks is slower there
@@ -276,16 +278,11 @@ class DenseRiccati:
                 f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.1e}; raise control.tolerance "
                 "or weigh Q and R nearer to each other"
             )
-        n_e = len(tissue.M)
         return RiccatiSolution(
-            Z_s=Z[: 2 * n_s],
-            Z_z=Z[2 * n_s : 2 * n_s + n_e],
-            Z_v=Z[2 * n_s + n_e :],
-            K_s=found.K[:, hand],
-            K_z=K_z,
-            K_v=K_v,
-            residual=residual,
-            method="dense",
+            Block(Z[: 2 * n_s], Z[2 * n_s :]),
+            Gain(found.K[:, hand], K_z, K_v),
+            residual,
+            "dense",
             counts={"newton_steps": found.newton_steps, "adi_steps": 0, "solves": 0},
             seconds={"modes": middle - begin, "schur": time.perf_counter() - middle},
         )
@@ -298,13 +295,9 @@ def spread(layout: BlockLayout, result: RiccatiSolution | None) -> RiccatiSoluti
     if result is not None and ranges is not None:
         pieces = []
         for a, b in ranges:
-            rows = (np.asfortranarray(x[a:b]) for x in (result.Z_z, result.Z_v, result.K_z, result.K_v))
-            Z_z, Z_v, K_z, K_v = rows
-            pieces.append(
-                RiccatiSolution(
-                    result.Z_s, Z_z, Z_v, result.K_s, K_z, K_v,
-                    result.residual, result.method, result.history, result.counts, result.seconds,
-                )
-            )  # fmt: skip
-    mine: RiccatiSolution = layout.comm.scatter(pieces)
-    return mine
+            Z, K, n_e = result.factor, result.gain, layout.n_e
+            tall = np.asfortranarray(np.concatenate([Z.tall[a:b], Z.tall[n_e + a : n_e + b]]))
+            gain = Gain(K.K_s, np.asfortranarray(K.K_z[a:b]), np.asfortranarray(K.K_v[a:b]))
+            pieces.append(replace(result, factor=Block(Z.hand, tall), gain=gain))
+    part: RiccatiSolution = layout.comm.scatter(pieces)
+    return part

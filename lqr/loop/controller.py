@@ -89,7 +89,7 @@ class Controller:
         one = np.eye(N)
         if not (np.array_equal(self.plant.S_q, one[:n_s]) and np.array_equal(self.plant.S_v, one[n_s : 2 * n_s])):
             raise ControlError(
-                "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small_plant.project"
+                "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small_plant.galerkin"
             )
         if not self.period > 0:
             raise ControlError(f"period = {self.period} s of the controller must be positive")

@@ -14,17 +14,17 @@ from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.adi import Progress
 from softgrasp.lqr.lowrank.modal_start import (
     MODES,
-    SmallPlant,
+    ModalSubspace,
     SmallSolution,
     check_damped,
     plant_modes,
-    project,
+    restrict,
     solve_small,
 )
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import shift_range
-from softgrasp.lqr.lowrank.solution import Outcome, make_solution
+from softgrasp.lqr.lowrank.solution import Iterate, make_solution
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
@@ -86,7 +86,7 @@ class Level:
         gain: K', z-row as it stands.
     """
 
-    small: SmallPlant
+    small: ModalSubspace
     solution: SmallSolution
     Z: Block
     a: Array
@@ -128,7 +128,7 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
         old: the level before, near the solution.
     """
     ritz, omega, S = space.ritz(plant)
-    small = project(plant, ritz.V, omega, ritz.M_V)
+    small = restrict(plant, ritz.V, omega, ritz.M_V)
     solution = solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
     values, vectors = np.linalg.eigh(solution.X)
     keep = values > 1e-17 * values[-1]
@@ -220,11 +220,11 @@ class StructuredGalerkin:
             seconds |= tissue.seconds
         finally:
             tissue.destroy()
-        reason = f"galerkin: {level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
+        about = f"{level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
         if level.small.order == plant.layout.n_e:
-            reason = f"galerkin: all {level.small.order} basis vectors that there are"
-        outcome = Outcome(level.Z, level.gain, reason, 1e-10, history, counts, seconds, lean=True)
-        result = make_solution(plant, outcome, check=False)
+            about = f"all {level.small.order} basis vectors that there are"
+        iterate = Iterate(level.Z, level.gain, "galerkin", about, 1e-10, history, counts, seconds, lean=True)
+        result = make_solution(plant, iterate, check=False)
         result.seconds["total"] = time.perf_counter() - begin
         return result
 

@@ -14,6 +14,7 @@ from softgrasp.fem.petsc import Array, Complex
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.shifted_distributed import DistributedTissue
 from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue
+from softgrasp.lqr.plant.checks import MODAL_KEY
 
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
@@ -85,5 +86,5 @@ def check_memory(layout: BlockLayout) -> None:
     if needed > free:
         raise ResourceError(
             f"the factor of the shifted tissue matrix (n_e = {layout.n_e} in {layout.dimension}D) needs about "
-            f"{needed:.1f} GiB and {free:.1f} GiB are free; take fewer cells, or set control.method = 'modal'"
+            f"{needed:.1f} GiB and {free:.1f} GiB are free; take fewer cells, or set {MODAL_KEY}"
         )

@@ -26,6 +26,8 @@ from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.engines import EPS, factor, small_svd
 from softgrasp.reduction.states import BasisError
 
+A_PRIORI = "structured"  # the basis that needs no P
+
 
 @dataclass(frozen=True)
 class RiccatiBasis:
@@ -239,9 +241,9 @@ def structured(problem: RiccatiProblem) -> BasisFamily:
 
     def make(N: int) -> RiccatiBasis:
         pick = order[: (N - 2 * n_s) // 2]
-        return modal_basis(problem, "structured", omega[pick], Phi[:, pick], massed[:, pick])
+        return modal_basis(problem, A_PRIORI, omega[pick], Phi[:, pick], massed[:, pick])
 
-    return BasisFamily("structured", 2 * n_s, 2 * n_s + 2 * k, 2, (weight[order],), make)
+    return BasisFamily(A_PRIORI, 2 * n_s, 2 * n_s + 2 * k, 2, (weight[order],), make)
 
 
 def modal_basis(problem: RiccatiProblem, name: str, omega: Array, Phi: Array, massed: Array) -> RiccatiBasis:
@@ -326,7 +328,7 @@ BASES: dict[str, Callable[[RiccatiProblem, Block], BasisFamily]] = {
     "pod_fixed_solid": pod_fixed_solid,
     "componentwise_pod": componentwise_pod,
     "pod_decomposed": pod_decomposed,
-    "structured": lambda problem, _: structured(problem),
+    A_PRIORI: lambda problem, _: structured(problem),
 }
 
 
@@ -336,7 +338,7 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
     Args:
         name: key of :data:`BASES`.
         problem: the plant.
-        Z: factor of X in hand-relative coordinates, see :func:`lqr.plant.coordinates.factor_of`.
+        Z: factor of X in hand-relative coordinates, see :class:`lqr.plant.problem.RiccatiSolution`.
 
     Raises:
         ControlError: the name is unknown, or the method does not apply.

@@ -13,6 +13,7 @@ from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import damp, descriptor
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
@@ -59,6 +60,20 @@ class Abscissa:
     def stable(self) -> bool:
         """Certified and left of the axis."""
         return self.certified and self.value < 0
+
+
+def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
+    """Largest real part of the spectrum of x' = (A + B K) x [1/s], see :func:`certified_abscissa`. Collective.
+
+    Args:
+        problem: the plant; damped in every layer for a certificate.
+        gain: u = K x.
+
+    Raises:
+        ControlError: the plant has no hand.
+        SolverError: no eigenvalue converges.
+    """
+    return certified_abscissa(problem, gain.block)
 
 
 def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:

@@ -13,10 +13,10 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.errors import Comparison
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import run
+from softgrasp.reduction.parameters import grid_of, materials_at, outside, training_of
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import Method
 from softgrasp.reduction.replay import Reference, prepare, reference
@@ -24,9 +24,7 @@ from softgrasp.reduction.states import States
 from softgrasp.study.reduce.sweep import COMPARED, LARGER, Point, Swept, bases_of, nearest
 from softgrasp.study.report.files import plain
 
-GRID = 3  # test values of each constant, from corner to corner of the box
 METHODS_TESTED = 4
-LAMBDA_SHARES, MU_SHARES = (0.6, 10.0), (0.4, 10.0)  # of the scene's own constants: the paper's box around its 50, 50
 
 
 @dataclass(frozen=True)
@@ -94,53 +92,6 @@ def best_methods(swept: Sequence[Swept]) -> list[Swept]:
 
 def _deformation(point: Point) -> float:
     return point.error_deformation if np.isfinite(point.error_deformation) else np.inf
-
-
-def box_of(model: Model) -> tuple[list[float], list[float]]:
-    """Ranges of lambda and mu of the first layer [Pa]: the scene's, or shares of its own constants. Not collective."""
-    ranges, first = model.scene.reduction, model.system.materials[0]
-    lam, mu = ranges.lambda_range, ranges.mu_range
-    return lam or [share * first.lam for share in LAMBDA_SHARES], mu or [share * first.mu for share in MU_SHARES]
-
-
-def outside(model: Model) -> str:
-    """Why the scene's own constants lie outside the box, so that errors there say nothing; empty when inside."""
-    first, box = model.system.materials[0], box_of(model)
-    for key, value, (low, high) in zip(("lambda", "mu"), (first.lam, first.mu), box, strict=True):
-        if value <= 0:
-            return f"{key} = {value:.4g} Pa of the scene is not positive, and the box is logarithmic"
-        if not low <= value <= high:
-            return (
-                f"{key} = {value:.4g} Pa of the scene lies outside reduction.{key}_range = [{low:g}, {high:g}]; "
-                "set that key to test other parameters"
-            )
-    return ""
-
-
-def grid_of(model: Model) -> list[tuple[float, float]]:
-    """Lame constants on a grid of the scene's box, logarithmically."""
-    lam, mu = (np.geomspace(low, high, GRID).tolist() for low, high in box_of(model))
-    return [(a, b) for a in lam for b in mu]
-
-
-def training_of(model: Model) -> list[tuple[float, float]]:
-    """Lame constants of the runs that train bases beside the scene's own."""
-    train = model.scene.reduction.train
-    if train == "corners":
-        lam, mu = box_of(model)
-        return [(a, b) for a in lam for b in mu]
-    return [(a, b) for a, b in train]
-
-
-def materials_at(model: Model, lam: float, mu: float) -> tuple[LayerMaterial, ...]:
-    """Materials with these constants in the first layer; the others keep their ratios to it."""
-    first = model.system.materials[0]
-    return tuple(replace(m, lam=m.lam * lam / first.lam, mu=m.mu * mu / first.mu) for m in model.system.materials)
-
-
-def box_materials(model: Model) -> list[tuple[LayerMaterial, ...]]:
-    """Materials at every parameter of the grid."""
-    return [materials_at(model, lam, mu) for lam, mu in grid_of(model)]
 
 
 def full_run(model: Model, lam: float, mu: float) -> Reference:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.reduce.box import box_of
+from softgrasp.reduction.parameters import box_of
 from softgrasp.study.reduce.tables import (
     BOX_HEADER,
     ERROR_HEADER,

@@ -20,9 +20,10 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save_model
+from softgrasp.reduction.parameters import box_of
 from softgrasp.reduction.replay import Reference, reference
 from softgrasp.study.forward.result import simulate_result
-from softgrasp.study.reduce.box import Box, box_of, box_result, measure_box
+from softgrasp.study.reduce.box import Box, box_result, measure_box
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.page import draw_all, write_all
 from softgrasp.study.reduce.sweep import Swept, best, chosen_methods, sweep

@@ -20,11 +20,12 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.archive import load_model
 from softgrasp.reduction.online import run
+from softgrasp.reduction.parameters import grid_of, outside, training_of
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import METHODS, PAPER_METHODS, make_bases
 from softgrasp.reduction.replay import Reference, prepare, reference
 from softgrasp.reduction.states import BasisError, States
-from softgrasp.study.reduce.box import cases_of, grid_of, measure_box, outside, summary, training_of, training_states
+from softgrasp.study.reduce.box import cases_of, measure_box, summary, training_states
 from softgrasp.study.reduce.pictures import gather_views, instants
 from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.reduce.sweep import BEYOND, sweep
