@@ -12,7 +12,7 @@ from softgrasp.lqr.dense.care import care
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
 from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
-from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.bases import modal_basis
 from softgrasp.lqr.reduced.riccati import project_plant
@@ -88,7 +88,7 @@ def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
     k = min(modes, system.layout.n_e)
     omega, Phi, massed = some_modes(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
-    g, c = reach(problem, Phi), total(comm, problem.C_z.T @ Phi)
+    g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c, largest=_largest_frequency(problem))
     findings += _damping(problem, rates)
     findings.sort(key=lambda f: f.kind != "error")

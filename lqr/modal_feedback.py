@@ -12,7 +12,7 @@ from softgrasp.lqr.dense.modal import factor_psd, some_modes
 from softgrasp.lqr.dense.poles import closed_loop_rates
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.checks import ControlError, check_weights
-from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import modal_basis
 from softgrasp.lqr.reduced.riccati import full_gain, project_plant
@@ -20,7 +20,7 @@ from softgrasp.lqr.spectrum.modal_loop import modal_damping
 
 
 def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) -> RiccatiSolution:
-    """Riccati equation of the hand and the lowest modes that feedback can stabilise, lifted by the filter Phi'M_ee.
+    """Riccati equation of the hand and the lowest modes that feedback can stabilise, expanded by the filter Phi'M_ee.
 
     One-way coupling and a modal filter leave the other modes where they are: with damping they decay by themselves,
     without damping they stay on the imaginary axis, driven but not destabilised. With two-way coupling the hand feels
@@ -45,7 +45,7 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
         raise ControlError(f"modal_lqr: modes = {modes} must be 0 or more")
     k = min(max(candidates, modes, 1), system.layout.n_e)
     omega, Phi, massed = some_modes(problem, k)
-    g, c = reach(problem, Phi), total(comm, problem.C_z.T @ Phi)
+    g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, np.diag(modal_damping(problem, Phi)), g, c)
     good = np.flatnonzero(rates.lost == 0)
     if len(good) < modes:

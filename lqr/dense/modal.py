@@ -164,8 +164,8 @@ def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
     """
     squares, Phi = scipy.linalg.eigh(tissue.K, tissue.M)
     _check_held(float(squares[0]), float(squares[-1]))
-    reach = tissue.G if tissue.B_z is None else tissue.B_z
-    parts = (Phi.T @ tissue.D @ Phi, Phi.T @ reach, tissue.C_z.T @ Phi)
+    inputs = tissue.G if tissue.B_z is None else tissue.B_z
+    parts = (Phi.T @ tissue.D @ Phi, Phi.T @ inputs, tissue.C_z.T @ Phi)
     return modal_plant(problem, np.sqrt(squares), Phi, tissue.M @ Phi, parts)
 
 
@@ -180,13 +180,13 @@ def some_modes(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
         omega, Phi = lowest_modes(system, k)
         return omega, Phi, times_columns(system.M_ee, Phi)
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
-    found: tuple[Array, Array] | None = None
+    modes: tuple[Array, Array] | None = None
     with agree(layout.comm):
         if M is not None and K is not None:
             squares, vectors = scipy.linalg.eigh(K, M, subset_by_index=[0, k - 1])
             _check_held(squares[0], float(np.linalg.norm(K, 2) / np.diag(M).max()))
-            found = np.sqrt(squares), vectors
-    omega, whole = layout.comm.bcast(found)
+            modes = np.sqrt(squares), vectors
+    omega, whole = layout.comm.bcast(modes)
     Phi = np.asfortranarray(whole[layout.start : layout.start + layout.n_local])
     return omega, Phi, times_columns(system.M_ee, Phi)
 
@@ -264,13 +264,13 @@ class DenseRiccati:
         check_poles(closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c))
         middle = time.perf_counter()
         space = plant.space
-        found = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)
+        solution = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)
         n_s, k = problem.layout.n_s, len(plant.omega)
         hand, q, v = slice(0, 2 * n_s), slice(2 * n_s, 2 * n_s + k), slice(2 * n_s + k, None)
-        small = factor_psd(found.X)
+        small = factor_psd(solution.X)
         Z = np.vstack([small[hand], plant.massed @ (plant.omega[:, None] * small[q]), plant.Phi @ small[v]])
-        K_z = plant.massed @ (plant.omega[:, None] * found.K[:, q].T)
-        K_v = plant.massed @ found.K[:, v].T
+        K_z = plant.massed @ (plant.omega[:, None] * solution.K[:, q].T)
+        K_v = plant.massed @ solution.K[:, v].T
         relative = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
         residual = dense_residual(problem, relative, Z)
         if not residual <= self.tolerance:
@@ -280,10 +280,10 @@ class DenseRiccati:
             )
         return RiccatiSolution(
             Block(Z[: 2 * n_s], Z[2 * n_s :]),
-            Gain(found.K[:, hand], K_z, K_v),
+            Gain(solution.K[:, hand], K_z, K_v),
             residual,
             "dense",
-            counts={"newton_steps": found.newton_steps, "adi_steps": 0, "solves": 0},
+            counts={"newton_steps": solution.newton_steps, "adi_steps": 0, "solves": 0},
             seconds={"modes": middle - begin, "schur": time.perf_counter() - middle},
         )
 

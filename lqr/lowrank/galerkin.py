@@ -120,7 +120,7 @@ def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
 
 
 def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[Level, Space]:
-    """Project, solve and lift: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
+    """Project, solve and expand: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
 
     Args:
         plant: the plant.
@@ -136,7 +136,7 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
     s, r = 2 * plant.n_s, len(omega)
     q, v = root[s : s + r] / omega[:, None], root[s + r :]
     Z = Block(root[:s], np.vstack([ritz.V @ q, ritz.V @ v]))
-    small_gain = plant.felt(Z)
+    small_gain = plant.inputs_of(Z)
     a, b = ritz.V @ (q @ small_gain), ritz.V @ (v @ small_gain)
     hand = np.vstack([root[: plant.n_s], plant.M_s @ root[plant.n_s : s]]) @ small_gain
     hand[plant.n_s :] += total(plant.comm, plant.G.T @ b)
@@ -242,7 +242,7 @@ class StructuredGalerkin:
         count = self.per_step * self.max_iterations
         if plant.viscous is not None:
             low = first  # the modes do not decouple, so the responses have to cover their range too
-        wanted = frequencies(low, max(limits.fastest, 2 * low), count).tolist()
+        grid = frequencies(low, max(limits.fastest, 2 * low), count).tolist()
         # two-way the reaction of the hand loads the tissue as well
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
         level, space = solve_level(plant, space)
@@ -252,7 +252,7 @@ class StructuredGalerkin:
             return level, used
         for i in range(self.max_iterations):
             # the static response first; shift number k + 1 belongs to frequency number k
-            take = [0j] if i == 0 else [_response_shift(plant, w) for w in wanted[used - 1 :][: self.per_step]]
+            take = [0j] if i == 0 else [_response_shift(plant, w) for w in grid[used - 1 :][: self.per_step]]
             for j, p in enumerate(take):
                 response = tissue.solve(p, loads, take[j + 1 :])
                 parts = [response.real] if p.imag == 0 else [response.real, response.imag]

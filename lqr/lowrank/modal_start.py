@@ -1,4 +1,4 @@
-"""Start of the low-rank solvers: the Riccati equation of the hand and the lowest modes, lifted by the modal filter."""
+"""Start of the low-rank solvers: the Riccati equation of hand and lowest modes, expanded by the modal filter."""
 
 from __future__ import annotations
 
@@ -159,11 +159,11 @@ def _few_modes(small: ModalSubspace) -> Array | None:
         return None
     at = np.r_[: N - 2 * r + k, N - r : N - r + k]
     E, A, B, C = (small.space.E[np.ix_(at, at)], small.space.A[np.ix_(at, at)], small.space.B[at], small.space.C[:, at])
-    found = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
-    if found is None:
+    solution = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+    if solution is None:
         return None
     X = np.zeros((N, N))
-    X[np.ix_(at, at)] = found
+    X[np.ix_(at, at)] = solution
     return X
 
 

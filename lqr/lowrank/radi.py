@@ -61,10 +61,10 @@ def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, A
     c = float(np.sqrt(-2 * s.real))
     if s.imag == 0:
         columns = V.real(np.asarray(c * one, dtype=complex))
-        V_B = plant.felt(columns)
+        V_B = plant.inputs_of(columns)
         return columns, one - V_B @ V_B.T / (2 * s.real), V_B, c
     columns = V.real(np.asarray(c * np.hstack([one, -1j * one]), dtype=complex))
-    V_B = plant.felt(columns)
+    V_B = plant.inputs_of(columns)
     real, imag = V_B[:q], V_B[q:]
     a, b = s.real / abs(s), s.imag / abs(s)
     F_1 = np.vstack([-a * real - b * imag, b * real - a * imag])

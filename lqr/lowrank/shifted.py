@@ -48,15 +48,14 @@ class ShiftedTissue(Protocol):
         """Free the factors. Collective."""
 
 
-def make_shifted(system: BlockSystem, wanted: str = "auto") -> ShiftedTissue:
+def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
     """The solver for a size: ``gathered`` or ``distributed``. Collective.
 
     Raises:
         SolverError: the name is unknown.
         ResourceError: the factor would not fit in the memory that is free now.
     """
-    name = wanted
-    if wanted == "auto":
+    if name == "auto":
         small = system.layout.n_e <= GATHER_LIMIT[system.layout.dimension]
         name = "gathered" if small else "distributed"
     if name == "gathered":
@@ -64,7 +63,7 @@ def make_shifted(system: BlockSystem, wanted: str = "auto") -> ShiftedTissue:
     if name == "distributed":
         check_memory(system.layout)
         return DistributedTissue(system)
-    raise SolverError(f"the shifted solver {wanted!r} is unknown; choose auto, gathered or distributed")
+    raise SolverError(f"the shifted solver {name!r} is unknown; choose auto, gathered or distributed")
 
 
 def factor_bytes(n: int, dimension: int) -> float:

@@ -13,7 +13,7 @@ from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
-from softgrasp.lqr.plant.problem import RiccatiSolution, Solver
+from softgrasp.lqr.plant.problem import RiccatiSolution, SolverName
 
 STOP = 0.8  # share of the tolerance at which a recursion stops
 DROP = 0.1  # share that the last compression may add
@@ -36,7 +36,7 @@ class Iterate:
 
     Z: Block
     gain: Block
-    method: Solver
+    method: SolverName
     about: str
     tol: float
     history: list[dict[str, float]] = field(default_factory=list)

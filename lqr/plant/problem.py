@@ -11,7 +11,7 @@ from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 
-Solver = Literal["dense", "newton_adi", "radi", "galerkin", "modal_lqr"]
+SolverName = Literal["dense", "newton_adi", "radi", "galerkin", "modal_lqr"]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class RiccatiSolution:
     factor: Block
     gain: Gain
     residual: float
-    method: Solver
+    method: SolverName
     about: str = ""
     reason: str = ""
     history: tuple[dict[str, float], ...] = ()

@@ -20,7 +20,7 @@ from softgrasp.lqr.lowrank.compress import gram, triangular
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
-from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.engines import EPS, factor, small_svd
@@ -71,9 +71,9 @@ class BasisFamily:
     sigma: tuple[Array, ...]
     make: Callable[[int], RiccatiBasis]
 
-    def orders(self, wanted: Sequence[int]) -> list[int]:
-        """The wanted orders that exist. Not collective."""
-        return [N for N in wanted if self.smallest <= N <= self.largest and (N - self.smallest) % self.step == 0]
+    def orders(self, sizes: Sequence[int]) -> list[int]:
+        """Those of the orders that exist. Not collective."""
+        return [N for N in sizes if self.smallest <= N <= self.largest and (N - self.smallest) % self.step == 0]
 
     def at(self, N: int) -> RiccatiBasis:
         """The basis of order N. Collective.
@@ -232,7 +232,7 @@ def structured(problem: RiccatiProblem) -> BasisFamily:
     omega, Phi, massed = some_modes(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
     c = total(system.layout.comm, problem.C_z.T @ Phi)
-    g = reach(problem, Phi)
+    g = modal_inputs(problem, Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c)
     floor = np.finfo(float).tiny
     weight = np.sum(c**2, axis=0) * np.sum(g**2, axis=1) / (np.maximum(rates.rate, floor) * omega**2)

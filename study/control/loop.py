@@ -11,30 +11,21 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.lqr.design.controller import NoController, certified_controller
+from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
-from softgrasp.study.control.result import LoopRuns, ReducedLoopRun, TimedController, a_priori
+from softgrasp.study.control.result import LoopRuns, ReducedLoopRun
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import move_steps
 
 TICKS = 1000  # behind the time of one tick of the controller
 
 
-def time_controller(design: Design, bases: Sequence[BasisGains]) -> tuple[TimedController | None, str]:
-    """The small controller and the time of its tick; None and why when there is none. Collective."""
-    try:
-        certified = certified_controller(design, a_priori(bases))
-    except NoController as error:
-        return None, str(error)
-    return TimedController(certified, design.problem.layout.comm.bcast(_tick(certified.controller))), ""
-
-
-def _tick(controller: Controller) -> float:
+def tick_seconds(controller: Controller) -> float:
     """Median seconds of a tick of ten."""
     q, v = np.zeros(controller.n_s), np.zeros(controller.n_s)
     times = []
@@ -47,11 +38,11 @@ def _tick(controller: Controller) -> float:
     return float(np.median(times))
 
 
-def save_controllers(design: Design, timed: TimedController | None, out: Path) -> list[Path]:
+def save_controllers(design: Design, controller: CertifiedController | None, out: Path) -> list[Path]:
     """controller.npz for the robot, gain.npz of full order. Collective."""
     files, layout = list[Path](), design.problem.layout
-    if timed is not None and layout.comm.rank == 0:
-        files.append(timed.certified.controller.save(out / "controller.npz"))
+    if controller is not None and layout.comm.rank == 0:
+        files.append(controller.controller.save(out / "controller.npz"))
     return [
         *files,
         save_gain(out / "gain.npz", design.gain, design.target.state, layout, scene_hash(design.model.scene)),

@@ -65,19 +65,6 @@ class Retuned:
 
 
 @dataclass(frozen=True)
-class TimedController:
-    """The small controller of a scene.
-
-    Attributes:
-        certified: what a robot runs, and its radius from tick to tick.
-        tick: seconds of one tick, median.
-    """
-
-    certified: CertifiedController
-    tick: float
-
-
-@dataclass(frozen=True)
 class ReducedLoopRun:
     """The full plant under the best stable gain of one basis.
 
@@ -122,6 +109,7 @@ class ControlStudy:
         bases: gains of the reduced equations.
         retuned: gains over the box.
         controller: the small controller; None when no small gain is certified.
+        tick: seconds of one tick of it, median.
         loops: closed loops.
         notes: what was chosen for the user, and why parts are missing.
     """
@@ -129,7 +117,8 @@ class ControlStudy:
     design: Design
     bases: tuple[BasisGains, ...]
     retuned: tuple[Retuned, ...]
-    controller: TimedController | None
+    controller: CertifiedController | None
+    tick: float
     loops: LoopRuns
     notes: tuple[Note, ...]
 
@@ -179,7 +168,7 @@ def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, 
         "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
         "refused": {b.name: b.refused for b in study.bases if b.refused},
         "retune": [_retuned(r) for r in study.retuned],
-        "controller": _controller(study.controller),
+        "controller": _controller(study),
         "loop": _loop(study),
         "notes": [note.text for note in study.notes],
         "time": {**seconds, "solver": dict(solution.seconds)},
@@ -216,12 +205,12 @@ def _retuned(r: Retuned) -> dict[str, Any]:
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}
 
 
-def _controller(timed: TimedController | None) -> dict[str, Any] | None:
-    if timed is None:
+def _controller(study: ControlStudy) -> dict[str, Any] | None:
+    if study.controller is None:
         return None
-    c = timed.certified.controller
-    return {"method": timed.certified.method, "N": c.plant.N, "period": c.period, "time_tick": timed.tick,
-            "sampled_radius": timed.certified.radius.value}  # fmt: skip
+    c = study.controller.controller
+    return {"method": study.controller.method, "N": c.plant.N, "period": c.period, "time_tick": study.tick,
+            "sampled_radius": study.controller.radius.value}  # fmt: skip
 
 
 def _loop(study: ControlStudy) -> dict[str, Any]:
@@ -263,5 +252,5 @@ def settled(times: Array, distance: Array, share: float = 0.01) -> float | None:
 
 
 def a_priori(bases: Sequence[BasisGains]) -> BasisGains | None:
-    """The gains of the basis that needs no P; None where they were not made."""
+    """The gains of the basis that needs no P; None where there are none."""
     return next((b for b in bases if b.name == A_PRIORI), None)

@@ -13,13 +13,14 @@ from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.lqr.design.controller import NoController, certified_controller
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.design.orders import BasisGains, orders
 from softgrasp.lqr.design.scene import with_control
-from softgrasp.study.control.loop import run_loops, save_controllers, time_controller
+from softgrasp.study.control.loop import run_loops, save_controllers, tick_seconds
 from softgrasp.study.control.page import sections
-from softgrasp.study.control.result import ControlStudy, Note, Retuned, control_result
+from softgrasp.study.control.result import ControlStudy, Note, Retuned, a_priori, control_result
 from softgrasp.study.control.sweep import retune, sweep
 from softgrasp.study.control.tables import best_table, summary_rows, tables
 from softgrasp.study.pictures.frames import Frames
@@ -148,8 +149,12 @@ def control_model(
             retuned, why = retune(feedback, bases, counted(bar, "re-tuning"))
         notes += [Note("orders", few)] if few else []
         notes += [Note("retune", f"no re-tuning: {why}")] if why else []
-    controller, why = time_controller(feedback, bases)
-    notes += [Note("controller", f"no small controller: {why}")] if why else []
+    controller, tick = None, float("nan")
+    try:
+        controller = certified_controller(feedback, a_priori(bases))
+        tick = model.system.layout.comm.bcast(tick_seconds(controller.controller))
+    except NoController as error:
+        notes.append(Note("controller", f"no small controller: {error}"))
     sampled = feedback.quality.sampled
     if sampled is not None and sampled.reason:
         notes.append(Note("sampling", f"the loop from tick to tick is not certified: {sampled.reason}"))
@@ -158,7 +163,7 @@ def control_model(
     frames = Frames(model, out, pictures)
     with watch.stage("loop"):
         loops = run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
-    return ControlStudy(feedback, bases, retuned, controller, loops, tuple(notes)), frames
+    return ControlStudy(feedback, bases, retuned, controller, tick, loops, tuple(notes)), frames
 
 
 def solver_bar(bar: Progress, model: Model) -> Callable[[dict[str, float]], None]:
@@ -193,4 +198,4 @@ def show(console: Console, study: ControlStudy, seconds: dict[str, float]) -> No
         console.print(f"note: {sentence}", soft_wrap=True, markup=False)
     console.print(pairs(summary_rows(study, seconds)))
     if study.bases:
-        console.print(best_table(study.bases).terminal(wrap=[0, 7]))
+        console.print(best_table(study.bases).terminal(wrap=[0]))

@@ -23,7 +23,7 @@ REDUCED_HEADER = ("basis", "N", "error of P", "error of K", "excess cost", *SPEC
 BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", "excess cost", *SPECTRUM, "re-tuned in [ms]", "gain")
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
 BEST_HEADER = (
-    "best stable gain", "N", "error of P", "error of K", "excess cost", "abscissa [1/s]", "ARE, ms", "not stable at N",
+    "best stable gain", "N", "error P", "error K", "excess", "abscissa", "ARE, ms", "unstable N",
 )  # fmt: skip
 
 
@@ -48,8 +48,8 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
     if full.saturated:
         rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
     if study.controller is not None:
-        c = study.controller.certified.controller
-        text = f"N = {c.plant.N}, {1e6 * study.controller.tick:.2g} us a tick of {1e3 * c.period:g} ms"
+        c = study.controller.controller
+        text = f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms"
         rows.append(("small controller", text))
     rows += [("re-tuned", _fast(r)) for r in study.retuned]
     stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
