@@ -11,11 +11,11 @@ from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import care
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
-from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
-from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.bases import modal_basis
-from softgrasp.lqr.reduced.riccati import project
+from softgrasp.lqr.reduced.riccati import project_plant
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
 
 MODES = 60
@@ -88,7 +88,7 @@ def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
     k = min(modes, system.layout.n_e)
     omega, Phi, massed = some_modes(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
-    g, c = reach(problem, Phi), total(comm, problem.C_z.T @ Phi)
+    g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c, largest=_largest_frequency(problem))
     findings += _damping(problem, rates)
     findings.sort(key=lambda f: f.kind != "error")
@@ -161,7 +161,7 @@ def _damping(problem: RiccatiProblem, rates: ModeRates) -> list[Finding]:
     """Modes that neither damping nor feedback brings to rest."""
     n_e, enough = problem.layout.n_e, enough_damping(rates)
     lost = int(rates.lost.sum())
-    way_out = f"set effects.damping.beta >= {enough:.2g} s, or control only the lowest modes with the method modal_lqr"
+    way_out = f"set effects.damping.beta >= {enough:.2g} s, or control only the lowest modes with {MODAL_KEY}"
     if not problem.system.damping.active:
         slowest = float(rates.rate.min())
         seen = f"{lost} of the lowest {len(rates.omega)} modes cannot be stabilised in double precision at all"
@@ -204,7 +204,7 @@ def _largest_frequency(problem: RiccatiProblem) -> float:
 def _small_rank(problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array) -> int:
     """Rank of X on hand and modes in energy coordinates, by a dense solve of that order. Collective."""
     basis = modal_basis(problem, "diagnose", omega, Phi, massed)
-    m = project(problem, basis)
+    m = project_plant(problem, basis)
 
     def count() -> int:
         try:

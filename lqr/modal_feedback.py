@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,15 +12,15 @@ from softgrasp.lqr.dense.modal import factor_psd, some_modes
 from softgrasp.lqr.dense.poles import closed_loop_rates
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.checks import ControlError, check_weights
-from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import modal_basis
-from softgrasp.lqr.reduced.riccati import lift_gain, project
+from softgrasp.lqr.reduced.riccati import full_gain, project_plant
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
 
 
 def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) -> RiccatiSolution:
-    """Riccati equation of the hand and the lowest modes that feedback can stabilise, lifted by the filter Phi'M_ee.
+    """Riccati equation of the hand and the lowest modes that feedback can stabilise, expanded by the filter Phi'M_ee.
 
     One-way coupling and a modal filter leave the other modes where they are: with damping they decay by themselves,
     without damping they stay on the imaginary axis, driven but not destabilised. With two-way coupling the hand feels
@@ -46,7 +45,7 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
         raise ControlError(f"modal_lqr: modes = {modes} must be 0 or more")
     k = min(max(candidates, modes, 1), system.layout.n_e)
     omega, Phi, massed = some_modes(problem, k)
-    g, c = reach(problem, Phi), total(comm, problem.C_z.T @ Phi)
+    g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, np.diag(modal_damping(problem, Phi)), g, c)
     good = np.flatnonzero(rates.lost == 0)
     if len(good) < modes:
@@ -56,26 +55,21 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
         )
     pick = good[:modes]
     basis = modal_basis(problem, "modal_lqr", omega[pick], Phi[:, pick], massed[:, pick])
-    m = project(problem, basis)
+    m = project_plant(problem, basis)
     middle = time.perf_counter()
     P_N = on_root(comm, lambda: care(m.A, m.B, m.C, m.Q, m.R, m.E).X)
     Z = basis.W.times(on_root(comm, lambda: factor_psd(P_N)))
-    K = lift_gain(problem, basis, P_N)
-    n = system.layout.n_local
+    gain = full_gain(problem, basis, P_N)
     left = system.layout.n_e - modes
     word = (
         "decay by their own damping" if system.damping.active else "are not stabilised and stay on the imaginary axis"
     )
-    solution = RiccatiSolution(
-        Z_s=Z.hand,
-        Z_z=Z.tall[:n],
-        Z_v=Z.tall[n:],
-        K_s=np.ascontiguousarray(K.hand.T),
-        K_z=K.tall[:n],
-        K_v=K.tall[n:],
-        residual=np.nan,
-        method=f"modal_lqr: hand and {modes} modes; the other {left} modes {word}",
+    return RiccatiSolution(
+        Z,
+        gain,
+        residual(problem, Z),
+        "modal_lqr",
+        f"hand and {modes} modes; the other {left} modes {word}",
         counts={"newton_steps": 0, "adi_steps": 0, "solves": 0},
         seconds={"modes": middle - begin, "small": time.perf_counter() - middle},
     )
-    return replace(solution, residual=residual(problem, solution))

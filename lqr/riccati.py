@@ -41,7 +41,7 @@ class Choice:
     reason: str
 
 
-def choose(problem: RiccatiProblem, wanted: Method = "auto") -> Choice:
+def choose(problem: RiccatiProblem, method: Method = "auto") -> Choice:
     """The method for a problem. Not collective.
 
     Newton-ADI by default; RADI where damping couples the modes; Galerkin where complex factorisations no longer fit.
@@ -52,10 +52,10 @@ def choose(problem: RiccatiProblem, wanted: Method = "auto") -> Choice:
     Raises:
         SolverError: the name is unknown.
     """
-    if wanted not in METHODS:
-        raise SolverError(f"the Riccati method {wanted!r} is unknown; choose one of {', '.join(METHODS)}")
-    if wanted != "auto":
-        return Choice(wanted, "asked for")
+    if method not in METHODS:
+        raise SolverError(f"the Riccati method {method!r} is unknown; choose one of {', '.join(METHODS)}")
+    if method != "auto":
+        return Choice(method, "asked for")
     layout, damping = problem.layout, problem.system.damping
     if layout.states <= DENSE_STATES:
         return Choice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes, exact to rounding")
@@ -117,10 +117,10 @@ def solve(
         # undamped and too large for the dense method: which modes are lost says more than the memory that is missing
         diagnose(problem).require()
     try:
-        result = make_solver(choice.method, tol, progress, checkpoint).solve(problem)
+        solution = make_solver(choice.method, tol, progress, checkpoint).solve(problem)
     except SolverError as error:
         if method != "auto" or choice.method != "newton_adi":
             raise
         choice = Choice("radi", f"newton_adi failed ({error})")
-        result = make_solver("radi", tol, progress).solve(problem)
-    return replace(result, method=f"{result.method} (chosen: {choice.reason})")
+        solution = make_solver("radi", tol, progress).solve(problem)
+    return replace(solution, reason=choice.reason)

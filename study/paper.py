@@ -15,8 +15,8 @@ from rich.console import Console
 from softgrasp.fem import _stack as _stack
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.reduction.registry import PAPER_PLAIN
+from softgrasp.study.control.result import TITLES
 from softgrasp.study.control.run import run_control
-from softgrasp.study.control.sweep import TITLES
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.report.page import Section, write_report

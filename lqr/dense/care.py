@@ -260,7 +260,7 @@ def unreached(A: Array, B: Array) -> list[complex]:
     candidates = candidates[candidates.imag >= 0]
     candidates = candidates[np.argsort(-candidates.real)][:PBH_LIMIT]
     scaled = B * ((size or 1.0) / (float(np.linalg.norm(B)) or 1.0))
-    found: list[complex] = []
+    poles: list[complex] = []
     seen: list[complex] = []
     for s in candidates:
         if any(abs(s - t) <= np.sqrt(EPS) * size for t in seen):  # a multiple eigenvalue splits by rounding
@@ -268,8 +268,8 @@ def unreached(A: Array, B: Array) -> list[complex]:
         seen.append(complex(s))
         pencil = np.hstack([A - (s if s.imag else s.real) * np.eye(n), scaled])
         if scipy.linalg.svdvals(pencil)[-1] <= 10 * n * EPS * size:
-            found.append(complex(s))
-    return found
+            poles.append(complex(s))
+    return poles
 
 
 def _check_detectable(A: Array, C: Array) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -15,7 +15,9 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
 from softgrasp.lqr.dense.care import care as care
 from softgrasp.lqr.dense.poles import check_poles, closed_loop_rates
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 DENSE_MODES = 600  # a tenth of a second; SLEPc on several ranks is slower there
@@ -162,8 +164,8 @@ def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
     """
     squares, Phi = scipy.linalg.eigh(tissue.K, tissue.M)
     _check_held(float(squares[0]), float(squares[-1]))
-    reach = tissue.G if tissue.B_z is None else tissue.B_z
-    parts = (Phi.T @ tissue.D @ Phi, Phi.T @ reach, tissue.C_z.T @ Phi)
+    inputs = tissue.G if tissue.B_z is None else tissue.B_z
+    parts = (Phi.T @ tissue.D @ Phi, Phi.T @ inputs, tissue.C_z.T @ Phi)
     return modal_plant(problem, np.sqrt(squares), Phi, tissue.M @ Phi, parts)
 
 
@@ -178,13 +180,13 @@ def some_modes(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
         omega, Phi = lowest_modes(system, k)
         return omega, Phi, times_columns(system.M_ee, Phi)
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
-    found: tuple[Array, Array] | None = None
+    modes: tuple[Array, Array] | None = None
     with agree(layout.comm):
         if M is not None and K is not None:
             squares, vectors = scipy.linalg.eigh(K, M, subset_by_index=[0, k - 1])
             _check_held(squares[0], float(np.linalg.norm(K, 2) / np.diag(M).max()))
-            found = np.sqrt(squares), vectors
-    omega, whole = layout.comm.bcast(found)
+            modes = np.sqrt(squares), vectors
+    omega, whole = layout.comm.bcast(modes)
     Phi = np.asfortranarray(whole[layout.start : layout.start + layout.n_local])
     return omega, Phi, times_columns(system.M_ee, Phi)
 
@@ -262,13 +264,13 @@ class DenseRiccati:
         check_poles(closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c))
         middle = time.perf_counter()
         space = plant.space
-        found = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)
+        solution = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)
         n_s, k = problem.layout.n_s, len(plant.omega)
         hand, q, v = slice(0, 2 * n_s), slice(2 * n_s, 2 * n_s + k), slice(2 * n_s + k, None)
-        small = factor_psd(found.X)
+        small = factor_psd(solution.X)
         Z = np.vstack([small[hand], plant.massed @ (plant.omega[:, None] * small[q]), plant.Phi @ small[v]])
-        K_z = plant.massed @ (plant.omega[:, None] * found.K[:, q].T)
-        K_v = plant.massed @ found.K[:, v].T
+        K_z = plant.massed @ (plant.omega[:, None] * solution.K[:, q].T)
+        K_v = plant.massed @ solution.K[:, v].T
         relative = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
         residual = dense_residual(problem, relative, Z)
         if not residual <= self.tolerance:
@@ -276,17 +278,12 @@ class DenseRiccati:
                 f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.1e}; raise control.tolerance "
                 "or weigh Q and R nearer to each other"
             )
-        n_e = len(tissue.M)
         return RiccatiSolution(
-            Z_s=Z[: 2 * n_s],
-            Z_z=Z[2 * n_s : 2 * n_s + n_e],
-            Z_v=Z[2 * n_s + n_e :],
-            K_s=found.K[:, hand],
-            K_z=K_z,
-            K_v=K_v,
-            residual=residual,
-            method="dense",
-            counts={"newton_steps": found.newton_steps, "adi_steps": 0, "solves": 0},
+            Block(Z[: 2 * n_s], Z[2 * n_s :]),
+            Gain(solution.K[:, hand], K_z, K_v),
+            residual,
+            "dense",
+            counts={"newton_steps": solution.newton_steps, "adi_steps": 0, "solves": 0},
             seconds={"modes": middle - begin, "schur": time.perf_counter() - middle},
         )
 
@@ -298,13 +295,9 @@ def spread(layout: BlockLayout, result: RiccatiSolution | None) -> RiccatiSoluti
     if result is not None and ranges is not None:
         pieces = []
         for a, b in ranges:
-            rows = (np.asfortranarray(x[a:b]) for x in (result.Z_z, result.Z_v, result.K_z, result.K_v))
-            Z_z, Z_v, K_z, K_v = rows
-            pieces.append(
-                RiccatiSolution(
-                    result.Z_s, Z_z, Z_v, result.K_s, K_z, K_v,
-                    result.residual, result.method, result.history, result.counts, result.seconds,
-                )
-            )  # fmt: skip
-    mine: RiccatiSolution = layout.comm.scatter(pieces)
-    return mine
+            Z, K, n_e = result.factor, result.gain, layout.n_e
+            tall = np.asfortranarray(np.concatenate([Z.tall[a:b], Z.tall[n_e + a : n_e + b]]))
+            gain = Gain(K.K_s, np.asfortranarray(K.K_z[a:b]), np.asfortranarray(K.K_v[a:b]))
+            pieces.append(replace(result, factor=Block(Z.hand, tall), gain=gain))
+    part: RiccatiSolution = layout.comm.scatter(pieces)
+    return part

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.plant.checks import EPS, ControlError, square_root
+from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, square_root
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 # A rate below this share of the largest frequency is rounding: an error eps |H| of the Hamiltonian matrix moves a pole
@@ -102,7 +102,7 @@ def lost_sentence(rates: ModeRates) -> str:
     return (
         f"{len(lost)} of {len(rates.omega)} modes cannot be stabilised in double precision, mode {shown}{more}: they "
         "are neither damped nor both reached by the hand and seen by the outputs; set effects.damping.beta >= "
-        f"{enough_damping(rates):.2g} s, or control only the lowest modes with the method modal_lqr"
+        f"{enough_damping(rates):.2g} s, or control only the lowest modes with {MODAL_KEY}"
     )
 
 

@@ -89,7 +89,7 @@ class Controller:
         one = np.eye(N)
         if not (np.array_equal(self.plant.S_q, one[:n_s]) and np.array_equal(self.plant.S_v, one[n_s : 2 * n_s])):
             raise ControlError(
-                "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small_plant.project"
+                "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small_plant.galerkin"
             )
         if not self.period > 0:
             raise ControlError(f"period = {self.period} s of the controller must be positive")
@@ -237,11 +237,11 @@ def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) ->
         ControlError: the file is missing or damaged, or belongs to another mesh (or scene).
     """
     order, nodes = _order(layout)
-    wanted = {"layout_hash": layout_hash(layout), "scene_hash": scene_hash}
+    expected = {"layout_hash": layout_hash(layout), "scene_hash": scene_hash}
     answer: tuple[Array, Array, Array, Array] | None = None
     with agree(layout.comm):
         if order is not None and nodes is not None:
-            _, arrays = read_npz(path, wanted)
+            _, arrays = read_npz(path, expected)
             try:
                 rows = np.empty_like(arrays["tissue"])
                 rows[_dofs(order, layout.dimension)] = arrays["tissue"]
@@ -281,7 +281,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
     return path
 
 
-def read_npz(path: Path, wanted: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
+def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
     """Read a file of :func:`write_npz` and check what it was made for. Not collective.
 
     Raises:
@@ -298,7 +298,7 @@ def read_npz(path: Path, wanted: dict[str, str | None]) -> tuple[dict[str, Any],
     if meta.get("format") != FORMAT:
         raise ControlError(f"{path} has the format {meta.get('format')}, this version reads {FORMAT}; save it again")
     kinds = {"layout_hash": "mesh or hand", "scene_hash": "scene"}
-    for key, value in wanted.items():
+    for key, value in expected.items():
         if value is not None and meta.get(key) != value:
             raise ControlError(
                 f"{path} was made for another {kinds[key]} ({key} {str(meta.get(key))[:12]}..., here {value[:12]}...); "

@@ -6,8 +6,6 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.lowrank.compress import gram
-from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.coordinates import factor_of
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.operators import descriptor
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
@@ -41,6 +39,5 @@ def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: floa
 
 def predicted_cost(problem: RiccatiProblem, solution: RiccatiSolution, error: PlantState) -> float:
     """V = e'E'XE e = |Z'E e|^2 for e = x - x_bar: the cost from here to infinity. Collective."""
-    hand, tall = np.concatenate([error.q_s, error.v_s]), np.concatenate([error.z, error.v_z])
-    moved = descriptor(problem, Block(hand[:, None], tall[:, None]))
-    return float(np.sum(gram(problem.layout.comm, factor_of(solution), moved) ** 2))
+    moved = descriptor(problem, error.block)
+    return float(np.sum(gram(problem.layout.comm, solution.factor, moved) ** 2))

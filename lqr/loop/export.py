@@ -98,6 +98,6 @@ def output_names(plant: SmallPlant) -> list[str]:
 
 
 def _check(plant: SmallPlant, K: Array) -> None:
-    wanted = (plant.B.shape[1], plant.N)
-    if K.shape != wanted or not np.isfinite(K).all():
-        raise ControlError(f"the gain has the shape {K.shape}; this plant needs finite numbers of shape {wanted}")
+    shape = (plant.B.shape[1], plant.N)
+    if K.shape != shape or not np.isfinite(K).all():
+        raise ControlError(f"the gain has the shape {K.shape}; this plant needs finite numbers of shape {shape}")

@@ -23,7 +23,7 @@ from softgrasp.lqr.loop.drive import Drive, HeldDrive, ImplicitDrive, PlantStep
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.plant.target import Target, rest
+from softgrasp.lqr.plant.target import Target, hand_target, rest
 
 CHUNKS = 50  # segments of a run without frames: progress, and the check that the numbers are finite
 
@@ -130,19 +130,30 @@ class ClosedLoop:
     def run(
         self,
         gain: Gain,
-        target: Target,
+        target: Target | Sequence[float] | Array,
         steps: int,
         actuation: Actuation | None = None,
         start: PlantState | None = None,
         options: LoopOptions | None = None,
     ) -> LoopTrajectory:
-        """Run from ``start`` (default: at rest at 0, in equilibrium under gravity) for some steps. Collective.
+        """Run for some steps of the implicit midpoint rule. Collective.
+
+        Args:
+            gain: u = u_bar + K (x - x_bar).
+            target: where the loop goes, or the displacement of the hand there, see
+                :func:`lqr.plant.target.hand_target`.
+            steps: number of steps.
+            actuation: sampling, delay, limits; default none of them.
+            start: x(0); default at rest with the hand at 0, in equilibrium under gravity.
+            options: what to keep and whom to tell.
 
         Raises:
-            ControlError: the actuation does not fit, or the implicit input of a step is singular.
+            ControlError: the target or the actuation does not fit, or the implicit input of a step is singular.
             SolverError: a solve failed, the loop diverged, or its cost leaves the bound; the message names the time.
         """
         actuation, options = actuation or Actuation(), options or LoopOptions()
+        if not isinstance(target, Target):
+            target = hand_target(self.problem, np.asarray(target, dtype=np.float64))
         bound = actuation.bound(self.problem.layout.n_s)
         held = actuation.ticks(self.dt) > 0
         start = start or rest(self.problem.system)

@@ -93,7 +93,7 @@ class Shapes:
         return Gain(K[:, : 2 * n_s], self.W @ K[:, 2 * n_s : 2 * n_s + k].T, self.W @ K[:, 2 * n_s + k :].T)
 
 
-def project(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
+def galerkin(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
     """Galerkin on x = [q_s, v_s, V eta, V eta']: the hand stays whole, the tissue stays of second order.
 
     V'M V, V'D V and V'K V keep their definiteness, so the reduced plant is as stable as the full one, for every V.

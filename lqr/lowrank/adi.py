@@ -163,7 +163,7 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueu
     Z = V.real(coefficients)
     small = np.zeros((Z.columns, q + 2 * m))
     np.fill_diagonal(small[:q, m : m + q], g)
-    small[:, m + q :] = plant.felt(Z)
+    small[:, m + q :] = plant.inputs_of(Z)
     sweep.state = sweep.state.plus(mass_right(plant, Z), small)
     sweep.Z.append(Z)
     sweep.steps += 1

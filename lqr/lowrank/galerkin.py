@@ -14,17 +14,17 @@ from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.adi import Progress
 from softgrasp.lqr.lowrank.modal_start import (
     MODES,
-    SmallPlant,
+    ModalSubspace,
     SmallSolution,
     check_damped,
     plant_modes,
-    project,
+    restrict,
     solve_small,
 )
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import shift_range
-from softgrasp.lqr.lowrank.solution import Outcome, make_solution
+from softgrasp.lqr.lowrank.solution import Iterate, make_solution
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
@@ -86,7 +86,7 @@ class Level:
         gain: K', z-row as it stands.
     """
 
-    small: SmallPlant
+    small: ModalSubspace
     solution: SmallSolution
     Z: Block
     a: Array
@@ -120,7 +120,7 @@ def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
 
 
 def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[Level, Space]:
-    """Project, solve and lift: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
+    """Project, solve and expand: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
 
     Args:
         plant: the plant.
@@ -128,7 +128,7 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
         old: the level before, near the solution.
     """
     ritz, omega, S = space.ritz(plant)
-    small = project(plant, ritz.V, omega, ritz.M_V)
+    small = restrict(plant, ritz.V, omega, ritz.M_V)
     solution = solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
     values, vectors = np.linalg.eigh(solution.X)
     keep = values > 1e-17 * values[-1]
@@ -136,7 +136,7 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
     s, r = 2 * plant.n_s, len(omega)
     q, v = root[s : s + r] / omega[:, None], root[s + r :]
     Z = Block(root[:s], np.vstack([ritz.V @ q, ritz.V @ v]))
-    small_gain = plant.felt(Z)
+    small_gain = plant.inputs_of(Z)
     a, b = ritz.V @ (q @ small_gain), ritz.V @ (v @ small_gain)
     hand = np.vstack([root[: plant.n_s], plant.M_s @ root[plant.n_s : s]]) @ small_gain
     hand[plant.n_s :] += total(plant.comm, plant.G.T @ b)
@@ -220,11 +220,11 @@ class StructuredGalerkin:
             seconds |= tissue.seconds
         finally:
             tissue.destroy()
-        reason = f"galerkin: {level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
+        about = f"{level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
         if level.small.order == plant.layout.n_e:
-            reason = f"galerkin: all {level.small.order} basis vectors that there are"
-        outcome = Outcome(level.Z, level.gain, reason, 1e-10, history, counts, seconds, lean=True)
-        result = make_solution(plant, outcome, check=False)
+            about = f"all {level.small.order} basis vectors that there are"
+        iterate = Iterate(level.Z, level.gain, "galerkin", about, 1e-10, history, counts, seconds, lean=True)
+        result = make_solution(plant, iterate, check=False)
         result.seconds["total"] = time.perf_counter() - begin
         return result
 
@@ -242,7 +242,7 @@ class StructuredGalerkin:
         count = self.per_step * self.max_iterations
         if plant.viscous is not None:
             low = first  # the modes do not decouple, so the responses have to cover their range too
-        wanted = frequencies(low, max(limits.fastest, 2 * low), count).tolist()
+        grid = frequencies(low, max(limits.fastest, 2 * low), count).tolist()
         # two-way the reaction of the hand loads the tissue as well
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
         level, space = solve_level(plant, space)
@@ -252,7 +252,7 @@ class StructuredGalerkin:
             return level, used
         for i in range(self.max_iterations):
             # the static response first; shift number k + 1 belongs to frequency number k
-            take = [0j] if i == 0 else [_response_shift(plant, w) for w in wanted[used - 1 :][: self.per_step]]
+            take = [0j] if i == 0 else [_response_shift(plant, w) for w in grid[used - 1 :][: self.per_step]]
             for j, p in enumerate(take):
                 response = tissue.solve(p, loads, take[j + 1 :])
                 parts = [response.real] if p.imag == 0 else [response.real, response.imag]

@@ -1,4 +1,4 @@
-"""Start of the low-rank solvers: the Riccati equation of the hand and the lowest modes, lifted by the modal filter."""
+"""Start of the low-rank solvers: the Riccati equation of hand and lowest modes, expanded by the modal filter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from softgrasp.lqr.dense.modal import StateSpace, assemble_space
 from softgrasp.lqr.dense.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.checks import MODAL_KEY, ControlError
 
 MODES = 30
 MORE_MODES = 60  # when the last of MODES is still lightly damped
@@ -25,7 +25,7 @@ CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost 
 
 
 @dataclass(frozen=True)
-class SmallPlant:
+class ModalSubspace:
     """Galerkin projection of the plant on a displacement basis, z = V eta, in xi = [q_s, v_s, omega eta, eta'].
 
     Attributes:
@@ -68,7 +68,7 @@ class ModalStart:
         poles: its closed-loop poles, most important first, one of each pair, Im >= 0.
     """
 
-    small: SmallPlant
+    small: ModalSubspace
     solution: SmallSolution
     gain: Block
     poles: np.ndarray
@@ -104,7 +104,7 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
         shell.destroy()
 
 
-def project(plant: Plant, V: Array, omega: Array, M_V: Array) -> SmallPlant:
+def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> ModalSubspace:
     """Galerkin projection on V with V' K_ee V = diag(omega^2). Collective."""
     r = len(omega)
     columns = [M_V, plant.damp(V, M_b=M_V), plant.G, plant.C_z]
@@ -121,10 +121,10 @@ def project(plant: Plant, V: Array, omega: Array, M_V: Array) -> SmallPlant:
         B[plant.n_s : 2 * plant.n_s] = plant.B
     else:
         B[2 * plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
-    return SmallPlant(V, omega, StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, B, C))
+    return ModalSubspace(V, omega, StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, B, C))
 
 
-def solve_small(plant: Plant, small: SmallPlant, guess: Array | None = None) -> SmallSolution:
+def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) -> SmallSolution:
     """Riccati equation of the small plant on rank 0, the result on all. Collective.
 
     Args:
@@ -149,7 +149,7 @@ def solve_small(plant: Plant, small: SmallPlant, guess: Array | None = None) -> 
     return on_root(plant.comm, solve)
 
 
-def _few_modes(small: SmallPlant) -> Array | None:
+def _few_modes(small: ModalSubspace) -> Array | None:
     """X of the lowest modes alone, zero for the others; None where all are few. Not collective.
 
     With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
@@ -159,11 +159,11 @@ def _few_modes(small: SmallPlant) -> Array | None:
         return None
     at = np.r_[: N - 2 * r + k, N - r : N - r + k]
     E, A, B, C = (small.space.E[np.ix_(at, at)], small.space.A[np.ix_(at, at)], small.space.B[at], small.space.C[:, at])
-    found = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
-    if found is None:
+    solution = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+    if solution is None:
         return None
     X = np.zeros((N, N))
-    X[np.ix_(at, at)] = found
+    X[np.ix_(at, at)] = solution
     return X
 
 
@@ -189,12 +189,12 @@ def _corrected(space: StateSpace, X: Array) -> Array | None:
     return None
 
 
-def ordered_poles(plant: Plant, small: SmallPlant, solution: SmallSolution) -> np.ndarray:
+def ordered_poles(plant: Plant, small: ModalSubspace, solution: SmallSolution) -> np.ndarray:
     """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost. Collective."""
     return on_root(plant.comm, lambda: _ordered(plant, small, solution.gain))
 
 
-def _ordered(plant: Plant, small: SmallPlant, gain: Array) -> np.ndarray:
+def _ordered(plant: Plant, small: ModalSubspace, gain: Array) -> np.ndarray:
     poles, vectors = np.linalg.eig(np.linalg.solve(small.space.E, small.space.A - small.space.B @ gain))
     kinetic = np.real(np.einsum("ij,ij->j", vectors.conj(), small.space.E @ vectors))
     s, r = plant.n_s, small.order
@@ -209,7 +209,7 @@ def _ordered(plant: Plant, small: SmallPlant, gain: Array) -> np.ndarray:
     return np.asarray(poles[keep])
 
 
-def lift_gain(plant: Plant, small: SmallPlant, solution: SmallSolution, M_V: Array) -> Block:
+def filtered_gain(plant: Plant, small: ModalSubspace, solution: SmallSolution, M_V: Array) -> Block:
     """K'x of the small gain through the modal filter: other modes are neither seen nor moved.
 
     eta = V'M~ z and, two-way, q_s + M_s^{-1} G'(z - V eta) instead of q_s; M~ = M_ee - G M_s^{-1} G'. For modes
@@ -234,7 +234,7 @@ def check_damped(plant: Plant) -> None:
     if not plant.system.damping.active:
         raise ControlError(
             "without damping X has no low rank and the high modes cannot be stabilised in double precision; "
-            "set effects.damping.beta, or control only the lowest modes with the method modal_lqr"
+            f"set effects.damping.beta, or control only the lowest modes with {MODAL_KEY}"
         )
 
 
@@ -252,16 +252,16 @@ def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     count = MODES if modes is None else modes
     omega, Phi = plant_modes(plant, min(count, plant.layout.n_e))
     M_Phi = plant.mass(Phi)
-    small = project(plant, Phi, omega, M_Phi)
+    small = restrict(plant, Phi, omega, M_Phi)
     if modes is None and plant.layout.n_e > MORE_MODES and _light(small):
         return modal_start(plant, MORE_MODES)
     solution = solve_small(plant, small)
     if plant.two_way:
         M_Phi = M_Phi - plant.G @ np.linalg.solve(plant.M_s, total(plant.comm, plant.G.T @ Phi))
-    gain = lift_gain(plant, small, solution, M_Phi)
+    gain = filtered_gain(plant, small, solution, M_Phi)
     return ModalStart(small, solution, gain, ordered_poles(plant, small, solution))
 
 
-def _light(small: SmallPlant) -> bool:
+def _light(small: ModalSubspace) -> bool:
     damping = -np.diag(small.space.A)[-small.order :]
     return bool(damping[-1] < 2 * LIGHT * small.omega[-1])

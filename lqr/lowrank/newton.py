@@ -17,8 +17,9 @@ from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.restart import Iteration, load_state, save_state
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
-from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
+from softgrasp.lqr.lowrank.solution import STOP, Iterate, make_solution
 from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.checks import MODAL_KEY
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 LINE_SEARCH = 0.5  # of the residual before: a Newton step that leaves more is shortened
@@ -145,7 +146,7 @@ class NewtonADI:
                 save_state(self.checkpoint, plant, state, sweep)
         raise SolverError(
             f"newton_adi: relative residual {relative:.1e} after {self.max_solves} solves of one sweep, tolerance "
-            f"{self.tol:.0e}; add damping, or use the method modal_lqr, which leaves the high modes alone"
+            f"{self.tol:.0e}; add damping, or use {MODAL_KEY}, which leaves the high modes alone"
         )
 
     def _finish(
@@ -160,8 +161,10 @@ class NewtonADI:
             "factorisations": tissue.factors,
             "columns": sweep.Z.appended,
         }
-        reason = f"newton_adi: low rank, {state.step} Newton steps, {tissue.name} tissue solves"
-        outcome = Outcome(sweep.Z.block, sweep.new.block, reason, self.tol, state.history, counts, dict(state.seconds))
-        result = make_solution(plant, outcome)
+        about = f"low rank, {state.step} Newton steps, {tissue.name} tissue solves"
+        iterate = Iterate(
+            sweep.Z.block, sweep.new.block, "newton_adi", about, self.tol, state.history, counts, dict(state.seconds)
+        )
+        result = make_solution(plant, iterate)
         result.seconds["total"] = time.perf_counter() - begin
         return result

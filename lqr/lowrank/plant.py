@@ -95,7 +95,7 @@ class Plant:
             result = result + self.viscous(b)
         return result
 
-    def felt(self, V: Block) -> Array:
+    def inputs_of(self, V: Block) -> Array:
         """V'B, (k, m), on every rank. Collective without a hand."""
         if self.B_z is None:
             return np.asarray(V.hand[self.n_s :].T @ self.B)

@@ -17,8 +17,9 @@ from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
-from softgrasp.lqr.lowrank.solution import STOP, Outcome, make_solution
+from softgrasp.lqr.lowrank.solution import STOP, Iterate, make_solution
 from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.checks import MODAL_KEY
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 
@@ -60,10 +61,10 @@ def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, A
     c = float(np.sqrt(-2 * s.real))
     if s.imag == 0:
         columns = V.real(np.asarray(c * one, dtype=complex))
-        V_B = plant.felt(columns)
+        V_B = plant.inputs_of(columns)
         return columns, one - V_B @ V_B.T / (2 * s.real), V_B, c
     columns = V.real(np.asarray(c * np.hstack([one, -1j * one]), dtype=complex))
-    V_B = plant.felt(columns)
+    V_B = plant.inputs_of(columns)
     real, imag = V_B[:q], V_B[q:]
     a, b = s.real / abs(s), s.imag / abs(s)
     F_1 = np.vstack([-a * real - b * imag, b * real - a * imag])
@@ -149,10 +150,10 @@ class RADI:
                 "factorisations": tissue.factors,
                 "columns": state.Z.appended,
             }
-            reason = f"radi: low rank from X = 0, {tissue.name} tissue solves"
+            about = f"low rank from X = 0, {tissue.name} tissue solves"
             result = make_solution(
                 plant,
-                Outcome(state.Z.block, state.gain.block, reason, self.tol, state.history, counts, state.seconds),
+                Iterate(state.Z.block, state.gain.block, "radi", about, self.tol, state.history, counts, state.seconds),
             )
             result.seconds["total"] = time.perf_counter() - begin
             return result
@@ -178,5 +179,5 @@ class RADI:
                 break
         raise SolverError(
             f"radi: relative residual {relative:.1e} after {state.solves} solves, tolerance {self.tol:.0e}; add "
-            "damping, or use the method modal_lqr, which leaves the high modes alone"
+            f"damping, or use {MODAL_KEY}, which leaves the high modes alone"
         )

@@ -9,53 +9,36 @@ and with the thin QR factorisation U = q r the 2-norm is the largest |eigenvalue
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, times_columns
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ROWS = 4_000  # rows of U that are reduced at a time
 
 
-class Candidate(Protocol):
-    """Anything with the rows of Z, see :class:`lqr.plant.problem.RiccatiSolution`."""
-
-    @property
-    def Z_s(self) -> Array:
-        """(2 n_s, rank)."""
-
-    @property
-    def Z_z(self) -> Array:
-        """Local rows (n_local, rank)."""
-
-    @property
-    def Z_v(self) -> Array:
-        """Local rows (n_local, rank)."""
-
-
-def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
+def residual(problem: RiccatiProblem, Z: Block) -> float:
     """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'.
 
     Collective. Inputs are not changed.
 
     Args:
         problem: operators and weights.
-        candidate: Z_s (2 n_s, rank) on every rank, Z_z and Z_v local rows (n_local, rank).
+        Z: factor, (2 n_s, rank) on every rank and local rows (2 n_local, rank).
 
     Returns:
         The relative residual; 2-norm in hand-relative coordinates.
     """
     system, comm = problem.system, problem.layout.comm
-    n_s, rank, p = problem.layout.n_s, candidate.Z_s.shape[1], problem.C_s.shape[0]
-    a_s, b_s = candidate.Z_s[:n_s], candidate.Z_s[n_s:]
-    felt = b_s if problem.B_z is None else comm.allreduce(problem.B_z.T @ candidate.Z_v)  # B'Z
-    n, h = len(candidate.Z_z), 2 * n_s if comm.rank == 0 else 0
+    n_s, n, rank, p = problem.layout.n_s, len(Z.tall) // 2, Z.columns, problem.C_s.shape[0]
+    a_s, b_s, Z_v = Z.hand[:n_s], Z.hand[n_s:], Z.tall[n:]
+    B_Z = b_s if problem.B_z is None else comm.allreduce(problem.B_z.T @ Z_v)
+    h = 2 * n_s if comm.rank == 0 else 0
     U = np.zeros((h + 2 * n, 2 * rank + p), order="F")
-    _fill_tissue(problem, candidate, U[h : h + n], U[h + n :])
-    G_b = comm.allreduce(system.G.T @ candidate.Z_v)
+    _fill_tissue(problem, Z, U[h : h + n], U[h + n :])
+    G_b = comm.allreduce(system.G.T @ Z_v)
     drag = system.damping.alpha if system.damping.in_space else 0.0
     own = drag * (system.M_rigid @ b_s) if system.two_way else 0.0
     if comm.rank == 0:
@@ -65,23 +48,24 @@ def residual(problem: RiccatiProblem, candidate: Candidate) -> float:
         U[:n_s, 2 * rank :] = problem.C_s.T
     r = _triangular(comm, U)
     rates, momenta, seen = r[:, :rank], r[:, rank : 2 * rank], r[:, 2 * rank :]
-    product, pushed = rates @ momenta.T, momenta @ felt.T
+    product, pushed = rates @ momenta.T, momenta @ B_Z.T
     small = product + product.T - pushed @ np.linalg.solve(problem.R, pushed.T) + seen @ problem.Q @ seen.T
     size = float(np.abs(np.linalg.eigvalsh(small)).max())
     C = np.linalg.qr(seen, mode="r")
     return size / (float(np.linalg.norm(C @ problem.Q @ C.T, 2)) or 1.0)
 
 
-def _fill_tissue(problem: RiccatiProblem, candidate: Candidate, top: Array, bottom: Array) -> None:
+def _fill_tissue(problem: RiccatiProblem, Z: Block, top: Array, bottom: Array) -> None:
     """Local rows z and v_z of [A'Z, E'Z, C']. Collective."""
     system, damping = problem.system, problem.system.damping
-    rank, b_s = candidate.Z_z.shape[1], candidate.Z_s[problem.layout.n_s :]
-    stiff, mass = times_columns(system.K_ee, candidate.Z_v), times_columns(system.M_ee, candidate.Z_v)
+    n, rank, b_s = len(top), Z.columns, Z.hand[problem.layout.n_s :]
+    Z_z, Z_v = Z.tall[:n], Z.tall[n:]
+    stiff, mass = times_columns(system.K_ee, Z_v), times_columns(system.M_ee, Z_v)
     np.negative(stiff, out=top[:, :rank])
-    bottom[:, :rank] = candidate.Z_z - damping.beta * stiff - damping.alpha * mass
+    bottom[:, :rank] = Z_z - damping.beta * stiff - damping.alpha * mass
     if damping.matrix is not None:
-        bottom[:, :rank] -= times_columns(damping.matrix, candidate.Z_v)
-    top[:, rank : 2 * rank] = candidate.Z_z
+        bottom[:, :rank] -= times_columns(damping.matrix, Z_v)
+    top[:, rank : 2 * rank] = Z_z
     bottom[:, rank : 2 * rank] = mass
     top[:, 2 * rank :] = problem.C_z
     if system.two_way:

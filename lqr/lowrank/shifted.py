@@ -14,6 +14,7 @@ from softgrasp.fem.petsc import Array, Complex
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.shifted_distributed import DistributedTissue
 from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue
+from softgrasp.lqr.plant.checks import MODAL_KEY
 
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
@@ -47,15 +48,14 @@ class ShiftedTissue(Protocol):
         """Free the factors. Collective."""
 
 
-def make_shifted(system: BlockSystem, wanted: str = "auto") -> ShiftedTissue:
+def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
     """The solver for a size: ``gathered`` or ``distributed``. Collective.
 
     Raises:
         SolverError: the name is unknown.
         ResourceError: the factor would not fit in the memory that is free now.
     """
-    name = wanted
-    if wanted == "auto":
+    if name == "auto":
         small = system.layout.n_e <= GATHER_LIMIT[system.layout.dimension]
         name = "gathered" if small else "distributed"
     if name == "gathered":
@@ -63,7 +63,7 @@ def make_shifted(system: BlockSystem, wanted: str = "auto") -> ShiftedTissue:
     if name == "distributed":
         check_memory(system.layout)
         return DistributedTissue(system)
-    raise SolverError(f"the shifted solver {wanted!r} is unknown; choose auto, gathered or distributed")
+    raise SolverError(f"the shifted solver {name!r} is unknown; choose auto, gathered or distributed")
 
 
 def factor_bytes(n: int, dimension: int) -> float:
@@ -85,5 +85,5 @@ def check_memory(layout: BlockLayout) -> None:
     if needed > free:
         raise ResourceError(
             f"the factor of the shifted tissue matrix (n_e = {layout.n_e} in {layout.dimension}D) needs about "
-            f"{needed:.1f} GiB and {free:.1f} GiB are free; take fewer cells, or set control.method = 'modal'"
+            f"{needed:.1f} GiB and {free:.1f} GiB are free; take fewer cells, or set {MODAL_KEY}"
         )

@@ -43,8 +43,8 @@ class GatheredTissue:
         self.counts = np.array(self.comm.allgather(layout.n_local))
         damping = system.damping
         self.alpha, self.beta = damping.alpha, damping.beta
-        wanted = [system.K_ee, system.M_ee] + ([] if damping.matrix is None else [damping.matrix])
-        parts, self.order = self._permuted(wanted)
+        matrices = [system.K_ee, system.M_ee] + ([] if damping.matrix is None else [damping.matrix])
+        parts, self.order = self._permuted(matrices)
         self.K, self.M = parts[:2]
         self.D = None if damping.matrix is None else parts[2]
         self.same = all(
@@ -62,22 +62,22 @@ class GatheredTissue:
         self.seconds = {"factor": 0.0, "solve": 0.0}
         self.factors = 0
 
-    def _permuted(self, wanted: Sequence[PETSc.Mat]) -> tuple[list[scipy.sparse.csc_matrix], NDArray[np.int64]]:
+    def _permuted(self, matrices: Sequence[PETSc.Mat]) -> tuple[list[scipy.sparse.csc_matrix], NDArray[np.int64]]:
         """All rows on every rank in the nested dissection order of the first, and that order. Collective."""
-        copies = [self._gather(A) for A in wanted] if self.comm.size > 1 else []
-        whole = copies or wanted
+        copies = [self._gather(A) for A in matrices] if self.comm.size > 1 else []
+        whole = copies or matrices
         rows, columns = whole[0].getOrdering("nd")
-        found = []
+        parts = []
         for A in whole:
             permuted = A.permute(rows, rows)
             indptr, indices, values = permuted.getValuesCSR()
             permuted.destroy()
             # the matrix is symmetric, so its rows serve as columns
-            found.append(scipy.sparse.csc_matrix((values, indices, indptr), shape=A.getSize()))
+            parts.append(scipy.sparse.csc_matrix((values, indices, indptr), shape=A.getSize()))
         order = np.array(rows.getIndices(), dtype=np.int64)
         for item in (rows, columns, *copies):
             item.destroy()
-        return found, order
+        return parts, order
 
     def _gather(self, A: PETSc.Mat) -> PETSc.Mat:
         indptr, columns, values = A.getValuesCSR()
@@ -110,20 +110,20 @@ class GatheredTissue:
     def _prepare(self, shifts: Sequence[complex]) -> None:
         """Factor up to one shift a rank. Collective."""
         distinct = list(dict.fromkeys(shifts))
-        wanted = distinct[: self.comm.size]
+        shifts = distinct[: self.comm.size]
         if self.comm.size == 1:
             self._forget()
-            self.cache[wanted[0]] = (0, self._factor(wanted[0]) if self.ahead is None else self.ahead.take(distinct))
+            self.cache[shifts[0]] = (0, self._factor(shifts[0]) if self.ahead is None else self.ahead.take(distinct))
         else:
             self.cache = {}
             fresh: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]]
-            fresh = {p: (rank, None) for rank, p in enumerate(wanted)}
+            fresh = {p: (rank, None) for rank, p in enumerate(shifts)}
             with agree(self.comm):
-                if self.comm.rank < len(wanted):
-                    p = wanted[self.comm.rank]
+                if self.comm.rank < len(shifts):
+                    p = shifts[self.comm.rank]
                     fresh[p] = (self.comm.rank, self._factor(p))
             self.cache = fresh
-        self.factors += len(wanted)
+        self.factors += len(shifts)
 
     def _forget(self) -> None:
         """Let the factors go."""
@@ -164,8 +164,8 @@ class GatheredTissue:
         """Rows to the owner of the factor, solve there, rows back. Collective."""
         k = F.shape[1]
         local = np.ascontiguousarray(F, dtype=complex)
-        mine = self.comm.rank == owner
-        whole = np.empty((int(self.counts.sum()), k), dtype=complex) if mine else None
+        owner_here = self.comm.rank == owner
+        whole = np.empty((int(self.counts.sum()), k), dtype=complex) if owner_here else None
         sizes = self.counts * k
         self.comm.Gatherv(local, None if whole is None else [whole, sizes], root=owner)
         if whole is not None and lu is not None:

@@ -79,10 +79,10 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
     Returns:
         The values, and the norm of the component of W along each Ritz vector.
     """
-    nothing = Block(np.zeros((2 * plant.n_s, 0)), np.zeros((2 * plant.n_local, 0)))
-    F, G, seen, felt = energy_products(plant, V, W, nothing if gain is None else gain.block)
+    empty = Block(np.zeros((2 * plant.n_s, 0)), np.zeros((2 * plant.n_local, 0)))
+    F, G, seen, X_part = energy_products(plant, V, W, empty if gain is None else gain.block)
     if gain is not None:
-        F -= felt @ plant.felt(V).T
+        F -= X_part @ plant.inputs_of(V).T
     return on_root(plant.comm, lambda: _pencil_pairs(F, G, seen))
 
 
@@ -108,7 +108,7 @@ def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, 
         b.T @ plant.G,
     ]
     widths = np.cumsum([k, k, W.columns, X.columns])
-    F, G, seen, felt, coupling = np.split(total(plant.comm, np.hstack(parts)), widths, axis=1)
+    F, G, seen, X_part, coupling = np.split(total(plant.comm, np.hstack(parts)), widths, axis=1)
     E_hand = plant.M_s @ b_s + coupling.T
     A_hand = V.hand[:s] - plant.drag_es * coupling.T - plant.drag_hand * (plant.system.M_rigid @ b_s)
     if plant.two_way:  # the hand's share in the rows of the tissue
@@ -118,7 +118,7 @@ def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, 
     test = np.vstack([test_q, test_v])
     F += test_v.T @ A_hand
     G += test_q.T @ V.hand[:s] + test_v.T @ E_hand
-    return F, G, seen + test.T @ W.hand, felt + test.T @ X.hand
+    return F, G, seen + test.T @ W.hand, X_part + test.T @ X.hand
 
 
 def _pencil_pairs(F: Array, G: Array, W: Array) -> tuple[np.ndarray, Array]:
@@ -181,8 +181,8 @@ class ShiftQueue:
         """The hand's and the lightly damped poles in their order, clipped, doubles removed. Not collective."""
         pending: list[complex] = []
         for i, p in enumerate(limits.clip_all(np.asarray(poles, dtype=complex)).tolist()):
-            wanted = i < 4 or -p.real < SHARP * abs(p)
-            if wanted and all(abs(p - q) > 1e-3 * abs(p.real) for q in pending):
+            important = i < 4 or -p.real < SHARP * abs(p)
+            if important and all(abs(p - q) > 1e-3 * abs(p.real) for q in pending):
                 pending.append(p)
         return cls(limits, pending)
 

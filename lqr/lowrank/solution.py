@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.problem import RiccatiSolution
+from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.plant.problem import RiccatiSolution, SolverName
 
 STOP = 0.8  # share of the tolerance at which a recursion stops
 DROP = 0.1  # share that the last compression may add
@@ -21,20 +22,22 @@ SLACK = 2.0
 
 
 @dataclass
-class Outcome:
+class Iterate:
     """What a low-rank solver hands over.
 
     Attributes:
         Z: columns in costate form.
         gain: K' = (B'XE)', z-row as it stands.
-        method: name and reason.
+        method: the solver.
+        about: what it did, in words.
         tol: tolerance asked for.
         lean: Z has no columns to spare.
     """
 
     Z: Block
     gain: Block
-    method: str
+    method: SolverName
+    about: str
     tol: float
     history: list[dict[str, float]] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
@@ -42,12 +45,12 @@ class Outcome:
     lean: bool = False
 
 
-def make_solution(plant: Plant, outcome: Outcome, check: bool = True) -> RiccatiSolution:
+def make_solution(plant: Plant, iterate: Iterate, check: bool = True) -> RiccatiSolution:
     """Compress, leave the costate scaling and recompute the residual from Z. Collective.
 
     Args:
         plant: the plant.
-        outcome: columns and gain.
+        iterate: columns and gain.
         check: raise when the true residual misses the tolerance.
 
     Raises:
@@ -55,27 +58,25 @@ def make_solution(plant: Plant, outcome: Outcome, check: bool = True) -> Riccati
     """
     begin = time.perf_counter()
     n = plant.n_local
-    Z = outcome.Z if outcome.lean else compress(plant, outcome.Z, DROP * outcome.tol * plant.scale)
-    K = -np.linalg.solve(np.linalg.cholesky(plant.problem.R).T, outcome.gain.hand.T)
-    tall = -outcome.gain.tall @ np.linalg.inv(np.linalg.cholesky(plant.problem.R))
-    result = RiccatiSolution(
-        Z_s=Z.hand,
-        Z_z=np.asfortranarray(plant.stiff(Z.tall[:n])),
-        Z_v=np.asfortranarray(Z.tall[n:]),
-        K_s=K,
-        K_z=np.asfortranarray(tall[:n]),
-        K_v=np.asfortranarray(tall[n:]),
-        residual=np.inf,
-        method=outcome.method,
-        history=tuple(outcome.history),
-        counts=outcome.counts,
-    )
+    Z = iterate.Z if iterate.lean else compress(plant, iterate.Z, DROP * iterate.tol * plant.scale)
+    K = -np.linalg.solve(np.linalg.cholesky(plant.problem.R).T, iterate.gain.hand.T)
+    tall = -iterate.gain.tall @ np.linalg.inv(np.linalg.cholesky(plant.problem.R))
+    factor = Block(Z.hand, np.asfortranarray(np.concatenate([plant.stiff(Z.tall[:n]), Z.tall[n:]])))
     middle = time.perf_counter()
-    value = residual(plant.problem, result)
-    seconds = outcome.seconds | {"compress": middle - begin, "residual": time.perf_counter() - middle}
-    if check and not value <= SLACK * outcome.tol:
+    value = residual(plant.problem, factor)
+    seconds = iterate.seconds | {"compress": middle - begin, "residual": time.perf_counter() - middle}
+    if check and not value <= SLACK * iterate.tol:
         raise SolverError(
-            f"{outcome.method.split(':')[0]}: the residual recomputed from Z is {value:.1e}, tolerance "
-            f"{outcome.tol:.0e}; rounding limits this problem: ask for a larger tolerance or add damping"
+            f"{iterate.method}: the residual recomputed from Z is {value:.1e}, tolerance "
+            f"{iterate.tol:.0e}; rounding limits this problem: ask for a larger tolerance or add damping"
         )
-    return replace(result, residual=value, seconds=seconds)
+    return RiccatiSolution(
+        factor,
+        Gain(K, np.asfortranarray(tall[:n]), np.asfortranarray(tall[n:])),
+        value,
+        iterate.method,
+        iterate.about,
+        history=tuple(iterate.history),
+        counts=iterate.counts,
+        seconds=seconds,
+    )

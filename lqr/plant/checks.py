@@ -8,6 +8,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.petsc import Array
 
 EPS = float(np.finfo(np.float64).eps)
+MODAL_KEY = "control.method = 'modal'"  # of a scene: modal_lqr, which needs no damping
 APART = 1e30  # of Q and R, either way: the gain goes with the root of their ratio, its squares must keep some digits
 
 

@@ -12,27 +12,11 @@ they are expanded in) go with L', states with S, gains with S.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-
-
-@dataclass(frozen=True)
-class AbsoluteSolution:
-    """P ~ Z Z' and u = K x in the paper's coordinates.
-
-    Attributes:
-        Z: factor, hand rows [q_s, v_s], local tissue rows [q_e; v_e].
-        K: gain, transposed, in the same rows, n_s columns.
-    """
-
-    Z: Block
-    K: Block
 
 
 def _split(system: BlockSystem, X: Block) -> tuple[Array, Array, Array, Array]:
@@ -83,21 +67,3 @@ def gain_to_relative(system: BlockSystem, K: Block) -> Block:
     """S'^{-1} K' for a transposed gain. Collective."""
     q_s, v_s, z, v = _split(system, K)
     return Block(np.concatenate([q_s + _under(system, z), v_s + _under(system, v)]), K.tall)
-
-
-def factor_of(solution: RiccatiSolution) -> Block:
-    """Z as a block, hand-relative. Not collective."""
-    return Block(solution.Z_s, np.concatenate([solution.Z_z, solution.Z_v]))
-
-
-def gain_of(solution: RiccatiSolution) -> Block:
-    """K' as a block, hand-relative. Not collective."""
-    return Block(solution.K_s.T, np.concatenate([solution.K_z, solution.K_v]))
-
-
-def to_absolute(problem: RiccatiProblem, solution: RiccatiSolution) -> AbsoluteSolution:
-    """A solution in the paper's coordinates. Collective."""
-    system = problem.system
-    return AbsoluteSolution(
-        costates_to_absolute(system, factor_of(solution)), gain_to_absolute(system, gain_of(solution))
-    )

@@ -1,4 +1,4 @@
-"""The feedback u = K x of a plant as blocks, apart from the solver it came from."""
+"""State x and feedback u = K x of the plant, by parts and as columns."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.lqr.plant.problem import RiccatiSolution
+from softgrasp.lqr.plant.block import Block
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,18 @@ class PlantState:
     def __sub__(self, other: PlantState) -> PlantState:
         return PlantState(self.q_s - other.q_s, self.v_s - other.v_s, self.z - other.z, self.v_z - other.v_z)
 
+    @property
+    def block(self) -> Block:
+        """The state as one column."""
+        return Block(np.concatenate([self.q_s, self.v_s])[:, None], np.concatenate([self.z, self.v_z])[:, None])
+
 
 @dataclass(frozen=True)
 class Gain:
     """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z.
 
     Attributes:
-        K_s: gain on the hand, (n_s, 2 n_s), on every rank.
+        K_s: gain on the hand [N/m, N s/m; N m for torques], (n_s, 2 n_s), on every rank.
         K_z, K_v: gain on z and v_z, transposed, local rows (n_local, n_s).
     """
 
@@ -42,10 +47,16 @@ class Gain:
     K_z: Array
     K_v: Array
 
+    @property
+    def block(self) -> Block:
+        """K' as columns of the size of the state."""
+        return Block(self.K_s.T, np.concatenate([self.K_z, self.K_v]))
+
     @classmethod
-    def of(cls, solution: RiccatiSolution) -> Gain:
-        """The gain of a solution. Not collective."""
-        return cls(solution.K_s, solution.K_z, solution.K_v)
+    def of_block(cls, K: Block) -> Gain:
+        """The gain whose columns K' are given. Not collective."""
+        n = len(K.tall) // 2
+        return cls(np.ascontiguousarray(K.hand.T), np.asfortranarray(K.tall[:n]), np.asfortranarray(K.tall[n:]))
 
     def apply(self, comm: MPI.Intracomm, x: PlantState) -> Array:
         """K x, (n_s,), on every rank. Collective."""

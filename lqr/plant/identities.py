@@ -17,13 +17,13 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 def gain_translation(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
     """Gain u for the whole body displaced by unit translations, (n_s, d) [N/m]. Not collective."""
-    return np.asarray(solution.K_s[:, : problem.layout.dimension])
+    return np.asarray(solution.gain.K_s[:, : problem.layout.dimension])
 
 
 def gain_rigid_velocity(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
     """Gain u for the whole body moving with unit velocities, (n_s, d) [N s/m]. Not collective."""
     n_s = problem.layout.n_s
-    return np.asarray(solution.K_s[:, n_s : n_s + problem.layout.dimension])
+    return np.asarray(solution.gain.K_s[:, n_s : n_s + problem.layout.dimension])
 
 
 def optimal_cost(problem: RiccatiProblem, solution: RiccatiSolution, displacement: Array) -> float:
@@ -34,12 +34,12 @@ def optimal_cost(problem: RiccatiProblem, solution: RiccatiSolution, displacemen
         solution: the Riccati solution.
         displacement: start minus target of the hand [m, rad], (n_s,).
     """
-    return float(np.sum((solution.Z_s[: problem.layout.n_s].T @ displacement) ** 2))
+    return float(np.sum((solution.factor.hand[: problem.layout.n_s].T @ displacement) ** 2))
 
 
 def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float:
     """||(K x_T)'R(K x_T) - C_s'QC_s|| / ||C_s'QC_s||. Not collective."""
-    K = solution.K_s[:, : problem.layout.n_s]
+    K = solution.gain.K_s[:, : problem.layout.n_s]
     exact = problem.C_s.T @ problem.Q @ problem.C_s
     return float(np.linalg.norm(K.T @ problem.R @ K - exact) / (np.linalg.norm(exact) or 1.0))
 
@@ -52,6 +52,6 @@ def velocity_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float
     if problem.system.damping.in_space and problem.system.damping.alpha > 0:
         return None
     n_s = problem.layout.n_s
-    left = solution.K_s[:, :n_s].T @ problem.R @ solution.K_s[:, n_s:]
-    right = solution.Z_s[:n_s] @ solution.Z_s[:n_s].T
+    left = solution.gain.K_s[:, :n_s].T @ problem.R @ solution.gain.K_s[:, n_s:]
+    right = solution.factor.hand[:n_s] @ solution.factor.hand[:n_s].T
     return float(np.linalg.norm(left - right) / (np.linalg.norm(right) or 1.0))

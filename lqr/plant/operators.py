@@ -71,8 +71,8 @@ def inputs_adjoint(problem: RiccatiProblem, Z: Block) -> Array:
     return total(problem.layout.comm, problem.B_z.T @ Z.tall[problem.layout.n_local :])
 
 
-def reach(problem: RiccatiProblem, Phi: Array) -> Array:
-    """What the inputs couple to shapes of the tissue by: Phi'G through the hand, without one Phi'B_z. Collective."""
+def modal_inputs(problem: RiccatiProblem, Phi: Array) -> Array:
+    """Coupling of the inputs to shapes of the tissue, (k, m): Phi'G through the hand, else Phi'B_z. Collective."""
     return total(problem.layout.comm, Phi.T @ (problem.system.G if problem.B_z is None else problem.B_z))
 
 

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import BlockSystem
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
+
+SolverName = Literal["dense", "newton_adi", "radi", "galerkin", "modal_lqr"]
 
 
 @dataclass(frozen=True)
@@ -61,25 +66,23 @@ class RiccatiSolution:
     """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`.
 
     Attributes:
-        Z_s: rows of Z that belong to q_s and v_s (in this order), (2 n_s, rank), on every rank.
-        Z_z, Z_v: local rows of Z for z and v_z, (n_local, rank).
-        K_s: gain on [q_s, v_s], (n_s, 2 n_s), on every rank.
-        K_z, K_v: gain on z and v_z, transposed, local rows (n_local, n_s).
+        factor: Z, hand rows [q_s, v_s] and local tissue rows [z; v_z], ``rank`` columns.
+        gain: K = -R^{-1} B'XE.
         residual: true relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z at the end.
-        method: name of the solver and why it was chosen.
+        method: the solver.
+        about: what the solver did, in words.
+        reason: why this solver was chosen; empty when the caller made it.
         history: one dictionary per iteration.
         counts: newton_steps, adi_steps, solves.
         seconds: time by stage.
     """
 
-    Z_s: Array
-    Z_z: Array
-    Z_v: Array
-    K_s: Array
-    K_z: Array
-    K_v: Array
+    factor: Block
+    gain: Gain
     residual: float
-    method: str
+    method: SolverName
+    about: str = ""
+    reason: str = ""
     history: tuple[dict[str, float], ...] = ()
     counts: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -87,4 +90,10 @@ class RiccatiSolution:
     @property
     def rank(self) -> int:
         """Columns of Z."""
-        return int(self.Z_s.shape[1])
+        return self.factor.columns
+
+    @property
+    def summary(self) -> str:
+        """Method, what it did and why it was chosen, in one line."""
+        about = f": {self.about}" if self.about else ""
+        return f"{self.method}{about}" + (f" (chosen: {self.reason})" if self.reason else "")

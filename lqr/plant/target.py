@@ -36,7 +36,7 @@ class Target:
     y: Array
 
 
-def sag(system: BlockSystem) -> Array:
+def static_tissue(system: BlockSystem) -> Array:
     """Static displacement relative to the hand, K_ee z = G g; local rows (n_local,). Collective.
 
     Raises:
@@ -63,7 +63,7 @@ def steady_input(system: BlockSystem) -> Array:
 def rest(system: BlockSystem, *, deformed: bool = True) -> PlantState:
     """The plant at rest with the hand at 0, in equilibrium or undeformed. Collective."""
     n_s, n = system.layout.n_s, system.layout.n_local
-    return PlantState(np.zeros(n_s), np.zeros(n_s), sag(system) if deformed else np.zeros(n), np.zeros(n))
+    return PlantState(np.zeros(n_s), np.zeros(n_s), static_tissue(system) if deformed else np.zeros(n), np.zeros(n))
 
 
 def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
@@ -81,7 +81,7 @@ def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
         )
     q = np.zeros(layout.n_s)
     q[: len(given)] = given
-    return _at(problem, q, sag(problem.system))
+    return _at(problem, q, static_tissue(problem.system))
 
 
 def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
@@ -93,18 +93,18 @@ def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
         ControlError: y_bar has another number of entries, or no position of the hand brings the outputs there.
         SolverError: the equilibrium under gravity fails.
     """
-    wanted = np.asarray(y_bar, dtype=np.float64).ravel()
+    y = np.asarray(y_bar, dtype=np.float64).ravel()
     C_s = problem.C_s
-    if len(wanted) != len(C_s) or not np.isfinite(wanted).all():
-        raise ControlError(f"the target {wanted.tolist()} of the outputs must have {len(C_s)} finite entries")
-    z = sag(problem.system)
-    right = wanted - total(problem.layout.comm, problem.C_z.T @ z)
+    if len(y) != len(C_s) or not np.isfinite(y).all():
+        raise ControlError(f"the target {y.tolist()} of the outputs must have {len(C_s)} finite entries")
+    z = static_tissue(problem.system)
+    right = y - total(problem.layout.comm, problem.C_z.T @ z)
     q = np.linalg.lstsq(C_s, right)[0]
     miss = float(np.abs(C_s @ q - right).max())
     # rounding of the least squares, far below any length that counts
     if miss > 1e-9 * (1.0 + float(np.abs(right).max())):
         raise ControlError(
-            f"no position of the hand brings the outputs to {wanted.tolist()}, the nearest misses by {miss:.3g} m; "
+            f"no position of the hand brings the outputs to {y.tolist()}, the nearest misses by {miss:.3g} m; "
             "give a target that the body reaches at rest"
         )
     return _at(problem, np.asarray(q), z)

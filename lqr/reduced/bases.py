@@ -20,11 +20,13 @@ from softgrasp.lqr.lowrank.compress import gram, triangular
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
-from softgrasp.lqr.plant.operators import reach
+from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.engines import EPS, factor, small_svd
 from softgrasp.reduction.states import BasisError
+
+A_PRIORI = "structured"  # the basis that needs no P
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,9 @@ class BasisFamily:
     sigma: tuple[Array, ...]
     make: Callable[[int], RiccatiBasis]
 
-    def orders(self, wanted: Sequence[int]) -> list[int]:
-        """The wanted orders that exist. Not collective."""
-        return [N for N in wanted if self.smallest <= N <= self.largest and (N - self.smallest) % self.step == 0]
+    def orders(self, sizes: Sequence[int]) -> list[int]:
+        """Those of the orders that exist. Not collective."""
+        return [N for N in sizes if self.smallest <= N <= self.largest and (N - self.smallest) % self.step == 0]
 
     def at(self, N: int) -> RiccatiBasis:
         """The basis of order N. Collective.
@@ -230,7 +232,7 @@ def structured(problem: RiccatiProblem) -> BasisFamily:
     omega, Phi, massed = some_modes(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
     c = total(system.layout.comm, problem.C_z.T @ Phi)
-    g = reach(problem, Phi)
+    g = modal_inputs(problem, Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c)
     floor = np.finfo(float).tiny
     weight = np.sum(c**2, axis=0) * np.sum(g**2, axis=1) / (np.maximum(rates.rate, floor) * omega**2)
@@ -239,9 +241,9 @@ def structured(problem: RiccatiProblem) -> BasisFamily:
 
     def make(N: int) -> RiccatiBasis:
         pick = order[: (N - 2 * n_s) // 2]
-        return modal_basis(problem, "structured", omega[pick], Phi[:, pick], massed[:, pick])
+        return modal_basis(problem, A_PRIORI, omega[pick], Phi[:, pick], massed[:, pick])
 
-    return BasisFamily("structured", 2 * n_s, 2 * n_s + 2 * k, 2, (weight[order],), make)
+    return BasisFamily(A_PRIORI, 2 * n_s, 2 * n_s + 2 * k, 2, (weight[order],), make)
 
 
 def modal_basis(problem: RiccatiProblem, name: str, omega: Array, Phi: Array, massed: Array) -> RiccatiBasis:
@@ -326,7 +328,7 @@ BASES: dict[str, Callable[[RiccatiProblem, Block], BasisFamily]] = {
     "pod_fixed_solid": pod_fixed_solid,
     "componentwise_pod": componentwise_pod,
     "pod_decomposed": pod_decomposed,
-    "structured": lambda problem, _: structured(problem),
+    A_PRIORI: lambda problem, _: structured(problem),
 }
 
 
@@ -336,7 +338,7 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
     Args:
         name: key of :data:`BASES`.
         problem: the plant.
-        Z: factor of X in hand-relative coordinates, see :func:`lqr.plant.coordinates.factor_of`.
+        Z: factor of X in hand-relative coordinates, see :class:`lqr.plant.problem.RiccatiSolution`.
 
     Raises:
         ControlError: the name is unknown, or the method does not apply.

@@ -13,11 +13,11 @@ from softgrasp.fem.system import LayerMaterial
 from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import gain_of
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.reduced.riccati import GainJudge, gain_error, project
+from softgrasp.lqr.reduced.riccati import GainJudge, gain_error, project_plant
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.sampled import Sampling
 
@@ -54,7 +54,7 @@ class Retuner:
         self.problem = problem
         self.basis = basis = energy_scaled(problem, basis)
         self.reference: Materials = problem.system.materials
-        self.matrices = project(problem, basis)
+        self.matrices = project_plant(problem, basis)
         comm, n = problem.layout.comm, problem.layout.n_local
         W_v, U_z, U_v = basis.W.tall[n:], basis.U.tall[:n], basis.U.tall[n:]
         self.parts: list[tuple[tuple[Array, Array], tuple[Array, Array]]] = []
@@ -65,7 +65,7 @@ class Retuner:
                 pairs.append((-elastic, -viscous))
             self.parts.append((pairs[0], pairs[1]))
         self.A_0 = self.matrices.A - self._stiffness(self.reference)
-        self.lift = descriptor_adjoint(problem, basis.W)
+        self.columns = descriptor_adjoint(problem, basis.W)
 
     @property
     def N(self) -> int:
@@ -103,9 +103,9 @@ class Retuner:
         K_N = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
         return Tuned(P_N, K_N, time.perf_counter() - begin)
 
-    def full_gain(self, tuned: Tuned) -> Block:
-        """K_hat of the full plant, transposed, hand-relative: E'W does not depend on the materials. Not collective."""
-        return self.lift.times(-tuned.P_N @ np.linalg.solve(self.problem.R, self.matrices.B.T).T)
+    def full_gain(self, tuned: Tuned) -> Gain:
+        """K_hat of the full plant: E'W does not depend on the materials. Not collective."""
+        return Gain.of_block(self.columns.times(-tuned.P_N @ np.linalg.solve(self.problem.R, self.matrices.B.T).T))
 
 
 @dataclass(frozen=True)
@@ -157,22 +157,21 @@ def over_box(
         try:
             tuned = on_root(comm, lambda materials=materials: retuner.solve(materials))  # type: ignore[misc]
         except ControlError as error:
-            nothing = float("nan")
-            result.append(BoxPoint(materials, nothing, nothing, nothing, nothing, str(error)))
+            nan = float("nan")
+            result.append(BoxPoint(materials, nan, nan, nan, nan, str(error)))
             continue
         gain = retuner.full_gain(tuned)
         best = solve(problem)
-        found = GainJudge(problem, best, start, ModalLoop(problem, modes), law).quality(gain)
-        miss, excess = gain_error(problem, gain_of(best), gain), found.cost_excess
+        quality = GainJudge(problem, best, start, ModalLoop(problem, modes), law).quality(gain)
         result.append(
             BoxPoint(
                 materials,
-                miss,
-                excess,
-                found.abscissa,
+                gain_error(problem, best.gain, gain),
+                quality.cost_excess,
+                quality.abscissa,
                 tuned.seconds,
-                certified=found.certified,
-                sampled=found.sampled,
+                certified=quality.certified,
+                sampled=quality.sampled,
             )
         )
     return tuple(result)

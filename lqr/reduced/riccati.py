@@ -1,19 +1,20 @@
-"""The paper's reduced Riccati equations: solve, lift, and say what the gain is worth on the full plant."""
+"""The paper's reduced Riccati equations: project, solve, and judge the gain on the full plant."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import costates_to_absolute, factor_of, gain_of, gain_to_absolute
+from softgrasp.lqr.plant.coordinates import costates_to_absolute, gain_to_absolute
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import descriptor, descriptor_adjoint, dynamics, inputs_adjoint, outputs
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
@@ -30,20 +31,18 @@ class ReducedRiccati:
         basis: the basis, scaled to energy.
         matrices: E_N, A_N, B_N, C_N with the weights.
         P_N: (N, N).
-        gain: K_hat, transposed, hand-relative coordinates.
-        seconds: to solve the reduced equation once the matrices are there, best of three.
+        gain: K_hat on the full plant.
     """
 
     basis: RiccatiBasis
     matrices: ReducedMatrices
     P_N: Array
-    gain: Block
-    seconds: float
+    gain: Gain
 
 
 @dataclass(frozen=True)
 class GainReport:
-    """What a reduced gain is worth.
+    """A reduced gain against the optimal one, on the full plant.
 
     Attributes:
         method: key of the basis.
@@ -52,10 +51,12 @@ class GainReport:
         error_K: ||K - K_hat||_F / ||K||_F in the paper's coordinates.
         cost_excess: J(K_hat) / J(K) - 1 from the scene's start on the full plant.
         abscissa_full: largest real part of the full closed loop [1/s].
-        time_are: seconds for the reduced equation.
+        time_are: seconds of one solution of the reduced equation, for who measures it; else nan.
         reason: why there is no gain; empty when there is one.
         certified: the sign of the abscissa is certain, see :class:`lqr.spectrum.modal_loop.LoopQuality`.
         sampled: the loop from tick to tick, where its instants are known.
+        gain: K_hat; None where there is none.
+        matrices: of the reduced equation; None where they are not kept.
     """
 
     method: str
@@ -64,10 +65,12 @@ class GainReport:
     error_K: float  # noqa: N815
     cost_excess: float
     abscissa_full: float
-    time_are: float
+    time_are: float = float("nan")
     reason: str = ""
     certified: bool = True
     sampled: SampledRadius | None = None
+    gain: Gain | None = None
+    matrices: ReducedMatrices | None = None
 
     @property
     def stable(self) -> bool:
@@ -76,7 +79,7 @@ class GainReport:
         return fine and (self.sampled is None or self.sampled.stable)
 
 
-def project(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
+def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
     """E_N = W'EU, A_N = W'AU, B_N = W'B, C_N = CU. Collective."""
     comm, W, U = problem.layout.comm, basis.W, basis.U
     return ReducedMatrices(
@@ -89,31 +92,22 @@ def project(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
     )
 
 
-def lift_gain(problem: RiccatiProblem, basis: RiccatiBasis, P_N: Array) -> Block:
-    """K_hat' = -E'W P_N (W'B) R^{-1}, transposed, hand-relative. Collective."""
+def full_gain(problem: RiccatiProblem, basis: RiccatiBasis, P_N: Array) -> Gain:
+    """K_hat' = -E'W P_N (W'B) R^{-1}. Collective."""
     small = -P_N @ np.linalg.solve(problem.R, inputs_adjoint(problem, basis.W)).T
-    return descriptor_adjoint(problem, basis.W).times(small)
+    return Gain.of_block(descriptor_adjoint(problem, basis.W).times(small))
 
 
 def reduce_riccati(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedRiccati:
-    """Scale to energy, project, solve the reduced equation on rank 0, lift. Collective.
+    """Scale to energy, project, solve the reduced equation on rank 0, and expand its gain. Collective.
 
     Raises:
         ControlError: the reduced equation has no stabilising solution.
     """
     basis = energy_scaled(problem, basis)
-    matrices = project(problem, basis)
-
-    def solve() -> tuple[Array, float]:
-        best = np.inf
-        for _ in range(3):
-            begin = time.perf_counter()
-            P_N = solve_reduced(matrices)
-            best = min(best, time.perf_counter() - begin)
-        return P_N, best
-
-    P_N, seconds = on_root(problem.layout.comm, solve)
-    return ReducedRiccati(basis, matrices, P_N, lift_gain(problem, basis, P_N), seconds)
+    matrices = project_plant(problem, basis)
+    P_N = on_root(problem.layout.comm, lambda: solve_reduced(matrices))
+    return ReducedRiccati(basis, matrices, P_N, full_gain(problem, basis, P_N))
 
 
 def factor_error(problem: RiccatiProblem, Z: Block, basis: RiccatiBasis, P_N: Array) -> float:
@@ -131,9 +125,9 @@ def norm(problem: RiccatiProblem, X: Block) -> float:
     return float(np.sqrt(square))
 
 
-def gain_error(problem: RiccatiProblem, K: Block, K_hat: Block) -> float:
+def gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
     """||K - K_hat||_F / ||K||_F in the paper's coordinates. Collective."""
-    system = problem.system
+    system, K, K_hat = problem.system, gain.block, gain_hat.block
     difference = gain_to_absolute(system, Block(K.hand - K_hat.hand, K.tall - K_hat.tall))
     return norm(problem, difference) / norm(problem, gain_to_absolute(system, K))
 
@@ -157,67 +151,86 @@ class GainJudge:
         loop: ModalLoop | None = None,
         law: Sampling | None = None,
     ) -> None:
-        self.problem = problem
-        self.Z, self.K = factor_of(solution), gain_of(solution)
-        self.Z_absolute = costates_to_absolute(problem.system, self.Z)
+        self.problem, self.gain, self.K = problem, solution.gain, solution.gain.block
+        Z = solution.factor
+        self.Z_absolute = costates_to_absolute(problem.system, Z)
         self.start = start
         self.loop = ModalLoop(problem) if loop is None else loop
-        self.whole: ModalLoop | None = None
         self.law, self.ticks = law, SampledLoop(problem, self.loop)
-        self.optimal = float(np.sum(gram(problem.layout.comm, self.Z, descriptor(problem, start)) ** 2))
+        self.optimal = float(np.sum(gram(problem.layout.comm, Z, descriptor(problem, start)) ** 2))
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
+        self._whole: ModalLoop | None = None
 
-    def quality(self, gain: Block) -> LoopQuality:
-        """Abscissa, cost excess and sampled radius of any gain. Collective.
+    def quality(self, gain: Gain) -> LoopQuality:
+        """Abscissa, excess cost and sampled radius of any gain. Collective.
 
-        Large scenes take the abscissa from :func:`lqr.spectrum.certificate.certified_abscissa` and the cost from the
-        lowest modes; where the certificate fails, all modes are taken as long as a dense spectrum is affordable.
+        Small plants take all modes. Large ones take the abscissa from
+        :func:`lqr.spectrum.certificate.certified_abscissa` and the cost from the lowest modes; where the certificate
+        fails, all modes are taken up to :data:`lqr.spectrum.modal_loop.DENSE_LIMIT`.
+
+        Raises:
+            SolverError: no eigenvalue converges, and there are too many modes to take all.
         """
+        K = gain.block
         if self.loop.complete:
-            return self._sampled(gain, self.loop.quality(gain, self.K, self.start, self.optimal))
-        spectrum = certified_abscissa(self.problem, gain)
-        if not spectrum.certified and self.problem.layout.n_e <= DENSE_LIMIT:
-            return self.by_all_modes(gain)
-        found = self.loop.quality(gain, self.K, self.start, self.optimal)
-        excess = found.cost_excess if spectrum.value < 0 else np.inf
+            return self._sampled(K, self._modal(self.loop, K))
+        fits = self.problem.layout.n_e <= DENSE_LIMIT
+        try:
+            spectrum = certified_abscissa(self.problem, K)
+        except SolverError:
+            if not fits:
+                raise
+            spectrum = None
+        if spectrum is None or (fits and not spectrum.certified):
+            if self._whole is None:
+                self._whole = ModalLoop(self.problem, DENSE_LIMIT)
+                self.ticks = SampledLoop(self.problem, self._whole)
+            if spectrum is None:  # nor would it converge for the next gain
+                self.loop = self._whole
+            return self._sampled(K, self._modal(self._whole, K))
+        excess = self._modal(self.loop, K).cost_excess if spectrum.value < 0 else np.inf
         poles = spectrum.eigenvalues
-        return self._sampled(gain, LoopQuality(spectrum.value, excess, spectrum.certified, spectrum.exact, poles))
+        return self._sampled(K, LoopQuality(spectrum.value, excess, spectrum.certified, spectrum.exact, poles))
 
-    def by_all_modes(self, gain: Block) -> LoopQuality:
-        """The same from the whole spectrum, up to :data:`lqr.spectrum.modal_loop.DENSE_LIMIT` modes. Collective."""
-        if self.whole is None:
-            self.whole = self.loop if self.loop.complete else ModalLoop(self.problem, DENSE_LIMIT)
-            self.ticks = SampledLoop(self.problem, self.whole)
-        return self._sampled(gain, self.whole.quality(gain, self.K, self.start, self.optimal))
+    def _modal(self, loop: ModalLoop, K: Block) -> LoopQuality:
+        return loop.quality(K, self.K, self.start, self.optimal)
 
-    def _sampled(self, gain: Block, found: LoopQuality) -> LoopQuality:
+    def _sampled(self, K: Block, quality: LoopQuality) -> LoopQuality:
         """With the radius from tick to tick; that of the law at the midpoint follows from the poles. Collective."""
         if self.law is None:
-            return found
+            return quality
         if self.law.every:
-            return replace(found, sampled=self.ticks.judge(gain, self.law))
-        radius = SampledRadius(midpoint_radius(found.poles, self.law.dt), found.certified, found.exact)
-        return replace(found, sampled=radius)
+            return replace(quality, sampled=self.ticks.judge(K, self.law))
+        radius = SampledRadius(midpoint_radius(quality.poles, self.law.dt), quality.certified, quality.exact)
+        return replace(quality, sampled=radius)
 
     def report(self, basis: RiccatiBasis) -> GainReport:
-        """All figures of one basis; a reduced equation without solution is reported, not raised. Collective."""
-        nothing = float("nan")
+        """All figures of one basis. Collective.
+
+        A reduced equation without solution is reported, not raised; a gain whose spectrum does not converge is not
+        certified.
+        """
+        nan = float("nan")
         try:
             reduced = reduce_riccati(self.problem, basis)
         except ControlError as error:
-            return GainReport(basis.name, basis.N, nothing, nothing, nothing, nothing, nothing, str(error))
-        found = self.quality(reduced.gain)
+            return GainReport(basis.name, basis.N, nan, nan, nan, nan, reason=str(error))
+        try:
+            quality = self.quality(reduced.gain)
+        except SolverError:
+            quality = LoopQuality(nan, nan, False)
         return GainReport(
             method=basis.name,
             N=basis.N,
             error_P=factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N),
-            error_K=gain_error(self.problem, self.K, reduced.gain),
-            cost_excess=found.cost_excess,
-            abscissa_full=found.abscissa,
-            time_are=reduced.seconds,
-            certified=found.certified,
-            sampled=found.sampled,
+            error_K=gain_error(self.problem, self.gain, reduced.gain),
+            cost_excess=quality.cost_excess,
+            abscissa_full=quality.abscissa,
+            certified=quality.certified,
+            sampled=quality.sampled,
+            gain=reduced.gain,
+            matrices=reduced.matrices,
         )
 
 

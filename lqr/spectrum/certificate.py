@@ -13,6 +13,7 @@ from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.lqr.dense.modal import some_modes
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import damp, descriptor
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
@@ -61,6 +62,20 @@ class Abscissa:
         return self.certified and self.value < 0
 
 
+def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
+    """Largest real part of the spectrum of x' = (A + B K) x [1/s], see :func:`certified_abscissa`. Collective.
+
+    Args:
+        problem: the plant; damped in every layer for a certificate.
+        gain: u = K x.
+
+    Raises:
+        ControlError: the plant has no hand.
+        SolverError: no eigenvalue converges.
+    """
+    return certified_abscissa(problem, gain.block)
+
+
 def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
     """Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it. Collective.
 
@@ -92,15 +107,15 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
     why = why_no_bound(problem)
     tail = None if why else Tail(problem, K)
     # the same bits on every rank: they decide how often all search
-    wanted, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
+    aim, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
     resolvent = Resolvent(problem, K, shift)
     try:
         for count in (guess, *(more for more in GROWTH if more > guess)):
-            asked = min(count, problem.layout.states - 2)
-            values = resolvent.nearest(asked)
+            number = min(count, problem.layout.states - 2)
+            values = resolvent.nearest(number)
             result: Abscissa = problem.layout.comm.bcast(_judge(values, shift, tail, why))
-            short = len(values) < asked  # asking for more would not help
-            enough = result.certified and (result.exact or result.radius >= ENOUGH * wanted)
+            short = len(values) < number  # asking for more would not help
+            enough = result.certified and (result.exact or result.radius >= ENOUGH * aim)
             if result.value >= 0 or short or enough or why:
                 break
     finally:
@@ -191,8 +206,8 @@ class Resolvent:
             load = Block(np.concatenate([np.zeros(n_s), unit])[:, None], np.zeros((2 * self.n, 1)))
             columns.append(self._open(load))
         self.columns = Block.join(columns)
-        felt = self.K.hand.T @ self.columns.hand + total(self.comm, self.K.tall.T @ self.columns.tall)
-        self.small = np.linalg.inv(np.eye(n_s) - felt)
+        input_ = self.K.hand.T @ self.columns.hand + total(self.comm, self.K.tall.T @ self.columns.tall)
+        self.small = np.linalg.inv(np.eye(n_s) - input_)
 
     def _open(self, b: Block) -> Block:
         """(sigma E - A)^{-1} b for one column. Collective."""
@@ -221,8 +236,8 @@ class Resolvent:
         self.comm.Bcast(hand)
         state = Block(hand[:, None], np.array(local[self.extra :])[:, None])
         answer = self._open(descriptor(self.problem, state))
-        felt = self.K.hand.T @ answer.hand + total(self.comm, self.K.tall.T @ answer.tall)
-        input_ = self.small @ felt
+        input_ = self.K.hand.T @ answer.hand + total(self.comm, self.K.tall.T @ answer.tall)
+        input_ = self.small @ input_
         out = y.array_w
         out[: self.extra] = (answer.hand + self.columns.hand @ input_)[: self.extra, 0]
         out[self.extra :] = (answer.tall + self.columns.tall @ input_)[:, 0]
@@ -255,14 +270,14 @@ class Resolvent:
         eps.setInitialSpace(start)
         try:
             eps.solve()
-            found = eps.getConverged()
-            if found == 0:
+            converged = eps.getConverged()
+            if converged == 0:
                 raise SolverError(
                     f"closed-loop spectrum: none of {count} eigenvalues converged in {eps.getIterationNumber()} "
                     "iterations; judge the gain by a time simulation or a smaller scene"
                 )
-            theta = np.array([eps.getEigenvalue(i) for i in range(found)])
-            worst = max(eps.computeError(i) for i in range(0, found, max(1, found // 6)))
+            theta = np.array([eps.getEigenvalue(i) for i in range(converged)])
+            worst = max(eps.computeError(i) for i in range(0, converged, max(1, converged // 6)))
             if not worst <= ERROR:
                 raise SolverError(
                     f"closed-loop spectrum: an eigenpair has the residual {worst:.1e}, allowed {ERROR:.0e}"

@@ -11,7 +11,7 @@ from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.operators import damp, reach
+from softgrasp.lqr.plant.operators import damp, modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
@@ -157,7 +157,7 @@ def _lowest(problem: RiccatiProblem, k: int) -> tuple[Array, Array, ModalPlant]:
     omega, Phi, massed = some_modes(problem, k)
     parts = (
         modal_damping(problem, Phi),
-        reach(problem, Phi),
+        modal_inputs(problem, Phi),
         total(comm, problem.C_z.T @ Phi),
     )
     return Phi, massed, modal_plant(problem, omega, Phi, massed, parts)

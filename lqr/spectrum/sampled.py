@@ -227,9 +227,9 @@ class SampledLoop:
         B[v], B[w] = np.linalg.inv(M_s), -force
         k = np.hstack([K.hand.T, (K_z / omega[:, None]).T, K_v.T])
         fastest = 4 * shift_range(Plant(self.problem), []).fastest  # estimated within a factor of 4
-        beyond = np.geomspace(omega[-1], max(fastest, 2 * omega[-1]), FREQUENCIES)
+        left_out = np.geomspace(omega[-1], max(fastest, 2 * omega[-1]), FREQUENCIES)
         size = float(np.hypot(tail.rest_z / omega[-1], tail.rest_v) * tail.rest_force)
-        return _Parts(A, B, k, False, _Rest(size, beyond, tail.alpha + tail.beta * beyond**2, tail.drag))
+        return _Parts(A, B, k, False, _Rest(size, left_out, tail.alpha + tail.beta * left_out**2, tail.drag))
 
     def _radius(self, parts: _Parts, law: Sampling) -> SampledRadius:
         return on_root(self.comm, lambda: _judge(parts, law))
@@ -318,7 +318,7 @@ def _carried(A: Array, B: Array, hand: Array, K: Controller, law: Sampling) -> S
     step, accelerated, dragged, _ = K.model
     drag = np.zeros_like(accelerated) if dragged is None else dragged
     C_v, m = hand[n_s:], n_s
-    felt = np.hstack([K.K[:, : 2 * n_s] @ hand, K.K[:, 2 * n_s :]])
+    gain = np.hstack([K.K[:, : 2 * n_s] @ hand, K.K[:, 2 * n_s :]])
     one = np.eye(n)
 
     def moved(x: Array) -> Array:
@@ -327,5 +327,5 @@ def _carried(A: Array, B: Array, hand: Array, K: Controller, law: Sampling) -> S
 
     free = np.block([[A_d, np.zeros((n, len(step)))], [moved(A_d) - (accelerated - drag) @ C_v @ one, step]])
     push = np.vstack([B_d, moved(B_d)])
-    T = np.block([[free, push], [felt, np.zeros((m, m))]]) if law.delay else free + push @ felt
+    T = np.block([[free, push], [gain, np.zeros((m, m))]]) if law.delay else free + push @ gain
     return SampledRadius(float(np.abs(np.linalg.eigvals(T)).max()))

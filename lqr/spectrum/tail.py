@@ -114,11 +114,11 @@ class Tail:
         beta, alpha = self.beta - 2 * a / last**2, self.alpha - 2 * a
         by_beta = self.rest_static / beta if beta > 0 else np.inf
         by_alpha = self.rest_force / alpha if alpha > 0 else np.inf
-        beyond = min(by_beta, by_alpha)
-        if not np.isfinite([*each, beyond]).all():
+        rest_of = min(by_beta, by_alpha)
+        if not np.isfinite([*each, rest_of]).all():
             return np.inf
         K_z, K_v, force = self.modes
-        rest = (self.rest_z / r + self.rest_v) * far * beyond
+        rest = (self.rest_z / r + self.rest_v) * far * rest_of
         return float(np.sum((K_z / r + K_v) * force * each)) + rest
 
     def _coupled(self, r: float) -> float:
@@ -130,10 +130,10 @@ class Tail:
         )
         return (K_z / r + K_v) * force
 
-    def radius(self, wanted: float) -> float:
-        """Radius, to a tenth, from where the bound for Re s >= 0 is below ``wanted``; inf if none. Not collective."""
+    def radius(self, limit: float) -> float:
+        """Radius, to a tenth, from where the bound for Re s >= 0 is below ``limit``; inf if none. Not collective."""
         grid = float(self.omega[0]) * 1e-3 * 1.1 ** np.arange(145)  # to 1000 omega_1
-        good = [r for r in grid if self.bound(r) < wanted]
+        good = [r for r in grid if self.bound(r) < limit]
         return float(min(good, default=np.inf))
 
 

@@ -20,13 +20,13 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_of, gain_to_relative
+from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.study.bench.peers import to_scipy
 from softgrasp.study.report.origin import peak_memory_mb
@@ -118,7 +118,7 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
             rows[name] = {"error": str(error)}
             continue
         rows[name] = describe(solution, seconds, base, peak_memory_mb(comm))
-        gain = gain_of(solution)
+        gain = solution.gain.block
         if reference is None:
             reference = gain
         else:
@@ -223,20 +223,16 @@ def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
     if importlib.util.find_spec(peer) is None:
         return {"missing": True}
     problem = problem_for(MPI.COMM_WORLD, nx, beta)
-    reference = gain_of(NewtonADI().solve(problem))
+    reference = NewtonADI().solve(problem).gain.block
     begin = time.perf_counter()
     try:
         answer = PEERS[peer](problem)
     except Exception as error:  # a peer's failure is a result of the comparison
         return {"error": f"{type(error).__name__}: {error}"[:200], "seconds": time.perf_counter() - begin}
-    n, Z = problem.layout.n_local, answer.Z
-    candidate = RiccatiSolution(
-        Z.hand, Z.tall[:n], Z.tall[n:], answer.K.hand.T, answer.K.tall[:n], answer.K.tall[n:], np.inf, peer
-    )
     return {
         "seconds": answer.seconds,
-        "rank": candidate.rank,
-        "residual": residual(problem, candidate),
+        "rank": answer.Z.columns,
+        "residual": residual(problem, answer.Z),
         "gain_difference": gain_difference(problem, answer.K, reference),
         "states": problem.layout.states,
     }

@@ -26,7 +26,7 @@ from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.solve.solvers import SolverName
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.lowrank.modal_start import plant_modes, project, solve_small
+from softgrasp.lqr.lowrank.modal_start import plant_modes, restrict, solve_small
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import make_shifted
@@ -139,7 +139,7 @@ def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     plant = Plant(problem_for(comm, 10, 0.002))
     for k in (15, 16, 30, 60):
         omega, V = plant_modes(plant, k)
-        small = project(plant, V, omega, plant.mass(V))
+        small = restrict(plant, V, omega, plant.mass(V))
 
         def from_all(small: Any = small) -> None:
             softgrasp.lqr.lowrank.modal_start.FEW_MODES = 2**30

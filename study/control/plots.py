@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,10 +12,11 @@ from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from softgrasp.lqr.plant.coordinates import gain_of
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
-from softgrasp.study.control.sweep import TITLES, SweptBasis, fast_order
-from softgrasp.study.pictures.loop import figure_decay, figure_histories, figure_loop_move
+from softgrasp.lqr.design.orders import BasisGains, fast_order
+from softgrasp.lqr.reduced.bases import A_PRIORI
+from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned, a_priori
+from softgrasp.study.pictures.frames import Frames
+from softgrasp.study.pictures.loop import Array, Poles, figure_decay, figure_histories, figure_loop_move
 from softgrasp.study.pictures.style import (
     BLUE,
     COLUMN,
@@ -29,14 +30,6 @@ from softgrasp.study.pictures.style import (
     paper_style,
     save,
 )
-
-if TYPE_CHECKING:
-    from softgrasp.fem.petsc import Array
-    from softgrasp.study.control.loop import LoopRuns
-    from softgrasp.study.control.solve import Design
-    from softgrasp.study.control.sweep import Retuned
-    from softgrasp.study.pictures.frames import Frames
-    from softgrasp.study.pictures.loop import Poles
 
 LOOKS = {
     "pod": (BLUE, "-", "o"),
@@ -56,21 +49,21 @@ LOWEST = 1e-12  # smaller excess cost is rounding
 SHOWN_MODES = 20
 
 
-def drawn(basis: SweptBasis, key: str) -> tuple[list[int], list[float]]:
+def drawn(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
     """Orders and values of the line of a method; nan, which breaks the line, for errors above 100 %. Not collective."""
     values = [getattr(r, key) for r in basis.reports]
     return [r.N for r in basis.reports], [max(v, LOWEST) if v <= TOP else float("nan") for v in values]
 
 
-def unstable(basis: SweptBasis, key: str) -> tuple[list[int], list[float]]:
+def unstable(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
     """Orders and values of gains not known to stabilise; nan for errors above 100 %. Not collective."""
     bad = [r for r in basis.reports if not r.stable and not r.reason]
     return [r.N for r in bad], [getattr(r, key) if getattr(r, key) <= TOP else float("nan") for r in bad]
 
 
-def figure_reduced(swept: Sequence[SweptBasis], out_png: Path) -> tuple[Path, Path]:
+def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, Path]:
     """Relative error of P, of K, and excess cost against N for all methods; unstable gains marked; PNG and PDF."""
-    ran = [s for s in swept if s.reports]
+    ran = [s for s in bases if s.reports]
     bad = False
     with paper_style():
         figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 3.1), layout="constrained", sharex=True)
@@ -100,12 +93,23 @@ def figure_reduced(swept: Sequence[SweptBasis], out_png: Path) -> tuple[Path, Pa
         return save(figure, out_png)
 
 
-def _entries(ran: Sequence[SweptBasis], bad: bool) -> list[Line2D]:
+def _entries(ran: Sequence[BasisGains], bad: bool) -> list[Line2D]:
     entries = []
     for s in ran:
         colour, dashes, marker = LOOKS.get(s.name, (HAND, ":", "x"))
         entries.append(
-            Line2D([], [], color=colour, ls=dashes, marker=marker, ms=3.4, mfc="none", mew=0.9, lw=1.1, label=s.title)
+            Line2D(
+                [],
+                [],
+                color=colour,
+                ls=dashes,
+                marker=marker,
+                ms=3.4,
+                mfc="none",
+                mew=0.9,
+                lw=1.1,
+                label=TITLES[s.name],
+            )
         )
     if bad:
         entries.append(
@@ -148,7 +152,7 @@ def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, Path
             ax.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]")
             ax.margins(0.25)
             _few_ticks(ax, sorted(set(lam)), sorted(set(mu)))
-            ax.set_title(f"{TITLES.get(r.name, r.name)}, $N = {r.N}$")
+            ax.set_title(f"{TITLES[r.name]}, $N = {r.N}$")
         axes[0, 0].set_ylabel(r"$\mu$ [Pa]")
         if picture is not None:
             figure.colorbar(picture, ax=axes[0].tolist(), label=QUANTITIES[2][1])
@@ -163,63 +167,57 @@ def _few_ticks(ax: Any, lam: Sequence[float], mu: Sequence[float]) -> None:
         axis.set_ticks([], minor=True)
 
 
-def pole_sets(found: Design, swept: Sequence[SweptBasis]) -> dict[str, Poles]:
+def pole_sets(study: ControlStudy) -> dict[str, Poles]:
     """Poles with the optimal and the a-priori gain and without any, on the lowest modes. Collective."""
-    loop: ModalLoop = found.judge.loop
-    K = gain_of(found.solution)
+    design, loop, basis = study.design, study.design.judge.loop, a_priori(study.bases)
+    K = design.gain.block
     sets = {
         "without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))),
-        ("modal gain" if found.modal else "optimal gain"): loop.poles(K),
+        ("modal gain" if design.modal else "optimal gain"): loop.poles(K),
     }
-    basis = next((s for s in swept if s.name == "structured"), None)
-    best = None if basis is None else basis.best(fast_order(found.problem.layout.n_s))
-    if basis is not None and best is not None:
-        sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(basis.reduced(found.problem, best.N).gain)
+    best = None if basis is None else basis.best(fast_order(design.problem.layout.n_s))
+    if best is not None and best.gain is not None:
+        sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(best.gain.block)
     return {name: p[np.argsort(np.abs(p))][: 2 * SHOWN_MODES] for name, p in sets.items()}
 
 
-def draw_all(
-    out: Path, found: Design, swept: Sequence[SweptBasis], retuned: Sequence[Retuned], poles: dict[str, Poles],
-    runs: LoopRuns, frames: Frames,
-) -> list[Path]:  # fmt: skip
+def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Frames) -> list[Path]:
     """All figures and the animation. Rank 0 only."""
-    files: list[Path] = []
-    if frames.picture is not None and frames.states:
-        files += _move(out, found, runs, frames)
-    full, d = runs.full, found.problem.layout.dimension
-    others = compared(runs)
+    design, loops, full = study.design, study.loops, study.loops.full
+    files = _move(out, study, frames) if frames.picture is not None and frames.states else []
     files += figure_histories(
-        full.times, full.outputs, full.inputs, full.output_names, out / "histories.png", target=found.target.y,
-        limits=runs.limits, others=others, settle=runs.plan.settle, dimension=d,
+        full.times, full.outputs, full.inputs, full.output_names, out / "histories.png", target=design.target.y,
+        limits=loops.limits, others=compared(loops), settle=loops.plan.settle,
+        dimension=design.problem.layout.dimension,
     )  # fmt: skip
-    if any(s.reports for s in swept):
-        files += figure_reduced(swept, out / "errors.png")
-    if retuned:
-        files += figure_retune(retuned, out / "retune.png")
+    if any(b.reports for b in study.bases):
+        files += figure_reduced(study.bases, out / "errors.png")
+    if study.retuned:
+        files += figure_retune(study.retuned, out / "retune.png")
     # rounding of the eigenvalues of the lowest modes
     noise = 1e-13 * max(float(np.abs(p).max(initial=0.0)) for p in poles.values())
     files += figure_decay(poles, out / "decay.png", noise=noise)
     return files
 
 
-def compared(runs: LoopRuns) -> dict[str, tuple[Array, Array]]:
-    """Outputs and inputs under the a-priori gain and under the dearest of the others. Not collective."""
-    ran = {name: (title, N, run) for name, (title, N, run) in runs.reduced.items() if not isinstance(run, str)}
-    paper = sorted((float(run.cost[-1]), name) for name, (_, _, run) in ran.items() if name != "structured")
-    names = [name for name in ("structured", *(name for _, name in paper[-1:])) if name in ran]
-    return {f"{ran[n][0]}, $N = {ran[n][1]}$": (ran[n][2].outputs, ran[n][2].inputs) for n in names}
+def compared(loops: LoopRuns) -> dict[str, tuple[Array, Array]]:
+    """Outputs and inputs under the a-priori gain and under the paper's gain of largest cost."""
+    ran = [(r, r.run) for r in loops.reduced if r.run is not None]
+    own = [x for x in ran if x[0].method == A_PRIORI]
+    paper = sorted((x for x in ran if x[0].method != A_PRIORI), key=lambda x: (float(x[1].cost[-1]), x[0].method))
+    return {f"{TITLES[r.method]}, $N = {r.N}$": (run.outputs, run.inputs) for r, run in (*own, *paper[-1:])}
 
 
-def _move(out: Path, found: Design, runs: LoopRuns, frames: Frames) -> list[Path]:
+def _move(out: Path, study: ControlStudy, frames: Frames) -> list[Path]:
     from softgrasp.study.pictures.animation import gif_move
 
-    states, times, full = np.stack(frames.states), np.array(frames.times), runs.full
+    states, times, full = np.stack(frames.states), np.array(frames.times), study.loops.full
     table = np.column_stack([full.times, full.q_s])
-    target = found.target.state.q_s
+    target = study.design.target.state.q_s
     files = [*figure_loop_move(frames.picture, states, times, table, target, out / "move.png")]  # type: ignore[arg-type]
     if not frames.few:
         # nothing moves between the settling time and the end of the run
         keep = slice(None) if len(times) < 3 or times[-1] <= 1.5 * times[-2] else slice(-1)
-        part = table[table[:, 0] <= times[keep][-1] + runs.plan.dt / 2]
+        part = table[table[:, 0] <= times[keep][-1] + study.loops.plan.dt / 2]
         files.append(gif_move(frames.picture, states[keep], times[keep], part, target, out / "move.gif"))  # type: ignore[arg-type]
     return files

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import Progress, TaskProgressColumn
-from rich.table import Table
 
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.scene.control import Control, ControlOutput
-from softgrasp.study.control.loop import make_controller, plan, run_loops, save_controllers
-from softgrasp.study.control.page import Found, control_result, summary_rows, write_all
-from softgrasp.study.control.solve import design
-from softgrasp.study.control.sweep import Retuned, SweptBasis, orders, retune, sweep
+from softgrasp.lqr.design.controller import NoController, certified_controller
+from softgrasp.lqr.design.duration import plan
+from softgrasp.lqr.design.feedback import design
+from softgrasp.lqr.design.orders import BasisGains, orders
+from softgrasp.lqr.design.scene import with_control
+from softgrasp.study.control.loop import run_loops, save_controllers, tick_seconds
+from softgrasp.study.control.page import sections
+from softgrasp.study.control.result import ControlStudy, Note, Retuned, a_priori, control_result
+from softgrasp.study.control.sweep import retune, sweep
+from softgrasp.study.control.tables import best_table, summary_rows, tables
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar
+from softgrasp.study.report.tables import pairs
+from softgrasp.study.shell.session import Page, Session, list_files
 
 GOAL = 1e-10  # of the solver when the scene names none: the right end of its progress bar
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
@@ -59,43 +59,46 @@ def run_control(
     Raises:
         SoftgraspError: with one sentence.
     """
-    begin = time.perf_counter()
-    comm = MPI.COMM_WORLD
-    model, note = with_control(open_model(open_scene(path, overrides, console), console))
-    if note:
-        console.print(note, soft_wrap=True, markup=False)
-    watch = Stopwatch(comm)
-    with progress_bar(console, TaskProgressColumn(), quiet=quiet) as bar:
-        restart = restart_folder(model, out)
+    session = Session("control", path, overrides, out, console, quiet, pictures)
+    model, sentence = with_control(session.model(session.scene()))
+    if sentence:
+        console.print(sentence, soft_wrap=True, markup=False)
+    watch, restart = Stopwatch(session.comm), restart_folder(model, out)
+    with session.progress(TaskProgressColumn()) as bar:
         if restart is not None:
-            word = "going on from" if comm.bcast(restart.exists()) else "interrupted, the same command goes on from"
+            exists = session.comm.bcast(restart.exists())
+            word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
-        found, frames = control_model(model, out, watch, bar, [note] if note else [], pictures, restart)
-    files = frames.close()
+        notes = [Note("table", sentence)] if sentence else []
+        study, frames = control_model(model, out, watch, bar, notes, pictures, restart)
+    fields = frames.close()
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
-        files += save_controllers(model, found.design, found.made, out)
-    poles = None
+        saved = save_controllers(study.design, study.controller, out)
+    poles = {}
     if pictures:
         from softgrasp.study.control.plots import pole_sets  # brings Matplotlib
 
-        poles = pole_sets(found.design, found.swept)
-    result = control_result(model, found, watch)
-    if comm.rank == 0:
-        drawing = time.perf_counter()
+        poles = pole_sets(study)
+    seconds = {**model.watch.seconds, **watch.seconds}
+    result = control_result(study, seconds)
+
+    def page() -> Page:
         drawn: list[Path] = []
-        if poles is not None:
+        if pictures:
             from softgrasp.study.control.plots import draw_all
 
-            drawn = draw_all(out, found.design, found.swept, found.retuned, poles, found.runs, frames)
-        now = time.perf_counter()
-        result["time"] |= {"pictures": now - drawing, "total": now - begin}
-        files = [*write_all(out, path, overrides, model, found, result, drawn), *files]
-        show(console, found, result)
+            drawn = draw_all(out, study, poles, frames)
+        title = f"{model.scene.name}: optimal feedback"
+        return Page(title, sections(study, seconds, drawn), tables(study), [*drawn, *fields, *saved])
+
+    files = session.write(model.scene, result, page)
+    if session.comm.rank == 0:
+        show(console, study, seconds)
         list_files(console, files)
         if restart is not None:
             shutil.rmtree(restart, ignore_errors=True)
-    comm.Barrier()
+    session.comm.Barrier()
     return result
 
 
@@ -107,34 +110,15 @@ def restart_folder(model: Model, out: Path) -> Path | None:
     return out / f"restart-{scene_hash(model.scene)[:12]}-{layout.comm.size}"
 
 
-def with_control(model: Model) -> tuple[Model, str]:
-    """A scene without a [control] table gets tip output and Q = R = 1, and a turning hand is seen too. Collective.
-
-    Returns:
-        The model, and the sentence that says so; empty when the scene has its own table.
-    """
-    if model.scene.control is not None:
-        return model, ""
-    tip = make_outputs(model.scene, model.system)[0]
-    outputs = [ControlOutput(kind="node", point=list(tip.point), name=tip.name)]
-    what = f"the node at ({', '.join(f'{x:.4g}' for x in tip.point)}), the farthest from the hand,"
-    if model.system.layout.n_s > model.system.layout.dimension:  # one node does not see all rotations
-        outputs.append(ControlOutput(kind="hand", point=None, name="hand"))
-        what += " and the hand itself"
-    control = Control(outputs=outputs)
-    note = f"the scene has no [control] table: {what} as output, Q = R = 1"
-    return replace(model, scene=model.scene.model_copy(update={"control": control})), note
-
-
 def control_model(
     model: Model,
     out: Path,
     watch: Stopwatch,
     bar: Progress,
-    notes: list[str],
+    notes: list[Note],
     pictures: bool,
     restart: Path | None = None,
-) -> tuple[Found, Frames]:
+) -> tuple[ControlStudy, Frames]:
     """Solve, reduce, re-tune and close the loop. Collective.
 
     Args:
@@ -150,30 +134,36 @@ def control_model(
         SoftgraspError: with one sentence.
     """
     own_end = not notes  # a scene made for control says how long its loop runs
-    solved = design(model, watch, solver_bar(bar, model), restart)
-    swept: tuple[SweptBasis, ...] = ()
+    feedback = design(model, watch, solver_bar(bar, model), restart)
+    bases: tuple[BasisGains, ...] = ()
     retuned: tuple[Retuned, ...] = ()
     notes = list(notes)
-    if solved.modal:
-        notes.append("control.method = 'modal': no P of the whole plant to compare reduced equations with")
+    if feedback.modal:
+        sentence = "control.method = 'modal': no P of the whole plant to compare reduced equations with"
+        notes.append(Note("modal", sentence))
     else:
-        wanted, few = orders(model, solved)
+        sizes, few = orders(feedback)
         with watch.stage("reduced"):
-            swept = sweep(solved, wanted, counted(bar, "reduced equations"))
+            bases = sweep(feedback, sizes, counted(bar, "reduced equations"))
         with watch.stage("retune"):
-            retuned, why = retune(model, solved, swept, counted(bar, "re-tuning"))
-        notes += [text for text in (few, why and f"no re-tuning: {why}") if text]
-    made, why = make_controller(model, solved, swept)
-    notes += [f"no small controller: {why}"] if why else []
-    sampled = solved.quality.sampled
+            retuned, why = retune(feedback, bases, counted(bar, "re-tuning"))
+        notes += [Note("orders", few)] if few else []
+        notes += [Note("retune", f"no re-tuning: {why}")] if why else []
+    controller, tick = None, float("nan")
+    try:
+        controller = certified_controller(feedback, a_priori(bases))
+        tick = model.system.layout.comm.bcast(tick_seconds(controller.controller))
+    except NoController as error:
+        notes.append(Note("controller", f"no small controller: {error}"))
+    sampled = feedback.quality.sampled
     if sampled is not None and sampled.reason:
-        notes.append(f"the loop from tick to tick is not certified: {sampled.reason}")
-    timing = plan(model, solved, own_end)
-    notes += [timing.note] if timing.note else []
+        notes.append(Note("sampling", f"the loop from tick to tick is not certified: {sampled.reason}"))
+    duration = plan(feedback, own_end)
+    notes += [Note("end", duration.note)] if duration.note else []
     frames = Frames(model, out, pictures)
     with watch.stage("loop"):
-        runs = run_loops(model, solved, swept, made, timing, frames, counted(bar, "closed loop"))
-    return Found(solved, swept, retuned, made, runs, tuple(notes)), frames
+        loops = run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
+    return ControlStudy(feedback, bases, retuned, controller, tick, loops, tuple(notes)), frames
 
 
 def solver_bar(bar: Progress, model: Model) -> Callable[[dict[str, float]], None]:
@@ -202,24 +192,10 @@ def counted(bar: Progress, text: str) -> Callable[[int, int], None]:
     return note
 
 
-def show(console: Console, found: Found, result: dict[str, Any]) -> None:
+def show(console: Console, study: ControlStudy, seconds: dict[str, float]) -> None:
     """Summary, then the reduced gains."""
-    for sentence in (*result["findings"], *(n for n in found.notes if "[control]" not in n)):
+    for sentence in (*study.findings, *(note.text for note in study.notes if note.topic != "table")):
         console.print(f"note: {sentence}", soft_wrap=True, markup=False)
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for row in summary_rows(result):
-        table.add_row(*map(escape, row))  # no brackets lost
-    console.print(table)
-    if not found.swept:
-        return
-    best = Table("best stable gain", "N", "error of P", "error of K", "excess cost", "abscissa [1/s]", "ARE, ms",
-                 "not stable at N", box=None, pad_edge=False)  # fmt: skip
-    for s in found.swept:
-        r = s.best()
-        bad = ", ".join(str(x.N) for x in s.reports if not x.stable)
-        if r is None:
-            best.add_row(s.title, *([""] * 6), bad or escape(s.refused))
-            continue
-        values = (f"{r.error_P:.1e}", f"{r.error_K:.1e}", f"{r.cost_excess:.1e}", f"{r.abscissa_full:.4g}")
-        best.add_row(s.title, str(r.N), *values, f"{1e3 * r.time_are:.2g}", bad)
-    console.print(best)
+    console.print(pairs(summary_rows(study, seconds)))
+    if study.bases:
+        console.print(best_table(study.bases).terminal(wrap=[0]))

@@ -12,7 +12,7 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.modal import DenseRiccati, gather_tissue, relative_space
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.diagnosis import diagnose
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
@@ -38,7 +38,7 @@ def problem_of(*more: str, beta: float = 0.002) -> RiccatiProblem:
 
 def gain_of(solution: RiccatiSolution) -> Array:
     """K, (m, states), of a solution of one rank. Not collective."""
-    return np.hstack([solution.K_s, solution.K_z.T, solution.K_v.T])
+    return np.hstack([solution.gain.K_s, solution.gain.K_z.T, solution.gain.K_v.T])
 
 
 def dense(problem: RiccatiProblem) -> Array:

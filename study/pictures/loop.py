@@ -32,13 +32,6 @@ FLOOR = 1e-16  # smallest distance to the target that a double of order one can 
 MANY_POINTS = 4000  # a line of more points is thinned, in print they coincide
 
 
-def move_steps(steps: int, dt: float, settle: float, count: int = 60) -> list[int]:
-    """Steps for pictures of a move that is over after ``settle`` seconds: equally spaced until then, and the last."""
-    end = int(np.clip(round(settle / dt), 1, steps))
-    grid = np.linspace(0, end, min(count, end) + 1).round().astype(int)
-    return sorted({*grid.tolist(), steps})
-
-
 def figure_histories(
     times: Array,
     outputs: Array,

@@ -243,3 +243,10 @@ def subdivision(n: int) -> Array:
     down = [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i in range(n - 1) for j in range(n - 1 - i)]
     ij = np.array(up + down, dtype=np.float64) / n
     return np.concatenate([1.0 - ij.sum(axis=2, keepdims=True), ij], axis=2)
+
+
+def move_steps(steps: int, dt: float, settle: float, count: int = 60) -> list[int]:
+    """Steps for pictures of a move that is over after ``settle`` seconds: equally spaced until then, and the last."""
+    end = int(np.clip(round(settle / dt), 1, steps))
+    grid = np.linspace(0, end, min(count, end) + 1).round().astype(int)
+    return sorted({*grid.tolist(), steps})

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.control.sweep import TITLES as BASIS_TITLES
+from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.precision.control_plots import (
     PAPER_ARE,
     PAPER_N,

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.study.control.plots import LOOKS
-from softgrasp.study.control.sweep import TITLES as BASIS_TITLES
+from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
 from softgrasp.study.precision.fit import usable
 from softgrasp.study.precision.plots import FRONT, LINE, axes_log, draw_front

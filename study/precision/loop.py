@@ -20,19 +20,18 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.fem.petsc import Array, on_root
+from softgrasp.lqr.design.orders import fast_order, orders
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
 from softgrasp.lqr.loop.small import ReducedLoop, ReducedTrajectory
-from softgrasp.lqr.loop.small_plant import SmallPlant, project
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.loop.small_plant import SmallPlant, galerkin
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import factor_of
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import reduce_riccati
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
-from softgrasp.study.control.sweep import TITLES, fast_order, judged, orders
+from softgrasp.study.control.result import TITLES
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.points import LEAST_STEPS, Row, WorkPoint, number
 from softgrasp.study.precision.riccati import SECOND, ControlRuns
@@ -126,18 +125,16 @@ class LoopRuns:
     def gain(self, what: Feedback) -> Gain:
         """The gain as blocks."""
         if what not in self._gains:
-            design, n = self.runs.design, self.layout.n_local
             if not what.basis:
-                self._gains[what] = Gain.of(design.solution)
+                self._gains[what] = self.runs.design.gain
             else:
-                K = reduce_riccati(self.runs.problem, self.family(what.basis).at(what.N)).gain
-                self._gains[what] = Gain(np.ascontiguousarray(K.hand.T), K.tall[:n], K.tall[n:])
+                self._gains[what] = reduce_riccati(self.runs.problem, self.family(what.basis).at(what.N)).gain
         return self._gains[what]
 
     def family(self, name: str) -> BasisFamily:
         """Bases of one method."""
         if name not in self._families:
-            self._families[name] = make_family(name, self.runs.problem, factor_of(self.runs.design.solution))
+            self._families[name] = make_family(name, self.runs.problem, self.runs.design.solution.factor)
         return self._families[name]
 
     # --- reference
@@ -183,7 +180,7 @@ class LoopRuns:
         """Reduced gains: a priori with the hand alone, with a little and with more tissue; the paper's. Cached."""
 
         def measure() -> Row:
-            wanted = orders(self.runs.model, self.runs.design)[0]
+            wanted = orders(self.runs.design)[0]
             there = self.family(A_PRIORI).orders(wanted)
             small = [N for N in there if fast_order(self.layout.n_s) >= N]
             rows = [[A_PRIORI, N] for N in dict.fromkeys([*small[:2], *small[-1:]])]
@@ -231,7 +228,7 @@ class LoopRuns:
         """The reduced plant of an a-priori gain, and the gain on it."""
         problem, n_s, n = self.runs.problem, self.layout.n_s, self.layout.n_local
         V = self.family(what.basis).at(what.N).U.tall[n:, -((what.N - 2 * n_s) // 2) :]
-        plant, shapes = project(problem, V)
+        plant, shapes = galerkin(problem, V)
         return plant, shapes.reduce_gain(problem, self.gain(what))
 
     def _reduced(self, what: Controller, steps: int) -> tuple[ReducedTrajectory, list[float]]:
@@ -256,7 +253,7 @@ class LoopRuns:
         def measure() -> Row:
             gain, stable = what.gain, True
             if gain.basis:
-                stable = judged(self.runs.design, self.family(gain.basis), gain.N).stable
+                stable = self.runs.design.judge.report(self.family(gain.basis).at(gain.N)).stable
             return {"rows": [self._row(what, steps) for steps in self.counts], "stable": stable}
 
         key = {"controller": what.label, "counts": self.counts, "repeats": self.runs.repeats}
@@ -311,7 +308,7 @@ def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -
 
     Collective.
     """
-    K = modal.gain(Block(gain.K_s.T, np.concatenate([gain.K_z, gain.K_v])))
+    K = modal.gain(gain.block)
     e = modal.state(runs.design.error)[:, 0]
     whole, dt = modal.plant.space.C, runs.scene.time_end / steps
     own = whole.copy()

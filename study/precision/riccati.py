@@ -16,12 +16,11 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.lqr.design.feedback import Design, check, design
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.lqr.riccati import Method, solve
-from softgrasp.study.control.solve import Design, check, design, scene_words
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.points import CONTROL, Cache, Guard, Row, WorkPoint, number
 
@@ -163,7 +162,7 @@ def make_reference(problem: RiccatiProblem) -> GainReference:
             break
     if not found:
         raise SolverError("no method solves the Riccati equation of this scene to 1e-8; add damping")
-    gains = [gain_of(s) for s in found.values()]
+    gains = [s.gain for s in found.values()]
     error = gain_error(problem, gains[0], gains[1]) if len(gains) == 2 else float("nan")
     return GainReference(found, reached, error)
 
@@ -218,7 +217,7 @@ def sweep_riccati(runs: ControlRuns) -> list[WorkPoint]:
 def _measure(runs: ControlRuns, method: Method, tol: float) -> Row:
     """Gain error, true residual, counts and median seconds of one solver at one tolerance. Collective."""
     problem, comm = runs.problem, runs.layout.comm
-    against = gain_of(runs.reference.judge_of(method))
+    against = runs.reference.judge_of(method).gain
     times: list[float] = []
     solution: RiccatiSolution | None = None
     row: Row = {"tolerance": tol, "reason": "", "gain_error": None, "residual": None, "seconds": None}
@@ -229,10 +228,10 @@ def _measure(runs: ControlRuns, method: Method, tol: float) -> Row:
             solution = solve(problem, method, tol)
             times.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
     except (SolverError, ResourceError) as error:
-        return row | {"reason": scene_words(str(error))}
+        return row | {"reason": str(error)}
     counts = {k: solution.counts.get(k, 0) for k in ("newton_steps", "solves", "factorisations")}
     return row | {
-        "gain_error": gain_error(problem, against, gain_of(solution)), "residual": solution.residual,
+        "gain_error": gain_error(problem, against, solution.gain), "residual": solution.residual,
         "seconds": statistics.median(times), "repeats": len(times), "rank": solution.rank, **counts,
     }  # fmt: skip
 

@@ -11,11 +11,12 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.small_care import solve_reduced
+from softgrasp.lqr.design.orders import orders
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import factor_of, gain_of
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import gain_error, reduce_riccati
-from softgrasp.study.control.sweep import TITLES, judged, orders, report_dict
+from softgrasp.study.control.result import TITLES, report_dict
+from softgrasp.study.control.sweep import timed
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.points import Row, WorkPoint, number
 from softgrasp.study.precision.riccati import CLOSE, SECOND, ControlRuns
@@ -61,12 +62,12 @@ def _point(name: str, row: Row, found: Row) -> WorkPoint:
 def _family(runs: ControlRuns, name: str) -> Row:
     """All orders of one basis; a basis that the plant refuses gives no rows. Collective."""
     design, comm = runs.design, runs.layout.comm
-    wanted, note = orders(runs.model, design)
+    wanted, note = orders(design)
     comm.Barrier()
     begin = time.perf_counter()
     empty: Row = {"rows": [], "refused": "", "time_basis": 0.0, "time_full": 0.0, "note": note}
     try:
-        family = make_family(name, runs.problem, factor_of(design.solution))
+        family = make_family(name, runs.problem, design.solution.factor)
     except ControlError as error:
         return empty | {"refused": str(error)}
     seconds = float(comm.allreduce(time.perf_counter() - begin, MPI.MAX))
@@ -81,21 +82,21 @@ def _order(runs: ControlRuns, family: BasisFamily, N: int) -> Row:
 
     Keys: those of :func:`study.control.sweep.report_dict`, seconds, time_lift.
     """
-    report = judged(runs.design, family, N)
+    report = timed(runs.problem, runs.design.judge.report(family.at(N)))
     row = report_dict(report) | {"seconds": None, "time_lift": 0.0}
     if report.reason:
         return row
     comm = runs.layout.comm
     comm.Barrier()
     begin = time.perf_counter()
-    reduced = reduce_riccati(runs.problem, family.at(N))
-    lift = comm.allreduce(time.perf_counter() - begin, MPI.MAX) - 3 * reduced.seconds  # it solves three times
+    matrices = reduce_riccati(runs.problem, family.at(N)).matrices
+    lift = comm.allreduce(time.perf_counter() - begin, MPI.MAX) - report.time_are  # the rest is solving
 
     def median() -> float:
         times: list[float] = []
         while not times or (len(times) < runs.repeats and sum(times) < REPEAT_SECONDS):
             begin = time.perf_counter()
-            solve_reduced(reduced.matrices)
+            solve_reduced(matrices)
             times.append(time.perf_counter() - begin)
         return statistics.median(times)
 
@@ -110,10 +111,8 @@ def reference_note(runs: ControlRuns) -> Row:
 
     def measure() -> Row:
         solution, tight = runs.design.solution, runs.reference
-        method = solution.method.split(":")[0].split(" ")[0]
-        other = tight.judge_of(method)
-        gap = gain_error(runs.problem, gain_of(other), gain_of(solution))
-        return {"method": solution.method, "residual": solution.residual, "error": gap,
+        gap = gain_error(runs.problem, tight.judge_of(solution.method).gain, solution.gain)
+        return {"method": solution.summary, "residual": solution.residual, "error": gap,
                 "optimal": runs.design.judge.optimal}  # fmt: skip
 
     runs.guard.next("gain of reference", 2 * runs.work)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.reduction.registry import METHODS
-from softgrasp.study.control.sweep import TITLES as BASIS_TITLES
+from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import WorkPoint
 from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES

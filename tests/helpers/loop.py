@@ -13,6 +13,7 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.lqr.loop.actuation import Actuation
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import rest
@@ -53,11 +54,11 @@ class Setup:
 
     @property
     def solution(self) -> RiccatiSolution:
-        n_s, n_e, layout, gain = self.problem.layout.n_s, self.problem.layout.n_e, self.problem.layout, self.gain
+        n_s, n_e, layout = self.problem.layout.n_s, self.problem.layout.n_e, self.problem.layout
         values, vectors = np.linalg.eigh(self.X)
         Z = vectors * np.sqrt(np.maximum(values, 0))
         parts = [local_rows(layout, Z[a : a + n_e].copy()) for a in (2 * n_s, 2 * n_s + n_e)]
-        return RiccatiSolution(Z[: 2 * n_s], *parts, gain.K_s, gain.K_z, gain.K_v, 0.0, "dense, in a test")
+        return RiccatiSolution(Block(Z[: 2 * n_s], np.concatenate(parts)), self.gain, 0.0, "dense")
 
     def full(self, x: PlantState) -> Array:
         z = gather_states(self.problem.layout, np.concatenate([x.z, x.v_z]))

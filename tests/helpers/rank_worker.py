@@ -16,8 +16,8 @@ from softgrasp.fem.fields.probe import make_probe
 from softgrasp.fem.model.build import Stopwatch, build
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
+from softgrasp.lqr.design.feedback import design
 from softgrasp.reduction.replay import full_run
-from softgrasp.study.control.solve import design
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.precision.probe import find_places
@@ -43,7 +43,7 @@ def numbers(folder: Path) -> dict[str, list[float]]:
         "simulate": [*run.outputs[-1], *(float(np.abs(state).sum()) for state in frames.states)],
         "warnings": [len(run_warnings(model, run, frames.most[1:]))],
         "reduce": [point.error for basis in swept for point in basis.points],
-        "control": np.abs(solved.solution.K_s).sum(axis=1).tolist(),
+        "control": np.abs(solved.gain.K_s).sum(axis=1).tolist(),
     }
 
 

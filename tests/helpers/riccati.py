@@ -13,7 +13,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from tests.helpers.models import CUBE, LAYERS, gather_rows, make_scene
 
@@ -56,7 +56,8 @@ def paper(*changes: str) -> RiccatiProblem:
 def gain(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
     """The gain in node order, (2n, m), on every rank."""
     layout = problem.layout
-    return np.vstack([solution.K_s.T, gather_rows(layout, solution.K_z), gather_rows(layout, solution.K_v)])
+    K = solution.gain
+    return np.vstack([K.K_s.T, gather_rows(layout, K.K_z), gather_rows(layout, K.K_v)])
 
 
 def gain_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSolution) -> float:
@@ -66,8 +67,8 @@ def gain_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSo
 
 def factor(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
     """Z in node order, on every rank."""
-    layout = problem.layout
-    return np.vstack([solution.Z_s, gather_rows(layout, solution.Z_z), gather_rows(layout, solution.Z_v)])
+    layout, n, Z = problem.layout, problem.layout.n_local, solution.factor
+    return np.vstack([Z.hand, gather_rows(layout, Z.tall[:n]), gather_rows(layout, Z.tall[n:])])
 
 
 def x_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSolution) -> float:

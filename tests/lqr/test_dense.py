@@ -16,18 +16,18 @@ from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.care import care, riccati_schur
 from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import (
+    costates_to_absolute,
     costates_to_relative,
-    factor_of,
-    gain_of,
+    gain_to_absolute,
     gain_to_relative,
     states_to_absolute,
     states_to_relative,
-    to_absolute,
 )
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.identities import translation_defect, velocity_defect
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from tests.helpers.models import (
@@ -282,9 +282,9 @@ def test_solution_in_the_papers_coordinates_against_scikit_fem(changes: list[dic
     model, problem = make(*changes)
     layout = problem.layout
     solution = DenseRiccati().solve(problem)
-    absolute = to_absolute(problem, solution)
+    Z, K = costates_to_absolute(problem.system, solution.factor), gain_to_absolute(problem.system, solution.gain.block)
     plant = first_order(reference(model, held))
-    n_s, Z = layout.n_s, gather_block(layout, absolute.Z)
+    n_s, Z = layout.n_s, gather_block(layout, Z)
     T, C_z = gather_rows(layout, problem.system.T), gather_rows(layout, problem.C_z)
     C = np.zeros((len(problem.Q), len(Z)))
     C[:, :n_s], C[:, n_s : n_s + len(C_z)] = problem.C_s - C_z.T @ T, C_z.T
@@ -292,7 +292,7 @@ def test_solution_in_the_papers_coordinates_against_scikit_fem(changes: list[dic
     residual = A.T @ P @ E + E.T @ P @ A - E.T @ P @ B @ np.linalg.solve(problem.R, B.T @ P @ E) + C.T @ problem.Q @ C
     # rounding of the two assemblies, 1e-13, times |A| |P| |E| / |C'QC| of about 1e4
     assert np.linalg.norm(residual, 2) < 1e-9 * np.linalg.norm(C.T @ problem.Q @ C, 2)
-    K = gather_block(layout, absolute.K).T
+    K = gather_block(layout, K).T
     assert close(K, -np.linalg.solve(problem.R, B.T @ P @ E)) < 1e-10  # P has the condition 1e4 here
     assert scipy.linalg.eigvals(A + B @ K, E).real.max() < 0
     assert solution.residual < 1e-10  # rounding, as above
@@ -307,7 +307,7 @@ def test_layers_of_different_damping_and_true_residual() -> None:
     _, problem = make(BETA, {"tissue": {"layers": layers}})
     solution = DenseRiccati().solve(problem)
     space = relative_space(problem)
-    Z, K = whole(problem, factor_of(solution)), whole(problem, gain_of(solution)).T
+    Z, K = whole(problem, solution.factor), whole(problem, solution.gain.block).T
     if space is not None:
         P, C = Z @ Z.T, space.C
         residual = space.A.T @ P @ space.E + space.E.T @ P @ space.A - K.T @ problem.R @ K + C.T @ problem.Q @ C
@@ -328,14 +328,12 @@ def test_coordinates_there_and_back(changes: list[dict]) -> None:
     system, rng = problem.system, np.random.default_rng(3)
     n_s, n = problem.layout.n_s, problem.layout.n_local
     X = Block(np.arange(2.0 * n_s * 3).reshape(2 * n_s, 3), rng.standard_normal((2 * n, 3)))
-    solution = RiccatiSolution(
-        X.hand, X.tall[:n], X.tall[n:], X.hand[:, :n_s].T, X.tall[:n, :n_s], X.tall[n:, :n_s], 0, ""
-    )
-    absolute = to_absolute(problem, solution)
+    solution = RiccatiSolution(X, Gain.of_block(X[:n_s]), 0, "dense")
+    Z, K = costates_to_absolute(problem.system, solution.factor), gain_to_absolute(problem.system, solution.gain.block)
     for back, there in (
         (states_to_relative(system, states_to_absolute(system, X)), X),
-        (costates_to_relative(system, absolute.Z), X),
-        (gain_to_relative(system, absolute.K), gain_of(solution)),
+        (costates_to_relative(system, Z), X),
+        (gain_to_relative(system, K), solution.gain.block),
     ):
         assert close(back.hand, there.hand) < 1e-14  # one product with T and back
         assert n == 0 or close(back.tall, there.tall) < 1e-13  # as above
@@ -351,7 +349,7 @@ def test_exact_identities(beta: float, weight: float) -> None:
     velocity = velocity_defect(problem, solution)
     assert velocity is not None
     assert velocity < 1e-11  # as above
-    wrong = replace(solution, K_s=solution.K_s * 1.001)
+    wrong = replace(solution, gain=replace(solution.gain, K_s=solution.gain.K_s * 1.001))
     assert translation_defect(problem, wrong) > 1e-3  # twice the 0.1 % in K'K
 
 
@@ -368,8 +366,8 @@ def test_problem_is_not_changed_and_limits_are_told() -> None:
     copies = [a.copy() for a in arrays]
     values = [A.getValuesCSR()[2].copy() for A in (problem.system.M_ee, problem.system.K_ee)]
     first, second = DenseRiccati().solve(problem), DenseRiccati().solve(problem)
-    assert (first.K_s == second.K_s).all()
-    assert (first.Z_z == second.Z_z).all()
+    assert (first.gain.K_s == second.gain.K_s).all()
+    assert (first.factor.tall == second.factor.tall).all()
     assert all((a == b).all() for a, b in zip(arrays, copies, strict=True))
     after = [A.getValuesCSR()[2] for A in (problem.system.M_ee, problem.system.K_ee)]
     assert all((a == b).all() for a, b in zip(after, values, strict=True))

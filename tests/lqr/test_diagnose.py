@@ -11,11 +11,10 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
-from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.identities import translation_defect
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
@@ -43,7 +42,7 @@ def test_a_good_problem_has_no_findings_and_its_poles_are_known_beforehand() -> 
     assert found.solvable
     found.require()
     assert found.rates is not None
-    poles = ModalLoop(problem).poles(gain_of(DenseRiccati().solve(problem)))
+    poles = ModalLoop(problem).poles(DenseRiccati().solve(problem).gain.block)
     # riccati.md: 3 to 4 digits as long as modes do not overlap; the lowest ones do not
     for pole in found.rates.poles[:8]:
         nearest = poles[np.argmin(np.abs(poles - pole))]
@@ -57,7 +56,7 @@ def test_rates_without_damping_are_those_of_the_dense_closed_loop() -> None:
     problem = make({"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}], "Q": 1.0, "R": 1.0}})
     found = diagnose(problem)
     assert found.rates is not None
-    poles = ModalLoop(problem).poles(gain_of(modal_lqr(problem, 4)))
+    poles = ModalLoop(problem).poles(modal_lqr(problem, 4).gain.block)
     first = poles[np.argmin(np.abs(poles - found.rates.poles[0]))]
     assert abs(first.real / found.rates.poles[0].real - 1) < 0.05  # first order in the rate; riccati.md
     assert first.real < -1e-3  # 6e-3 measured: damped, beyond rounding
@@ -70,7 +69,7 @@ def test_undamped_is_refused_with_a_way_out(reaction: bool) -> None:
     (sentence,) = sentences(found, "error")
     assert sentence.startswith("no damping: feedback alone has to stabilise all")
     assert f"effects.damping.beta >= {found.damping_enough:.2g} s" in sentence
-    assert "modal_lqr" in sentence
+    assert "control.method = 'modal'" in sentence
     with pytest.raises(ControlError, match="no damping"):
         found.require()
     enough = diagnose(make(damped(1.01 * found.damping_enough), {"effects": {"reaction": reaction}}))
@@ -98,8 +97,8 @@ def test_rank_estimate_is_that_of_the_solution() -> None:
     layout, system = problem.layout, problem.system
     K, M = (gather_matrix(layout, A).toarray() for A in (system.K_ee, system.M_ee))
     omega, Phi = scipy.linalg.eigh(K, M)
-    z, v = gather_rows(layout, solution.Z_z), gather_rows(layout, solution.Z_v)
-    energy = np.vstack([solution.Z_s, Phi.T @ z / np.sqrt(omega)[:, None], np.linalg.solve(Phi, v)])
+    z, v = (gather_rows(layout, part) for part in np.vsplit(solution.factor.tall, 2))
+    energy = np.vstack([solution.factor.hand, Phi.T @ z / np.sqrt(omega)[:, None], np.linalg.solve(Phi, v)])
     sigma = np.linalg.svd(energy, compute_uv=False) ** 2
     rank = int(np.sum(sigma > 1e-10 * sigma[0]))
     assert abs(diagnose(problem).rank_estimate - rank) <= 2  # modes beyond the 60 lowest
@@ -160,15 +159,15 @@ def test_modal_lqr_says_what_it_leaves_and_does_not_move_it() -> None:
     for modes in (0, 3, 10):
         solution = modal_lqr(problem, modes)
         left = problem.layout.n_e - modes
-        assert solution.method.endswith(f"the other {left} modes are not stabilised and stay on the imaginary axis")
+        assert solution.about.endswith(f"the other {left} modes are not stabilised and stay on the imaginary axis")
         assert solution.rank <= 4 + 2 * modes
         assert solution.residual > 1e-3  # it is no solution of the whole equation, and says so
         assert translation_defect(problem, solution) < 1e-10  # the residual of the small equation
-        poles = ModalLoop(problem).poles(gain_of(solution))
+        poles = ModalLoop(problem).poles(solution.gain.block)
         assert (poles.real > -1e-9).sum() >= 2 * left  # still on the axis
         assert poles.real.max() < 1e-8  # not driven off it: rounding of frequencies up to 3e2
         assert (poles.real < -1e-9).sum() >= 2 * min(modes, 3) + 4  # off it
-        gains.append(solution.K_s)
+        gains.append(solution.gain.K_s)
     assert close(gains[1], gains[2]) < 1e-4  # riccati.md: hand gains settle with the modes
     assert 0 < close(gains[1], gains[2]) < close(gains[0], gains[2])
 
@@ -178,9 +177,9 @@ def test_modal_lqr_with_all_modes_is_the_full_solution() -> None:
     full, n_e = DenseRiccati().solve(problem), problem.layout.n_e
     modal = modal_lqr(problem, n_e)
     assert modal.residual < 1e-9  # modes from SLEPc are good to 1e-11 relative, amplified by |A|
-    assert close(modal.K_s, full.K_s) < 1e-9  # as above
+    assert close(modal.gain.K_s, full.gain.K_s) < 1e-9  # as above
     comm = problem.layout.comm
-    parts = [np.concatenate(comm.allgather(np.array(x))) for x in (modal.K_z, full.K_z)]
+    parts = [np.concatenate(comm.allgather(np.array(x))) for x in (modal.gain.K_z, full.gain.K_z)]
     assert close(parts[0], parts[1]) < 1e-7  # K_z is 1e-3 of K_s
 
 

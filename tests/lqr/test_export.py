@@ -21,7 +21,7 @@ from softgrasp.lqr.loop.controller import Controller, layout_hash, load_gain, sa
 from softgrasp.lqr.loop.export import to_pymor, to_python_control
 from softgrasp.lqr.loop.full import ClosedLoop
 from softgrasp.lqr.loop.small import ReducedLoop
-from softgrasp.lqr.loop.small_plant import Shapes, SmallPlant, project
+from softgrasp.lqr.loop.small_plant import Shapes, SmallPlant, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -64,7 +64,7 @@ def problem(model: Model) -> RiccatiProblem:
 def small(problem: RiccatiProblem) -> tuple[SmallPlant, Shapes, Array]:
     """Ten modes and the optimal gain of their plant, by SciPy."""
     _, Phi = lowest_modes(problem.system, 10)
-    plant, shapes = project(problem, Phi)
+    plant, shapes = galerkin(problem, Phi)
     inverse = np.linalg.inv(plant.E)
     A, B = inverse @ plant.A, inverse @ plant.B
     P = scipy.linalg.solve_continuous_are(A, B, Q * plant.C.T @ plant.C, R * np.eye(B.shape[1]))

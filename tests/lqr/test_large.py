@@ -15,7 +15,7 @@ import softgrasp.lqr.lowrank.adi
 from softgrasp.fem.errors import CheckpointError, ResourceError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
@@ -61,10 +61,10 @@ def test_paper_scene_over_damping_and_weight(beta: float, weight: float) -> None
     assert gain_error(problem, newton, radi) < 1e-8  # at Q = 1e4 the gain is 100 times the residual's scale
     assert newton.counts["newton_steps"] <= 2  # one, unless Q is large on a coarse mesh
     # whole body displaced: hand-relative state [I; 0; 0; 0], (K x_T)'(K x_T) = Q
-    K_q, K_v = newton.K_s[:, :2], newton.K_s[:, 2:]
+    K_q, K_v = newton.gain.K_s[:, :2], newton.gain.K_s[:, 2:]
     assert np.allclose(K_q.T @ K_q, weight * np.eye(2), rtol=0, atol=1e-9 * weight)  # a residual of 2e-10
     # whole body moving: (K x_T)'(K v_T) = x_T'E'XE x_T, E x_T = [I; 0; 0; 0]
-    E_x = newton.Z_s[:2]
+    E_x = newton.factor.hand[:2]
     assert np.allclose(K_q.T @ K_v, E_x @ E_x.T, rtol=0, atol=1e-8 * np.abs(K_q.T @ K_v).max())  # as above
 
 
@@ -112,7 +112,7 @@ def test_same_result_on_every_rank_count() -> None:
         found = method.solve(problem)
         error = np.linalg.norm(gain(problem, found) - reference) / np.linalg.norm(reference)
         assert error < 1e-9  # both stop at a residual of 1e-10
-        assert len(set(problem.layout.comm.allgather(found.K_s.tobytes()))) == 1
+        assert len(set(problem.layout.comm.allgather(found.gain.K_s.tobytes()))) == 1
 
 
 # --- roads and refusals
@@ -157,7 +157,7 @@ def test_large_undamped_scene_is_diagnosed_not_refused_for_its_size() -> None:
     """What is wrong with it is the damping, not the memory of the dense method."""
     problem = paper("tissue.cells=[18,36]", "effects.damping.beta=0.0")
     assert problem.layout.states > DenseRiccati().limit
-    with pytest.raises(ControlError, match=r"no damping: .* all 1366 modes, .*beta >= .* method modal_lqr"):
+    with pytest.raises(ControlError, match=r"no damping: .* all 1366 modes, .*beta >= .* control.method = 'modal'"):
         solve(problem)
 
 
@@ -268,6 +268,6 @@ def test_choice_names_its_reason() -> None:
     assert choose(paper_like).method == "newton_adi"
     layers = make_problem(build(make_scene(*CASES["layers"], tissue={"cells": [6, 12]}), comm=MPI.COMM_WORLD))
     assert choose(layers).method == "radi"
-    assert "(chosen: asked for)" in solve(small, "galerkin").method
+    assert solve(small, "galerkin").reason == "asked for"
     with pytest.raises(SolverError, match="unknown"):
         solve(small, "magic")  # type: ignore[arg-type]

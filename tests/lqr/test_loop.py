@@ -15,7 +15,7 @@ from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
 from softgrasp.lqr.loop.small import ReducedLoop
-from softgrasp.lqr.loop.small_plant import m_orthonormal, project
+from softgrasp.lqr.loop.small_plant import galerkin, m_orthonormal
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.target import hand_target, output_target, rest
@@ -248,7 +248,7 @@ def test_all_shapes_give_the_full_loop(case: Setup) -> None:
     problem = case.problem
     full = np.eye(problem.layout.n_e)
     V = m_orthonormal(problem.system.M_ee, local_rows(problem.layout, full))
-    plant, shapes = project(problem, V)
+    plant, shapes = galerkin(problem, V)
     target, dt = hand_target(problem, aim(case)), 0.05
     x_bar, u_bar = plant.rest_at(aim(case))
     assert close(shapes.reduce(problem, target.state), x_bar) < 1e-9  # condition of K
@@ -274,7 +274,7 @@ def test_few_modes_give_nearly_the_full_loop() -> None:
     case = setup("one_way")
     problem = case.problem
     _, V = lowest_modes(problem.system, 12)
-    plant, shapes = project(problem, V)
+    plant, shapes = galerkin(problem, V)
     target = hand_target(problem, aim(case))
     loop = ClosedLoop(problem, 0.05)
     run = loop.run(case.gain, target, 200)
@@ -289,11 +289,11 @@ def test_few_modes_give_nearly_the_full_loop() -> None:
 def test_reduced_loop_refuses_what_does_not_fit() -> None:
     case = setup("one_way")
     _, V = lowest_modes(case.problem.system, 3)
-    plant, _ = project(case.problem, V)
+    plant, _ = galerkin(case.problem, V)
     x_u, weights = plant.rest_at(aim(case)), (case.problem.Q, case.problem.R)
     with pytest.raises(ControlError, match="shape"):
         ReducedLoop(plant, 0.1).run(np.zeros((2, 3)), x_u, 5, weights)
     with pytest.raises(SolverError, match="diverged"):
         ReducedLoop(plant, 0.1).run(np.hstack([100 * np.eye(2), np.zeros((2, 8))]), x_u, 5000, weights)
     with pytest.raises(ControlError, match="linearly dependent"):
-        project(case.problem, np.asfortranarray(np.hstack([V, V])))
+        galerkin(case.problem, np.asfortranarray(np.hstack([V, V])))

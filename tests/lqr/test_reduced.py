@@ -13,16 +13,17 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model, build
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.dense.small_care import closed_loop, fast_solution, solve_reduced
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import factor_of, gain_of, gain_to_absolute, to_absolute
+from softgrasp.lqr.plant.coordinates import costates_to_absolute, gain_to_absolute
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.identities import optimal_cost
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, energy_scaled, make_family
 from softgrasp.lqr.reduced.retune import Retuner, over_box
-from softgrasp.lqr.reduced.riccati import GainJudge, hand_start, project, reduce_riccati
-from softgrasp.lqr.spectrum.certificate import certified_abscissa
+from softgrasp.lqr.reduced.riccati import GainJudge, hand_start, project_plant, reduce_riccati
+from softgrasp.lqr.spectrum.certificate import abscissa, certified_abscissa
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.models import (
     Array,
@@ -50,7 +51,7 @@ def plant(two_way: bool = False) -> tuple[Model, RiccatiProblem, RiccatiSolution
 @cache
 def family(name: str) -> BasisFamily:
     _, problem, solution = plant()
-    return make_family(name, problem, factor_of(solution))
+    return make_family(name, problem, solution.factor)
 
 
 @cache
@@ -76,7 +77,7 @@ def matrices() -> tuple[Array, Array, Array, Array]:
     _, problem, solution = plant()
     full, n_s, n_e = full_order(), problem.layout.n_s, problem.layout.n_e
     order = to_paper(n_s, n_e)
-    Z = ordered(to_absolute(problem, solution).Z)
+    Z = ordered(costates_to_absolute(problem.system, solution.factor))
     return full.E[np.ix_(order, order)], full.A[np.ix_(order, order)], full.B[order], Z @ Z.T
 
 
@@ -147,7 +148,7 @@ def test_reduced_equation_is_the_papers(name: str) -> None:
     assert abs(report.error_P - error) < 1e-6 * (1 + error)  # SciPy's accuracy
     K, K_hat = -B.T @ P @ E, -B.T @ P_hat @ E
     assert abs(report.error_K - np.linalg.norm(K - K_hat) / np.linalg.norm(K)) < 1e-6 * (1 + error)  # as above
-    mine = ordered(gain_to_absolute(problem.system, reduced.gain)).T
+    mine = ordered(gain_to_absolute(problem.system, reduced.gain.block)).T
     assert close(mine, K_hat) < 1e-6  # SciPy's accuracy
     assert mine.shape == (n_s, len(E))
 
@@ -176,10 +177,10 @@ def test_marks_come_from_the_spectrum_of_the_full_closed_loop() -> None:
             if report.reason:
                 assert not report.stable
                 continue
-            K = ordered(gain_to_absolute(problem.system, reduce_riccati(problem, family(name).at(N)).gain)).T
-            abscissa = scipy.linalg.eigvals(A + B @ K, E).real.max()
-            assert abs(report.abscissa_full - abscissa) < 1e-9 * (1 + np.linalg.norm(K)), (name, N)  # rounding of B K
-            assert report.stable == (abscissa < 0), (name, N)
+            K = ordered(gain_to_absolute(problem.system, reduce_riccati(problem, family(name).at(N)).gain.block)).T
+            exact = scipy.linalg.eigvals(A + B @ K, E).real.max()
+            assert abs(report.abscissa_full - exact) < 1e-9 * (1 + np.linalg.norm(K)), (name, N)  # rounding of B K
+            assert report.stable == (exact < 0), (name, N)
             assert np.isfinite(report.cost_excess) == report.stable
             seen.add(report.stable)
     assert seen == {True, False}
@@ -188,14 +189,14 @@ def test_marks_come_from_the_spectrum_of_the_full_closed_loop() -> None:
 def test_a_gain_that_drives_away_is_marked_unstable() -> None:
     _, problem, solution = plant()
     judge = GainJudge(problem, solution, hand_start(problem, -TARGET))
-    K = gain_of(solution)
-    good, bad = judge.quality(K), judge.quality(K.times(-np.eye(2)))
+    away = Gain.of_block(solution.gain.block.times(-np.eye(2)))
+    good, bad = judge.quality(solution.gain), judge.quality(away)
     assert good.stable
     assert good.cost_excess == 0
     assert bad.abscissa > 0.1  # 0.43: no rounding
     assert not bad.stable
     assert bad.cost_excess == np.inf
-    large = certified_abscissa(problem, K.times(-np.eye(2)))
+    large = abscissa(problem, away)
     assert abs(large.value - bad.abscissa) < 1e-7  # tolerance 1e-9 of eigenvalues of size 10
     assert not large.stable
 
@@ -231,7 +232,7 @@ def test_cost_excess_against_a_dense_lyapunov_equation() -> None:
     assert abs(optimal_cost(problem, solution, TARGET) / optimal - 1) < 1e-10  # rounding of P, as above
     for name, N in (("pod", 12), ("pod_decomposed", 8), ("structured", 6)):
         gain = reduce_riccati(problem, family(name).at(N)).gain
-        K = ordered(gain_to_absolute(problem.system, gain)).T
+        K = ordered(gain_to_absolute(problem.system, gain.block)).T
         F = np.linalg.solve(E, A + B @ K)
         Y = scipy.linalg.solve_continuous_lyapunov(F.T, -(C.T @ C + K.T @ K))
         excess = x @ Y @ x / optimal - 1
@@ -249,7 +250,7 @@ def test_structured_basis_needs_no_solution_and_converges() -> None:
     assert all(r.stable for r in reports)
     assert errors[-1] < 1e-4 < 1e-2 < 1e3 * errors[0]  # measured: 7e-3, 4e-5, 2e-6, 8e-7
     assert errors == sorted(errors, reverse=True)
-    m = project(problem, modes.at(8))
+    m = project_plant(problem, modes.at(8))
     assert close(m.E[4:, 4:], np.eye(4)) < 1e-10  # energy scaling: Phi'M Phi = I
     assert scipy.linalg.eigvals(m.A, m.E).real.max() < 1e-7  # double zero of the hand: sqrt(eps)
 
@@ -259,7 +260,7 @@ def test_energy_scaling_keeps_the_span_and_the_fast_way_agrees_with_the_careful_
     for name in ("pod", "pod_decomposed", "structured"):
         basis = family(name).at(12)
         scaled = energy_scaled(problem, basis)
-        raw, m = project(problem, basis), project(problem, scaled)
+        raw, m = project_plant(problem, basis), project_plant(problem, scaled)
         fast, careful = fast_solution(m), solve_reduced(raw)
         assert fast is not None
         T = np.linalg.lstsq(ordered(basis.U), ordered(scaled.U), rcond=None)[0]
@@ -273,19 +274,19 @@ def test_weighted_pod_is_refused_when_the_hand_is_light() -> None:
     _, problem, solution = plant()
     light = replace(problem, system=replace(problem.system, M_hand=1e-3 * np.eye(2)))
     with pytest.raises(ControlError, match=r"W = \(E \+ E'\)/2 is not positive definite"):
-        make_family("weighted_pod", light, factor_of(solution))
+        make_family("weighted_pod", light, solution.factor)
     E = matrices()[0].copy()
     assert np.linalg.eigvalsh((E + E.T) / 2)[0] > 0
     E[2:4, 2:4] = 1e-3 * np.eye(2)
     assert np.linalg.eigvalsh((E + E.T) / 2)[0] < 0
     _, two_way, other = plant(two_way=True)
-    assert make_family("weighted_pod", two_way, factor_of(other)).largest > 20  # E itself is symmetric there
+    assert make_family("weighted_pod", two_way, other.factor).largest > 20  # E itself is symmetric there
 
 
 def test_orders_and_names_are_checked() -> None:
     _, problem, solution = plant()
     with pytest.raises(ControlError, match="basis 'psd' is unknown; choose one of pod, weighted_pod"):
-        make_family("psd", problem, factor_of(solution))
+        make_family("psd", problem, solution.factor)
     with pytest.raises(ControlError, match=r"has no order N = 7; choose 4 to .* in steps of 2"):
         family("pod_decomposed").at(7)
     with pytest.raises(ControlError, match="the start is the target"):
@@ -300,7 +301,7 @@ def test_orders_and_names_are_checked() -> None:
 def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
     """Shift-and-invert finds what LAPACK finds, and the bound certifies the optimal gain."""
     _, problem, solution = plant(two_way)
-    gain = gain_of(solution)
+    gain = solution.gain.block
     found = certified_abscissa(problem, gain)
     values = GainJudge(problem, solution, hand_start(problem, -TARGET)).loop.poles(gain)
     inside = values[np.abs(values) <= found.radius]
@@ -327,10 +328,10 @@ def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
 def test_what_cannot_be_certified_is_not_called_stable() -> None:
     _, problem, solution = plant()
     none = replace(problem, system=replace(problem.system, damping=type(problem.system.damping)()))
-    found = certified_abscissa(none, gain_of(solution))
+    found = certified_abscissa(none, solution.gain.block)
     assert not found.stable
     assert "no damping" in found.reason or found.value >= 0
-    free = Block(np.zeros((4, 2)), gain_of(solution).tall)
+    free = Block(np.zeros((4, 2)), solution.gain.block.tall)
     assert not certified_abscissa(problem, free).stable  # a hand that nothing holds
 
 
@@ -342,14 +343,14 @@ def test_retuning_equals_projection_at_the_new_material() -> None:
         for lam, mu in ((50.0, 50.0), (30.0, 20.0), (500.0, 500.0)):
             new = (replace(material, lam=lam, mu=mu),)
             moved = replace(problem, system=problem.system.with_materials(new))
-            exact, mine = project(moved, retuner.basis), retuner.at(new)
+            exact, mine = project_plant(moved, retuner.basis), retuner.at(new)
             assert close(mine.A, exact.A) < 1e-11  # rounding of two sums, and K_ee T + K_es = 0
             assert close(mine.E, exact.E) < 1e-14  # no stiffness in E: the same sums
             tuned = retuner.solve(new)
             direct = reduce_riccati(moved, family(name).at(12)) if (lam, mu) == (50.0, 50.0) else None
             if direct is not None:
                 full = retuner.full_gain(tuned)
-                assert close(ordered(full), ordered(direct.gain)) < 1e-8  # same equation
+                assert close(ordered(full.block), ordered(direct.gain.block)) < 1e-8  # same equation
     assert solution.rank > 12
 
 
@@ -375,13 +376,13 @@ def test_bases_of_the_papers_scene_equal_the_dense_definition() -> None:
     model = build(make_scene(DAMPED, {"tissue": {"cells": [10, 20]}}), comm=MPI.COMM_WORLD)
     problem = make_problem(model)
     solution = DenseRiccati().solve(problem)
-    Z = to_absolute(problem, solution).Z
+    Z = costates_to_absolute(problem.system, solution.factor)
     layout = problem.layout
     n = layout.n_local
     dense = np.concatenate([Z.hand, gather_rows(layout, Z.tall[:n]), gather_rows(layout, Z.tall[n:])])
     P = dense @ dense.T
     U, s, _ = np.linalg.svd(P)
-    V = make_family("pod", problem, factor_of(solution))
+    V = make_family("pod", problem, solution.factor)
     assert close(V.sigma[0][:40], s[:40]) < 1e-12  # rounding, of the largest
     basis = V.at(8)
     T = problem.system.T

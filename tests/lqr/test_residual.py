@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -11,8 +9,9 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.modal import DenseRiccati, dense_residual, relative_space
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import LAYERS, make_scene
 
@@ -29,17 +28,10 @@ CASES = {
 }
 
 
-@dataclass(frozen=True)
-class Candidate:
-    Z_s: Array
-    Z_z: Array
-    Z_v: Array
-
-
-def spread(problem: RiccatiProblem, Z: Array) -> Candidate:
+def spread(problem: RiccatiProblem, Z: Array) -> Block:
     layout, s = problem.layout, 2 * problem.layout.n_s
     own = slice(layout.start, layout.start + layout.n_local)
-    return Candidate(Z[:s], Z[s : s + layout.n_e][own], Z[s + layout.n_e :][own])
+    return Block(Z[:s], np.concatenate([Z[s : s + layout.n_e][own], Z[s + layout.n_e :][own]]))
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -58,15 +50,15 @@ def test_residual_of_any_z_is_the_dense_one(name: str) -> None:
 
 def test_residual_sees_a_small_error() -> None:
     problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), comm=MPI.COMM_WORLD))
-    found = DenseRiccati().solve(problem)
+    found = DenseRiccati().solve(problem).factor
     assert residual(problem, found) < 1e-9  # rounding times |A||X|
-    worse = Candidate(found.Z_s * (1 + 1e-6), found.Z_z, found.Z_v)
+    worse = Block(found.hand * (1 + 1e-6), found.tall)
     assert residual(problem, worse) > 1e-7  # a hundred times the bound above
 
 
 def test_residual_leaves_its_input_alone() -> None:
     problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), comm=MPI.COMM_WORLD))
-    found = DenseRiccati().solve(problem)
-    copies = [x.copy() for x in (found.Z_s, found.Z_z, found.Z_v)]
+    found = DenseRiccati().solve(problem).factor
+    copies = [x.copy() for x in (found.hand, found.tall)]
     residual(problem, found)
-    assert all(np.array_equal(a, b) for a, b in zip(copies, (found.Z_s, found.Z_z, found.Z_v), strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(copies, (found.hand, found.tall), strict=True))

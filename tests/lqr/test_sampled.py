@@ -13,7 +13,7 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
-from softgrasp.lqr.loop.small_plant import m_orthonormal, project
+from softgrasp.lqr.loop.small_plant import galerkin, m_orthonormal
 from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import hand_target
@@ -168,7 +168,7 @@ def test_a_controller_that_carries_its_tissue_is_judged_as_it_runs(name: str, fa
     case, law = setup(name), Sampling(0.1, 4, True)
     problem, n_s = case.problem, case.problem.layout.n_s
     V = m_orthonormal(problem.system.M_ee, lowest_modes(problem.system, 3)[1])
-    plant, shapes = project(problem, V)
+    plant, shapes = galerkin(problem, V)
     K = shapes.reduce_gain(problem, scaled(case.gain, factor))
     controller = Controller(K, np.zeros(plant.N), np.zeros(n_s), plant, period=0.4)
     found = SampledLoop(problem).controller(controller, law)

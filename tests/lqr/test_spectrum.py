@@ -11,17 +11,16 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
-from softgrasp.lqr.design import make_problem
+from softgrasp.lqr.design.scene import problem as make_problem
+from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 from softgrasp.lqr.spectrum.tail import Tail
-from softgrasp.study.control.run import with_control
 from tests.helpers.models import LAYERS, make_scene
 
 SCENES = Path(__file__).parents[2] / "demos" / "scenes"
@@ -66,7 +65,7 @@ def poles(problem: RiccatiProblem, K: Block) -> np.ndarray:
 def test_shipped_scenes_are_certified(name: str, changes: tuple[str, ...]) -> None:
     """Also where the poles of fast modes accumulate at -1/beta, before and behind those of the hand."""
     problem = shipped(name, *changes)
-    K = gain_of(solve(problem)) if "control.Q=1e6" in changes else gain(problem)
+    K = solve(problem).gain.block if "control.Q=1e6" in changes else gain(problem)
     found, exact = certified_abscissa(problem, K), poles(problem, K)
     assert found.certified, found.reason
     assert found.bound < 1

@@ -18,15 +18,15 @@ from rich.console import Console
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.design.orders import BasisGains
+from softgrasp.lqr.design.scene import actuation, with_control
 from softgrasp.lqr.loop.controller import Controller, load_gain
 from softgrasp.lqr.loop.export import to_python_control
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
-from softgrasp.study.control.page import settled
 from softgrasp.study.control.plots import drawn, figure_reduced, unstable
-from softgrasp.study.control.run import run_control, with_control
-from softgrasp.study.control.solve import actuation, scene_words
-from softgrasp.study.control.sweep import SweptBasis
+from softgrasp.study.control.result import settled
+from softgrasp.study.control.run import run_control
 from softgrasp.study.report.files import plain
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene
@@ -337,8 +337,8 @@ def test_a_scene_without_control_watches_tip_and_turning_hand() -> None:
         assert not nothing
 
 
-def points(name: str, *values: tuple[int, float, float]) -> SweptBasis:
-    return SweptBasis(name, None, tuple(GainReport(name, N, e, e, e, a, 1e-3) for N, e, a in values))
+def points(name: str, *values: tuple[int, float, float]) -> BasisGains:
+    return BasisGains(name, None, tuple(GainReport(name, N, e, e, e, a, 1e-3) for N, e, a in values))
 
 
 def test_large_errors_break_the_line_and_unstable_gains_are_marked() -> None:
@@ -355,8 +355,8 @@ def test_large_errors_break_the_line_and_unstable_gains_are_marked() -> None:
 
 @pytest.mark.serial
 def test_figure_of_the_errors(tmp_path: Path) -> None:
-    swept = (points("pod", (4, 0.5, -1.0), (6, 30.0, 0.1)), points("structured", (4, 1e-3, -1.0), (6, 1e-5, -1.0)))
-    png, pdf = figure_reduced(swept, tmp_path / "errors.png")
+    bases = (points("pod", (4, 0.5, -1.0), (6, 30.0, 0.1)), points("structured", (4, 1e-3, -1.0), (6, 1e-5, -1.0)))
+    png, pdf = figure_reduced(bases, tmp_path / "errors.png")
     assert png.stat().st_size > 10_000
     assert pdf.stat().st_size > 5_000
 
@@ -369,6 +369,5 @@ def test_small_helpers() -> None:
         "a": [None, None, 1.0, 2],
         "b": True,
     }
-    assert scene_words("use the method modal_lqr, which x") == "use control.method = 'modal', which x"
     assert issubclass(ControlError, SoftgraspError)
     assert issubclass(SceneError, SoftgraspError)

@@ -12,7 +12,8 @@ from PIL import Image
 
 from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.study.pictures import loop as loop_plots
-from softgrasp.study.pictures.loop import figure_decay, figure_histories, move_steps, still_to_come
+from softgrasp.study.pictures.loop import figure_decay, figure_histories, still_to_come
+from softgrasp.study.pictures.shapes import move_steps
 
 pytestmark = pytest.mark.serial
 

@@ -16,8 +16,7 @@ from rich.console import Console
 
 from softgrasp.fem.errors import Interrupted, SceneError
 from softgrasp.fem.model.build import build
-from softgrasp.lqr.design import make_problem
-from softgrasp.lqr.plant.coordinates import gain_of
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.lqr.riccati import solve
@@ -83,14 +82,14 @@ def test_gain_errors_agree_with_the_dense_solution(comm: MPI.Intracomm, result: 
     rows = result["points"]["riccati"]
     assert {r["series"] for r in rows} == {"newton_adi", "radi", "galerkin", "dense"}
     problem = the_problem(comm)
-    oracle = gain_of(solve(problem, "dense"))
+    oracle = solve(problem, "dense").gain
     own = result["references"]["riccati"]["error"]
     # two low-rank methods to 1e-11 or better on a small plant
     assert own < 1e-9
     for row in rows:
         if row["series"] == "dense" or row["tolerance"] not in (1e-2, 1e-6) or not row["ok"]:
             continue
-        true = gain_error(problem, oracle, gain_of(solve(problem, row["series"], row["tolerance"])))
+        true = gain_error(problem, oracle, solve(problem, row["series"], row["tolerance"]).gain)
         # rounding of the dense solution, and of a solution that is made again
         assert row["error"] == pytest.approx(true, rel=1e-3, abs=10 * own + 1e-11)
         if row["series"] != "galerkin":

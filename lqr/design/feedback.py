@@ -1,0 +1,175 @@
+"""From a scene to its optimal gain: diagnosis, the solver by size, and a check of the closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.lqr.design.scene import actuation, problem, sampling, scene_target
+from softgrasp.lqr.diagnosis import Diagnosis, diagnose
+from softgrasp.lqr.loop.actuation import Actuation
+from softgrasp.lqr.modal_feedback import modal_lqr
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.gain import Gain, PlantState
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.plant.target import Target, hand_target, rest
+from softgrasp.lqr.reduced.riccati import GainJudge
+from softgrasp.lqr.riccati import Method, choose, solve
+from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality, ModalLoop
+from softgrasp.lqr.spectrum.sampled import Sampling
+
+Progress = Callable[[dict[str, float]], None]
+MODAL_MODES = 10
+MODAL_CANDIDATES = 40
+ROUNDING = 1e-8  # of an eigenvalue on the unit circle
+
+
+@dataclass(frozen=True)
+class Design:
+    """The optimal feedback of a scene.
+
+    Attributes:
+        model: the built scene.
+        problem: plant, outputs and weights.
+        solution: Riccati solution and gain.
+        target, start: where the loop goes and where it begins.
+        error: start minus target, one column.
+        diagnosis: what was known before the solve.
+        judge: compares gains with the optimal one.
+        quality: closed loop of the full plant under the optimal gain.
+        modal: the gain controls some modes only.
+    """
+
+    model: Model
+    problem: RiccatiProblem
+    solution: RiccatiSolution
+    target: Target
+    start: PlantState
+    error: Block
+    diagnosis: Diagnosis
+    judge: GainJudge
+    quality: LoopQuality
+    modal: bool
+
+    @property
+    def gain(self) -> Gain:
+        """The optimal gain."""
+        return self.solution.gain
+
+    @property
+    def actuation(self) -> Actuation:
+        """Sampling, delay and limits of the scene's loop."""
+        return actuation(self.model)
+
+    @property
+    def largest_radius(self) -> float:
+        """Bound on the radius of a controller; modal feedback leaves undamped modes on the circle."""
+        return 1 + ROUNDING if self.modal else 1.0
+
+
+def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
+    """The problem and what is known before the solve; whether only some modes are to be controlled. Collective.
+
+    Raises:
+        SoftgraspError: the scene has no solution, in one sentence.
+    """
+    scene_target(model)
+    actuation(model)
+    plant = problem(model)
+    diagnosis = diagnose(plant)
+    modal = model.scene.control is not None and model.scene.control.method == "modal"
+    for finding in diagnosis.findings:
+        if finding.kind == "error" and not (modal and finding.topic == "damping"):
+            raise ControlError(finding.sentence)
+    return plant, diagnosis, modal
+
+
+def design(
+    model: Model, watch: Stopwatch | None = None, progress: Progress | None = None, checkpoint: Path | None = None
+) -> Design:
+    """Solve the Riccati equation of a scene and check the closed loop of the full plant. Collective.
+
+    Args:
+        model: the built scene.
+        watch: takes the seconds of "diagnosis", "are" and "judge".
+        progress: called after every step of the solver with its history entry.
+        checkpoint: folder for the solver's restart files.
+
+    Raises:
+        SceneError: the scene names no target, or Q or R has the wrong size.
+        ControlError: no gain exists, in one sentence.
+        SolverError: not converged, or a gain that does not stabilise the full plant at the scene's own step, rate and
+            delay.
+    """
+
+    def stage(name: str) -> Any:
+        return nullcontext() if watch is None else watch.stage(name)
+
+    with stage("diagnosis"):
+        plant, diagnosis, modal = check(model)
+        target = hand_target(plant, scene_target(model))
+        start = rest(plant.system, deformed=model.scene.time.start == "equilibrium")
+    with stage("are"):
+        solution = _modal(plant, diagnosis) if modal else _solve(model, plant, progress, checkpoint)
+    with stage("judge"):
+        error = (start - target.state).block
+        loop = ModalLoop(plant, min(SOME_MODES, plant.layout.n_e))
+        judge = GainJudge(plant, solution, error, loop, sampling(model))
+        quality = judge.quality(solution.gain)
+    if quality.certified and not quality.abscissa < 0 and not modal:
+        raise SolverError(
+            f"the gain leaves the closed loop with the spectral abscissa {quality.abscissa:.1e}/s, which must be "
+            "negative; add damping, or try another control.method"
+        )
+    result = Design(model, plant, solution, target, start, error, diagnosis, judge, quality, modal)
+    with stage("judge"):
+        _require_sampled(result)
+    return result
+
+
+def _modal(plant: RiccatiProblem, diagnosis: Diagnosis) -> RiccatiSolution:
+    """As many of the lowest modes as feedback can stabilise, at most :data:`MODAL_MODES`."""
+    rates = diagnosis.rates
+    good = MODAL_MODES if rates is None else int((rates.lost[:MODAL_CANDIDATES] == 0).sum())
+    return modal_lqr(plant, min(MODAL_MODES, good), MODAL_CANDIDATES)
+
+
+def _solve(model: Model, plant: RiccatiProblem, progress: Progress | None, checkpoint: Path | None) -> RiccatiSolution:
+    control = model.scene.control
+    method = cast(Method, "auto" if control is None else control.method.replace("-", "_"))
+    tol = None
+    # galerkin measures the change of its gain, not the residual
+    if control is not None and "tolerance" in control.model_fields_set and choose(plant, method).method != "galerkin":
+        tol = control.tolerance
+    return solve(plant, method, tol, progress, checkpoint)
+
+
+def loop_words(law: Sampling) -> str:
+    """Rate and delay of a held loop."""
+    return f"sampled at {1 / (law.dt * law.every):.6g} Hz" + (" and one tick late" if law.delay else "")
+
+
+def _require_sampled(design: Design) -> None:
+    """Refuse a held loop that is unstable, with a rate that is not. Collective."""
+    judge, radius, time = design.judge, design.quality.sampled, design.model.scene.time
+    law, largest = judge.law, design.largest_radius
+    if law is None or not law.every or radius is None or radius.value < largest:
+        return
+    good = judge.ticks.stable_rate(judge.K, law, design.model.scene.time_end, largest)
+    advice = "no rate makes it stable"
+    if good is not None:
+        steps = "" if good.steps == time.steps else f" with time.steps = {good.steps}"
+        advice = (
+            f"it begins to be stable at control.loop.rate = {good.rate:.9g}{steps} (radius {good.radius:.6g}), so take "
+            "a higher one"
+        )
+    raise SolverError(
+        f"the loop {loop_words(law)} is unstable: its spectral radius from tick to tick is {radius.value:.4g}, which "
+        f"must be below 1; {advice}, or lower control.Q for a slower move"
+    )

@@ -1,0 +1,130 @@
+"""What a scene asks of its control: outputs and weights, target, actuation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.motion import motion_table
+from softgrasp.fem.scene.control import Control, ControlOutput
+from softgrasp.lqr.loop.actuation import Actuation
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.spectrum.sampled import Sampling
+
+
+def weight(value: float | list[list[float]], size: int, key: str) -> Array:
+    """A number as multiple of the identity, a matrix as it is. Not collective.
+
+    Raises:
+        SceneError: the matrix has the wrong size.
+    """
+    if isinstance(value, list):
+        matrix = np.array(value, dtype=float)
+        if matrix.shape != (size, size):
+            raise SceneError(
+                f"{key} is {matrix.shape[0]} x {matrix.shape[1]}; it must be {size} x {size} or one number"
+            )
+        return matrix
+    return float(value) * np.eye(size)
+
+
+def problem(model: Model) -> RiccatiProblem:
+    """Outputs y = C_s q_s + C_z' z and weights Q, R of the scene's ``[control]`` table.
+
+    Without that table: the free node farthest from the hand, Q = R = 1. Collective.
+
+    Args:
+        model: a built scene.
+
+    Raises:
+        SceneError: an output lies outside the body, or Q or R has the wrong size.
+    """
+    scene, system = model.scene, model.system
+    outputs = make_outputs(scene, system)
+    p = sum(output.size for output in outputs)
+    C_z = np.zeros((system.layout.n_local, p), order="F")
+    first, names = 0, list[str]()
+    for output in outputs:
+        for c in range(output.size):
+            # every listed dof enters with the weight of the output; a dof is listed once
+            C_z[output.dofs[:, c], first + c] = output.weight
+        names += output.names
+        first += output.size
+    control = scene.control
+    Q = weight(1.0 if control is None else control.Q, p, "control.Q")
+    R = weight(1.0 if control is None else control.R, system.layout.n_s, "control.R")
+    return RiccatiProblem(system, np.vstack([o.C_s for o in outputs]), C_z, Q, R, tuple(names))
+
+
+def scene_target(model: Model) -> Array:
+    """Where the closed loop takes the hand: motion.target, or the end of the table. Not collective.
+
+    Raises:
+        SceneError: the scene names no target, or it is the start.
+    """
+    scene, n_s = model.scene, model.system.layout.n_s
+    target = scene.motion.target
+    if target is None and scene.motion.profile == "csv" and scene.motion.drive == "motion":
+        target = motion_table(scene, n_s).q[-1].tolist()
+    if target is None:
+        raise SceneError("motion.target is missing; `softgrasp control` moves the hand there, so give its displacement")
+    if not np.any(target):
+        raise SceneError(f"motion.target is {target}, where the hand starts; give another place to go to")
+    return np.asarray(target, dtype=np.float64)
+
+
+def actuation(model: Model) -> Actuation:
+    """How the feedback of the scene reaches the hand; checked against the time step. Not collective.
+
+    Raises:
+        ControlError: rate, delay or limit do not fit.
+    """
+    scene = model.scene
+    if scene.control is None:
+        return Actuation()
+    loop, layout = scene.control.loop, model.system.layout
+    turns = layout.n_s - layout.dimension
+    if loop.limit_torque is not None and turns == 0:
+        raise ControlError(
+            "control.loop.limit_torque limits a hand that does not turn; set effects.rotation = true, or leave it out"
+        )
+    limits = None
+    if loop.limit is not None or loop.limit_torque is not None:
+        limits = (loop.limit or np.inf,) * layout.dimension + (loop.limit_torque or np.inf,) * turns
+    law = Actuation(loop.rate if loop.sampling == "held" else None, loop.delay, limits)
+    law.ticks(scene.time_end / scene.time.steps)
+    return law
+
+
+def sampling(model: Model) -> Sampling:
+    """The instants of the scene's loop. Not collective.
+
+    Raises:
+        ControlError: the tick is no multiple of the time step.
+    """
+    return Sampling.of(actuation(model), model.scene.time_end / model.scene.time.steps)
+
+
+def with_control(model: Model) -> tuple[Model, str]:
+    """A scene without a [control] table gets tip output and Q = R = 1, and a turning hand is seen too. Collective.
+
+    Returns:
+        The model, and the sentence that says so; empty when the scene has its own table.
+    """
+    if model.scene.control is not None:
+        return model, ""
+    tip = make_outputs(model.scene, model.system)[0]
+    outputs = [ControlOutput(kind="node", point=list(tip.point), name=tip.name)]
+    what = f"the node at ({', '.join(f'{x:.4g}' for x in tip.point)}), the farthest from the hand,"
+    if model.system.layout.n_s > model.system.layout.dimension:  # one node does not see all rotations
+        outputs.append(ControlOutput(kind="hand", point=None, name="hand"))
+        what += " and the hand itself"
+    control = Control(outputs=outputs)
+    note = f"the scene has no [control] table: {what} as output, Q = R = 1"
+    return replace(model, scene=model.scene.model_copy(update={"control": control})), note

@@ -1,0 +1,256 @@
+"""What ``softgrasp control`` finds, and result.json made from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.model.outputs_named import farthest
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.design.controller import CertifiedController
+from softgrasp.lqr.design.duration import LoopPlan
+from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.orders import BasisGains
+from softgrasp.lqr.loop.full import LoopTrajectory
+from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
+from softgrasp.lqr.reduced.bases import A_PRIORI
+from softgrasp.lqr.reduced.retune import BoxPoint
+from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.study.report.origin import origin, peak_memory_mb
+
+TITLES = {
+    "pod": "POD of P",
+    "weighted_pod": "weighted POD of P",
+    "pod_fixed_solid": "POD, fixed solid modes",
+    "componentwise_pod": "componentwise POD",
+    "pod_decomposed": "POD of decomposed P",
+    "structured": "modes by cost, a priori",
+}
+
+
+@dataclass(frozen=True)
+class Note:
+    """What was chosen for the user, or why a part is missing.
+
+    Attributes:
+        topic: table, modal, orders, retune, controller, sampling, end.
+        text: one sentence.
+    """
+
+    topic: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Retuned:
+    """One basis of one parameter over the box of lambda and mu.
+
+    Attributes:
+        name: basis.
+        N: order.
+        points: gains at the settings.
+    """
+
+    name: str
+    N: int
+    points: tuple[BoxPoint, ...]
+
+    @property
+    def slowest(self) -> float:
+        """Seconds of the slowest re-tuning; nan when none was possible."""
+        return max((p.seconds for p in self.points if not p.reason), default=float("nan"))
+
+
+@dataclass(frozen=True)
+class ReducedLoopRun:
+    """The full plant under the best stable gain of one basis.
+
+    Attributes:
+        method: key of the basis.
+        N: order.
+        run: None when it failed.
+        reason: why it failed; else empty.
+    """
+
+    method: str
+    N: int
+    run: LoopTrajectory | None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class LoopRuns:
+    """All closed-loop runs.
+
+    Attributes:
+        plan: times.
+        full: under the optimal gain.
+        to_come: cost still to come at the end, from the Riccati solution.
+        reduced: under the best stable gain of each basis.
+        limits: of the inputs [N, N m], inf for none; None without any.
+    """
+
+    plan: LoopPlan
+    full: LoopTrajectory
+    to_come: float
+    reduced: tuple[ReducedLoopRun, ...]
+    limits: Array | None = None
+
+
+@dataclass(frozen=True)
+class ControlStudy:
+    """All that ``softgrasp control`` finds.
+
+    Attributes:
+        design: the optimal feedback.
+        bases: gains of the reduced equations.
+        retuned: gains over the box.
+        controller: the small controller; None when no small gain is certified.
+        tick: seconds of one tick of it, median.
+        loops: closed loops.
+        notes: what was chosen for the user, and why parts are missing.
+    """
+
+    design: Design
+    bases: tuple[BasisGains, ...]
+    retuned: tuple[Retuned, ...]
+    controller: CertifiedController | None
+    tick: float
+    loops: LoopRuns
+    notes: tuple[Note, ...]
+
+    @property
+    def findings(self) -> list[str]:
+        """Sentences of the diagnosis."""
+        return [finding.sentence for finding in self.design.diagnosis.findings]
+
+    def distance(self, run: LoopTrajectory) -> Array:
+        """Distance of the farthest output to its target at every instant [m], (steps + 1,)."""
+        return farthest(run.outputs, self.design.target.y, self.design.problem.names)
+
+
+def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, Any]:
+    """The keys of ``result.json``. Collective.
+
+    Args:
+        study: what was found.
+        seconds: of the stages.
+    """
+    d = study.design
+    problem, solution, quality, layout = d.problem, d.solution, d.quality, d.problem.layout
+    return {
+        "command": "control",
+        **origin(d.model.scene, layout.comm.size),
+        "n_s": layout.n_s,
+        "n_e": layout.n_e,
+        "states": layout.states,
+        "method": solution.summary,
+        "rank": solution.rank,
+        **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
+        "residual": solution.residual,
+        "optimal_cost": d.judge.optimal,
+        "gain_translation": gain_translation(problem, solution).tolist(),
+        "gain_rigid_velocity": gain_rigid_velocity(problem, solution).tolist(),
+        "identity_translation": translation_defect(problem, solution),
+        "identity_velocity": velocity_defect(problem, solution),
+        "closed_loop_abscissa": quality.abscissa,
+        "closed_loop_certified": quality.certified,
+        "closed_loop_exact": quality.exact,
+        "sampled_radius": None if quality.sampled is None else quality.sampled.value,
+        "sampled_certified": quality.sampled is not None and quality.sampled.certified,
+        "sampled_exact": quality.sampled is not None and quality.sampled.exact,
+        "stable": quality.stable,
+        "findings": study.findings,
+        "damping_enough": d.diagnosis.damping_enough,
+        "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
+        "refused": {b.name: b.refused for b in study.bases if b.refused},
+        "retune": [_retuned(r) for r in study.retuned],
+        "controller": _controller(study),
+        "loop": _loop(study),
+        "notes": [note.text for note in study.notes],
+        "time": {**seconds, "solver": dict(solution.seconds)},
+        "memory_peak_mb": peak_memory_mb(layout.comm),
+    }
+
+
+def report_dict(report: GainReport) -> dict[str, Any]:
+    """One point of result.json."""
+    keys = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
+    return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
+
+
+def radius_of(report: GainReport | BoxPoint) -> float:
+    """Spectral radius from tick to tick; nan where there is no gain."""
+    return float("nan") if report.sampled is None else report.sampled.value
+
+
+def _retuned(r: Retuned) -> dict[str, Any]:
+    points = [
+        {
+            "lambda": p.materials[0].lam,
+            "mu": p.materials[0].mu,
+            "error_K": p.error_K,
+            "cost_excess": p.cost_excess,
+            "abscissa_full": p.abscissa_full,
+            "sampled_radius": radius_of(p),
+            "time": p.seconds,
+            "stable": p.stable,
+            "reason": p.reason,
+        }
+        for p in r.points
+    ]
+    return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}
+
+
+def _controller(study: ControlStudy) -> dict[str, Any] | None:
+    if study.controller is None:
+        return None
+    c = study.controller.controller
+    return {"method": study.controller.method, "N": c.plant.N, "period": c.period, "time_tick": study.tick,
+            "sampled_radius": study.controller.radius.value}  # fmt: skip
+
+
+def _loop(study: ControlStudy) -> dict[str, Any]:
+    loops, full = study.loops, study.loops.full
+    away = study.distance(full)
+    return {
+        "steps": loops.plan.steps,
+        "dt": loops.plan.dt,
+        "hand_final": full.q_s[-1].tolist(),
+        "output_names": list(full.output_names),
+        "output_target": study.design.target.y.tolist(),
+        "output_final": full.outputs[-1].tolist(),
+        "distance_first": float(away[0]),
+        "distance_final": float(away[-1]),
+        "settled": settled(full.times, away),
+        "cost": float(full.cost[-1]),
+        "cost_to_come": loops.to_come,
+        "input_largest": np.abs(full.inputs).max(axis=0).tolist(),
+        "saturated": full.saturated,
+        "solver": {"name": full.solver[0], "reason": full.solver[1]},
+        "time": dict(full.seconds),
+        "reduced": [_reduced_run(study, r) for r in loops.reduced],
+    }
+
+
+def _reduced_run(study: ControlStudy, r: ReducedLoopRun) -> dict[str, Any]:
+    if r.run is None:
+        return {"method": r.method, "N": r.N, "reason": r.reason}
+    end = float(study.distance(r.run)[-1])
+    return {"method": r.method, "N": r.N, "distance_final": end, "cost": float(r.run.cost[-1]), "reason": ""}
+
+
+def settled(times: Array, distance: Array, share: float = 0.01) -> float | None:
+    """First time after which the distance stays below a share of the first; None when it never does."""
+    outside = np.flatnonzero(distance > share * distance[0])
+    if len(outside) == 0:
+        return float(times[0])
+    return None if outside[-1] + 1 >= len(times) else float(times[outside[-1] + 1])
+
+
+def a_priori(bases: Sequence[BasisGains]) -> BasisGains | None:
+    """The gains of the basis that needs no P; None where there are none."""
+    return next((b for b in bases if b.name == A_PRIORI), None)

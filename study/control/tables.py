@@ -1,0 +1,186 @@
+"""Tables of ``softgrasp control``: the summary, reduced gains, re-tuning, closed loops, the trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.model.outputs import hand_axes
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.design.orders import BasisGains
+from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation
+from softgrasp.lqr.reduced.retune import BoxPoint
+from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.study.control.result import TITLES, ControlStudy, Retuned, radius_of, settled
+from softgrasp.study.forward.result import force_unit, trajectory_header
+from softgrasp.study.report.tables import Table
+
+Row = tuple[Any, ...]
+SPECTRUM = ("abscissa [1/s]", "radius a tick")
+REDUCED_HEADER = ("basis", "N", "error of P", "error of K", "excess cost", *SPECTRUM, "reduced ARE [ms]", "gain")
+BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", "excess cost", *SPECTRUM, "re-tuned in [ms]", "gain")
+LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
+BEST_HEADER = (
+    "best stable gain", "N", "error P", "error K", "excess", "abscissa", "ARE, ms", "unstable N",
+)  # fmt: skip
+
+
+def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[str, str]]:
+    """The short table as label and text."""
+    design, full, loops = study.design, study.loops.full, study.loops
+    solution, away = design.solution, study.distance(full)
+    counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
+    arrived = settled(full.times, away)
+    rows = [
+        ("method", solution.summary),
+        ("rank, Newton steps, solves", ", ".join(counts)),
+        ("true relative residual", f"{solution.residual:.1e}"),
+        ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
+        *_spectrum(study),
+        ("gain, body displaced", _matrix(gain_translation(design.problem, solution))),
+        ("gain, body moving", _matrix(gain_rigid_velocity(design.problem, solution))),
+        ("distance to the target", f"{away[0]:.3g} m at first, {away[-1]:.3g} m at the end"),
+        ("within 1 % for good after", "not within the run" if arrived is None else f"{arrived:.4g} s"),
+        ("cost of the run + still to come", f"{full.cost[-1]:.6g} + {loops.to_come:.3g}"),
+    ]
+    if full.saturated:
+        rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
+    if study.controller is not None:
+        c = study.controller.controller
+        text = f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms"
+        rows.append(("small controller", text))
+    rows += [("re-tuned", _fast(r)) for r in study.retuned]
+    stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
+    return [*rows, ("time: ARE, reduced, loop", stages)]
+
+
+def _spectrum(study: ControlStudy) -> list[tuple[str, str]]:
+    """Abscissa and radius of the closed loop, with what is certain of them."""
+    quality, left_out = study.design.quality, ", not certified for the modes left out"
+    if not quality.certified:
+        remark = left_out
+    elif not quality.abscissa < 0:
+        remark = ": not stable"
+    else:
+        remark = "" if quality.exact else ", a lower bound; stable for certain"
+    if remark and study.design.modal and not study.design.problem.system.damping.active:
+        remark = ": that of the modes left out, zero to rounding"
+    rows = [("closed-loop spectral abscissa", f"{quality.abscissa:.4g} 1/s{remark}")]
+    if quality.sampled is not None:
+        remark = "" if quality.sampled.exact else ", of the modes kept"
+        remark += "" if quality.sampled.certified else left_out
+        rows.append(("spectral radius from tick to tick", f"{quality.sampled.value:.6g}{remark}"))
+    return rows
+
+
+def _matrix(values: Array) -> str:
+    return "; ".join(" ".join(f"{v:.5g}" for v in row) for row in values)
+
+
+def _fast(r: Retuned) -> str:
+    stable = [p for p in r.points if p.stable]
+    largest = max((p.cost_excess for p in stable), default=float("nan"))
+    return (
+        f"{TITLES[r.name]}, N = {r.N}: {len(stable)} of {len(r.points)} stable, at most {1e3 * r.slowest:.2g} ms, "
+        f"excess cost up to {largest:.1e}"
+    )
+
+
+def _mark(gain: GainReport | BoxPoint) -> str:
+    if gain.reason:
+        return "none"
+    if gain.stable or not gain.certified:
+        return "stable" if gain.stable else "not certified"
+    if gain.abscissa_full >= 0 or gain.sampled is None:
+        return "unstable"
+    return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
+
+
+def _cells(gain: GainReport | BoxPoint, *values: float) -> list[float | None]:
+    """Nothing where there is no gain, or no finite number."""
+    return [None if gain.reason or not np.isfinite(x) else float(x) for x in values]
+
+
+def reduced_table(bases: Sequence[BasisGains]) -> Table:
+    """One row a gain; errors of an unusable gain are shown, its cost is not."""
+    rows = [
+        (
+            TITLES[b.name],
+            r.N,
+            *_cells(r, r.error_P, r.error_K, r.cost_excess),
+            None if r.reason else r.abscissa_full,
+            None if r.sampled is None else radius_of(r),
+            None if r.reason else 1e3 * r.time_are,
+            _mark(r),
+        )
+        for b in bases
+        for r in b.reports
+    ]
+    return Table(REDUCED_HEADER, rows, "Reduced Riccati equations")
+
+
+def best_table(bases: Sequence[BasisGains]) -> Table:
+    """The best stable gain of every basis, in short."""
+    rows: list[Row] = []
+    for b in bases:
+        r, unstable = b.best(), ", ".join(str(x.N) for x in b.reports if not x.stable)
+        if r is None:
+            rows.append((TITLES[b.name], *([""] * 6), unstable or b.refused))
+            continue
+        values = (f"{r.error_P:.1e}", f"{r.error_K:.1e}", f"{r.cost_excess:.1e}", f"{r.abscissa_full:.4g}")
+        rows.append((TITLES[b.name], r.N, *values, f"{1e3 * r.time_are:.2g}", unstable))
+    return Table(BEST_HEADER, rows)
+
+
+def box_rows(r: Retuned) -> list[Row]:
+    """One row a setting."""
+    return [
+        (
+            p.materials[0].lam,
+            p.materials[0].mu,
+            *_cells(p, p.error_K, p.cost_excess, p.abscissa_full, radius_of(p), 1e3 * p.seconds),
+            _mark(p),
+        )
+        for p in r.points
+    ]
+
+
+def retune_table(retuned: Sequence[Retuned]) -> Table:
+    """All settings of all bases."""
+    return Table(("basis", "N", *BOX_HEADER), [(TITLES[r.name], r.N, *row) for r in retuned for row in box_rows(r)])
+
+
+def loop_table(study: ControlStudy) -> Table:
+    """Full plant under every gain."""
+    full = study.loops.full
+    rows: list[Row] = [("optimal", None, float(study.distance(full)[-1]), float(full.cost[-1]), 0.0)]
+    for r in study.loops.reduced:
+        if r.run is None:
+            rows.append((f"{TITLES[r.method]}: {r.reason}", r.N, None, None, None))
+            continue
+        cost, end = float(r.run.cost[-1]), float(study.distance(r.run)[-1])
+        rows.append((TITLES[r.method], r.N, end, cost, cost / float(full.cost[-1]) - 1))
+    return Table(LOOP_HEADER, rows, "Closed loop")
+
+
+def trajectory_table(study: ControlStudy) -> Table:
+    """Hand, outputs, load and cost at every instant under the optimal gain."""
+    full, d = study.loops.full, study.design.problem.layout.dimension
+    n_s = full.q_s.shape[1]
+    names = trajectory_header(n_s, d, full.output_names, velocity=False)
+    names += [*(f"u_{axis} [{force_unit(axis)}]" for axis in hand_axes(n_s, d)), "cost"]
+    inputs = np.vstack([full.inputs, full.inputs[-1:]])
+    data = np.column_stack([full.times, full.q_s, full.outputs, inputs, full.cost])
+    return Table(tuple(names), data.tolist())
+
+
+def tables(study: ControlStudy) -> dict[str, Table]:
+    """CSV file name -> table."""
+    files = {"trajectory.csv": trajectory_table(study)}
+    if study.bases:
+        files["reduced.csv"] = reduced_table(study.bases)
+    if study.retuned:
+        files["retune.csv"] = retune_table(study.retuned)
+    return files
