@@ -39,7 +39,7 @@ assert abs(move.q_s[-1] - [5, 3]).max() < 1e-2  # 300 s are about five time cons
 # microseconds of NumPy.
 
 # %%
-controller = sg.make_controller(model, order=8)
+controller = sg.make_controller(sg.design(model), order=8)
 force = controller.towards(np.array([5.0, 3.0])).step(np.zeros(2), np.zeros(2))
 if speak:
     print("first force on the hand", force)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.scene.file import load_scene as load_scene
     from softgrasp.fem.scene.file import shipped_scenes as shipped_scenes
     from softgrasp.fem.scene.scene import Scene as Scene
+    from softgrasp.lqr.design import design as design
     from softgrasp.lqr.design import make_controller as make_controller
     from softgrasp.lqr.design import problem as problem
     from softgrasp.lqr.loop.controller import Controller as Controller
@@ -55,6 +56,7 @@ _FACE = {
     "save": "reduction.archive",
     "load": "reduction.archive",
     "problem": "lqr.design",
+    "design": "lqr.design",
     "solve": "lqr.riccati",
     "abscissa": "lqr.spectrum.certificate",
     "ClosedLoop": "lqr.loop.full",
@@ -64,8 +66,8 @@ _FACE = {
 """What a user imports -> the module that has it."""
 
 __all__ = [
-    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "errors", "load", "load_scene",
-    "make_controller", "problem", "reduce", "replay", "save", "shipped_scenes", "simulate", "solve",
+    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors", "load",
+    "load_scene", "make_controller", "problem", "reduce", "replay", "save", "shipped_scenes", "simulate", "solve",
 ]  # fmt: skip
 
 
