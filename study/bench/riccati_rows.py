@@ -20,6 +20,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design import make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
@@ -28,7 +29,7 @@ from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_of, gain_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.study.bench.peers import to_scipy
+from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.jobs import leave_result
 
@@ -56,16 +57,6 @@ def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
     """The paper's control problem on nx x 2 nx cells. Collective."""
     changes = [f"tissue.cells=[{nx}, {2 * nx}]", f"effects.damping.beta={beta!r}"]
     return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm))
-
-
-def gain_difference(problem: RiccatiProblem, K: Block, reference: Block) -> float:
-    """||K - K_ref||_2 / ||K_ref||_2, Frobenius, hand-relative coordinates. Collective."""
-    comm = problem.layout.comm
-
-    def size(X: Block) -> float:
-        return float(np.sum(X.hand**2) + comm.allreduce(float(np.sum(X.tall**2))))
-
-    return float(np.sqrt(size(Block(K.hand - reference.hand, K.tall - reference.tall)) / size(reference)))
 
 
 def run_method(comm: MPI.Intracomm, problem: RiccatiProblem, name: str, repeats: int) -> tuple[RiccatiSolution, float]:
@@ -122,42 +113,10 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
         if reference is None:
             reference = gain
         else:
-            rows[name]["gain_difference"] = gain_difference(problem, gain, reference)
+            rows[name]["gain_difference"] = gain_error(problem, reference, gain)
         if partial and comm.rank == 0:
             Path(partial).write_text(json.dumps(result | {"methods": rows}))
     return result | {"methods": rows}
-
-
-def paper_form(problem: RiccatiProblem) -> tuple[Any, Any, Array, Array]:
-    """Sparse E, A and dense B, C of the paper, x = [q_s, v_s, q_e, v_e], one rank, one-way. Not collective."""
-    system, n_s = problem.system, problem.layout.n_s
-    M, K = to_scipy(system.M_ee), to_scipy(system.K_ee)
-    n = M.shape[0]
-    D = system.damping.alpha * M + system.damping.beta * K
-    M_es, one = scipy.sparse.csc_matrix(system.G - M @ system.T), scipy.sparse.identity
-    K_es, D_es = scipy.sparse.csc_matrix(-K @ system.T), scipy.sparse.csc_matrix(-D @ system.T)
-    E = scipy.sparse.bmat(
-        [
-            [one(n_s), None, None, None],
-            [None, scipy.sparse.csc_matrix(problem.M_s), None, None],
-            [None, None, one(n), None],
-            [None, M_es, None, M],
-        ]
-    ).tocsc()
-    A = scipy.sparse.bmat(
-        [
-            [None, one(n_s), None, None],
-            [scipy.sparse.csc_matrix((n_s, n_s)), None, None, None],
-            [None, None, scipy.sparse.csc_matrix((n, n)), one(n)],
-            [-K_es, -D_es, -K, -D],
-        ]
-    ).tocsc()
-    B = np.zeros((2 * (n + n_s), n_s))
-    B[n_s : 2 * n_s] = np.eye(n_s)
-    C = np.zeros((problem.C_s.shape[0], len(B)))
-    C[:, :n_s] = problem.C_s - problem.C_z.T @ system.T
-    C[:, 2 * n_s : 2 * n_s + n] = problem.C_z.T
-    return E, A, B, C
 
 
 def _answer(problem: RiccatiProblem, E: Any, B: Array, Z: Array, seconds: float) -> Answer:
@@ -237,7 +196,7 @@ def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
         "seconds": answer.seconds,
         "rank": candidate.rank,
         "residual": residual(problem, candidate),
-        "gain_difference": gain_difference(problem, answer.K, reference),
+        "gain_difference": gain_error(problem, reference, answer.K),
         "states": problem.layout.states,
     }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -14,8 +13,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from softgrasp import PACKAGE
-from softgrasp.study.shell.processes import find_mpiexec
+from softgrasp.study.shell.processes import child_environment, find_mpiexec
 
 
 def launch_worker(name: str, spec: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
@@ -32,9 +30,7 @@ def launch_worker(name: str, spec: dict[str, Any], ranks: int, limit: float) -> 
     mpiexec = find_mpiexec()
     if mpiexec is None:
         return {"error": "no mpiexec found; `softgrasp doctor` says what to do"}
-    root = str(PACKAGE.parent)
-    path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
+    environment = child_environment() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "row.json"
         text = json.dumps(spec | {"file": str(file)})
