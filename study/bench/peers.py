@@ -66,11 +66,7 @@ class BareSolve:
 class PlainCholesky(BareSolve):
     """The solves of PETSc's Cholesky as ``-pc_type cholesky`` gives it: single entries, its nested dissection.
 
-    Args:
-        S: the matrix, all of it on one rank; consumed.
-
-    Attributes:
-        ksp: the factored solver.
+    S, all of it on one rank, is used up.
     """
 
     def __init__(self, S: PETSc.Mat) -> None:

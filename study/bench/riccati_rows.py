@@ -31,7 +31,7 @@ from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_of, gain_
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.jobs import leave_result
+from softgrasp.study.shell.timing import timed
 
 METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
 REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
@@ -61,29 +61,15 @@ def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
 
 def run_method(comm: MPI.Intracomm, problem: RiccatiProblem, name: str, repeats: int) -> tuple[RiccatiSolution, float]:
     """The solution and the median time of a few runs [s]. Collective."""
-    times: list[float] = []
-    while True:
-        comm.Barrier()
-        begin = time.perf_counter()
-        solution = METHODS[name]().solve(problem)
-        times.append(comm.allreduce(time.perf_counter() - begin, op=MPI.MAX))
-        if len(times) >= repeats or sum(times) > REPEAT_SECONDS:
-            return solution, float(np.median(times))
+    solution: list[RiccatiSolution] = []
 
+    def solve() -> None:
+        solution[:] = [METHODS[name]().solve(problem)]
 
-def describe(solution: RiccatiSolution, seconds: float, base: float, memory: float) -> dict[str, Any]:
-    """The numbers of one method. Not collective."""
-    split = {name: sum(solution.seconds.get(key, 0.0) for key in keys) for name, keys in STAGES.items()}
-    return {
-        "seconds": seconds,
-        "split": split,
-        "solves": solution.counts["solves"],
-        "newton_steps": solution.counts["newton_steps"],
-        "rank": solution.rank,
-        "residual": solution.residual,
-        "memory_mb": memory,
-        "memory_base_mb": base,
-    }
+    times = [timed(comm, solve)]
+    while len(times) < repeats and sum(times) <= REPEAT_SECONDS:
+        times.append(timed(comm, solve))
+    return solution[0], float(np.median(times))
 
 
 def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str = "") -> dict[str, Any]:
@@ -108,7 +94,16 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
         except SoftgraspError as error:
             rows[name] = {"error": str(error)}
             continue
-        rows[name] = describe(solution, seconds, base, peak_memory_mb(comm))
+        rows[name] = {
+            "seconds": seconds,
+            "split": {part: sum(solution.seconds.get(key, 0.0) for key in keys) for part, keys in STAGES.items()},
+            "solves": solution.counts["solves"],
+            "newton_steps": solution.counts["newton_steps"],
+            "rank": solution.rank,
+            "residual": solution.residual,
+            "memory_mb": peak_memory_mb(comm),
+            "memory_base_mb": base,
+        }
         gain = gain_of(solution)
         if reference is None:
             reference = gain
@@ -126,15 +121,20 @@ def _answer(problem: RiccatiProblem, E: Any, B: Array, Z: Array, seconds: float)
     return Answer(relative, gain_to_relative(problem.system, Block(gain[:s], gain[s:])), seconds)
 
 
+def _factor(X: Array) -> Array:
+    """Z with X = Z Z', negative eigenvalues left out."""
+    values, vectors = np.linalg.eigh((X + X.T) / 2)
+    keep = values > 0
+    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
+
+
 def scipy_answer(problem: RiccatiProblem) -> Answer:
     """SciPy's dense solver on the paper's matrices as they stand. Not collective."""
     E, A, B, C = paper_form(problem)
     begin = time.perf_counter()
     X = scipy.linalg.solve_continuous_are(A.toarray(), B, C.T @ problem.Q @ C, problem.R, e=E.toarray())
     seconds = time.perf_counter() - begin
-    values, vectors = np.linalg.eigh((X + X.T) / 2)
-    keep = values > 0
-    return _answer(problem, E, B, vectors[:, keep] * np.sqrt(values[keep]), seconds)
+    return _answer(problem, E, B, _factor(X), seconds)
 
 
 def slycot_answer(problem: RiccatiProblem) -> Answer:
@@ -144,14 +144,12 @@ def slycot_answer(problem: RiccatiProblem) -> Answer:
     E, A, B, C = paper_form(problem)
     n, m, p = len(B), B.shape[1], len(C)
     begin = time.perf_counter()
-    found = slycot.sg02ad(
+    _, X, *_ = slycot.sg02ad(
         "C", "B", "N", "U", "Z", "N", "S", "R", n, m, p, A.toarray(), E.toarray(), B,
         C.T @ problem.Q @ C, problem.R, np.zeros((n, m)),
     )  # fmt: skip
     seconds = time.perf_counter() - begin
-    values, vectors = np.linalg.eigh((found[1] + found[1].T) / 2)
-    keep = values > 0
-    return _answer(problem, E, B, vectors[:, keep] * np.sqrt(values[keep]), seconds)
+    return _answer(problem, E, B, _factor(X), seconds)
 
 
 def pymor_answer(problem: RiccatiProblem) -> Answer:
@@ -201,7 +199,6 @@ def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
     }
 
 
-def run_worker(spec: dict[str, Any]) -> None:
-    """Measure what the driver asks for and leave the numbers in its file. Collective."""
-    arguments = {key: value for key, value in spec.items() if key != "file"}
-    leave_result(spec["file"], lambda: measure_peer(**arguments) if "peer" in arguments else measure(**arguments))
+def measure_row(**arguments: Any) -> dict[str, Any]:
+    """A row that :mod:`study.bench.riccati` launches. Collective."""
+    return (measure_peer if "peer" in arguments else measure)(**arguments)

@@ -18,11 +18,6 @@ from softgrasp.study.forward.cautions import LOCKING
 def judge_elements(model: Model, trajectory: Trajectory, tolerance: float) -> Elements | None:
     """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective.
 
-    Args:
-        model: the scene as it is.
-        trajectory: its run.
-        tolerance: relative change of the outputs that counts.
-
     Raises:
         SolverError: a solve failed.
     """

@@ -28,12 +28,6 @@ def judge(change: float, controls: bool, costs: bool, tolerance: float) -> str:
 
     Needed: it changes the outputs by more than the tolerance. Optional: it does not, but it is free, or the control
     problem needs it. Wasted: it costs something and nothing shows it.
-
-    Args:
-        change: of the outputs of this run [1].
-        controls: the control problem needs it.
-        costs: counted work or memory grows.
-        tolerance: of the scene [1].
     """
     if change > tolerance:
         return "needed"
@@ -97,16 +91,7 @@ def prove_off(name: str, before: Case, again: Case) -> OffProof:
 def find(
     s: Switch, explanation: Explanation, cases: dict[str, Case], changes: Changes, together: Together, noise: float
 ) -> Finding:
-    """Judge one effect and say what to do about it. Collective.
-
-    Args:
-        s: the effect.
-        explanation: of the scene as it is.
-        cases: measured, by name of the effect that is switched.
-        changes: by each effect alone.
-        together: all effects judged again.
-        noise: share that a step of the scene differs from itself by [1].
-    """
+    """Judge one effect and say what to do about it. Collective."""
     scene = cases[SCENE].model.scene
     gate, tolerance = explanation.effects[s.name], scene.study.tolerance
     proof = None if s.on else prove_off(s.name, cases[SCENE], cases[AGAIN])

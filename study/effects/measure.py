@@ -228,14 +228,7 @@ def measure_builds(
 
 
 def measure_steps(comm: MPI.Intracomm, cases: dict[str, Case], repeats: int, tick: Callable[[], None]) -> None:
-    """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective.
-
-    Args:
-        comm: ranks.
-        cases: filled in.
-        repeats: samples of each.
-        tick: called after each sample.
-    """
+    """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective."""
     steppers = {name: Stepper(case.model) for name, case in cases.items()}
     try:
         pace = next(iter(steppers.values())).seconds_per_step(5)
@@ -261,13 +254,13 @@ def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[
 
     Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
     """
-    with counting(comm) as made:
+    with counting(comm) as at_first:
         stepper = Stepper(build(scene, comm))
         stepper.advance(1)
     with counting(comm) as in_steps:
         stepper.advance(STEPS)
     stepper.destroy()
-    return made, in_steps
+    return at_first, in_steps
 
 
 def count_objects(comm: MPI.Intracomm, cases: dict[str, Case], scenes: dict[str, Scene]) -> None:

@@ -43,7 +43,7 @@ def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: 
         (f"{f.name}: {f.value}" if f.on else f"{f.name}, tried: {f.value}" if f.value else f.name, f.advice)
         for f in study.findings
     ]
-    advice += [("all together", judged_again(study)), *(("look at", text) for text in study.warnings)]
+    advice += [("all together", in_company(study)), *(("look at", text) for text in study.warnings)]
     how = [
         ("tolerance", f"{study.tolerance:g}: relative change of the outputs that counts"),
         ("needed", "changes the outputs of the run by more than the tolerance, alone or with others that are advised"),
@@ -77,7 +77,7 @@ def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: 
     return Page(f"{scene.name}: effects", sections, {"effects.csv": csv_table(study)}, files)
 
 
-def judged_again(study: EffectsStudy) -> str:
+def in_company(study: EffectsStudy) -> str:
     """What each effect changes beside all that are advised, one sentence. Not collective."""
     parts = [
         f"{f.name} {f.company.change.outputs:.1e}"
@@ -188,7 +188,7 @@ def show(study: EffectsStudy, console: Console) -> None:
     for f in study.findings:
         value = f" ({f.value})" if f.value and f.on else f" (tried {f.value})" if f.value else ""
         say(f"{f.name}{value}: {f.advice}")
-    say(judged_again(study))
+    say(in_company(study))
     for text in study.warnings:
         say(f"look at: {text}")
     proofs = {f.name: f.proof for f in study.findings if f.proof is not None}

@@ -27,17 +27,7 @@ Tried = tuple[Finding, Change, Cost]
 def figure_effects(
     findings: Sequence[Finding], tolerance: float, noise: tuple[float, float], out_png: Path
 ) -> tuple[Path, Path]:
-    """Each effect in a row: what it changes on the left, what it costs on the right; PNG and PDF.
-
-    Args:
-        findings: effects; those that were tried are drawn.
-        tolerance: change that counts [1].
-        noise: quartiles of the step times of one scene against itself [1].
-        out_png: name of the picture; the PDF gets its stem.
-
-    Returns:
-        Names of PNG and PDF.
-    """
+    """Each effect in a row: what it changes on the left, what it costs on the right; PNG and PDF."""
     marks = [(f, f.change, f.cost) for f in findings if f.change is not None and f.cost is not None]
     with paper_style():
         height = ROW * len(marks)

@@ -117,13 +117,6 @@ def run_effects(
 ) -> dict[str, Any]:
     """Judge the effects of a scene file and write result.json, table, picture and report. Collective.
 
-    Args:
-        path: the scene file.
-        out: folder of the results.
-        overrides: as of ``--set``.
-        console: writes on rank 0.
-        quiet: no progress bar.
-
     Raises:
         SoftgraspError: with one sentence.
     """

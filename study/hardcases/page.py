@@ -40,14 +40,7 @@ def show(console: Console, result: FamilyResult) -> None:
 
 
 def write_files(out: Path, result: HardCaseResult, family: str | None, pictures: bool) -> list[Path]:
-    """Write result.json, hardcases.csv, one picture a family and report.html.
-
-    Args:
-        out: folder.
-        result: of the suite.
-        family: the only one that was run.
-        pictures: draw them.
-    """
+    """Write result.json, hardcases.csv, one picture a family and report.html."""
     figures = {
         f.family.name: figure_family(f.family, f.cases, out / f"hard_{f.family.name}.png")
         for f in result.families

@@ -23,16 +23,7 @@ SIZE = 4.5  # of a mark
 
 
 def figure_family(family: Family, rows: Sequence[HardCase], out_png: Path) -> tuple[Path, Path]:
-    """Numbers against what is varied, with lanes above for refusals and for what has no number; PNG and PDF.
-
-    Args:
-        family: labels.
-        rows: at least one.
-        out_png: name of the picture; the PDF gets its stem.
-
-    Returns:
-        Names of PNG and PDF.
-    """
+    """Numbers against what is varied, with lanes above for refusals and for what has no number; PNG and PDF."""
     with paper_style():
         draw = _listed if family.axis == "listed" else _curves
         return save(draw(family, rows), out_png)

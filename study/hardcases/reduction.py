@@ -166,17 +166,17 @@ def edge_rows(quick: bool) -> Iterator[HardCase]:
 # --- models that grow
 
 
-def textbook_loop(small: SmallModel, dt: float, force: Array) -> Array:
+def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
     """Outputs of the midpoint rule on E x' = A x + B u as a textbook has it, unstable or not. Not collective."""
-    op = small.operators
+    op = rom.operators
     lu = scipy.linalg.lu_factor(op.E - dt / 2 * op.A)
-    x = np.zeros(small.N)
+    x = np.zeros(rom.N)
     states = [x]
     for u in force:
         x = scipy.linalg.lu_solve(lu, (op.E + dt / 2 * op.A) @ x + dt * (op.B @ u))
         states.append(x)
     X = np.array(states)
-    return np.asarray(X @ small.outputs.C_z.T + X @ op.S_q.T @ small.outputs.C_s.T)
+    return np.asarray(X @ rom.outputs.C_z.T + X @ op.S_q.T @ rom.outputs.C_s.T)
 
 
 def _tip_error(case: Moved, outputs: Array) -> float:
@@ -187,12 +187,12 @@ def _tip_error(case: Moved, outputs: Array) -> float:
     return float(np.abs(outputs - exact).max() / np.abs(exact - case.trajectory.outputs_rigid).max())
 
 
-def _checked(case: Moved, small: SmallModel, dt: float) -> float:
-    return _tip_error(case, run(small, dt, force=case.force).outputs)
+def _checked(case: Moved, rom: SmallModel, dt: float) -> float:
+    return _tip_error(case, run(rom, dt, force=case.force).outputs)
 
 
-def _unchecked(case: Moved, small: SmallModel, dt: float) -> float:
-    return _tip_error(case, textbook_loop(small, dt, case.force))
+def _unchecked(case: Moved, rom: SmallModel, dt: float) -> float:
+    return _tip_error(case, textbook_loop(rom, dt, case.force))
 
 
 def growth_rows(quick: bool) -> Iterator[HardCase]:
@@ -205,12 +205,12 @@ def growth_rows(quick: bool) -> Iterator[HardCase]:
     sweeps = {name: make_bases(name, trained, dimensions) for name in ("psd", "global_pod")}
     growing = []
     for i, N in enumerate(dimensions):
-        small = {name: project(bases[i], system, outputs).at() for name, bases in sweeps.items()}
-        midpoint, loop = here(_checked, case, small["psd"], dt), textbook(_unchecked, case, small["global_pod"], dt)
+        roms = {name: project(bases[i], system, outputs).at() for name, bases in sweeps.items()}
+        midpoint, loop = here(_checked, case, roms["psd"], dt), textbook(_unchecked, case, roms["global_pod"], dt)
         reason = "two vibrations of one size differ by twice their size at most: nothing grows"
         yield HardCase(f"N = {N}", N, midpoint, loop, 2.0, reason)
-        if not small["global_pod"].stable:
-            growing.append((N, small["global_pod"], loop))
+        if not roms["global_pod"].stable:
+            growing.append((N, roms["global_pod"], loop))
     for N, model, loop in growing[:: max(1, len(growing) // 3)]:
         name = f"(q, v) POD, N = {N}, grows by {model.spectral_abscissa:.1e}/s"
         refusal, reason = here(_checked, case, model, dt), "a growing model must not be run silently"

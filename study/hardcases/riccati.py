@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -62,6 +62,12 @@ def low_rank(problem: RiccatiProblem) -> Array:
     return gain_of(NewtonADI(tol=TOLERANCE).solve(problem))
 
 
+SOLVERS: dict[str, tuple[Callable[[RiccatiProblem], Array], float]] = {
+    "dense": (dense, DENSE),
+    "low rank": (low_rank, LOW_RANK),
+}
+
+
 def scipy_error(problem: RiccatiProblem, exact: Array | None, pencil: bool = False) -> Outcome:
     """SciPy's solver, which balances, on x' = E^{-1}A x + E^{-1}B u of the paper; error of its gain. Not collective.
 
@@ -96,12 +102,17 @@ def both_ways(problem: RiccatiProblem, exact: Array | None) -> Outcome:
     return replace(first, text=f"{second.value:.1g} with e = E")
 
 
-def gain_row(name: str, x: float, problem: RiccatiProblem, bound: float, scipy_: Outcome, exact: Array,
-             note: str = "", group: str = "") -> HardCase:  # fmt: skip
-    """Error of one solver's gain against the exact one; ``note`` says why it may be refused. Not collective."""
-    solver = low_rank if bound == LOW_RANK else dense
-    error = here(lambda: worst_part_error(solver(problem), exact, problem.layout.n_s))
-    return HardCase(name, x, error, scipy_, bound, REASONS[bound] + note, may_refuse=bool(note), group=group)
+def gain_rows(
+    name: str, x: float, problem: RiccatiProblem, note: str = "", solvers: Sequence[str] = tuple(SOLVERS)
+) -> Iterator[HardCase]:
+    """Error of the solvers' gains against the exact one; ``note`` says why it may be refused. Not collective."""
+    exact = exact_gain(problem)
+    scipy_ = both_ways(problem, exact)
+    for group in solvers:
+        solve, bound = SOLVERS[group]
+        error = here(lambda: worst_part_error(solve(problem), exact, problem.layout.n_s))  # noqa: B023  (called at once)
+        case, group = (f"{name}, {group}", group) if len(solvers) > 1 else (name, "")
+        yield HardCase(case, x, error, scipy_, bound, REASONS[bound] + note, may_refuse=bool(note), group=group)
 
 
 # --- weights
@@ -112,11 +123,7 @@ def weight_rows(quick: bool) -> Iterator[HardCase]:
     problem = problem_of()
     for power in thin([-12, -8, -4, -2, 0, 2, 4, 8, 12], quick):
         r = 10.0**power
-        case = replace(problem, R=r * problem.R)
-        exact = exact_gain(case)
-        scipy_, note = both_ways(case, exact), HEAVY if r > 1e10 else ""
-        for name, bound in (("dense", DENSE), ("low rank", LOW_RANK)):
-            yield gain_row(f"R = {r:.0e}, {name}", r, case, bound, scipy_, exact, note, name)
+        yield from gain_rows(f"R = {r:.0e}", r, replace(problem, R=r * problem.R), HEAVY if r > 1e10 else "")
 
 
 def output_rows(quick: bool) -> Iterator[HardCase]:
@@ -139,13 +146,12 @@ def output_rows(quick: bool) -> Iterator[HardCase]:
     for i, (name, case, refuse) in enumerate(cases[::2] if quick else cases):
         if refuse:
             reason = "there is no stabilising feedback, or no minimum"
-            yield HardCase(name, i + 1, here(_some, dense, case), both_ways(case, None), None, reason)
+            yield HardCase(name, i + 1, here(gain_size, dense, case), both_ways(case, None), None, reason)
         else:
-            exact = exact_gain(case)
-            yield gain_row(name, i + 1, case, DENSE, both_ways(case, exact), exact)
+            yield from gain_rows(name, i + 1, case, solvers=("dense",))
 
 
-def _some(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) -> float:
+def gain_size(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) -> float:
     """Size of a gain that ought to have been refused. Not collective."""
     return float(np.linalg.norm(solver(problem)))
 
@@ -156,17 +162,13 @@ def _some(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) ->
 def lqr_damping_rows(quick: bool) -> Iterator[HardCase]:
     """Kelvin-Voigt damping down to none: the gain must be right, or the modes that are lost must be named."""
     for beta in [2e-3, 2e-6] if quick else [0.2, 0.02, 2e-3, 2e-4, 2e-5, 2e-6, 2e-8, 2e-10, 2e-14]:
-        case, name = problem_of(beta=beta), f"beta = {beta:.0e} s"
-        exact = exact_gain(case)
-        scipy_, note = both_ways(case, exact), WEAK if beta < 1e-5 else ""
-        for way, bound in (("dense", DENSE), ("low rank", LOW_RANK)):
-            yield gain_row(f"{name}, {way}", beta, case, bound, scipy_, exact, note, way)
+        yield from gain_rows(f"beta = {beta:.0e} s", beta, problem_of(beta=beta), WEAK if beta < 1e-5 else "")
     reason = "without damping X is not of low rank and high modes are lost to rounding"
     undamped = [("undamped", problem_of(beta=0.0))]
     if not quick:
         undamped.append(("paper_lqr_undamped, 880 states", make_problem(make("paper_lqr_undamped"))))
     for name, case in undamped:
-        answer = here(_some, low_rank, case)
+        answer = here(gain_size, low_rank, case)
         yield HardCase(name, 0.0, answer, textbook(scipy_error, case, None), None, reason, group="low rank")
 
 

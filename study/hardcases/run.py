@@ -45,14 +45,6 @@ def run_hardcases(
 ) -> dict[str, Any]:
     """Run the cases, print one table a family, and write result.json, hardcases.csv, pictures and report.html.
 
-    Args:
-        out: folder for the files.
-        console: where the tables go.
-        quick: only some cases of each family, in less than a minute.
-        family: only this one.
-        quiet: no progress bar.
-        pictures: one a family; without them numbers and report only.
-
     Returns:
         What result.json holds; ``ok`` tells whether every promise is kept.
 
