@@ -77,10 +77,10 @@ def whole_copy(A: PETSc.Mat) -> PETSc.Mat:
     return copy
 
 
-def to_scipy(A: PETSc.Mat) -> scipy.sparse.csr_matrix:
-    """The rows of this rank in SciPy; columns keep their global numbers."""
+def to_scipy(A: PETSc.Mat) -> Any:
+    """This rank's rows of a matrix as SciPy's CSR, (n_local, n); a copy."""
     indptr, columns, values = A.getValuesCSR()
-    return scipy.sparse.csr_matrix((values, columns, indptr), shape=(len(indptr) - 1, A.getSize()[1]))
+    return scipy.sparse.csr_matrix((values, columns, indptr), shape=(A.getLocalSize()[0], A.getSize()[1]))
 
 
 def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
