@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from typing import Any
+
 import typer
 
-from softgrasp.study.bench import bases, forward, meshes, riccati, switches
+from softgrasp.study.bench import bases, forward, forward_rows, meshes, riccati, riccati_rows, switches
+from softgrasp.study.shell.ending import run_command
+from softgrasp.study.shell.jobs import leave_result
+
+ROWS: dict[str, Callable[..., dict[str, Any]]] = {
+    "forward": forward_rows.measure_row,
+    "riccati": riccati_rows.measure_row,
+    "bases": bases.measure,
+    "switches": switches.measure,
+}
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -22,5 +35,13 @@ for _name, _module in (
 ):
     app.command(name=_name, help=_module.HELP)(_module.main)
 
+
+@app.command(hidden=True)
+def worker(name: str, spec: str) -> None:
+    """Measure one row of a benchmark and leave it where the launcher looks, see `launch_worker`. Collective."""
+    arguments = json.loads(spec)
+    leave_result(arguments.pop("file"), lambda: ROWS[name](**arguments))
+
+
 if __name__ == "__main__":
-    app()
+    run_command(app)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,9 +14,9 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array, total
 from softgrasp.reduction.engines import factor, small_svd
-from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, write_bench
+from softgrasp.study.bench.driver import list_bench, open_console, parse_list, parse_ranks, write_bench
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.jobs import launch_worker, leave_result
+from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.timing import interleave, medians, timed
 
 SIZES = "10000x600,100000x600"
@@ -28,7 +27,6 @@ RIGHT, ROUGH = 1e-8, 0.1  # relative errors of a singular value
 GOAL = 1e-10  # sigma / sigma_1 down to which the default has to be right
 SCALAPACK_LIMIT = 20_000  # rows; minutes beyond
 NUMPY_LIMIT = 200_000
-WORKER_LIMIT = 3600.0  # [s]
 TITLES = {
     "tsqr": "POD, SLEPc BV TSQR (default)",
     "svd": "POD, SLEPc SVD trlanczos, leading 60",
@@ -58,13 +56,12 @@ def parse_shapes(text: str) -> list[tuple[int, int]]:
     Raises:
         typer.BadParameter: anything else.
     """
-    result = []
-    for part in text.split(","):
-        n, _, m = part.strip().partition("x")
-        if not (n.isdigit() and m.isdigit() and int(m) >= 4 and int(n) >= int(m)):
-            raise typer.BadParameter(f"'{part}' is no shape; write 10000x600 with at least 4 columns and more rows")
-        result.append((int(n), int(m)))
-    return result
+    advice = "shape; write 10000x600 with at least 4 columns and more rows"
+    shapes = [(int(n), int(m)) for n, m in parse_list(text, r"(\d+)x(\d+)", advice)]
+    for n, m in shapes:
+        if not n >= m >= 4:
+            raise typer.BadParameter(f"'{n}x{m}' is no {advice}")
+    return shapes
 
 
 def spectrum_of(m: int) -> Array:
@@ -100,10 +97,10 @@ def known_matrix(comm: MPI.Intracomm, n: int, m: int, complex_valued: bool) -> N
     return X
 
 
-def reach(found: Array, true: Array, tolerance: float) -> float:
+def right_down_to(sigma: Array, true: Array, tolerance: float) -> float:
     """Smallest sigma / sigma_1 down to which all values are right to a relative tolerance. Not collective."""
-    k = min(len(found), len(true))
-    wrong = np.abs(found[:k] / true[:k] - 1) > tolerance
+    k = min(len(sigma), len(true))
+    wrong = np.abs(sigma[:k] / true[:k] - 1) > tolerance
     count = int(np.argmax(wrong)) if wrong.any() else k
     return float(true[count - 1] / true[0]) if count else float("inf")
 
@@ -152,35 +149,34 @@ def methods_for(comm: MPI.Intracomm, n: int, m: int) -> dict[str, tuple[Callable
     return result
 
 
-def measure(comm: MPI.Intracomm, n: int, m: int, repeats: int) -> Row:
-    """One size on this many ranks: seconds, reach and orthonormality of every engine. Collective."""
+def measure(n: int, m: int, repeats: int, comm: MPI.Intracomm = MPI.COMM_WORLD) -> Row:
+    """One size on this many ranks: seconds, accuracy and orthonormality of every engine. Collective."""
     methods = methods_for(comm, n, m)
     rows: dict[str, Row] = {}
     for name, (call, true) in methods.items():
         sigma, U = call()  # also warms up
         gram = total(comm, np.array([(U.conj().T @ U).real, (U.conj().T @ U).imag]))
         off = np.abs(gram[0] + 1j * gram[1] - np.eye(U.shape[1])).max()
-        rows[name] = {"right": reach(sigma, true, RIGHT), "rough": reach(sigma, true, ROUGH), "off": float(off)}
+        rows[name] = {
+            "right": right_down_to(sigma, true, RIGHT),
+            "rough": right_down_to(sigma, true, ROUGH),
+            "off": float(off),
+        }
     samples = interleave({name: partial(timed, comm, call) for name, (call, _) in methods.items()}, repeats)
     for name, seconds in medians(samples).items():
         rows[name] |= {"seconds": seconds, "samples": samples[name]}
     return {"rows": n, "columns": m, "ranks": comm.size, "repeats": repeats, "engines": rows}
 
 
-def launch(n: int, m: int, ranks: int, repeats: int) -> Row:
-    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
-    spec = {"n": n, "m": m, "repeats": repeats}
-    return {"rows": n, "columns": m, "ranks": ranks} | launch_worker("bases", spec, ranks, WORKER_LIMIT)
-
-
-HEADER = ("engine", "rows", "columns", "ranks", "s", "/ default", f"right to {RIGHT:g}", f"to {ROUGH:g}", "|U'U - I|")
+SHAPE = ("rows", "columns", "ranks")
+HEADER = ("engine", *SHAPE, "s", "/ default", f"right to {RIGHT:g}", f"to {ROUGH:g}", "|U'U - I|")
 
 
 def table_of(results: Sequence[Row]) -> Table:
     """The one table, accuracy against time. Not collective."""
     cells: list[tuple[Any, ...]] = []
     for row in results:
-        size = (row["rows"], row["columns"], row["ranks"])
+        size = tuple(row[key] for key in SHAPE)
         if "error" in row:
             cells.append(("failed", *size, *["-"] * 5))
         for name, engine in row.get("engines", {}).items():
@@ -212,23 +208,11 @@ def missed(results: Sequence[Row]) -> list[str]:
 def csv_table(results: Sequence[Row]) -> Table:
     """One line an engine, numbers in full. Not collective."""
     cells = [
-        (
-            name,
-            row["rows"],
-            row["columns"],
-            row["ranks"],
-            *(engine[key] for key in ("seconds", "right", "rough", "off")),
-        )
+        (name, *(row[key] for key in SHAPE), *(engine[key] for key in ("seconds", "right", "rough", "off")))
         for row in results
         for name, engine in row.get("engines", {}).items()
     ]
-    header = ("engine", "rows", "columns", "ranks", "seconds", "right", "rough", "orthonormality")
-    return Table(header, cells)
-
-
-def run_worker(spec: dict[str, Any]) -> None:
-    """Measure what the driver asks for and leave the numbers in its file. Collective."""
-    leave_result(spec["file"], lambda: measure(MPI.COMM_WORLD, spec["n"], spec["m"], spec["repeats"]))
+    return Table(("engine", *SHAPE, "seconds", "right", "rough", "orthonormality"), cells)
 
 
 def main(
@@ -236,19 +220,16 @@ def main(
     ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
     repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 3,
     out: Annotated[Path, typer.Option(help="folder for bench_bases.json and bench_bases.csv")] = Path("out"),
-    worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",
 ) -> None:
     """See HELP."""
-    if worker:
-        run_worker(json.loads(worker))
-        return
-    wanted, counts = parse_shapes(sizes), parse_ranks(ranks)
+    shapes, counts = parse_shapes(sizes), parse_ranks(ranks)
     console = open_console(130)
     results = []
-    for n, m in wanted:
+    for n, m in shapes:
         for k in counts:
             with console.status(f"{n} x {m}, {k} rank(s)"):
-                results.append(launch(n, m, k, repeats))
+                row = launch_worker("bases", {"n": n, "m": m, "repeats": repeats}, k)
+            results.append({"rows": n, "columns": m, "ranks": k} | row)
     console.print(table_of(results).terminal())
     for row in results:
         if "error" in row:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,16 +32,26 @@ class Goal:
         return self.value <= self.limit
 
 
+def parse_list(text: str, pattern: str, advice: str) -> list[Any]:
+    """The groups of a regular expression for each part of a list with commas. Not collective.
+
+    Raises:
+        typer.BadParameter: a part does not match.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    for part in parts:
+        if not re.fullmatch(pattern, part):
+            raise typer.BadParameter(f"'{part}' is no {advice}")
+    return [groups for part in parts for groups in re.findall(f"^{pattern}$", part)]
+
+
 def parse_ranks(text: str) -> list[int]:
     """``1,2`` as numbers. Not collective.
 
     Raises:
         typer.BadParameter: anything else.
     """
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdigit() and int(part) > 0 for part in parts):
-        raise typer.BadParameter(f"'{text}' is no list of rank counts; write 1,2")
-    return [int(part) for part in parts]
+    return [int(part) for part in parse_list(text, r"([1-9]\d*)", "number of ranks; write 1,2")]
 
 
 def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +16,7 @@ from softgrasp.study.bench.driver import (
     list_bench,
     number,
     open_console,
+    parse_list,
     parse_ranks,
     show_goals,
     write_bench,
@@ -31,7 +31,6 @@ LIMIT_SMALL, LIMIT = 1.5, 1.15  # TS step over bare solve, below and from n_e = 
 BIG = 9_000
 MEMORY_LIMIT_MB = 24 * 1024
 MEMORY_FLOOR_MB = 8.0  # growth of memory above the libraries is noise below
-WORKER_LIMIT = 3600.0  # [s]
 METHODS = {
     "ts": "PETSc TS",
     "solve": "bare solve",
@@ -64,18 +63,8 @@ def parse_sizes(text: str) -> list[tuple[str, int]]:
     Raises:
         typer.BadParameter: anything else.
     """
-    result = []
-    for part in text.split(","):
-        kind, _, number = part.strip().rpartition(":")
-        if kind not in ("", "2d", "3d") or not number.isdigit() or int(number) < 20:
-            raise typer.BadParameter(f"'{part}' is no size; write 2d:1000 or 3d:50000 with at least 20 unknowns")
-        result.append((kind or "2d", int(number)))
-    return result
-
-
-def launch(spec: dict[str, Any], ranks: int) -> Row:
-    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective."""
-    return {"ranks": ranks} | launch_worker("forward", spec, ranks, WORKER_LIMIT)
+    advice = "size; write 2d:1000 or 3d:50000 with at least 20 unknowns"
+    return [(kind or "2d", int(size)) for kind, size in parse_list(text, r"(?:(2d|3d)?:)?([2-9]\d|[1-9]\d\d+)", advice)]
 
 
 def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
@@ -83,24 +72,16 @@ def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     result = {}
     good = [row for row in rows if "error" not in row and row["dimension"] == 2 and not row["large"]]
     for ranks in sorted({row["ranks"] for row in good}):
-        mine = [row for row in good if row["ranks"] == ranks]
-        n = [row["n_e"] for row in mine]
-        memory = [row["memory_mb"] - row["memory_base_mb"] for row in mine]
+        own = [row for row in good if row["ranks"] == ranks]
+        n = [row["n_e"] for row in own]
+        memory = [row["memory_mb"] - row["memory_base_mb"] for row in own]
         result[str(ranks)] = {
-            "assembly": growth(n, [row["seconds"]["assembly"] for row in mine]),
-            "factor": growth(n, [row["seconds"]["factor"] for row in mine]),
-            "step": growth(n, [row["step_us"]["ts"] for row in mine]),
+            "assembly": growth(n, [row["seconds"]["assembly"] for row in own]),
+            "factor": growth(n, [row["seconds"]["factor"] for row in own]),
+            "step": growth(n, [row["step_us"]["ts"] for row in own]),
             "memory": growth(n, [m if m > MEMORY_FLOOR_MB else 0.0 for m in memory]),
         }
     return result
-
-
-def ratio_goal(row: Row) -> Goal | None:
-    """TS over bare solve; None where nothing was compared. Not collective."""
-    if "ratio" not in row:
-        return None
-    limit = LIMIT if row["n_e"] >= BIG else LIMIT_SMALL
-    return Goal(f"{row['problem']}, {row['ranks']} rank(s): TS step / bare solve", row["ratio"], limit)
 
 
 def goals(rows: Sequence[Row]) -> list[Goal]:
@@ -109,16 +90,17 @@ def goals(rows: Sequence[Row]) -> list[Goal]:
     for row in rows:
         if "error" in row:
             continue
-        ratio = ratio_goal(row)
-        if ratio is not None:
-            result.append(ratio)
+        label = f"{row['problem']}, {row['ranks']} rank(s)"
+        if "ratio" in row:
+            limit = LIMIT if row["n_e"] >= BIG else LIMIT_SMALL
+            result.append(Goal(f"{label}: TS step / bare solve", row["ratio"], limit))
         seconds = (row["whole"] or {}).get("seconds", {})
         if "scipy" in seconds:
             # both keep every state
             text = f"{row['problem']}, whole run: TS / SciPy"
             result.append(Goal(text, seconds["ts_memory"] / seconds["scipy"], 1.0))
         if row["large"]:
-            text = f"{row['problem']}, {row['ranks']} rank(s), {row['drift_steps']} steps end to end: MiB"
+            text = f"{label}, {row['drift_steps']} steps end to end: MiB"
             result.append(Goal(text, row["memory_mb"], MEMORY_LIMIT_MB))
     return result
 
@@ -227,8 +209,8 @@ def collect(console: Console, sizes: list[tuple[str, int]], ranks: list[int], re
         spec: dict[str, Any] = {"dimension": int(kind[0]), "size": size, "large": big}
         spec |= {"steps": LARGE_STEPS} if big else {"repeats": repeats, "whole": paper}
         with console.status(f"{problem}, {k} rank(s)"):
-            row = launch(spec, k)
-        rows.append(row | {"problem": problem, "large": big})
+            row = launch_worker("forward", spec, k)
+        rows.append({"ranks": k} | row | {"problem": problem, "large": big})
     return rows
 
 
@@ -238,17 +220,10 @@ def main(
     repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 25,
     out: Annotated[Path, typer.Option(help="folder for bench.json, bench.csv, bench.png and bench.pdf")] = Path("out"),
     large: Annotated[bool, typer.Option("--large", help=f"also 1e6 (2D) and 2e5 (3D), {LARGE_STEPS} steps")] = False,
-    worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",
 ) -> None:
     """See HELP."""
-    if worker:
-        from softgrasp.study.bench.forward_rows import run_worker
-
-        run_worker(json.loads(worker))
-        return
-    wanted, counts = parse_sizes(sizes), parse_ranks(ranks)
     console = open_console(175)
-    rows = collect(console, wanted, counts, repeats, large)
+    rows = collect(console, parse_sizes(sizes), parse_ranks(ranks), repeats, large)
     show(console, rows)
     content = {"command": "bench_forward", "rows": rows, "exponents": exponents(rows), "goals": goal_rows(goals(rows))}
     files = write_bench(

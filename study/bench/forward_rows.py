@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import Array, whole_copy
+from softgrasp.fem.petsc import Array, to_scipy, whole_copy
 from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
@@ -22,17 +22,8 @@ from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import make_solver
-from softgrasp.study.bench.peers import (
-    BareSolve,
-    PlainCholesky,
-    PymorLoop,
-    ScipyLoop,
-    TextbookLoop,
-    has_pymor,
-    to_scipy,
-)
+from softgrasp.study.bench.peers import BareSolve, PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, has_pymor
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.jobs import leave_result
 from softgrasp.study.shell.timing import interleave, medians, timed, warm
 
 DT = 0.005  # [s], that of the paper: 600 steps in 3 s
@@ -117,7 +108,7 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int,
         return steps
 
     factor: dict[str, float] = {}
-    loops, made = _loops(run, factor)
+    loops, solvers = _loops(run, factor)
     methods = {"ts": of_ts} | {name: of(loop, k) for name, loop in loops.items()}
     if peers and comm.size == 1:
         methods |= {name: of(loop, peer_k) for name, loop in _peers(run, factor).items()}
@@ -129,20 +120,12 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int,
         return statistics.median(a / b for a, b in zip(samples["ts"], samples[name], strict=True))
 
     residual = run.check_step(ts, run.reached + 1)
-    result = {
-        "step_us": medians(samples),
-        "samples_us": samples,
-        "ratio": ratio("solve"),
-        "ratio_own": ratio("own"),
-        "factor_peer_s": factor,
-        "drift": run.drift(),
-        "drift_steps": run.reached,
-        "residual": residual,
-        "solver": run.solver[0],
-    }
+    result = {"step_us": medians(samples), "samples_us": samples, "ratio": ratio("solve"), "ratio_own": ratio("own")}
+    result |= {"factor_peer_s": factor, "drift": run.drift(), "drift_steps": run.reached, "residual": residual}
+    result |= {"solver": run.solver[0]}
     ts.destroy()
-    for thing in (run.midpoint, *made):
-        thing.destroy()
+    for solver in (run.midpoint, *solvers):
+        solver.destroy()
     return result
 
 
@@ -160,20 +143,20 @@ def _loops(run: Run, factor: dict[str, float]) -> tuple[dict[str, Any], list[Any
     system, midpoint, name = run.model.system, run.midpoint, run.solver[0]
     bare = BareSolve(midpoint.solver, midpoint.r)
     loops: dict[str, Any] = {"solve": bare}
-    made: list[Any] = []
+    solvers: list[Any] = []
     solve = midpoint.solver.solve
     if name == "cholesky":
         S = midpoint_matrix(system, DT)
         begin = time.perf_counter()
-        plain = PlainCholesky(whole_copy(S))
+        petsc = PlainCholesky(whole_copy(S))
         factor["petsc"] = time.perf_counter() - begin
         S.destroy()
-        loops, solve, made = {"solve": plain, "own": bare}, plain.solve, [plain.ksp]
+        loops, solve, solvers = {"solve": petsc, "own": bare}, petsc.solve, [petsc.ksp]
     if midpoint.held.whole and system.layout.comm.size > 1:
-        made.append(make_solver(midpoint_matrix(system, DT), name, system.layout, "textbook_"))
-        solve = made[-1].solve
+        solvers.append(make_solver(midpoint_matrix(system, DT), name, system.layout, "textbook_"))
+        solve = solvers[-1].solve
     loops["loop"] = TextbookLoop(system, DT, solve, _loads(run))
-    return loops, made
+    return loops, solvers
 
 
 def _peers(run: Run, factor: dict[str, float]) -> dict[str, Any]:
@@ -181,11 +164,11 @@ def _peers(run: Run, factor: dict[str, float]) -> dict[str, Any]:
     system = run.model.system
     K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
     begin = time.perf_counter()
-    found: dict[str, Any] = {"scipy": ScipyLoop(K, M, system.G, DT, _loads(run))}
+    loops: dict[str, Any] = {"scipy": ScipyLoop(K, M, system.G, DT, _loads(run))}
     factor["scipy"] = time.perf_counter() - begin
     if has_pymor() and system.layout.n_e <= PYMOR_LIMIT:
-        found["pymor"] = PymorLoop(K, M, system.G, DT, _loads(run))
-    return found
+        loops["pymor"] = PymorLoop(K, M, system.G, DT, _loads(run))
+    return loops
 
 
 def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repeats: int) -> dict[str, Any]:
@@ -197,8 +180,8 @@ def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repe
     drifts: list[float] = []
 
     def of_ts(kind: str) -> Callable[[], float]:
-        wanted = dataclasses.replace(model, scene=scenes[kind])
-        return lambda: timed(comm, lambda: drifts.append(simulate(wanted).energy_drift))
+        of_kind = dataclasses.replace(model, scene=scenes[kind])
+        return lambda: timed(comm, lambda: drifts.append(simulate(of_kind).energy_drift))
 
     methods = {"ts_none": of_ts("none"), "ts_memory": of_ts("memory")}
     if comm.size == 1 and isinstance(drive, TableDrive):
@@ -225,7 +208,7 @@ def measure(
     Args:
         comm: ranks.
         dimension: 2 or 3.
-        size: wanted number of tissue unknowns.
+        size: about so many tissue unknowns.
         repeats: how often each number is taken.
         repeat_seconds: aimed length of one repeat [s].
         whole: also run the paper's 600 steps as a whole.
@@ -269,20 +252,10 @@ def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int) ->
 
 def _row(comm: MPI.Intracomm, model: Model, cells: list[int], seconds: dict[str, float]) -> dict[str, Any]:
     layout = model.system.layout
-    return {
-        "dimension": layout.dimension,
-        "cells": cells,
-        "n_e": layout.n_e,
-        "states": layout.states,
-        "ranks": comm.size,
-        "seconds": seconds,
-    }
+    sizes = {"n_e": layout.n_e, "states": layout.states, "ranks": comm.size}
+    return {"dimension": layout.dimension, "cells": cells, **sizes, "seconds": seconds}
 
 
-def run_worker(spec: dict[str, Any]) -> None:
-    """Measure what the driver asks for and leave the numbers in its file. Collective."""
-    comm = MPI.COMM_WORLD
-    arguments = {key: value for key, value in spec.items() if key not in ("file", "large")}
-    leave_result(
-        spec["file"], lambda: measure_large(comm, **arguments) if spec["large"] else measure(comm, **arguments)
-    )
+def measure_row(*, large: bool, **arguments: Any) -> dict[str, Any]:
+    """A row that :mod:`study.bench.forward` launches. Collective."""
+    return (measure_large if large else measure)(MPI.COMM_WORLD, **arguments)

@@ -26,6 +26,7 @@ from softgrasp.study.reduce.sweep import sweep
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
 from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.ending import console
 from softgrasp.study.shell.session import list_files
 
 SIZES = "1e3,1e4,1e5,1e6"
@@ -145,7 +146,7 @@ def findings(rows: Sequence[MeshRow]) -> dict[str, Any]:
     return {key: value if math.isfinite(value) else None for key, value in values.items()}
 
 
-def show(console: Console, rows: Sequence[MeshRow], found: dict[str, Any], title: str) -> None:
+def show(console: Console, rows: Sequence[MeshRow], trends: dict[str, Any], title: str) -> None:
     """Print table and exponents."""
     header = ("n_e", "factor", "full", "offline", "run", "new", "x again", "x new", "error", "deform.")
     console.print(
@@ -162,19 +163,19 @@ def show(console: Console, rows: Sequence[MeshRow], found: dict[str, Any], title
         for row in rows
     ]  # fmt: skip
     console.print(Table(header, cells).terminal())
-    if found["exponent_offline"] is None:
+    if trends["exponent_offline"] is None:
         return
     console.print(
-        f"growth with n_e: full run n_e^{found['exponent_full']:.2f}, offline n_e^{found['exponent_offline']:.2f}, "
-        f"online n_e^{found['exponent_online']:.2f} (largest over least online time {found['online_spread']:.2f})"
+        f"growth with n_e: full run n_e^{trends['exponent_full']:.2f}, offline n_e^{trends['exponent_offline']:.2f}, "
+        f"online n_e^{trends['exponent_online']:.2f} (largest over least online time {trends['online_spread']:.2f})"
     )
-    if found["break_even_n_e"] is not None:
+    if trends["break_even_n_e"] is not None:
         console.print(
-            f"break-even mesh: a reduced run is faster than a full one from n_e = {found['break_even_n_e']:.0f}"
+            f"break-even mesh: a reduced run is faster than a full one from n_e = {trends['break_even_n_e']:.0f}"
         )
 
 
-def draw(path: Path, rows: Sequence[MeshRow], found: dict[str, Any]) -> tuple[Path, Path]:
+def draw(path: Path, rows: Sequence[MeshRow], trends: dict[str, Any]) -> tuple[Path, Path]:
     """Times against n_e; PNG and PDF."""
     import matplotlib.pyplot as plt
 
@@ -189,7 +190,7 @@ def draw(path: Path, rows: Sequence[MeshRow], found: dict[str, Any]) -> tuple[Pa
             ("time_online", "online run", "exponent_online", GREEN, "^"),
         )
         for key, label, slope, colour, marker in curves:
-            power = "" if found[slope] is None else rf", $n_e^{{{found[slope]:.2f}}}$"
+            power = "" if trends[slope] is None else rf", $n_e^{{{trends[slope]:.2f}}}$"
             seconds = [getattr(row, key) for row in rows]
             ax.loglog(n_e, seconds, marker=marker, ms=3.5, color=colour, label=label + power)
         ax.set_xlabel("tissue unknowns $n_e$")
@@ -213,9 +214,9 @@ def run_mesh_study(
         scene = block(size, steps, method, N)
         console.print(f"n_e about {size}: {scene.tissue.cells} cells, {steps} steps", markup=False)
         rows.append(measure_mesh(scene, comm))
-    found = findings(rows)
+    trends = findings(rows)
     title = METHODS[method].title
-    show(console, rows, found, f"{title}, N = {N}, {comm.size} rank(s); !: unstable")
+    show(console, rows, trends, f"{title}, N = {N}, {comm.size} rank(s); !: unstable")
     result = {
         "command": "mesh_study",
         "method": method,
@@ -225,12 +226,12 @@ def run_mesh_study(
         "ranks": comm.size,
         "machine": machine(),
         "rows": [asdict(row) for row in rows],
-        **found,
+        **trends,
     }
     if comm.rank == 0:
         out.mkdir(parents=True, exist_ok=True)
         numbers = write_json(out / "mesh_study.json", result)
-        list_files(console, [numbers, *draw(out / "mesh_study.png", rows, found)])
+        list_files(console, [numbers, *draw(out / "mesh_study.png", rows, trends)])
     comm.Barrier()
     return result
 
@@ -261,12 +262,4 @@ def main(
     out: Annotated[Path, typer.Option(help="folder for mesh_study.json, .png and .pdf")] = Path("out"),
 ) -> None:
     """See HELP."""
-    comm = MPI.COMM_WORLD
-    wanted = parse_sizes(sizes)
-    console = Console(quiet=comm.rank != 0, highlight=False)
-    try:
-        run_mesh_study(wanted, steps, method, dimension, out, console, comm)
-    except SoftgraspError as error:
-        if comm.rank == 0:
-            Console(stderr=True, highlight=False).print(f"error: {error}", soft_wrap=True, markup=False)
-        raise typer.Exit(1) from None
+    run_mesh_study(parse_sizes(sizes), steps, method, dimension, out, console(), MPI.COMM_WORLD)

@@ -66,11 +66,7 @@ class BareSolve:
 class PlainCholesky(BareSolve):
     """The solves of PETSc's Cholesky as ``-pc_type cholesky`` gives it: single entries, its nested dissection.
 
-    Args:
-        S: the matrix, all of it on one rank; consumed.
-
-    Attributes:
-        ksp: the factored solver.
+    S, all of it on one rank, is used up.
     """
 
     def __init__(self, S: PETSc.Mat) -> None:
@@ -85,12 +81,6 @@ class PlainCholesky(BareSolve):
         self.r.set(1.0)
         self.solve = self.ksp.getPC().getFactorMatrix().solve
         S.destroy()  # the ksp holds it
-
-
-def to_scipy(A: PETSc.Mat) -> Any:
-    """A matrix of one rank as SciPy CSR. Not collective."""
-    indptr, columns, values = A.getValuesCSR()
-    return scipy.sparse.csr_matrix((values, columns, indptr), shape=A.getSize())
 
 
 class ScipyLoop:

@@ -19,6 +19,7 @@ from softgrasp.study.bench.driver import (
     list_bench,
     number,
     open_console,
+    parse_list,
     parse_ranks,
     show_goals,
 )
@@ -28,7 +29,6 @@ from softgrasp.study.shell.jobs import launch_worker
 SIZES = "10,20,40,80,160"
 LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
 PEER_LIMIT = {"scipy": 10, "slycot": 10, "pymor": 40}  # nx; minutes beyond
-WORKER_LIMIT = 3600.0  # [s]
 LIMITS = {("newton_adi", 10): 0.2, ("newton_adi", 80): 20.0, ("galerkin", 10): 0.03, ("galerkin", 80): 4.0}  # [s]
 LARGE_SECONDS, LARGE_MB = 900.0, 24 * 1024
 RESIDUAL, GAIN = 1e-10, 1e-6
@@ -55,10 +55,7 @@ def parse_meshes(text: str) -> list[int]:
     Raises:
         typer.BadParameter: anything else.
     """
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part.isdigit() and int(part) >= 2 for part in parts):
-        raise typer.BadParameter(f"'{text}' is no list of meshes; write 10,20,40")
-    return [int(part) for part in parts]
+    return [int(part) for part in parse_list(text, r"([2-9]|[1-9]\d+)", "number of cells; write 10,20,40")]
 
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
@@ -69,7 +66,7 @@ def launch(spec: dict[str, Any], ranks: int) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         partial = Path(folder) / "partial.json"
         extra = {"partial": str(partial)} if "methods" in spec else {}
-        row = {"ranks": ranks} | launch_worker("riccati", spec | extra, ranks, WORKER_LIMIT)
+        row = {"ranks": ranks} | launch_worker("riccati", spec | extra, ranks)
         if "error" in row and partial.is_file():
             reason = row.pop("error")
             row |= json.loads(partial.read_text())
@@ -82,19 +79,19 @@ class Record:
     """Rows as they come, in a file that outlives whatever goes wrong with the next one.
 
     Attributes:
-        file: bench_riccati.json; None keeps nothing.
+        file: bench_riccati.json.
         beta: Kelvin-Voigt time of all rows [s].
         rows, peers: what is measured.
     """
 
-    file: Path | None
+    file: Path
     beta: float
     rows: list[Row] = field(default_factory=list)
     peers: list[Row] = field(default_factory=list)
 
     def resume(self) -> None:
         """Take over the rows of an earlier run with the same damping that have no error. Not collective."""
-        if self.file is None or not self.file.is_file():
+        if not self.file.is_file():
             return
         old = json.loads(self.file.read_text())
         if old.get("beta") == self.beta:
@@ -103,8 +100,6 @@ class Record:
 
     def save(self) -> None:
         """Write the file. Not collective."""
-        if self.file is None:
-            return
         self.file.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": "bench_riccati", "beta": self.beta, "rows": self.rows, "peers": self.peers}
         report |= {"exponents": exponents(self.rows), "goals": goal_rows(goals(self.rows))}
@@ -126,8 +121,8 @@ def exponents(rows: Sequence[Row]) -> dict[str, float | None]:
     result: dict[str, float | None] = {}
     good = [entry for entry in flat(rows) if "error" not in entry and entry["nx"] >= 20]
     for key in sorted({(entry["method"], entry["ranks"]) for entry in good}):
-        mine = [entry for entry in good if (entry["method"], entry["ranks"]) == key]
-        result[f"{key[0]}, {key[1]} rank(s)"] = growth([e["states"] for e in mine], [e["seconds"] for e in mine])
+        own = [entry for entry in good if (entry["method"], entry["ranks"]) == key]
+        result[f"{key[0]}, {key[1]} rank(s)"] = growth([e["states"] for e in own], [e["seconds"] for e in own])
     return result
 
 
@@ -163,7 +158,7 @@ HEADS += ["true residual", "gain diff.", "MiB"]
 
 def cells_of(entry: Row) -> list[str]:
     """One table line. Not collective."""
-    first = [str(entry["nx"]), str(entry["states"]), str(entry["ranks"]), entry["method"]]
+    first = [str(entry[name]) for name in ("nx", "states", "ranks", "method")]
     if "error" in entry:
         return [*first, "failed", *[""] * (len(HEADS) - 5)]
     split = [number(entry["split"][name]) for name in SPLIT]
@@ -301,14 +296,8 @@ def main(
     peers: Annotated[bool, typer.Option(help="also SciPy, slycot and pyMOR")] = True,
     large: Annotated[bool, typer.Option("--large", help=f"also nx = {LARGEST}, 2n > 1e6")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="keep the good rows of bench_riccati.json in --out")] = False,
-    worker: Annotated[str, typer.Option(hidden=True, help="job of one row as JSON")] = "",
 ) -> None:
     """See HELP."""
-    if worker:
-        from softgrasp.study.bench.riccati_rows import run_worker
-
-        run_worker(json.loads(worker))
-        return
     meshes, counts = parse_meshes(sizes), parse_ranks(ranks)
     console = open_console(160)
     record = Record(out / "bench_riccati.json", beta)

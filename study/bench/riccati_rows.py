@@ -20,6 +20,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
@@ -27,10 +28,11 @@ from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_to_relative
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.study.bench.peers import to_scipy
+from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.jobs import leave_result
+from softgrasp.study.shell.timing import timed
 
 METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
 REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
@@ -58,41 +60,17 @@ def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
     return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm=comm))
 
 
-def gain_difference(problem: RiccatiProblem, K: Block, reference: Block) -> float:
-    """||K - K_ref||_2 / ||K_ref||_2, Frobenius, hand-relative coordinates. Collective."""
-    comm = problem.layout.comm
-
-    def size(X: Block) -> float:
-        return float(np.sum(X.hand**2) + comm.allreduce(float(np.sum(X.tall**2))))
-
-    return float(np.sqrt(size(Block(K.hand - reference.hand, K.tall - reference.tall)) / size(reference)))
-
-
 def run_method(comm: MPI.Intracomm, problem: RiccatiProblem, name: str, repeats: int) -> tuple[RiccatiSolution, float]:
     """The solution and the median time of a few runs [s]. Collective."""
-    times: list[float] = []
-    while True:
-        comm.Barrier()
-        begin = time.perf_counter()
-        solution = METHODS[name]().solve(problem)
-        times.append(comm.allreduce(time.perf_counter() - begin, op=MPI.MAX))
-        if len(times) >= repeats or sum(times) > REPEAT_SECONDS:
-            return solution, float(np.median(times))
+    solution: list[RiccatiSolution] = []
 
+    def solve() -> None:
+        solution[:] = [METHODS[name]().solve(problem)]
 
-def describe(solution: RiccatiSolution, seconds: float, base: float, memory: float) -> dict[str, Any]:
-    """The numbers of one method. Not collective."""
-    split = {name: sum(solution.seconds.get(key, 0.0) for key in keys) for name, keys in STAGES.items()}
-    return {
-        "seconds": seconds,
-        "split": split,
-        "solves": solution.counts["solves"],
-        "newton_steps": solution.counts["newton_steps"],
-        "rank": solution.rank,
-        "residual": solution.residual,
-        "memory_mb": memory,
-        "memory_base_mb": base,
-    }
+    times = [timed(comm, solve)]
+    while len(times) < repeats and sum(times) <= REPEAT_SECONDS:
+        times.append(timed(comm, solve))
+    return solution[0], float(np.median(times))
 
 
 def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str = "") -> dict[str, Any]:
@@ -110,54 +88,31 @@ def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str
     base = peak_memory_mb(comm)
     result: dict[str, Any] = {"states": problem.layout.states, "n_e": problem.layout.n_e, "ranks": comm.size}
     rows: dict[str, Any] = {}
-    reference: Block | None = None
+    reference: Gain | None = None
     for name in methods:
         try:
             solution, seconds = run_method(comm, problem, name, repeats)
         except SoftgraspError as error:
             rows[name] = {"error": str(error)}
             continue
-        rows[name] = describe(solution, seconds, base, peak_memory_mb(comm))
-        gain = solution.gain.block
+        rows[name] = {
+            "seconds": seconds,
+            "split": {part: sum(solution.seconds.get(key, 0.0) for key in keys) for part, keys in STAGES.items()},
+            "solves": solution.counts["solves"],
+            "newton_steps": solution.counts["newton_steps"],
+            "rank": solution.rank,
+            "residual": solution.residual,
+            "memory_mb": peak_memory_mb(comm),
+            "memory_base_mb": base,
+        }
+        gain = solution.gain
         if reference is None:
             reference = gain
         else:
-            rows[name]["gain_difference"] = gain_difference(problem, gain, reference)
+            rows[name]["gain_difference"] = gain_error(problem, reference, gain)
         if partial and comm.rank == 0:
             Path(partial).write_text(json.dumps(result | {"methods": rows}))
     return result | {"methods": rows}
-
-
-def paper_form(problem: RiccatiProblem) -> tuple[Any, Any, Array, Array]:
-    """Sparse E, A and dense B, C of the paper, x = [q_s, v_s, q_e, v_e], one rank, one-way. Not collective."""
-    system, n_s = problem.system, problem.layout.n_s
-    M, K = to_scipy(system.M_ee), to_scipy(system.K_ee)
-    n = M.shape[0]
-    D = system.damping.alpha * M + system.damping.beta * K
-    M_es, one = scipy.sparse.csc_matrix(system.G - M @ system.T), scipy.sparse.identity
-    K_es, D_es = scipy.sparse.csc_matrix(-K @ system.T), scipy.sparse.csc_matrix(-D @ system.T)
-    E = scipy.sparse.bmat(
-        [
-            [one(n_s), None, None, None],
-            [None, scipy.sparse.csc_matrix(problem.M_s), None, None],
-            [None, None, one(n), None],
-            [None, M_es, None, M],
-        ]
-    ).tocsc()
-    A = scipy.sparse.bmat(
-        [
-            [None, one(n_s), None, None],
-            [scipy.sparse.csc_matrix((n_s, n_s)), None, None, None],
-            [None, None, scipy.sparse.csc_matrix((n, n)), one(n)],
-            [-K_es, -D_es, -K, -D],
-        ]
-    ).tocsc()
-    B = np.zeros((2 * (n + n_s), n_s))
-    B[n_s : 2 * n_s] = np.eye(n_s)
-    C = np.zeros((problem.C_s.shape[0], len(B)))
-    C[:, :n_s] = problem.C_s - problem.C_z.T @ system.T
-    C[:, 2 * n_s : 2 * n_s + n] = problem.C_z.T
-    return E, A, B, C
 
 
 def _answer(problem: RiccatiProblem, E: Any, B: Array, Z: Array, seconds: float) -> Answer:
@@ -167,15 +122,20 @@ def _answer(problem: RiccatiProblem, E: Any, B: Array, Z: Array, seconds: float)
     return Answer(relative, gain_to_relative(problem.system, Block(gain[:s], gain[s:])), seconds)
 
 
+def _factor(X: Array) -> Array:
+    """Z with X = Z Z', negative eigenvalues left out."""
+    values, vectors = np.linalg.eigh((X + X.T) / 2)
+    keep = values > 0
+    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
+
+
 def scipy_answer(problem: RiccatiProblem) -> Answer:
     """SciPy's dense solver on the paper's matrices as they stand. Not collective."""
     E, A, B, C = paper_form(problem)
     begin = time.perf_counter()
     X = scipy.linalg.solve_continuous_are(A.toarray(), B, C.T @ problem.Q @ C, problem.R, e=E.toarray())
     seconds = time.perf_counter() - begin
-    values, vectors = np.linalg.eigh((X + X.T) / 2)
-    keep = values > 0
-    return _answer(problem, E, B, vectors[:, keep] * np.sqrt(values[keep]), seconds)
+    return _answer(problem, E, B, _factor(X), seconds)
 
 
 def slycot_answer(problem: RiccatiProblem) -> Answer:
@@ -185,14 +145,12 @@ def slycot_answer(problem: RiccatiProblem) -> Answer:
     E, A, B, C = paper_form(problem)
     n, m, p = len(B), B.shape[1], len(C)
     begin = time.perf_counter()
-    found = slycot.sg02ad(
+    _, X, *_ = slycot.sg02ad(
         "C", "B", "N", "U", "Z", "N", "S", "R", n, m, p, A.toarray(), E.toarray(), B,
         C.T @ problem.Q @ C, problem.R, np.zeros((n, m)),
     )  # fmt: skip
     seconds = time.perf_counter() - begin
-    values, vectors = np.linalg.eigh((found[1] + found[1].T) / 2)
-    keep = values > 0
-    return _answer(problem, E, B, vectors[:, keep] * np.sqrt(values[keep]), seconds)
+    return _answer(problem, E, B, _factor(X), seconds)
 
 
 def pymor_answer(problem: RiccatiProblem) -> Answer:
@@ -223,7 +181,7 @@ def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
     if importlib.util.find_spec(peer) is None:
         return {"missing": True}
     problem = problem_for(MPI.COMM_WORLD, nx, beta)
-    reference = NewtonADI().solve(problem).gain.block
+    reference = NewtonADI().solve(problem).gain
     begin = time.perf_counter()
     try:
         answer = PEERS[peer](problem)
@@ -233,12 +191,11 @@ def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
         "seconds": answer.seconds,
         "rank": answer.Z.columns,
         "residual": residual(problem, answer.Z),
-        "gain_difference": gain_difference(problem, answer.K, reference),
+        "gain_difference": gain_error(problem, reference, Gain.of_block(answer.K)),
         "states": problem.layout.states,
     }
 
 
-def run_worker(spec: dict[str, Any]) -> None:
-    """Measure what the driver asks for and leave the numbers in its file. Collective."""
-    arguments = {key: value for key, value in spec.items() if key != "file"}
-    leave_result(spec["file"], lambda: measure_peer(**arguments) if "peer" in arguments else measure(**arguments))
+def measure_row(**arguments: Any) -> dict[str, Any]:
+    """A row that :mod:`study.bench.riccati` launches. Collective."""
+    return (measure_peer if "peer" in arguments else measure)(**arguments)

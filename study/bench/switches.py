@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 import numpy as np
@@ -39,13 +40,12 @@ from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, 
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
 from softgrasp.study.bench.riccati_rows import problem_for
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.jobs import launch_worker, leave_result
+from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.timing import interleave, timed
 
 BATCH = 100  # models of a batch
 STEPS = 600
 SHIFT = -0.5 + 5.0j  # a shift in the middle of the paper's spectrum
-WORKER_LIMIT = 3600.0  # [s]
 HELP = """Measure two methods at sizes near those at which softgrasp changes from one to the other.
 
 Each row compares a first and a second method at one size, medians of runs in turn (set-ups and the largest sizes are
@@ -100,6 +100,17 @@ def compare(
     return Row(*names, setting, comm.size, first, second)
 
 
+@contextmanager
+def setting_of(module: ModuleType, name: str, value: float) -> Iterator[None]:
+    """Another value of a module's constant inside. Not collective."""
+    before = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
+
+
 def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     """Reduced models of random materials, together and one by one. One rank."""
     changes = ["effects.damping={kind='kelvin-voigt', beta=0.002}", "motion={drive='force', profile='hold'}"]
@@ -117,11 +128,8 @@ def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         size = sum(p.block.nbytes for p in many)
 
         def together(many: list[Any] = many) -> None:
-            kept, softgrasp.reduction.online.TOGETHER = softgrasp.reduction.online.TOGETHER, 2**62
-            try:
+            with setting_of(softgrasp.reduction.online, "TOGETHER", 2**62):
                 run_batch(many, DT, force)
-            finally:
-                softgrasp.reduction.online.TOGETHER = kept
 
         def alone(many: list[Any] = many) -> None:
             for p in many:
@@ -139,16 +147,13 @@ def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     plant = Plant(problem_for(comm, 10, 0.002))
     for k in (15, 16, 30, 60):
         omega, V = plant_modes(plant, k)
-        small = restrict(plant, V, omega, plant.mass(V))
+        modal = restrict(plant, V, omega, plant.mass(V))
 
-        def from_all(small: Any = small) -> None:
-            softgrasp.lqr.lowrank.modal_start.FEW_MODES = 2**30
-            try:
-                solve_small(plant, small)
-            finally:
-                softgrasp.lqr.lowrank.modal_start.FEW_MODES = few
+        def from_all(modal: Any = modal) -> None:
+            with setting_of(softgrasp.lqr.lowrank.modal_start, "FEW_MODES", 2**30):
+                solve_small(plant, modal)
 
-        calls = (lambda small=small: solve_small(plant, small), from_all)
+        calls = (lambda modal=modal: solve_small(plant, modal), from_all)
         yield compare(comm, ("start", f"FEW_MODES = {few}"), f"2D, {k} modes", calls, repeats)
 
 
@@ -215,24 +220,24 @@ def _two(
     """Set-up and step with two solvers."""
     system = model.system
     setting = f"{system.layout.dimension}D, n_e = {system.layout.n_e}"
-    seconds, made = [], []
+    seconds, midpoints = [], []
     for name, reproducible in (one, other):
         comm.Barrier()
         begin = time.perf_counter()
-        made.append(TissueMidpoint(system, DT, name, reproducible=reproducible))
+        midpoints.append(TissueMidpoint(system, DT, name, reproducible=reproducible))
         seconds.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
     yield Row(heads[0], limit, setting, comm.size, *seconds)
     c = np.ones(system.layout.n_s)
-    states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in made]
-    for midpoint, state in zip(made, states, strict=True):
+    states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in midpoints]
+    for midpoint, state in zip(midpoints, states, strict=True):
         midpoint.start(state)
 
     def step(i: int) -> None:
-        made[i].solve_midpoint(c)
-        made[i].advance(states[i], states[i])
+        midpoints[i].solve_midpoint(c)
+        midpoints[i].advance(states[i], states[i])
 
     yield compare(comm, (heads[1], limit), setting, (partial(step, 0), partial(step, 1)), max(repeats, 3))
-    for midpoint in made:
+    for midpoint in midpoints:
         midpoint.destroy()
 
 
@@ -247,13 +252,9 @@ SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
 SERIAL = ("batch", "start", "dense")
 
 
-def run_worker(spec: dict[str, Any]) -> None:
-    """Measure one switch and leave the rows in the file. Collective."""
-
-    def measure() -> dict[str, Any]:
-        return {"rows": [asdict(r) for r in SWITCHES[spec["switch"]](MPI.COMM_WORLD, spec["repeats"], spec["large"])]}
-
-    leave_result(spec["file"], measure)
+def measure(switch: str, repeats: int, large: bool) -> dict[str, Any]:
+    """The rows of one switch. Collective."""
+    return {"rows": [asdict(row) for row in SWITCHES[switch](MPI.COMM_WORLD, repeats, large)]}
 
 
 HEADER = ("switch", "constant", "size", "ranks", "first s", "second s", "second / first")
@@ -274,30 +275,26 @@ def main(
     repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 5,
     large: Annotated[bool, typer.Option("--large", help="also sizes that take minutes")] = False,
     out: Annotated[Path, typer.Option(help="folder for bench_switches.json and bench_switches.csv")] = Path("out"),
-    worker: Annotated[str, typer.Option(hidden=True, help="job of one switch as JSON")] = "",
 ) -> None:
     """See HELP."""
-    if worker:
-        run_worker(json.loads(worker))
-        return
-    wanted, counts = [name.strip() for name in switches.split(",")], parse_ranks(ranks)
-    for name in wanted:
+    names, counts = [name.strip() for name in switches.split(",")], parse_ranks(ranks)
+    for name in names:
         if name not in SWITCHES:
             raise typer.BadParameter(f"'{name}' is no switch; choose from {', '.join(SWITCHES)}")
-        if name == "whole" and max(counts) == 1 and len(wanted) == 1:
+        if name == "whole" and max(counts) == 1 and len(names) == 1:
             raise typer.BadParameter("whole and spread factors are the same on one rank; add --ranks 2")
     console = open_console(130)
     rows: list[Row] = []
     failed = False
-    for name in wanted:
+    for name in names:
         for k in [k for k in counts if k == 1 or name not in SERIAL]:
             with console.status(f"{name}, {k} rank(s)"):
                 spec = {"switch": name, "repeats": repeats, "large": large}
-                found = launch_worker("switches", spec, k, WORKER_LIMIT)
-            if "error" in found:
+                answer = launch_worker("switches", spec, k)
+            if "error" in answer:
                 failed = True
-                console.print(f"{name}, {k} rank(s): {found['error']}", markup=False)
-            rows += [Row(**row) for row in found.get("rows", [])]
+                console.print(f"{name}, {k} rank(s): {answer['error']}", markup=False)
+            rows += [Row(**row) for row in answer.get("rows", [])]
     console.print(table_of(rows).terminal())
     content = {"command": "bench_switches", "rows": [asdict(row) for row in rows]}
     table = Table(tuple(Row.__dataclass_fields__), [tuple(asdict(row).values()) for row in rows])

@@ -15,24 +15,11 @@ from softgrasp.fem.run.drive import Force
 from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.run.simulate import RunOptions, Trajectory, simulate
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.effects.result import Change, Company
 from softgrasp.study.effects.switch import Scales, switch
 
 Names = frozenset[str]
-
-
-@dataclass(frozen=True)
-class Change:
-    """Largest change of the outputs over the run.
-
-    Attributes:
-        outputs: max |y - y'| over max |y|, y the displacements of all outputs [1].
-        deformation: the same of the outputs relative to the rigid motion of the hand [1].
-        absolute: max |y - y'| [m].
-    """
-
-    outputs: float
-    deformation: float
-    absolute: float
+Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a force
 
 
 @dataclass(frozen=True)
@@ -144,6 +131,13 @@ class Experiments:
         """Change of the outputs when a force moves the hand; None where that is no question. Collective."""
         return None if self.force is None else compare(self.of(a, True), self.of(b, True)).outputs
 
+    def alone(self, name: str) -> tuple[Change, float | None]:
+        """Change by one effect switched in the scene; under a force too where the run does not show it. Collective."""
+        other = self.on ^ {name}
+        change = self.change(self.on, other)
+        hidden = change.outputs <= self.scene.study.tolerance
+        return change, self.control(self.on, other) if hidden else None
+
     def shows(self, a: Names, b: Names, tolerance: float) -> tuple[float, bool] | None:
         """A change of the outputs above the tolerance, and whether only a force brings it out. Collective."""
         change = self.change(a, b).outputs
@@ -151,27 +145,6 @@ class Experiments:
             return change, False
         control = self.control(a, b)
         return None if control is None or control <= tolerance else (control, True)
-
-
-@dataclass(frozen=True)
-class Company:
-    """One effect judged beside all others that are advised.
-
-    Attributes:
-        change: of the outputs when it alone is switched, the others as advised.
-        control: the same under a force [1]; None when that is no question.
-        partners: effects whose switching makes it show, though it does not show in the scene as it is.
-        either: it and its partner are on, each can go, but not both.
-        together: change that made it count beside the partners [1].
-        forced: it shows only when a force moves the hand.
-    """
-
-    change: Change
-    control: float | None
-    partners: tuple[str, ...] = ()
-    either: bool = False
-    together: float = 0.0
-    forced: bool = False
 
 
 @dataclass(frozen=True)
@@ -221,23 +194,23 @@ def judge_together(runs: Experiments, tried: tuple[str, ...], needed: Names, tol
 
 def _singles(runs: Experiments, tried: tuple[str, ...], on: Names, tolerance: float) -> Joined:
     """Effects that show beside those that are on, with the partners that bring them out. Collective."""
-    found: Joined = {}
+    joined: Joined = {}
     for name in tried:
-        hit = None if name in on else runs.shows(on, on | {name}, tolerance)
-        if hit is None:
+        change = None if name in on else runs.shows(on, on | {name}, tolerance)
+        if change is None:
             continue
         others = [p for p in tried if p != name and (p in on) != (p in runs.on)]
         near = [p for p in others if runs.shows(runs.on ^ {p}, runs.on ^ {p, name}, tolerance)]
-        found[name] = (tuple(near or others), False, *hit)
-    return found
+        joined[name] = (tuple(near or others), False, *change)
+    return joined
 
 
 def _pair(runs: Experiments, tried: tuple[str, ...], on: Names, tolerance: float) -> Joined:
     """The first two effects that show together and not one by one. Collective."""
     for a, b in combinations([name for name in tried if name not in on], 2):
-        hit = runs.shows(on, on | {a, b}, tolerance)
-        if hit is not None and {a, b} <= runs.on:
-            return {a: ((b,), True, *hit)}
-        if hit is not None:
-            return {a: ((b,), False, *hit), b: ((a,), False, *hit)}
+        change = runs.shows(on, on | {a, b}, tolerance)
+        if change is not None and {a, b} <= runs.on:
+            return {a: ((b,), True, *change)}
+        if change is not None:
+            return {a: ((b,), False, *change), b: ((a,), False, *change)}
     return {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from softgrasp.fem.model.build import Model, build
@@ -10,37 +9,14 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import RunOptions, Trajectory, simulate
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.change import Change, compare, shown
+from softgrasp.study.effects.change import compare, shown
+from softgrasp.study.effects.result import Elements
 from softgrasp.study.effects.switch import changed
 from softgrasp.study.forward.cautions import LOCKING
 
 
-@dataclass(frozen=True)
-class Elements:
-    """What quadratic elements on the same mesh change where linear ones may lock.
-
-    Attributes:
-        nu: largest ratio of Poisson in the tissue [1].
-        change: of the outputs of the run, P2 against P1.
-        unknowns: n_e with P2 over n_e with P1 [1].
-        needed: the change is above the tolerance.
-        advice: one sentence.
-    """
-
-    nu: float
-    change: Change
-    unknowns: float
-    needed: bool
-    advice: str
-
-
 def judge_elements(model: Model, trajectory: Trajectory, tolerance: float) -> Elements | None:
     """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective.
-
-    Args:
-        model: the scene as it is.
-        trajectory: its run.
-        tolerance: relative change of the outputs that counts.
 
     Raises:
         SolverError: a solve failed.

@@ -1,127 +1,37 @@
-"""Cost, verdict and proof for one effect, from the cases that `study.effects.measure` measured."""
+"""Cost, verdict, proof and advice for one effect, from the cases that `study.effects.measure` measured."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import Run, RunOptions
-from softgrasp.study.effects.measure import Case, fingerprint, nothing_of, objects_of
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.effects.change import Changes, Together
+from softgrasp.study.effects.measure import (
+    AGAIN,
+    SCENE,
+    Case,
+    fingerprint,
+    objects_of,
+)
 from softgrasp.study.effects.objects import difference
-from softgrasp.study.effects.switch import neutral
-
-COUNTED = 1e-3  # relative growth of work or memory that counts as a cost; gravity's n_s numbers do not
-TIMER = 0.03  # relative difference of two equal runs that cache and page placement can leave in every sample
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What the effect adds: the scene with it minus the scene without it.
-
-    Attributes:
-        assembly, setup, step: seconds, medians of paired samples; setup is factor and solves before the first step.
-        assembly_range, setup_range: smallest and largest paired sample [s].
-        step_relative: added share of a step's time [1].
-        step_low, step_high: smallest and largest paired share [1].
-        step_noise: share that a step of the scene differs from itself by [1].
-        step_quartiles: lower and upper quartile of the paired shares [1].
-        flops: added operations of PETSc in a step [1]; flops_relative: their share.
-        memory: added memory [byte]; memory_relative: its share.
-        holds: names of what only the scene with the effect holds.
-        objects: what PETSc counts as created more, by class.
-    """
-
-    assembly: float
-    setup: float
-    assembly_range: tuple[float, float]
-    setup_range: tuple[float, float]
-    step: float
-    step_relative: float
-    step_low: float
-    step_high: float
-    step_noise: float
-    step_quartiles: tuple[float, float]
-    flops: float
-    flops_relative: float
-    memory: float
-    memory_relative: float
-    holds: tuple[str, ...]
-    objects: dict[str, int]
-
-    @property
-    def any(self) -> bool:
-        """Whether counted work or memory grows; times are too noisy to decide."""
-        return self.flops_relative > COUNTED or self.memory_relative > COUNTED
-
-    @property
-    def step_shows(self) -> bool:
-        """Whether all paired samples agree that a step takes longer, or shorter, by more than the noise."""
-        return (self.step_low > 0 or self.step_high < 0) and abs(self.step_relative) > self.step_noise
+from softgrasp.study.effects.result import Change, Company, Cost, Finding, OffProof, listed
+from softgrasp.study.effects.switch import Switch, neutral
+from softgrasp.study.forward.explain import EffectReport, Explanation
 
 
-@dataclass(frozen=True)
-class OffProof:
-    """What shows that an effect that is off costs nothing.
-
-    Attributes:
-        same_operators: built again after the trial with the effect on, all hashes are those from before.
-        zero_strength: named with strength zero it gives the same hashes; None for effects without a strength.
-        absent: operators made without its term have the same bits.
-        same_objects: PETSc's own log counts the same objects, by class, created after the trial as before, and with the
-            effect named at strength zero; and none in the steps.
-        same_allocations: Inventory and held memory are those of the scene before the trial.
-        declared: the Inventory holds what the effects that are on declare, and nothing more.
-        same_work: as many operations in a step.
-        step_ratio: median of paired step times, again over before [1]; its range is low to high.
-        noise: spread of the single step times of one run, at least `TIMER` [1].
-        within_noise: the range holds 1, or the median is no farther from it than the noise.
-    """
-
-    same_operators: bool
-    zero_strength: bool | None
-    absent: bool
-    same_objects: bool
-    same_allocations: bool
-    declared: bool
-    same_work: bool
-    step_ratio: float
-    step_low: float
-    step_high: float
-    noise: float
-    within_noise: bool
-
-    @property
-    def holds(self) -> bool:
-        """Whether the cost is zero: everything is the same but time, and time within noise."""
-        counted = self.same_operators and self.absent and self.same_objects and self.same_work
-        return (
-            counted
-            and self.same_allocations
-            and self.declared
-            and self.zero_strength is not False
-            and self.within_noise
-        )
-
-
-def judge(change: float, felt: bool, costs: bool, tolerance: float) -> str:
+def judge(change: float, controls: bool, costs: bool, tolerance: float) -> str:
     """needed, optional or wasted. Not collective.
 
     Needed: it changes the outputs by more than the tolerance. Optional: it does not, but it is free, or the control
-    problem feels it. Wasted: it costs something and nothing shows it.
-
-    Args:
-        change: of the outputs of this run [1].
-        felt: the control problem needs it.
-        costs: counted work or memory grows.
-        tolerance: of the scene [1].
+    problem needs it. Wasted: it costs something and nothing shows it.
     """
     if change > tolerance:
         return "needed"
-    return "wasted" if costs and not felt else "optional"
+    return "wasted" if costs and not controls else "optional"
 
 
 def quartiles(samples: Array) -> tuple[float, float]:
@@ -130,7 +40,7 @@ def quartiles(samples: Array) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def cost_of(with_: Case, without: Case, noise: float = TIMER) -> Cost:
+def cost_of(with_: Case, without: Case, noise: float) -> Cost:
     """The differences of two cases; ``noise`` is what a step of one scene differs from itself by. Not collective."""
 
     def added(stage: str) -> Array:
@@ -159,42 +69,102 @@ def cost_of(with_: Case, without: Case, noise: float = TIMER) -> Cost:
     )
 
 
-def declared_operators(model: Model) -> list[str]:
-    """Operators that the bare model and the effects that are on declare, sorted. Not collective."""
-    scene, bodies = model.scene, [layer.name for layer in model.system.layers]
-    names = {"M_ee", "K_ee", "T", "G", *(f"{key}[{body}]" for body in bodies for key in ("K_mu", "K_lambda", "M_1"))}
-    at_build = {name for name in EFFECTS["damping"].operators(scene) if EFFECTS["damping"].active(scene)}
-    return sorted(names | at_build)
-
-
 def prove_off(name: str, before: Case, again: Case) -> OffProof:
     """Compare the scene before and after the effect was on in this process. Collective."""
-    ratio = np.array(again.seconds["step"]) / np.array(before.seconds["step"])
-    median, low, high = float(np.median(ratio)), float(ratio.min()), float(ratio.max())
-    noise = max(TIMER, before.spread, again.spread)
-    zero: bool | None = None
-    counts = [(again.objects, again.objects_in_steps)]
-    with_zero = neutral(before.model.scene, name, before.model.system.layout.dimension)
+    layout = before.model.system.layout
+    prints, counts = [again.prints], [(again.objects, again.objects_in_steps)]
+    with_zero = neutral(before.model.scene, name, layout.dimension)
     if with_zero is not None:
-        model = build(with_zero, comm=before.model.system.layout.comm)
+        model = build(with_zero, comm=layout.comm)
         run = Run(model, RunOptions())
-        zero = fingerprint(model, run) == before.prints
+        prints.append(fingerprint(model, run))
         run.midpoint.destroy()
         if before.objects:
-            counts.append(objects_of(before.model.system.layout.comm, with_zero))
-    made, new = before.model.inventory, again.model.inventory
+            counts.append(objects_of(layout.comm, with_zero))
     return OffProof(
-        same_operators=again.prints == before.prints,
-        zero_strength=zero,
-        absent=nothing_of(name, before),
+        same_operators=all(p == before.prints for p in prints),
         same_objects=not before.objects_in_steps and all(c == (before.objects, {}) for c in counts),
-        same_allocations=made.forms == new.forms and made.operators == new.operators and before.bytes == again.bytes,
-        declared=made.forms == ["K_mu", "K_lambda", "M_1"]
-        and sorted(made.operators) == declared_operators(before.model),
         same_work=again.flops == before.flops,
-        step_ratio=median,
-        step_low=low,
-        step_high=high,
-        noise=noise,
-        within_noise=low <= 1 <= high or abs(median - 1) <= noise,
     )
+
+
+def find(
+    s: Switch, explanation: Explanation, cases: dict[str, Case], changes: Changes, together: Together, noise: float
+) -> Finding:
+    """Judge one effect and say what to do about it. Collective."""
+    scene = cases[SCENE].model.scene
+    gate, tolerance = explanation.effects[s.name], scene.study.tolerance
+    proof = None if s.on else prove_off(s.name, cases[SCENE], cases[AGAIN])
+    if s.other is None:
+        advice = f"Not tried: {s.reason}."
+        return Finding(s.name, s.on, s.value, gate, "not tried", advice, None, None, None, None, proof)
+    (change, control), company = changes[s.name], together.company[s.name]
+    pair = (cases[SCENE], cases[s.name]) if s.on else (cases[s.name], cases[SCENE])
+    cost = cost_of(*pair, noise)
+    why = needed_for_control(s, control, gate, scene)
+    largest = max(change.outputs, 0.0 if company.forced else company.together)
+    verdict = judge(largest, bool(why) or company.forced, cost.any, tolerance)
+    if company.partners:
+        advice = _advice_together(s, change.outputs, company, scene)
+    else:
+        advice = _advice(s, verdict, change.outputs, why, cost, tolerance)
+        if verdict == "needed" and company.change.outputs <= tolerance:
+            advice += f" Beside the other advised effects it changes them by {company.change.outputs:.1e} only."
+    return Finding(s.name, s.on, s.value, gate, verdict, advice, change, control, company, cost, proof)
+
+
+def shows(s: Switch, changes: tuple[Change, float | None], gate: EffectReport, scene: Scene) -> bool:
+    """Whether the effect shows in the scene as it is, or its control problem needs it."""
+    change, control = changes
+    return change.outputs > scene.study.tolerance or bool(needed_for_control(s, control, gate, scene))
+
+
+def needed_for_control(s: Switch, control: float | None, gate: EffectReport, scene: Scene) -> str:
+    """Why the control problem needs an effect that does not show in the run; empty if it does not."""
+    if control is not None and control > scene.study.tolerance:
+        return f"when a force moves the hand, as in the control problem, it changes them by {control:.2g}"
+    if s.name == "damping" and scene.control is not None and gate.gate.matters:
+        return "without damping no feedback stabilises the high modes in the control problem"
+    return ""
+
+
+def _advice(s: Switch, verdict: str, change: float, why: str, cost: Cost, tolerance: float) -> str:
+    if verdict == "needed":
+        text = "Keep it: it changes" if s.on else "Switch it on if it acts: it would change"
+        text += f" the outputs by {change:.2g}, tolerance {tolerance:g}"
+        if s.strength is not None and change < 0.1:  # where the change still grows with the strength
+            text += f"; below about {s.strength * tolerance / change:.2g} {s.unit} it would not show"
+        return text + "."
+    little = _change_in_words(change)
+    if why:
+        return f"{'Keep' if s.on else 'Switch'} it{'' if s.on else ' on'} for control alone: it {little}, but {why}."
+    if verdict == "wasted":
+        text = "Switch it off: it" if s.on else "Rightly off: it would cost and not show: it"
+        return f"{text} {little} and adds {_cost_in_words(cost)}."
+    return f"{'Keep or drop it' if s.on else 'Rightly off'}: it {little} and costs nothing in this run."
+
+
+def _advice_together(s: Switch, change: float, company: Company, scene: Scene) -> str:
+    """For an effect that shows only when others are switched too."""
+    partners = listed(company.partners)
+    force = " when a force moves the hand, as in the control problem" if company.forced else ""
+    number = f"the outputs by {company.together:.2g}{force}, tolerance {scene.study.tolerance:g}"
+    if company.either:
+        return f"Keep it, or {partners}: each can go alone, but leaving out both changes {number}."
+    begin = f"{'Keep it' if s.on else 'Switch it on'}{' for control' if force else ''}"
+    switched = [name for name in company.partners if EFFECTS[name].active(scene)]
+    state = f"without {partners}" if switched else f"with {partners} on"
+    return f"{begin}, {state}: alone it {_change_in_words(change)}, but {state} it changes {number}."
+
+
+def _change_in_words(change: float) -> str:
+    return "changes nothing" if change == 0 else f"changes the outputs by {change:.1e} only"
+
+
+def _cost_in_words(cost: Cost) -> str:
+    parts = []
+    if cost.flops_relative > 0:
+        parts.append(f"{cost.flops_relative:.2g} of the operations of a step")
+    if cost.memory_relative > 0:
+        parts.append(f"{cost.memory_relative:.2g} of the memory")
+    return " and ".join(parts)

@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import gc
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import Array, PETSc, whole_copy
-from softgrasp.fem.run.motion import motion_table
+from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.solve.order import dissect
 from softgrasp.study.effects.objects import STEPS, counting
 from softgrasp.study.effects.switch import changed
 from softgrasp.study.shell.timing import interleave, medians
@@ -30,6 +29,7 @@ BURSTS = 7  # short ones make a sample by their median, so that a busy moment of
 BURST_SECONDS = 0.02  # of the steps of one; long against the timer
 BUILD_SECONDS = 6.0  # the builds are repeated at most about this long
 MOST_STEPS = 20_000  # in one sample
+SCENE, AGAIN = "scene", "scene again"  # cases: as it is, before and after its effects are switched
 
 
 @dataclass
@@ -42,7 +42,6 @@ class Case:
         prints: hash of each operator, see `fingerprint`.
         bytes: memory of what the run holds, over all ranks [byte].
         flops: operations of PETSc in a step, over all ranks [1].
-        spread: distance of the quartiles of its single step times, over their median [1].
         objects: what PETSc's log counts as created by build, factor, start and the first step, by class.
         objects_in_steps: the same of the next steps.
     """
@@ -52,7 +51,6 @@ class Case:
     prints: dict[str, str] = field(default_factory=dict)
     bytes: dict[str, float] = field(default_factory=dict)
     flops: float = 0.0
-    spread: float = 0.0
     objects: dict[str, int] = field(default_factory=dict)
     objects_in_steps: dict[str, int] = field(default_factory=dict)
 
@@ -163,67 +161,33 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     for layer in system.layers:
         holders += [(f"{key}[{layer.name}].", getattr(layer, key)) for key in ("K_mu", "K_lambda", "M_1")]
     seen: set[int] = set()
-    found: dict[str, float] = {}
+    sizes: dict[str, float] = {}
 
-    def everywhere(size: float, thing: Any) -> float:
-        return float(comm.allreduce(size)) if thing.comm.size < comm.size else size
+    def everywhere(size: float, obj: PETSc.Object) -> float:
+        return float(comm.allreduce(size)) if obj.comm.size < comm.size else size
 
     for prefix, holder in holders:
         for name, value in vars(holder).items():
             if isinstance(value, PETSc.Mat) and value.handle not in seen:
                 seen.add(value.handle)
-                found[prefix + name] = everywhere(matrix_memory(value), value)
+                sizes[prefix + name] = everywhere(matrix_memory(value), value)
             elif isinstance(value, PETSc.Vec):
                 seen.add(value.array_r.ctypes.data)
-                found[prefix + name] = everywhere(8.0 * value.getSize(), value)
+                sizes[prefix + name] = everywhere(8.0 * value.getSize(), value)
     for prefix, holder in holders:
         for name, value in vars(holder).items():
             if isinstance(value, np.ndarray):
                 new = value.ctypes.data not in seen or value.size == 0
                 seen.add(value.ctypes.data)
-                found[prefix + name] = found.get(prefix + name, 0.0) + float(comm.allreduce(value.nbytes * new))
+                sizes[prefix + name] = sizes.get(prefix + name, 0.0) + float(comm.allreduce(value.nbytes * new))
     solver = run.midpoint.solver
-    found["S"] = everywhere(matrix_memory(solver.S), solver.S)
+    sizes["S"] = everywhere(matrix_memory(solver.S), solver.S)
     factored = solver.ksp.getOperators()[0]
     if factored.handle != solver.S.handle:
-        found["S, factored"] = everywhere(matrix_memory(factored), factored)
+        sizes["S, factored"] = everywhere(matrix_memory(factored), factored)
     if solver.name != "cg" and solver.S.comm.size == 1:  # factors spread over ranks are out of reach
-        found["factor"] = everywhere(matrix_memory(solver.ksp.getPC().getFactorMatrix()), solver.S)
-    return {name: size for name, size in found.items() if size > 0}
-
-
-def _as_stepped(S: PETSc.Mat, d: int) -> Iterator[list[Array]]:
-    """The entries of a matrix as the steps may hold them: spread, whole, whole in the order of Cholesky. Collective."""
-    yield list(S.getValuesCSR())
-    whole = whole_copy(S)
-    ordered = dissect(whole, d).matrix(whole)
-    for copy in (whole, ordered):
-        yield list(copy.getValuesCSR())
-        copy.destroy()
-
-
-def nothing_of(name: str, case: Case) -> bool:
-    """Whether the operators are free of the effect: made again without its term they have the same bits. Collective."""
-    system, comm = case.model.system, case.model.system.layout.comm
-    layout, scene = system.layout, case.model.scene
-    if name == "damping":
-        s = 2 * scene.time.steps / scene.time_end
-        S = system.K_ee.copy()
-        S.axpy(s * s, system.M_ee, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        same = case.prints["S"] in (digest(comm, found) for found in _as_stepped(S, layout.dimension))
-        S.destroy()
-        return same and not system.damping.active and "step.k_old" not in case.bytes
-    if name == "gravity":
-        free = system.gravity is None
-        if scene.motion.drive == "motion" and not system.damping.in_space:
-            loads = -motion_table(scene, layout.n_s).a
-            free = free and digest(comm, [loads]) == case.prints["hand"]
-        return free
-    if name == "reaction":
-        return not system.two_way and not any(name.endswith(".Y") for name in case.bytes)
-    if name == "rotation":
-        return bool(layout.n_s == layout.dimension == system.T.shape[1])
-    return len(system.layers) == 1
+        sizes["factor"] = everywhere(matrix_memory(solver.ksp.getPC().getFactorMatrix()), solver.S)
+    return {name: size for name, size in sizes.items() if size > 0}
 
 
 # --- times
@@ -264,38 +228,19 @@ def measure_builds(
 
 
 def measure_steps(comm: MPI.Intracomm, cases: dict[str, Case], repeats: int, tick: Callable[[], None]) -> None:
-    """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective.
-
-    Args:
-        comm: ranks.
-        cases: filled in.
-        repeats: samples of each.
-        tick: called after each sample.
-    """
+    """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective."""
     steppers = {name: Stepper(case.model) for name, case in cases.items()}
     try:
         pace = next(iter(steppers.values())).seconds_per_step(5)
         for stepper in steppers.values():
             stepper.seconds_per_step(5)
         count = comm.bcast(int(np.clip(BURST_SECONDS / pace, 5, MOST_STEPS)))
-
-        def sampler(stepper: Stepper) -> Callable[[], float]:
-            def sample() -> float:
-                return stepper.seconds_per_step(count)
-
-            return sample
-
-        samplers = {name: sampler(stepper) for name, stepper in steppers.items()}
-        bursts: dict[str, list[float]] = {name: [] for name in cases}
+        samplers = {name: partial(stepper.seconds_per_step, count) for name, stepper in steppers.items()}
         for _ in range(repeats):
-            samples = interleave(samplers, BURSTS)
-            for name, seconds in medians(samples).items():
+            for name, seconds in medians(interleave(samplers, BURSTS)).items():
                 cases[name].seconds.setdefault("step", []).append(seconds)
-                bursts[name] += samples[name]
                 tick()
         for name, case in cases.items():
-            low, median, high = np.quantile(bursts[name], [0.25, 0.5, 0.75])
-            case.spread = float((high - low) / median)
             case.flops = steppers[name].flops()
             case.prints = fingerprint(case.model, steppers[name].run)
             case.bytes = holdings(case.model, steppers[name].run)
@@ -309,13 +254,13 @@ def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[
 
     Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
     """
-    with counting(comm) as made:
+    with counting(comm) as at_first:
         stepper = Stepper(build(scene, comm=comm))
         stepper.advance(1)
     with counting(comm) as in_steps:
         stepper.advance(STEPS)
     stepper.destroy()
-    return made, in_steps
+    return at_first, in_steps
 
 
 def count_objects(comm: MPI.Intracomm, cases: dict[str, Case], scenes: dict[str, Scene]) -> None:

@@ -31,7 +31,7 @@ def created(comm: MPI.Intracomm) -> dict[str, int]:
 
 def read_table(text: str) -> dict[str, int]:
     """Class and number of creations from the text of PETSc's log. Not collective."""
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     inside = False
     for line in text.splitlines():
         if line.startswith("Object Type"):
@@ -40,18 +40,18 @@ def read_table(text: str) -> dict[str, int]:
             break
         elif inside and len(parts := line.rsplit(None, 2)) == 3 and parts[1].isdigit() and parts[2].isdigit():
             name = parts[0].strip()
-            found[name] = found.get(name, 0) + int(parts[1])  # one row a stage
-    found.pop(OWN, None)
-    return found
+            counts[name] = counts.get(name, 0) + int(parts[1])  # one row a stage
+    counts.pop(OWN, None)
+    return counts
 
 
 @contextmanager
 def counting(comm: MPI.Intracomm) -> Iterator[dict[str, int]]:
     """Fills the dictionary with what is created inside. Collective."""
     PETSc.Log.begin()
-    before, found = created(comm), dict[str, int]()
-    yield found
-    found.update({name: n - before.get(name, 0) for name, n in created(comm).items() if n > before.get(name, 0)})
+    before, counts = created(comm), dict[str, int]()
+    yield counts
+    counts.update({name: n - before.get(name, 0) for name, n in created(comm).items() if n > before.get(name, 0)})
 
 
 def difference(more: dict[str, int], less: dict[str, int]) -> dict[str, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from softgrasp.study.effects.result import Change, Cost, Finding
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, OUTLINE, STEPS, WIDTH, paper_style, save
 
 COLOURS = {"needed": GREEN, "optional": BLUE, "wasted": ORANGE}
@@ -21,49 +21,14 @@ ROUNDING = 1e-15  # a smaller change is drawn as none
 ROW, BELOW = 0.34, 0.8  # [inch]
 
 
-@dataclass(frozen=True)
-class Mark:
-    """One effect in the picture.
-
-    Attributes:
-        name: the effect.
-        on: the scene has it on.
-        verdict: needed, optional or wasted.
-        label: the verdict in words.
-        change: of the outputs of the run [1].
-        control: of the outputs under a force [1]; None when that is no question.
-        together: of the outputs when the effects that bring it out are switched too [1]; None when it needs none.
-        step: added share of a step's time, median [1].
-        quartiles: of its samples [1].
-        memory: added share of the memory [1].
-    """
-
-    name: str
-    on: bool
-    verdict: str
-    label: str
-    change: float
-    control: float | None
-    together: float | None
-    step: float
-    quartiles: tuple[float, float]
-    memory: float
+Tried = tuple[Finding, Change, Cost]
 
 
 def figure_effects(
-    marks: Sequence[Mark], tolerance: float, noise: tuple[float, float], out_png: Path
+    findings: Sequence[Finding], tolerance: float, noise: tuple[float, float], out_png: Path
 ) -> tuple[Path, Path]:
-    """Each effect in a row: what it changes on the left, what it costs on the right; PNG and PDF.
-
-    Args:
-        marks: one for each effect that was tried.
-        tolerance: change that counts [1].
-        noise: quartiles of the step times of one scene against itself [1].
-        out_png: name of the picture; the PDF gets its stem.
-
-    Returns:
-        Names of PNG and PDF.
-    """
+    """Each effect in a row: what it changes on the left, what it costs on the right; PNG and PDF."""
+    marks = [(f, f.change, f.cost) for f in findings if f.change is not None and f.cost is not None]
     with paper_style():
         height = ROW * len(marks)
         size = (WIDTH, height + BELOW + 0.25)
@@ -76,7 +41,7 @@ def figure_effects(
         rows = np.arange(len(marks))[::-1]
         _changes(axes[0], marks, rows, tolerance)
         _costs(axes[1], marks, rows, noise)
-        axes[0].set_yticks(rows, [f"{m.name} ({'on' if m.on else 'off'})" for m in marks])
+        axes[0].set_yticks(rows, [f"{f.name} ({'on' if f.on else 'off'})" for f, _, _ in marks])
         for ax in axes:
             ax.set_ylim(-0.6, len(marks) - 0.4)
             ax.tick_params(axis="y", length=0)
@@ -86,20 +51,20 @@ def figure_effects(
         return save(figure, out_png)
 
 
-def _changes(ax: Any, marks: Sequence[Mark], rows: Any, tolerance: float) -> None:
-    values = [v for m in marks for v in (m.change, m.control, m.together) if v is not None and v > ROUNDING]
+def _changes(ax: Any, marks: Sequence[Tried], rows: Any, tolerance: float) -> None:
+    values = [v for f, c, _ in marks for v in (c.outputs, f.control, f.together) if v is not None and v > ROUNDING]
     low, high = min([*values, tolerance]), max([*values, tolerance])
     left = 10.0 ** (np.floor(np.log10(low)) - 1)  # a decade for those that change nothing
     nothing = 1.5 * left
-    for mark, row in zip(marks, rows, strict=True):
+    for (mark, change, _), row in zip(marks, rows, strict=True):
         colour = COLOURS[mark.verdict]
         look: dict[str, Any] = {"color": colour, "mfc": colour if mark.on else "white", "mew": 1.3, "ls": "none"}
         if mark.control is not None and mark.control > ROUNDING:
             ax.plot(mark.control, row, marker="D", ms=4.5, zorder=2, **look)
         if mark.together is not None:
             ax.plot(mark.together, row, marker="^", ms=6, zorder=2, **look)
-        if mark.change > ROUNDING:
-            ax.plot(mark.change, row, marker="o", ms=7, zorder=3, **look)
+        if change.outputs > ROUNDING:
+            ax.plot(change.outputs, row, marker="o", ms=7, zorder=3, **look)
         else:
             ax.plot(nothing, row, marker="<", ms=6.5, zorder=3, **look)
             ax.annotate("none", (nothing, row), (7, 0), textcoords="offset points", va="center", color=OUTLINE)
@@ -115,26 +80,28 @@ def _changes(ax: Any, marks: Sequence[Mark], rows: Any, tolerance: float) -> Non
     ax.set_xlabel("relative change of the outputs")
     grey: dict[str, Any] = {"color": OUTLINE, "ls": "none", "mew": 1.3}
     entries = [Line2D([], [], marker="o", ms=6, label="this run", **grey)]
-    if any(m.control is not None and m.control > ROUNDING for m in marks):
+    if any(f.control is not None and f.control > ROUNDING for f, _, _ in marks):
         entries.append(Line2D([], [], marker="D", ms=4.5, label="under a force", **grey))
-    if any(m.together is not None for m in marks):
+    if any(f.together is not None for f, _, _ in marks):
         entries.append(Line2D([], [], marker="^", ms=6, label="with a partner", **grey))
-    if not all(m.on for m in marks):
+    if not all(f.on for f, _, _ in marks):
         entries.append(Line2D([], [], marker="o", ms=6, mfc="white", label="off, tried", **grey))
     _legend(ax, entries)
 
 
-def _costs(ax: Any, marks: Sequence[Mark], rows: Any, noise: tuple[float, float]) -> None:
+def _costs(ax: Any, marks: Sequence[Tried], rows: Any, noise: tuple[float, float]) -> None:
     ax.axvspan(100 * min(noise[0], 0.0), 100 * max(noise[1], 0.0), color=BAND, lw=0, zorder=0)
-    for mark, row in zip(marks, rows, strict=True):
+    for (mark, _, cost), row in zip(marks, rows, strict=True):
         colour = COLOURS[mark.verdict]
         face = colour if mark.on else "white"
-        error = 100 * np.array([[mark.step - mark.quartiles[0]], [mark.quartiles[1] - mark.step]])
+        low, high = cost.step_quartiles
+        error = 100 * np.array([[cost.step_relative - low], [high - cost.step_relative]])
         ax.errorbar(
-            100 * mark.step, row + 0.13, xerr=error, fmt="o", ms=5.5, color=colour, mfc=face, mew=1.3, elinewidth=0.8,
+            100 * cost.step_relative, row + 0.13, xerr=error, fmt="o", ms=5.5, color=colour, mfc=face,
+            mew=1.3, elinewidth=0.8,
             capsize=2, zorder=3,
         )  # fmt: skip
-        ax.plot(100 * mark.memory, row - 0.17, marker="s", ms=4.5, color=colour, mfc=face, mew=1.3, zorder=3)
+        ax.plot(100 * cost.memory_relative, row - 0.17, marker="s", ms=4.5, color=colour, mfc=face, mew=1.3, zorder=3)
         ax.annotate(
             mark.label, (1.02, row), xycoords=("axes fraction", "data"), va="center", color=colour, weight="bold"
         )

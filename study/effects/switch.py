@@ -107,7 +107,7 @@ def neutral(scene: Scene, name: str, d: int) -> Scene | None:
 def _without(scene: Scene, name: str, d: int) -> Switch:
     if name == "rotation" and scene.motion.profile == "csv":
         return Switch(name, True, "on", None, "the columns of motion.csv hold the angles")
-    strength, unit = _strength(scene, name)
+    value, strength, unit = _value(scene, name)
 
     def edit(table: Table) -> None:
         effects = table["effects"]
@@ -126,32 +126,20 @@ def _without(scene: Scene, name: str, d: int) -> Switch:
         else:
             effects[name] = False
 
-    return Switch(name, True, _stated(scene, name), changed(scene, edit), "", strength, unit)
+    return Switch(name, True, value, changed(scene, edit), "", strength, unit)
 
 
-def _stated(scene: Scene, name: str) -> str:
-    effects = scene.effects
-    if name == "gravity" and effects.gravity is not None:
-        return f"g = {_vector(effects.gravity.g)} m/s2"
-    if name == "damping" and effects.damping is not None:
-        damping = effects.damping
-        alpha = f", alpha = {damping.alpha:g} 1/s" if damping.alpha else ""
-        return f"beta = {damping.beta:g} s{alpha}"
-    if name == "layers":
-        return f"{', '.join(scene.tissue.layers)} instead of tissue.material everywhere"
-    if name == "rotation":
-        return f"hand.inertia = {_inertia(scene.hand.inertia)} kg m2"
-    return "on"
-
-
-def _strength(scene: Scene, name: str) -> tuple[float | None, str]:
-    """Size of what the scene states; the change is proportional to g, and to beta and alpha while they are small."""
+def _value(scene: Scene, name: str) -> tuple[str, float | None, str]:
+    """What the scene states; size and unit where the change is proportional to it, for beta while it is small."""
     gravity, damping = scene.effects.gravity, scene.effects.damping
     if name == "gravity" and gravity is not None:
-        return math.hypot(*gravity.g), "m/s2"
-    if name == "damping" and damping is not None and not damping.alpha:
-        return damping.beta, "s"
-    return None, ""
+        return f"g = {_vector(gravity.g)} m/s2", math.hypot(*gravity.g), "m/s2"
+    if name == "damping" and damping is not None:
+        text = f"beta = {damping.beta:g} s"
+        return (f"{text}, alpha = {damping.alpha:g} 1/s", None, "") if damping.alpha else (text, damping.beta, "s")
+    if name == "layers":
+        return f"{', '.join(scene.tissue.layers)} instead of tissue.material everywhere", None, ""
+    return f"hand.inertia = {_inertia(scene.hand.inertia)} kg m2" if name == "rotation" else "on", None, ""
 
 
 # --- an effect that is off, put in with a trial value

@@ -5,15 +5,16 @@ The numbering is that of the SLICOT subroutine BB01AD (Abels, Benner, SLICOT Wor
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.care import care
-from softgrasp.study.hardcases.cases import EPS, Family, Row, ours, plain, thin
+from softgrasp.study.hardcases.cases import EPS, Family, HardCase, here, textbook, thin
 
 BYERS = "as many roundings as the Hamiltonian matrix has rows, times the condition of the equation [B85]"
 
@@ -121,7 +122,7 @@ def _error(X: Array, exact: Array) -> float:
     return float(np.linalg.norm(X - exact) / np.linalg.norm(exact))
 
 
-def _ours(x: Example) -> float:
+def _here(x: Example) -> float:
     return _error(care(x.A, x.B, x.C, x.Q, x.R).X, x.X)
 
 
@@ -134,7 +135,7 @@ def chain(n: int = 21) -> tuple[Array, Array, Array]:
     return np.eye(n, k=1), np.eye(n)[:, -1:], np.eye(n)[:1]
 
 
-def _chain_ours() -> float:
+def _chain_here() -> float:
     A, B, C = chain()
     return abs(float(care(A, B, C, np.eye(1), np.eye(1)).X[0, -1]) - 1)
 
@@ -144,34 +145,31 @@ def _chain_scipy() -> float:
     return abs(float(scipy.linalg.solve_continuous_are(A, B, C.T @ C, np.eye(1))[0, -1]) - 1)
 
 
-def carex_rows(quick: bool) -> list[Row]:
+def carex_rows(quick: bool) -> Iterator[HardCase]:
     """Relative error of X against the known solution."""
-    rows: list[Row] = []
+    place = count(1)
     for number, make, parameters in EXAMPLES:
         for e in parameters[:1] + parameters[-1:] if quick and len(parameters) > 1 else parameters:
             x = make(e)
             name = f"CAREX {number}" + (f", parameter {e:g}" if len(parameters) > 1 else "")
-            rows.append(Row(name, len(rows) + 1, ours(_ours, x), plain(_scipy, x), x.bound, BYERS))
+            yield HardCase(name, next(place), here(_here, x), textbook(_scipy, x), x.bound, BYERS)
     reason = "X has the condition 2e17, so nothing is certain; three digits are asked, the tolerance of every study"
-    rows.append(Row("CAREX 4.1, entry x_1n", len(rows) + 1, ours(_chain_ours), plain(_chain_scipy), 1e-3, reason))
-    return rows
+    yield HardCase("CAREX 4.1, entry x_1n", next(place), here(_chain_here), textbook(_chain_scipy), 1e-3, reason)
 
 
-def reach_rows(quick: bool) -> list[Row]:
+def reach_rows(quick: bool) -> Iterator[HardCase]:
     """CAREX 2.1: an unstable mode that the input reaches less and less."""
-    rows = []
     for power in thin([0, -1, -2, -3, -4, -5, -6, -7, -8, -10, -12], quick):
         e = 10.0**power
         x = example_2_1(e)
         reason = BYERS + "; X grows like 2 / e^2 and from 1e12 on it may be refused"
-        mine = ours(_ours, x)
-        rows.append(Row(f"B = [{e:.0e}, 0]", e, mine, plain(_scipy, x), x.bound, reason, may_refuse=power < -6))
-    return rows
+        answers = here(_here, x), textbook(_scipy, x)
+        yield HardCase(f"B = [{e:.0e}, 0]", e, *answers, x.bound, reason, may_refuse=power < -6)
 
 
 FAMILIES = (
     Family("carex", "Riccati equations with known solutions", "example", "relative error of X", "SciPy's solver",
-           "Balancing and two Newton steps keep what the plain Schur method loses when scales differ.", carex_rows,
+           "Balancing and two Newton steps keep what the Schur method alone loses when scales differ.", carex_rows,
            axis="listed"),
     Family("reach", "A mode that the input hardly reaches", "share of the input that reaches the unstable mode",
            "relative error of X", "SciPy's solver",

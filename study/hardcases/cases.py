@@ -1,12 +1,12 @@
-"""What a hard case is: a number from our way and from the plain one, a bound with its reason, and a verdict."""
+"""A hard case: a number from here and from the textbook way, a bound with its reason, and a verdict."""
 
 from __future__ import annotations
 
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.petsc import PETSc, to_scipy
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 
 Array = NDArray[np.float64]
@@ -26,12 +26,12 @@ LENGTH = 400  # characters of a message that are kept
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one way gave: a number, or the sentence with which it ended.
+    """Result of one way: a number, or the sentence with which it ended.
 
     Attributes:
         value: the measured number; None when there is none.
         text: the refusal or failure in words, or a remark on the number.
-        refused: whether it ended by one of our own errors.
+        refused: it ended by one of our own errors.
     """
 
     value: float | None
@@ -45,14 +45,14 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Row:
+class HardCase:
     """One case.
 
     Attributes:
         case: what is special, in words.
         x: the varied number, the position in the picture.
-        ours, plain: what our way and the textbook way gave.
-        bound: ours must not exceed it; None when the case has to be refused.
+        here, textbook: what softgrasp and the textbook way gave.
+        bound: the number from here must not exceed it; None when the case has to be refused.
         reason: where the bound comes from.
         may_refuse: a refusal is as good as a number within the bound.
         group: curve of the picture it belongs to.
@@ -60,8 +60,8 @@ class Row:
 
     case: str
     x: float
-    ours: Outcome
-    plain: Outcome
+    here: Outcome
+    textbook: Outcome
     bound: float | None
     reason: str
     may_refuse: bool = False
@@ -69,12 +69,12 @@ class Row:
 
     @property
     def verdict(self) -> Verdict:
-        """Within the bound, beyond it, or refused with a sentence. NaN is beyond every bound."""
-        if self.ours.refused:
+        """Within the bound, above it, or refused with a sentence. NaN is above every bound."""
+        if self.here.refused:
             return "refused"
-        if self.ours.value is None or self.bound is None:
+        if self.here.value is None or self.bound is None:
             return "fail"
-        return "pass" if self.ours.value <= self.bound else "fail"
+        return "pass" if self.here.value <= self.bound else "fail"
 
     @property
     def ok(self) -> bool:
@@ -87,7 +87,7 @@ class Row:
     def verdict_text(self) -> str:
         """The verdict with the sentence of a refusal."""
         if self.verdict == "refused":
-            return f"refused: {self.ours.text}" if self.ok else f"fail, refused: {self.ours.text}"
+            return f"refused: {self.here.text}" if self.ok else f"fail, refused: {self.here.text}"
         return self.verdict
 
     @property
@@ -96,6 +96,22 @@ class Row:
         if self.bound is None:
             return "must be refused"
         return f"<= {self.bound:.2g}" + (" or refused" if self.may_refuse else "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its entry in result.json."""
+        return {
+            "case": self.case,
+            "x": self.x,
+            "group": self.group,
+            "bound": self.bound,
+            "must_be_refused": self.bound is None,
+            "may_be_refused": self.may_refuse,
+            "reason": self.reason,
+            "ours": asdict(self.here),
+            "plain": asdict(self.textbook),
+            "verdict": self.verdict_text,
+            "ok": self.ok,
+        }
 
 
 @dataclass(frozen=True)
@@ -107,9 +123,9 @@ class Family:
         title: what is hard, in words.
         varied: label of the varied number with its unit.
         quantity: label of the measured number with its unit.
-        plain: the textbook way in a few words.
+        textbook: the textbook way in a few words.
         lesson: what the comparison shows, one or two sentences.
-        rows: makes the rows; True for the quick half.
+        cases: runs them; True for the quick half.
         axis: of the varied number in the picture: a logarithm, linear, or the cases one below the other.
     """
 
@@ -117,9 +133,9 @@ class Family:
     title: str
     varied: str
     quantity: str
-    plain: str
+    textbook: str
     lesson: str
-    rows: Callable[[bool], list[Row]]
+    cases: Callable[[bool], Iterable[HardCase]]
     axis: Literal["log", "linear", "listed"] = "log"
 
 
@@ -129,15 +145,15 @@ def _short(error: BaseException) -> str:
     return text if len(text) <= LENGTH else text[: LENGTH - 3] + "..."
 
 
-def ours(work: Callable[..., float], *arguments: Any) -> Outcome:
-    """Run our way; one of our own errors is a refusal, any other exception goes through. Not collective."""
+def here(work: Callable[..., float], *arguments: Any) -> Outcome:
+    """Run a case here; one of our own errors is a refusal, any other exception goes through."""
     try:
         return Outcome(float(work(*arguments)))
     except SoftgraspError as error:
         return Outcome(None, _short(error), refused=True)
 
 
-def plain(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
+def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
     """Run the textbook way; whatever it raises or warns is its outcome. Not collective."""
     with np.errstate(all="ignore"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -163,21 +179,13 @@ def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Mod
     return build(load_scene(shipped_scenes()[name], overrides), comm=comm)
 
 
-def sparse(A: PETSc.Mat) -> Any:
-    """A matrix of one rank as SciPy CSR. Not collective."""
-    import scipy.sparse
-
-    indptr, columns, values = A.getValuesCSR()
-    return scipy.sparse.csr_matrix((values, columns, indptr), shape=A.getSize())
-
-
 def scaled_condition(A: PETSc.Mat) -> float:
     """Condition of a symmetric positive definite matrix with its diagonal scaled to one [VDS69]. Not collective.
 
     Up to the size of the matrix it is the least that any diagonal scaling reaches, and what Cholesky's error depends
     on. For matrices of hundreds of rows.
     """
-    dense = np.asarray(sparse(A).toarray())
+    dense = np.asarray(to_scipy(A).toarray())
     scale = 1 / np.sqrt(np.diag(dense))
     values = np.linalg.eigvalsh(scale[:, None] * dense * scale)
     return float(values[-1] / values[0])
@@ -186,13 +194,6 @@ def scaled_condition(A: PETSc.Mat) -> float:
 def qr_rounding(rows: int, columns: int) -> float:
     """Bound on |Q'Q - I| of Householder's QR without its constant, rows x columns x eps [H02]. Not collective."""
     return rows * columns * EPS
-
-
-def relative(a: Array, b: Array) -> float:
-    """Largest difference over the largest entry of b; infinite when it is not finite. Not collective."""
-    if not np.isfinite(a).all():
-        return math.inf
-    return float(np.abs(a - b).max() / np.abs(b).max())
 
 
 def thin(values: Sequence[float], quick: bool) -> list[float]:

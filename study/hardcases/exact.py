@@ -70,7 +70,7 @@ def exact_gain(problem: RiccatiProblem) -> Array:
     raise ValueError(f"the exact gain is not settled after {STEPS} corrections")
 
 
-def gain_error(K: Array, exact: Array, n_s: int) -> float:
+def worst_part_error(K: Array, exact: Array, n_s: int) -> float:
     """Largest relative error among the gains for q_s, v_s, z and v_z, each over its own norm. Not collective.
 
     The gain for the hand is up to twelve decades larger; over the norm of all, gains for the tissue could be left

@@ -4,35 +4,34 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.errors import Interrupted
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem, Damping
-from softgrasp.study.hardcases.cases import EPS, Family, Row, make, ours, plain, scaled_condition, sparse, thin
+from softgrasp.study.hardcases.cases import EPS, Family, HardCase, here, make, scaled_condition, textbook, thin
 from softgrasp.study.hardcases.textbook import implicit_and_explicit, in_turn, textbook_midpoint
 
 SMALL = ("tissue.cells=[3, 6]", "control=false")
-REST = "motion={profile='hold'}"
 
 
-def mixed_state(system: BlockSystem) -> Array:
-    """A displacement in which every mode takes part, of the size of the body's cells. Not collective."""
-    return 0.05 * np.random.default_rng(3).standard_normal(system.layout.n_e)
-
-
-def first_period(system: BlockSystem) -> float:
-    """T_1 = 2 pi / omega_1 [s]. Not collective."""
-    return float(2 * math.pi / lowest_modes(system, 1)[0][0])
+def free_body() -> tuple[BlockSystem, Array, float, Any, Any]:
+    """A held body, a displacement in which every mode takes part, T_1 = 2 pi / omega_1 [s], and M, K in SciPy."""
+    system = make("paper_forward", *SMALL, "motion={profile='hold'}").system
+    z = 0.05 * np.random.default_rng(3).standard_normal(system.layout.n_e)
+    period = float(2 * math.pi / lowest_modes(system, 1)[0][0])
+    return system, z, period, to_scipy(system.M_ee), to_scipy(system.K_ee)
 
 
 def let_go(system: BlockSystem, z: Array, dt: float, steps: int) -> tuple[float, float]:
@@ -89,52 +88,39 @@ def drift_bound(system: BlockSystem, ratio: float, dt: float, steps: int) -> tup
     )
 
 
-def step_rows(quick: bool) -> list[Row]:
+def step_rows(quick: bool) -> Iterator[HardCase]:
     """Energy of a free vibration for steps from a thousandth to a thousand first periods."""
-    system = make("paper_forward", *SMALL, REST).system
-    z, period, steps = mixed_state(system), first_period(system), 400 if quick else 2000
-    M, K = sparse(system.M_ee), sparse(system.K_ee)
-    rows = []
+    (system, z, period, M, K), steps = free_body(), 400 if quick else 2000
     for ratio in thin([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e3], quick):
         dt = ratio * period
-        mine = ours(_drift, system, z, dt, steps)
-        newmark = plain(implicit_and_explicit, M, K, None, z, dt, steps)
-        rows.append(
-            Row(f"dt = {ratio:g} T1, {steps} steps", ratio, mine, newmark, *drift_bound(system, ratio, dt, steps))
-        )
-    return rows
+        drift = here(_drift, system, z, dt, steps)
+        newmark = textbook(implicit_and_explicit, M, K, None, z, dt, steps)
+        bound = drift_bound(system, ratio, dt, steps)
+        yield HardCase(f"dt = {ratio:g} T1, {steps} steps", ratio, drift, newmark, *bound)
 
 
-def long_rows(quick: bool) -> list[Row]:
+def long_rows(quick: bool) -> Iterator[HardCase]:
     """Energy after 1e5 steps of free vibration."""
-    system = make("paper_forward", *SMALL, REST).system
-    z, period, steps = mixed_state(system), first_period(system), 3000 if quick else 100_000
-    M, K = sparse(system.M_ee), sparse(system.K_ee)
-    rows = []
+    (system, z, period, M, K), steps = free_body(), 3000 if quick else 100_000
     for ratio in [1e-3] if quick else [1e-3, 1e-2, 1.0, 100.0]:
         dt = ratio * period
-        mine = ours(_drift, system, z, dt, steps)
-        loop = plain(textbook_midpoint, M, K, z, dt, steps)
-        rows.append(Row(f"{steps} steps of {ratio:g} T1", ratio, mine, loop, *drift_bound(system, ratio, dt, steps)))
-    return rows
+        drift = here(_drift, system, z, dt, steps)
+        loop = textbook(textbook_midpoint, M, K, z, dt, steps)
+        yield HardCase(f"{steps} steps of {ratio:g} T1", ratio, drift, loop, *drift_bound(system, ratio, dt, steps))
 
 
-def damping_rows(quick: bool) -> list[Row]:
+def damping_rows(quick: bool) -> Iterator[HardCase]:
     """Energy balance of a let-go body for damping from none to a million times critical."""
-    system = make("paper_forward", *SMALL, REST).system
-    z, period, steps = mixed_state(system), first_period(system), 200 if quick else 1000
+    (system, z, period, M, K), steps = free_body(), 200 if quick else 1000
     omega, dt = 2 * math.pi / period, period / 500
-    M, K = sparse(system.M_ee), sparse(system.K_ee)
-    rows = []
     for zeta in thin([0.0, 1e-14, 1e-8, 1e-2, 1.0, 1e3, 1e6], quick):
         beta = 2 * zeta / omega
         damped = replace(system, damping=Damping(beta=beta))
-        newmark = plain(implicit_and_explicit, M, K, beta * K if beta else None, z, dt, steps)
+        newmark = textbook(implicit_and_explicit, M, K, beta * K if beta else None, z, dt, steps)
         name = "undamped" if zeta == 0 else f"{zeta:g} of critical in the first mode"
         reason = "what is lost must be what damping took, up to 2 p eps cond(S) sqrt(steps), a random walk of roundings"
         bound = math.sqrt(steps) * solve_rounding(damped, dt)
-        rows.append(Row(name, zeta, ours(_balance, damped, z, dt, steps), newmark, bound, reason))
-    return rows
+        yield HardCase(name, zeta, here(_balance, damped, z, dt, steps), newmark, bound, reason)
 
 
 def _momentum_error(model: Model, push: Array) -> float:
@@ -143,24 +129,22 @@ def _momentum_error(model: Model, push: Array) -> float:
     still = np.zeros_like(push)
     run = simulate(model, force=lambda n, t, q, v: push / dt if n == 0 else still)
     v_z = run.final[system.layout.n_local :]
-    found = (system.M_hand + system.M_rigid) @ run.v_s[-1] + system.G.T @ v_z
-    return float(np.abs(found - push).max() / push.max())
+    momentum = (system.M_hand + system.M_rigid) @ run.v_s[-1] + system.G.T @ v_z
+    return float(np.abs(momentum - push).max() / push.max())
 
 
-def mass_rows(quick: bool) -> list[Row]:
+def mass_rows(quick: bool) -> Iterator[HardCase]:
     """Momentum of hand and tissue after a short push, for hands from a thousandth to a million tissue masses."""
-    rows = []
     tissue, push, dt, steps = 2.0, np.array([1.0, 0.5]), 0.005, 200 if quick else 1000
     for ratio in thin([1e-3, 1e-2, 0.1, 1.0, 10.0, 1e3, 1e6], quick):
         scene = (f"hand.mass={tissue * ratio!r}", "effects={reaction=true}", "motion={profile='hold', drive='force'}")
         model = make("paper_forward", *SMALL, *scene, f"time={{steps={steps}, end={dt * steps!r}}}")
         system = model.system
-        operators = sparse(system.M_ee), sparse(system.K_ee), system.G, system.M_rigid, system.M_hand
-        turns = plain(in_turn, *operators, push, dt, steps)
+        operators = to_scipy(system.M_ee), to_scipy(system.K_ee), system.G, system.M_rigid, system.M_hand
+        turns = textbook(in_turn, *operators, push, dt, steps)
         reason = "without outer force the momentum is constant: ten sums and products a step, each rounded once"
         bound = 10 * steps * EPS
-        rows.append(Row(f"hand / tissue = {ratio:g}", ratio, ours(_momentum_error, model, push), turns, bound, reason))
-    return rows
+        yield HardCase(f"hand / tissue = {ratio:g}", ratio, here(_momentum_error, model, push), turns, bound, reason)
 
 
 RESTARTS = {
@@ -220,22 +204,19 @@ def _from_state_only(model: Model, stop: int) -> float:
     return float((final.view(np.int64) != whole.final.view(np.int64)).sum())
 
 
-def restart_rows(quick: bool) -> list[Row]:
+def restart_rows(quick: bool) -> Iterator[HardCase]:
     """Stop in the middle, go on from the restart file, and count the doubles that differ from an unbroken run."""
-    rows = []
-    names = list(RESTARTS)[: 2 if quick else None]
-    for i, name in enumerate(names):
+    for i, name in enumerate(list(RESTARTS)[: 2 if quick else None]):
         model = make("paper_forward", "tissue.cells=[4, 8]", "time.steps=60", *RESTARTS[name])
-        mine, lost = ours(_interrupted, model, 23), plain(_from_state_only, model, 23)
-        rows.append(Row(name, i + 1, mine, lost, 0.0, "the same bits, not nearly the same"))
-    return rows
+        resumed, lost = here(_interrupted, model, 23), textbook(_from_state_only, model, 23)
+        yield HardCase(name, i + 1, resumed, lost, 0.0, "the same bits, not nearly the same")
 
 
 FAMILIES = (
     Family("step", "Time steps from tiny to huge", "time step / first period", "relative energy drift",
            "Newmark's rule",
-           "Both implicit rules keep the energy, ours with up to three digits more at huge steps; explicit leapfrog "
-           "blows up beyond the period of the smallest cell.",
+           "Both implicit rules keep the energy, this one with up to three digits more at huge steps; explicit "
+           "leapfrog blows up beyond the period of the smallest cell.",
            step_rows),
     Family("long", "Very many steps", "time step / first period", "relative energy drift",
            "midpoint rule with M v computed anew",

@@ -14,10 +14,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import scene_schema
-from softgrasp.study.hardcases.cases import Family, Outcome, Row, make, ours, plain, sparse
+from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, make, textbook
 from softgrasp.study.hardcases.textbook import textbook_midpoint
 
 BAD = ("nan", "inf", "-inf")
@@ -50,11 +51,11 @@ outputs = [{ kind = "node", point = [0.5, 0.0] }]
 def numeric_keys() -> list[tuple[str, str, str]]:
     """Every numeric key of a scene as (dotted path, number or integer, TOML text with %s for the value)."""
     schema = scene_schema()
-    found = sorted({key for key in _walk(schema, schema["$defs"], "") if not key[0].endswith((".young", ".poisson"))})
+    keys = sorted({key for key in _walk(schema, schema["$defs"], "") if not key[0].endswith((".young", ".poisson"))})
     for part in ("tissue.material", "tissue.layers.low.material"):  # the other way to write a material
-        found.append((f"{part}.young", "number", "{young=%s, poisson=0.3, rho=1.0}"))
-        found.append((f"{part}.poisson", "number", "{young=1.0, poisson=%s, rho=1.0}"))
-    return found
+        keys.append((f"{part}.young", "number", "{young=%s, poisson=0.3, rho=1.0}"))
+        keys.append((f"{part}.poisson", "number", "{young=1.0, poisson=%s, rho=1.0}"))
+    return keys
 
 
 def _walk(node: dict[str, Any], definitions: dict[str, Any], path: str) -> Iterator[tuple[str, str, str]]:
@@ -94,7 +95,7 @@ def accepted(file: Path, path: str, text: str) -> list[str]:
     return result
 
 
-def plain_accepted(kind: str) -> int:
+def type_check_accepts(kind: str) -> int:
     """How many of the bad values a type check alone takes: TOML has them, and they are floats."""
     adapter: TypeAdapter[Any] = TypeAdapter(float if kind == "number" else int)
     count = 0
@@ -107,27 +108,26 @@ def plain_accepted(kind: str) -> int:
     return count
 
 
-def number_rows(quick: bool) -> list[Row]:
+def number_rows(quick: bool) -> Iterator[HardCase]:
     """One row a section of the scene; then files and forces with NaN."""
-    keys, rows = numeric_keys(), []
+    keys = numeric_keys()
     sections = list(dict.fromkeys(path.split(".", 1)[0] for path, _, _ in keys))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scene.toml"
         file.write_text(SCENE)
         load_scene(file)
         for i, section in enumerate(sections):
-            mine = [key for key in keys if key[0].split(".", 1)[0] == section]
-            taken = [note for path, _, text in mine for note in accepted(file, path, text)]
-            found = Outcome(float(len(taken)), taken[0] if taken else "")
-            count = float(sum(plain_accepted(kind) for _, kind, _ in mine))
-            rows.append(Row(f"[{section}], {len(mine)} keys", i + 1, found, Outcome(count), 0.0,
-                            "every one must be refused, and the sentence must name the key"))  # fmt: skip
-        rows += _file_rows(Path(folder), file, len(sections) + 1)
-    rows.append(_force_row(len(rows) + 1))
-    return rows
+            own = [key for key in keys if key[0].split(".", 1)[0] == section]
+            taken = [note for path, _, text in own for note in accepted(file, path, text)]
+            answer = Outcome(float(len(taken)), taken[0] if taken else "")
+            accepts = Outcome(float(sum(type_check_accepts(kind) for _, kind, _ in own)))
+            reason = "every one must be refused, and the sentence must name the key"
+            yield HardCase(f"[{section}], {len(own)} keys", i + 1, answer, accepts, 0.0, reason)
+        yield from _file_rows(Path(folder), file, len(sections) + 1)
+    yield _force_row(len(sections) + 3)
 
 
-def _file_rows(folder: Path, scene: Path, at: int) -> list[Row]:
+def _file_rows(folder: Path, scene: Path, at: int) -> Iterator[HardCase]:
     """NaN in a trajectory and in a mesh file."""
     (folder / "hand.csv").write_text("0,0,0\n0.5,nan,0\n1,1,1\n")
     (folder / "body.mesh").write_text(
@@ -147,13 +147,11 @@ def _file_rows(folder: Path, scene: Path, at: int) -> list[Row]:
     reason = "a file must be refused before the first step"
     lines = (folder / "body.mesh").read_text().split()
     taken = Outcome(float(sum(not np.isfinite(float(x)) for x in lines if x[0].isdigit() or x == "nan")))
-    return [
-        Row("NaN in a trajectory file", at, ours(lambda: run(motion)), plain(read), None, reason),
-        Row("NaN in a mesh file", at + 1, ours(lambda: run(mesh)), taken, None, reason),
-    ]
+    yield HardCase("NaN in a trajectory file", at, here(lambda: run(motion)), textbook(read), None, reason)
+    yield HardCase("NaN in a mesh file", at + 1, here(lambda: run(mesh)), taken, None, reason)
 
 
-def _force_row(at: int) -> Row:
+def _force_row(at: int) -> HardCase:
     """A controller that gives NaN in the middle of a run."""
     model = make("paper_forward", "tissue.cells=[2, 4]", "time.steps=60")
 
@@ -163,10 +161,10 @@ def _force_row(at: int) -> Row:
 
     def loop() -> float:
         z = np.full(model.system.layout.n_e, np.nan)
-        return textbook_midpoint(sparse(model.system.M_ee), sparse(model.system.K_ee), z, 0.1, 5)
+        return textbook_midpoint(to_scipy(model.system.M_ee), to_scipy(model.system.K_ee), z, 0.1, 5)
 
-    return Row("feedback that turns NaN at step 30", at, ours(run), plain(loop), None,
-               "the run must stop and not write NaN as a result")  # fmt: skip
+    reason = "the run must stop and not write NaN as a result"
+    return HardCase("feedback that turns NaN at step 30", at, here(run), textbook(loop), None, reason)
 
 
 FAMILIES = (

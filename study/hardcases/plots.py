@@ -1,4 +1,4 @@
-"""One picture a family of hard cases: ours and the textbook way against the bound."""
+"""One picture a family of hard cases: softgrasp and the textbook way against the bound."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.study.hardcases.cases import Family, Outcome, Row
+from softgrasp.study.hardcases.cases import Family, HardCase, Outcome
 from softgrasp.study.pictures.style import BLUE, COLUMN, ORANGE, OUTLINE, WIDTH, paper_style, save
 
 FLOOR = 1e-17  # smaller numbers, and zero, are drawn here
@@ -22,17 +22,8 @@ WORDS = 42  # [letters] of a failure that fit beside the frame
 SIZE = 4.5  # of a mark
 
 
-def figure_family(family: Family, rows: Sequence[Row], out_png: Path) -> tuple[Path, Path]:
-    """Numbers against what is varied, with lanes above for refusals and for what has no number; PNG and PDF.
-
-    Args:
-        family: labels.
-        rows: at least one.
-        out_png: name of the picture; the PDF gets its stem.
-
-    Returns:
-        Names of PNG and PDF.
-    """
+def figure_family(family: Family, rows: Sequence[HardCase], out_png: Path) -> tuple[Path, Path]:
+    """Numbers against what is varied, with lanes above for refusals and for what has no number; PNG and PDF."""
     with paper_style():
         draw = _listed if family.axis == "listed" else _curves
         return save(draw(family, rows), out_png)
@@ -46,20 +37,20 @@ def _drawn(outcome: Outcome) -> float:
     return math.log10(max(value, FLOOR))
 
 
-def _range(rows: Sequence[Row]) -> tuple[float, float]:
+def _range(rows: Sequence[HardCase]) -> tuple[float, float]:
     """Decades that hold all numbers and bounds."""
-    values = [v for r in rows for o in (r.ours, r.plain) if math.isfinite(v := _drawn(o))]
+    values = [v for r in rows for o in (r.here, r.textbook) if math.isfinite(v := _drawn(o))]
     values += [math.log10(max(r.bound, FLOOR)) for r in rows if r.bound is not None]
     return (min(values) - GAP, max(values) + GAP) if values else (-1.0, 1.0)
 
 
-def _ticks(low: float, high: float, wanted: int) -> list[int]:
-    """Round powers of ten between two, not more than about wanted."""
-    step = next(s for s in (1, 2, 3, 4, 5, 10, 20, 50, 100, 200, 500) if (high - low) / s <= wanted)
+def _ticks(low: float, high: float, count: int) -> list[int]:
+    """Round powers of ten between two, not more than about so many."""
+    step = next(s for s in (1, 2, 3, 4, 5, 10, 20, 50, 100, 200, 500) if (high - low) / s <= count)
     return list(range(step * math.ceil(low / step), math.floor(high) + 1, step))
 
 
-def _positions(family: Family, rows: Sequence[Row]) -> tuple[dict[float, float], list[float], list[str]]:
+def _positions(family: Family, rows: Sequence[HardCase]) -> tuple[dict[float, float], list[float], list[str]]:
     """Where each varied number stands, and the ticks; zero stands apart on the left of a logarithm."""
     xs = sorted({r.x for r in rows})
     if family.axis == "linear":
@@ -74,8 +65,8 @@ def _positions(family: Family, rows: Sequence[Row]) -> tuple[dict[float, float],
     return (at, [apart, *ticks], ["0", *names]) if 0.0 in at else (at, ticks, names)
 
 
-def _curves(family: Family, rows: Sequence[Row]) -> Any:
-    """Number against varied number; a curve for each group of ours, one for the textbook way."""
+def _curves(family: Family, rows: Sequence[HardCase]) -> Any:
+    """Number against varied number; a curve for each group, one for the textbook way."""
     figure, ax = plt.subplots(figsize=(COLUMN + 0.9, 2.9), layout="constrained")
     low, high = _range(rows)
     lane = max(0.6, 0.11 * (high - low))
@@ -84,19 +75,19 @@ def _curves(family: Family, rows: Sequence[Row]) -> Any:
     marks: dict[str, Any] = {}
     groups = list(dict.fromkeys(r.group for r in rows))
     first = {r.x: r for r in reversed(rows)}
-    ways = [("plain", family.plain, sorted(first.values(), key=lambda r: r.x), ORANGE, "x", "-")]
+    ways = [("textbook", family.textbook, sorted(first.values(), key=lambda r: r.x), ORANGE, "x", "-")]
     for k, group in enumerate(groups):
-        mine = sorted((r for r in rows if r.group == group), key=lambda r: r.x)
-        name = f"ours, {group}" if group else "ours"
-        ways.append(("ours", name, mine, BLUE, "os"[k % 2], "-" if k == 0 else "--"))
-    for way, name, mine, colour, marker, line in ways:
-        x = [at[r.x] for r in mine]
-        ax.plot(x, [_drawn(getattr(r, way)) for r in mine], color=colour, marker=marker, ms=SIZE, lw=1.0, ls=line)
-        for r in mine:
+        own = sorted((r for r in rows if r.group == group), key=lambda r: r.x)
+        name = f"here, {group}" if group else "here"
+        ways.append(("here", name, own, BLUE, "os"[k % 2], "-" if k == 0 else "--"))
+    for way, name, own, colour, marker, line in ways:
+        x = [at[r.x] for r in own]
+        ax.plot(x, [_drawn(getattr(r, way)) for r in own], color=colour, marker=marker, ms=SIZE, lw=1.0, ls=line)
+        for r in own:
             outcome: Outcome = getattr(r, way)
             if math.isnan(_drawn(outcome)):
                 height = (
-                    lanes["refused" if outcome.refused else "no number"] + (0.12 if way == "plain" else -0.12) * lane
+                    lanes["refused" if outcome.refused else "no number"] + (0.12 if way == "textbook" else -0.12) * lane
                 )
                 ax.plot(at[r.x], height, marker, color=colour, ms=SIZE)
         marks[name] = Line2D([], [], color=colour, marker=marker, ms=SIZE, lw=1.0, ls=line)
@@ -113,17 +104,17 @@ def _curves(family: Family, rows: Sequence[Row]) -> Any:
     ax.set_xlim(min(at.values()) - 0.06 * span, max(at.values()) + 0.06 * span)
     ax.set_xlabel(family.varied)
     ax.set_ylabel(family.quantity)
-    shown = sorted(marks, key=lambda name: (name == "bound", not name.startswith("ours")))
+    shown = sorted(marks, key=lambda name: (name == "bound", not name.startswith("here")))
     figure.legend(
         [marks[n] for n in shown], shown, loc="outside upper left", ncols=2, handlelength=1.6, columnspacing=1.2
     )
     return figure
 
 
-def _listed(family: Family, rows: Sequence[Row]) -> Any:
+def _listed(family: Family, rows: Sequence[HardCase]) -> Any:
     """One line a case; numbers to the right, on a logarithm when some of them are small."""
     figure, ax = plt.subplots(figsize=(WIDTH, 0.95 + 0.33 * len(rows)), layout="constrained")
-    values = [v for r in rows for v in (r.ours.value, r.plain.value, r.bound) if v is not None and math.isfinite(v)]
+    values = [v for r in rows for v in (r.here.value, r.textbook.value, r.bound) if v is not None and math.isfinite(v)]
     scaled = min((v for v in values if v > 0), default=1.0) < 1e-2
     if scaled:
         low, high = _range(rows)
@@ -134,7 +125,7 @@ def _listed(family: Family, rows: Sequence[Row]) -> Any:
         if row.bound is not None:
             at = math.log10(max(row.bound, FLOOR)) if scaled else row.bound
             ax.plot([at, at], [i - 0.36, i + 0.36], color=OUTLINE, lw=1.6)
-        for outcome, colour, marker, shift in ((row.ours, BLUE, "o", -0.2), (row.plain, ORANGE, "x", 0.2)):
+        for outcome, colour, marker, shift in ((row.here, BLUE, "o", -0.2), (row.textbook, ORANGE, "x", 0.2)):
             place = _drawn(outcome)
             if not scaled and math.isfinite(place):
                 place = outcome.value or 0.0
@@ -156,8 +147,8 @@ def _listed(family: Family, rows: Sequence[Row]) -> Any:
     ax.axvline(high, color="#bbbbbb", lw=0.6)
     ax.set_xlabel(family.quantity, loc="left")
     marks = {
-        "ours": Line2D([], [], color=BLUE, marker="o", ms=SIZE, ls=""),
-        family.plain: Line2D([], [], color=ORANGE, marker="x", ms=SIZE, ls=""),
+        "here": Line2D([], [], color=BLUE, marker="o", ms=SIZE, ls=""),
+        family.textbook: Line2D([], [], color=ORANGE, marker="x", ms=SIZE, ls=""),
         "bound": Line2D([], [], color=OUTLINE, lw=1.6),
     }
     figure.legend(marks.values(), marks.keys(), loc="outside upper left", ncols=3, handlelength=1.6)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Iterator
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.hardcases.cases import LENGTH, Family, Outcome, Row, plain
-from softgrasp.study.shell.processes import IN_MPI_JOB, find_mpiexec, run_limited
+from softgrasp.study.hardcases.cases import LENGTH, Family, HardCase, Outcome, textbook
+from softgrasp.study.shell.processes import IN_MPI_JOB, child_environment, find_mpiexec, run_limited
 
 # what happens, what must be said, and the same in a bare script
 FAULTS: dict[str, tuple[str, str, str]] = {
@@ -35,52 +33,7 @@ if MPI.COMM_WORLD.rank == 1:
     {fault}
 print(MPI.COMM_WORLD.allreduce(x))
 """
-WORKER = "import sys; sys.path[:] = {path!r}; from softgrasp.study.hardcases.ranks import worker; worker(*sys.argv[1:])"
-
-
-def inject(fault: str) -> None:
-    """Make rank 1 of this job fail in the named way, or not at all when the name is empty. Not collective."""
-    import softgrasp.fem.run.checkpoint
-    from softgrasp.fem import _stack as _stack
-    from softgrasp.fem.run.simulate import Run
-
-    step: Callable[..., None] = Run.step
-
-    def disk(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    def faulty(run: Run, ts: Any) -> None:
-        if run.reached == 20 and run.model.system.layout.comm.rank == 1:
-            if fault == "bug":
-                raise RuntimeError("a bug on rank 1")
-            if fault == "killed":
-                os.kill(os.getpid(), signal.SIGKILL)
-            run.midpoint.r.array_w[:] = float("nan")
-        step(run, ts)
-
-    from mpi4py import MPI
-
-    if not fault:
-        return
-    if fault == "disk":
-        if MPI.COMM_WORLD.rank == 1:
-            softgrasp.fem.run.checkpoint._write_rank = disk  # type: ignore[assignment]
-    else:
-        Run.step = faulty  # type: ignore[method-assign,assignment]
-
-
-def worker(fault: str, folder: str) -> None:
-    """The real `softgrasp simulate` with a fault on rank 1. Collective."""
-    import softgrasp.fem  # noqa: F401  (threads and MPI first)
-    from softgrasp.fem.scene.file import shipped_scenes
-    from softgrasp.study.cli import main
-
-    inject(fault)
-    scene = str(shipped_scenes()["paper_forward"])
-    sys.argv = ["softgrasp", "simulate", scene, "--out", folder, "--quiet", "--no-pictures"]
-    for change in ("tissue.cells=[3,6]", "time.steps=60", "output.checkpoint_every=10", "output.fields='none'"):
-        sys.argv += ["--set", change]
-    main()
+FAULTY = ["-m", "softgrasp.study.hardcases.faulty"]  # then fault and folder
 
 
 def healthy_seconds() -> float:
@@ -90,7 +43,7 @@ def healthy_seconds() -> float:
         SoftgraspError: there is no mpiexec, or the run fails.
     """
     with tempfile.TemporaryDirectory() as folder:
-        status, output, seconds = job(["-c", WORKER.format(path=sys.path), "", folder], HEALTHY_LIMIT)
+        status, output, seconds = job([*FAULTY, "", folder], HEALTHY_LIMIT)
     if status != 0:
         said = output.strip().splitlines()[-1:] or ["it says nothing"]
         raise SoftgraspError(f"a run on two ranks without a fault fails, status {status}: {said[0]}")
@@ -109,7 +62,7 @@ def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
     if mpiexec is None:
         raise SoftgraspError("no mpiexec found; `softgrasp doctor` says what to do")
     begin = time.perf_counter()
-    status, output = run_limited([mpiexec, "-n", "2", sys.executable, *command], limit)
+    status, output = run_limited([mpiexec, "-n", "2", sys.executable, *command], limit, child_environment())
     return status, output, time.perf_counter() - begin
 
 
@@ -126,19 +79,18 @@ def judge(command: list[str], patience: float, healthy: float, sentence: str) ->
     return Outcome(seconds / healthy, re.sub(r"/\S*/(?=[^/\s])", "", said)[:LENGTH])
 
 
-def rank_rows(quick: bool) -> list[Row]:
+def rank_rows(quick: bool) -> Iterator[HardCase]:
     """Two ranks, one of them fails; all must end, with a status and a sentence."""
     if any(variable in os.environ for variable in IN_MPI_JOB):
-        return []  # an MPI job cannot start another one
-    rows, healthy = [], healthy_seconds()
+        return  # an MPI job cannot start another one
+    healthy = healthy_seconds()
     reason = "nobody waits for the rank that is gone: sooner than a healthy run, times what other work may slow it down"
     for i, fault in enumerate(["disk"] if quick else list(FAULTS)):
         text, sentence, same = FAULTS[fault]
         with tempfile.TemporaryDirectory() as folder:
-            outcome = judge(["-c", WORKER.format(path=sys.path), fault, folder], PATIENCE, healthy, sentence)
-        bare = plain(judge, ["-c", BARE.format(fault=same)], BARE_PATIENCE, healthy, "")
-        rows.append(Row(text, i + 1, outcome, bare, PATIENCE, reason))
-    return rows
+            outcome = judge([*FAULTY, fault, folder], PATIENCE, healthy, sentence)
+        bare = textbook(judge, ["-c", BARE.format(fault=same)], BARE_PATIENCE, healthy, "")
+        yield HardCase(text, i + 1, outcome, bare, PATIENCE, reason)
 
 
 FAMILIES = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -25,7 +26,7 @@ from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import make_bases, make_basis
 from softgrasp.reduction.states import States, states_of
-from softgrasp.study.hardcases.cases import EPS, Family, Outcome, Row, make, ours, plain, qr_rounding, thin
+from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, qr_rounding, textbook, thin
 
 REASON = "rounding of a QR factorisation, rows x columns x eps [H02]"
 
@@ -71,32 +72,25 @@ def gram_basis(X: Array, k: int) -> Array:
     return np.asarray(X @ W[:, ::-1][:, :k] / np.sqrt(values[::-1][:k]))
 
 
-def defect(V: Array) -> float:
-    """Largest entry of V'V - I. Not collective."""
-    return float(np.abs(V.T @ V - np.eye(V.shape[1])).max())
-
-
 # --- small singular values
 
 
-def sigma_rows(quick: bool) -> list[Row]:
+def sigma_rows(quick: bool) -> Iterator[HardCase]:
     """Singular values of a matrix made with known ones, from 1 to 1e-14."""
     generator, k = np.random.default_rng(7), 57
     U = np.linalg.qr(generator.standard_normal((400, k)))[0]
     W = np.linalg.qr(generator.standard_normal((k, k)))[0]
     exact = 10.0 ** (-14 * np.arange(k) / (k - 1))
     X = np.asfortranarray(U * exact @ W.T)
-    found = factor(MPI.COMM_SELF, X)
-    mine = np.linalg.svd(found.R, compute_uv=False) * found.scale
+    f = factor(MPI.COMM_SELF, X)
+    tsqr = np.linalg.svd(f.R, compute_uv=False) * f.scale
     gram = np.sqrt(np.linalg.eigvalsh(X.T @ X)[::-1].astype(complex)).real
-    rows = []
     for j in thin(list(range(0, k, 8)), quick):
         i = int(j)
         reason = "backward error of QR and SVD: sqrt(rows) = 20 roundings of the largest singular value"
-        errors = [Outcome(float(abs(s[i] / exact[i] - 1))) for s in (mine, gram)]
+        errors = [Outcome(float(abs(s[i] / exact[i] - 1))) for s in (tsqr, gram)]
         name = f"singular value {exact[i]:.0e} of the largest"
-        rows.append(Row(name, float(exact[i]), errors[0], errors[1], math.sqrt(len(X)) * EPS / exact[i], reason))
-    return rows
+        yield HardCase(name, float(exact[i]), errors[0], errors[1], math.sqrt(len(X)) * EPS / exact[i], reason)
 
 
 # --- snapshots of any scale, of no rank
@@ -114,20 +108,18 @@ def _pod_defect(states: States, N: int) -> float:
 def _gram_defect(X: Array, N: int) -> Outcome:
     V = gram_basis(X, N)
     missing = "" if V.shape[1] == N else f"only {V.shape[1]} of {N} vectors, no warning"
-    found = defect(V)
-    return Outcome(found if np.isfinite(found) else None, missing or ("" if np.isfinite(found) else "not a number"))
+    error = float(np.abs(V.T @ V - np.eye(V.shape[1])).max())
+    return Outcome(error if np.isfinite(error) else None, missing or ("" if np.isfinite(error) else "not a number"))
 
 
-def scale_rows(quick: bool) -> list[Row]:
+def scale_rows(quick: bool) -> Iterator[HardCase]:
     """Orthonormality of ten POD vectors of snapshots in units from 1e-300 to 1e300."""
-    case, rows = moved(4, 6), []
+    case = moved(4, 6)
     X = stacked(case.snapshots, case.model.system.T)
     for power in thin([-300, -200, -150, -100, 0, 100, 150, 200, 300], quick):
         unit = 10.0**power
-        mine = ours(_pod_defect, _scaled(case, unit), 10)
-        gram = plain(_gram_defect, unit * X, 10)
-        rows.append(Row(f"snapshots times {unit:.0e}", unit, mine, gram, qr_rounding(*X.shape), REASON))
-    return rows
+        pod, gram = here(_pod_defect, _scaled(case, unit), 10), textbook(_gram_defect, unit * X, 10)
+        yield HardCase(f"snapshots times {unit:.0e}", unit, pod, gram, qr_rounding(*X.shape), REASON)
 
 
 def _columns(case: Moved, pick: NDArray[Any]) -> States:
@@ -137,7 +129,7 @@ def _columns(case: Moved, pick: NDArray[Any]) -> States:
     return states_of(case.model.system, chosen)
 
 
-def deficient_rows(quick: bool) -> list[Row]:
+def deficient_rows(quick: bool) -> Iterator[HardCase]:
     """Snapshots that repeat each other, are alone, or are all at rest."""
     case = moved(4, 6)
     last = case.snapshots.Z.shape[1] - 1
@@ -149,45 +141,42 @@ def deficient_rows(quick: bool) -> list[Row]:
         ("one snapshot, N = 2", five[:1], 2, True),
         ("only the state at rest, N = 1", np.zeros(3, dtype=int), 1, True),
     ]
-    rows = []
     for i, (name, pick, N, refuse) in enumerate(cases[1::3] if quick else cases):
         states = _columns(case, pick)
         X = stacked(states.runs[0][1], case.model.system.T)
-        mine, gram = ours(_pod_defect, states, N), plain(_gram_defect, X, N)
+        pod, gram = here(_pod_defect, states, N), textbook(_gram_defect, X, N)
         bound = None if refuse else qr_rounding(*X.shape)
         reason = "N is more than the rank" if refuse else REASON
-        rows.append(Row(name, i + 1, mine, gram, bound, reason))
-    return rows
+        yield HardCase(name, i + 1, pod, gram, bound, reason)
 
 
-def edge_rows(quick: bool) -> list[Row]:
+def edge_rows(quick: bool) -> Iterator[HardCase]:
     """Orthonormality of POD for N up to the number of snapshots and one more."""
-    case, rows = moved(4, 6), []
+    case = moved(4, 6)
     X = stacked(case.snapshots, case.model.system.T)
     m = X.shape[1] - 1  # the first snapshot is zero
     for N in thin([4, 12, 20, 28, 36, 44, m, m + 1], quick):
         n = int(N)
-        mine, gram = ours(_pod_defect, case.states, n), plain(_gram_defect, X, n)
+        pod, gram = here(_pod_defect, case.states, n), textbook(_gram_defect, X, n)
         bound = qr_rounding(*X.shape) if n <= m else None
         reason = REASON + "; above the numerical rank a refusal is right" if bound else f"there are only {m} snapshots"
-        rows.append(Row(f"N = {n}", n, mine, gram, bound, reason, may_refuse=n > m // 2))
-    return rows
+        yield HardCase(f"N = {n}", n, pod, gram, bound, reason, may_refuse=n > m // 2)
 
 
 # --- models that grow
 
 
-def textbook_loop(small: SmallModel, dt: float, force: Array) -> Array:
+def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
     """Outputs of the midpoint rule on E x' = A x + B u as a textbook has it, unstable or not. Not collective."""
-    op = small.operators
+    op = rom.operators
     lu = scipy.linalg.lu_factor(op.E - dt / 2 * op.A)
-    x = np.zeros(small.N)
+    x = np.zeros(rom.N)
     states = [x]
     for u in force:
         x = scipy.linalg.lu_solve(lu, (op.E + dt / 2 * op.A) @ x + dt * (op.B @ u))
         states.append(x)
     X = np.array(states)
-    return np.asarray(X @ small.outputs.C_z.T + X @ op.S_q.T @ small.outputs.C_s.T)
+    return np.asarray(X @ rom.outputs.C_z.T + X @ op.S_q.T @ rom.outputs.C_s.T)
 
 
 def _tip_error(case: Moved, outputs: Array) -> float:
@@ -198,15 +187,15 @@ def _tip_error(case: Moved, outputs: Array) -> float:
     return float(np.abs(outputs - exact).max() / np.abs(exact - case.trajectory.outputs_rigid).max())
 
 
-def _checked(case: Moved, small: SmallModel, dt: float) -> float:
-    return _tip_error(case, run(small, dt, force=case.force).outputs)
+def _checked(case: Moved, rom: SmallModel, dt: float) -> float:
+    return _tip_error(case, run(rom, dt, force=case.force).outputs)
 
 
-def _unchecked(case: Moved, small: SmallModel, dt: float) -> float:
-    return _tip_error(case, textbook_loop(small, dt, case.force))
+def _unchecked(case: Moved, rom: SmallModel, dt: float) -> float:
+    return _tip_error(case, textbook_loop(rom, dt, case.force))
 
 
-def growth_rows(quick: bool) -> list[Row]:
+def growth_rows(quick: bool) -> Iterator[HardCase]:
     """Bases from the move of 3 s, run five times as long; and what happens to models that grow."""
     case = moved(5 if quick else 10, periods=5)
     scene, system = case.model.scene, case.model.system
@@ -214,19 +203,18 @@ def growth_rows(quick: bool) -> list[Row]:
     trained = _columns(case, np.arange(301))
     dimensions = [10, 20, 40] if quick else [10, 14, 18, 22, 26, 30, 34, 38, 42, 46, 50, 60]
     sweeps = {name: make_bases(name, trained, dimensions) for name in ("psd", "global_pod")}
-    rows, growing = [], []
+    growing = []
     for i, N in enumerate(dimensions):
-        small = {name: project(bases[i], system, outputs).at() for name, bases in sweeps.items()}
-        mine, loop = ours(_checked, case, small["psd"], dt), plain(_unchecked, case, small["global_pod"], dt)
+        roms = {name: project(bases[i], system, outputs).at() for name, bases in sweeps.items()}
+        midpoint, loop = here(_checked, case, roms["psd"], dt), textbook(_unchecked, case, roms["global_pod"], dt)
         reason = "two vibrations of one size differ by twice their size at most: nothing grows"
-        rows.append(Row(f"N = {N}", N, mine, loop, 2.0, reason))
-        if not small["global_pod"].stable:
-            growing.append((N, small["global_pod"], loop))
+        yield HardCase(f"N = {N}", N, midpoint, loop, 2.0, reason)
+        if not roms["global_pod"].stable:
+            growing.append((N, roms["global_pod"], loop))
     for N, model, loop in growing[:: max(1, len(growing) // 3)]:
         name = f"(q, v) POD, N = {N}, grows by {model.spectral_abscissa:.1e}/s"
-        refusal, reason = ours(_checked, case, model, dt), "a growing model must not be run silently"
-        rows.append(Row(name, N, refusal, loop, None, reason, group="(q, v) POD"))
-    return rows
+        refusal, reason = here(_checked, case, model, dt), "a growing model must not be run silently"
+        yield HardCase(name, N, refusal, loop, None, reason, group="(q, v) POD")
 
 
 FAMILIES = (
@@ -238,7 +226,7 @@ FAMILIES = (
            "Squares of small numbers underflow, of large ones overflow; a scale prevents both.",
            scale_rows),
     Family("deficient", "Snapshots without rank", "case", "defect of orthonormality", "POD by the Gram matrix",
-           "Beyond the rank there is no vector to take: the plain way returns noise or NaN, ours says so.",
+           "Beyond the rank there is no vector to take: the textbook way returns noise or NaN, here it is said.",
            deficient_rows, axis="listed"),
     Family("edge", "Reduced dimension at the edge of the rank", "N", "defect of orthonormality",
            "POD by the Gram matrix", "Gram vectors lose orthogonality long before the rank is reached.", edge_rows,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -11,13 +11,14 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.modal import DenseRiccati, gather_tissue, relative_space
+from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.diagnosis import diagnose
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.study.hardcases.cases import EPS, Family, Outcome, Row, make, ours, plain, thin
-from softgrasp.study.hardcases.exact import exact_gain, gain_error
+from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, textbook, thin
+from softgrasp.study.hardcases.exact import exact_gain, worst_part_error
 
 TOLERANCE = 1e-8  # of both solvers on the residual, relative to |C'QC|
 DENSE, LOW_RANK = math.sqrt(EPS), math.sqrt(TOLERANCE)
@@ -61,24 +62,13 @@ def low_rank(problem: RiccatiProblem) -> Array:
     return gain_of(NewtonADI(tol=TOLERANCE).solve(problem))
 
 
-def paper_matrices(problem: RiccatiProblem) -> tuple[Array, Array, Array, Array, Array]:
-    """E, A, B, C of the paper in absolute displacements [q_s, v_s, q_e, v_e], and T. Not collective.
-
-    Raises:
-        ValueError: more than one rank.
-    """
-    space, tissue = relative_space(problem), gather_tissue(problem)
-    if space is None or tissue is None:
-        raise ValueError("the textbook way runs on one rank")
-    n_s, n = problem.layout.n_s, len(tissue.M)
-    L, R = np.eye(len(space.E)), np.eye(len(space.E))
-    q, v = slice(2 * n_s, 2 * n_s + n), slice(2 * n_s + n, None)
-    L[q, :n_s], L[v, n_s : 2 * n_s] = -tissue.T, -tissue.T
-    R[q, :n_s] = tissue.T
-    return R @ space.E @ L, R @ space.A @ L, space.B, space.C @ L, tissue.T
+SOLVERS: dict[str, tuple[Callable[[RiccatiProblem], Array], float]] = {
+    "dense": (dense, DENSE),
+    "low rank": (low_rank, LOW_RANK),
+}
 
 
-def textbook(problem: RiccatiProblem, exact: Array | None, pencil: bool = False) -> Outcome:
+def scipy_error(problem: RiccatiProblem, exact: Array | None, pencil: bool = False) -> Outcome:
     """SciPy's solver, which balances, on x' = E^{-1}A x + E^{-1}B u of the paper; error of its gain. Not collective.
 
     Args:
@@ -86,8 +76,8 @@ def textbook(problem: RiccatiProblem, exact: Array | None, pencil: bool = False)
         exact: the gain to compare with; None when there is none, and the answer is where the closed loop's poles lie.
         pencil: hand over E as it is, as the solver also allows.
     """
-    E, A, B, C, T = paper_matrices(problem)
-    H = C.T @ problem.Q @ C
+    (E, A, B, C), T = paper_form(problem), problem.system.T
+    E, A, H = E.toarray(), A.toarray(), C.T @ problem.Q @ C
     if pencil:
         X = scipy.linalg.solve_continuous_are(A, B, H, problem.R, e=E)
         K = -np.linalg.solve(problem.R, B.T @ X @ E)
@@ -101,42 +91,42 @@ def textbook(problem: RiccatiProblem, exact: Array | None, pencil: bool = False)
     n_s, n = problem.layout.n_s, len(T)
     K[:, :n_s] += K[:, 2 * n_s : 2 * n_s + n] @ T  # from absolute to hand-relative coordinates
     K[:, n_s : 2 * n_s] += K[:, 2 * n_s + n :] @ T
-    return Outcome(gain_error(K, exact, n_s), grows)
+    return Outcome(worst_part_error(K, exact, n_s), grows)
 
 
 def both_ways(problem: RiccatiProblem, exact: Array | None) -> Outcome:
     """SciPy without E and with E; the better number, and in words what the other one is. Not collective."""
-    first, second = plain(textbook, problem, exact), plain(textbook, problem, exact, True)
+    first, second = textbook(scipy_error, problem, exact), textbook(scipy_error, problem, exact, True)
     if first.value is None or first.text or second.value is None:
         return first if exact is None or first.value is not None else second
     return replace(first, text=f"{second.value:.1g} with e = E")
 
 
-def gain_row(name: str, x: float, problem: RiccatiProblem, bound: float, textbook_: Outcome, exact: Array,
-             note: str = "", group: str = "") -> Row:  # fmt: skip
-    """Error of one solver's gain against the exact one; ``note`` says why it may be refused. Not collective."""
-    solver = low_rank if bound == LOW_RANK else dense
-    error = ours(lambda: gain_error(solver(problem), exact, problem.layout.n_s))
-    return Row(name, x, error, textbook_, bound, REASONS[bound] + note, may_refuse=bool(note), group=group)
+def gain_rows(
+    name: str, x: float, problem: RiccatiProblem, note: str = "", solvers: Sequence[str] = tuple(SOLVERS)
+) -> Iterator[HardCase]:
+    """Error of the solvers' gains against the exact one; ``note`` says why it may be refused. Not collective."""
+    exact = exact_gain(problem)
+    scipy_ = both_ways(problem, exact)
+    for group in solvers:
+        solve, bound = SOLVERS[group]
+        error = here(lambda: worst_part_error(solve(problem), exact, problem.layout.n_s))  # noqa: B023  (called at once)
+        case, group = (f"{name}, {group}", group) if len(solvers) > 1 else (name, "")
+        yield HardCase(case, x, error, scipy_, bound, REASONS[bound] + note, may_refuse=bool(note), group=group)
 
 
 # --- weights
 
 
-def weight_rows(quick: bool) -> list[Row]:
+def weight_rows(quick: bool) -> Iterator[HardCase]:
     """Input weights R from 1e-12 to 1e12."""
-    problem, rows = problem_of(), []
+    problem = problem_of()
     for power in thin([-12, -8, -4, -2, 0, 2, 4, 8, 12], quick):
         r = 10.0**power
-        case = replace(problem, R=r * problem.R)
-        exact = exact_gain(case)
-        scipy_, note = both_ways(case, exact), HEAVY if r > 1e10 else ""
-        for name, bound in (("dense", DENSE), ("low rank", LOW_RANK)):
-            rows.append(gain_row(f"R = {r:.0e}, {name}", r, case, bound, scipy_, exact, note, name))
-    return rows
+        yield from gain_rows(f"R = {r:.0e}", r, replace(problem, R=r * problem.R), HEAVY if r > 1e10 else "")
 
 
-def output_rows(quick: bool) -> list[Row]:
+def output_rows(quick: bool) -> Iterator[HardCase]:
     """Outputs that are weighted hugely, singularly or not at all, that see little, or nothing of what moves."""
     problem, undamped = problem_of(), problem_of(beta=0.0)
     hand = problem_of("control.outputs=[{kind='hand'}]")
@@ -153,18 +143,15 @@ def output_rows(quick: bool) -> list[Row]:
         ("Q with a negative eigenvalue", replace(problem, Q=np.diag([1.0, -1.0])), True),
         ("R singular", replace(problem, R=np.diag([1.0, 0.0])), True),
     ]
-    rows = []
     for i, (name, case, refuse) in enumerate(cases[::2] if quick else cases):
         if refuse:
             reason = "there is no stabilising feedback, or no minimum"
-            rows.append(Row(name, i + 1, ours(_some, dense, case), both_ways(case, None), None, reason))
+            yield HardCase(name, i + 1, here(gain_size, dense, case), both_ways(case, None), None, reason)
         else:
-            exact = exact_gain(case)
-            rows.append(gain_row(name, i + 1, case, DENSE, both_ways(case, exact), exact))
-    return rows
+            yield from gain_rows(name, i + 1, case, solvers=("dense",))
 
 
-def _some(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) -> float:
+def gain_size(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) -> float:
     """Size of a gain that ought to have been refused. Not collective."""
     return float(np.linalg.norm(solver(problem)))
 
@@ -172,34 +159,29 @@ def _some(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) ->
 # --- damping
 
 
-def lqr_damping_rows(quick: bool) -> list[Row]:
+def lqr_damping_rows(quick: bool) -> Iterator[HardCase]:
     """Kelvin-Voigt damping down to none: the gain must be right, or the modes that are lost must be named."""
-    rows = []
     for beta in [2e-3, 2e-6] if quick else [0.2, 0.02, 2e-3, 2e-4, 2e-5, 2e-6, 2e-8, 2e-10, 2e-14]:
-        case, name = problem_of(beta=beta), f"beta = {beta:.0e} s"
-        exact = exact_gain(case)
-        scipy_, note = both_ways(case, exact), WEAK if beta < 1e-5 else ""
-        for way, bound in (("dense", DENSE), ("low rank", LOW_RANK)):
-            rows.append(gain_row(f"{name}, {way}", beta, case, bound, scipy_, exact, note, way))
+        yield from gain_rows(f"beta = {beta:.0e} s", beta, problem_of(beta=beta), WEAK if beta < 1e-5 else "")
     reason = "without damping X is not of low rank and high modes are lost to rounding"
     undamped = [("undamped", problem_of(beta=0.0))]
     if not quick:
         undamped.append(("paper_lqr_undamped, 880 states", make_problem(make("paper_lqr_undamped"))))
     for name, case in undamped:
-        answer = ours(_some, low_rank, case)
-        rows.append(Row(name, 0.0, answer, plain(textbook, case, None), None, reason, group="low rank"))
-    return rows
+        answer = here(gain_size, low_rank, case)
+        yield HardCase(name, 0.0, answer, textbook(scipy_error, case, None), None, reason, group="low rank")
 
 
 FAMILIES = (
     Family("weights", "Input weights from 1e-12 to 1e12", "R", "relative error of the gain",
            "SciPy, E inverted",
            "In energy coordinates the gain for the tissue, far smaller than that for the hand, keeps its digits over "
-           "twenty decades of weights; in plain ones it loses up to ten of them, with E handed over nearly all.",
+           "twenty decades of weights; in the paper's it loses up to ten of them, with E handed over nearly all.",
            weight_rows),
     Family("outputs", "Weights and outputs that see too little", "case", "relative error of the gain",
            "SciPy, E inverted",
-           "Where no feedback exists the plain way may return a number all the same; ours names what is not seen.",
+           "Where no feedback exists the textbook way may return a number all the same; here the sentence names what "
+           "is not seen.",
            output_rows, axis="listed"),
     Family("lqr_damping", "Riccati equations with hardly any damping", "Kelvin-Voigt time beta [s]",
            "relative error of the gain", "SciPy, E inverted",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,11 @@ import scipy.sparse.linalg
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.scene import materials
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
-from softgrasp.study.hardcases.cases import EPS, Family, Outcome, Row, make, ours, plain, scaled_condition, sparse, thin
+from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, scaled_condition, textbook, thin
 from softgrasp.study.hardcases.textbook import linear_triangles, solve_twice
 
 CELLS = 4  # over the height 1 of the beam
@@ -38,7 +39,7 @@ def static(model: Model) -> Array:
 def unchecked(model: Model) -> Array:
     """The same by SuperLU, believed as it is. Not collective."""
     load = model.system.G @ np.array([0.0, -1.0])
-    return np.asarray(scipy.sparse.linalg.spsolve(sparse(model.system.K_ee).tocsc(), load))
+    return np.asarray(scipy.sparse.linalg.spsolve(to_scipy(model.system.K_ee).tocsc(), load))
 
 
 def tip(model: Model, z: Array) -> float:
@@ -65,49 +66,45 @@ def _lame(nu: float) -> Outcome:
     return Outcome(None, f"goes on with lambda = {materials.lame(1000.0, nu)[0]:g}")
 
 
-def locking_rows(quick: bool) -> list[Row]:
+def locking_rows(quick: bool) -> Iterator[HardCase]:
     """Tip of a heavy beam against P2 on a finer mesh by SuperLU, for nu up to 0.49999."""
-    rows = []
     for nu in thin([0.3, 0.45, 0.49, 0.499, 0.4999, 0.49999], quick):
         reference = _sag(nu, 2, "[32, 8]" if quick else "[64, 16]", check=False)
-        mine, locked = ours(_sag_error, nu, 2, reference, True), plain(_sag_error, nu, 1, reference, False)
+        p2, locked = here(_sag_error, nu, 2, reference, True), textbook(_sag_error, nu, 1, reference, False)
         reason = "P2 keeps one order of h in the energy for every nu [BS92], so its square at the tip: h = 1/4"
-        rows.append(Row(f"nu = {nu:g}", 1 - 2 * nu, mine, locked, CELLS**-2.0, reason))
+        yield HardCase(f"nu = {nu:g}", 1 - 2 * nu, p2, locked, CELLS**-2.0, reason)
     for value in (0.5, 0.6):
-        refusal = ours(_sag, value, 2, "[4, 1]")
-        lame = plain(_lame, value)
-        rows.append(Row(f"nu = {value!r}", 0.0, refusal, lame, None, "lambda is infinite or negative"))
-    return rows
+        answers = here(_sag, value, 2, "[4, 1]"), textbook(_lame, value)
+        yield HardCase(f"nu = {value!r}", 0.0, *answers, None, "lambda is infinite or negative")
 
 
 # --- layers
 
 
-def stretch_error(model: Model, z: Array, height: float = 1.0, contrast: float = 1.0) -> float:
+def stretch_error(y: Array, z: Array, height: float, contrast: float = 1.0) -> float:
     """Worst relative error of the mean stretch of a hanging column below and above a height, exact by one integral.
 
     With lambda = 0 the column of height 2 is in uniaxial stress rho g y, so that u(y) = -int_y^2 rho g s / (2 mu) ds;
     below ``height`` mu is ``contrast`` times larger. The mean over x leaves out that the lower part may turn as a
     whole, which is no stretch. Not collective.
     """
-    y, u, mu = model.system.layout.nodes[:, 1], z[1::2], 50.0
+    u, mu = z[1::2], 50.0
     bottom, edge = (float(u[np.abs(y - level) < 1e-9].mean()) for level in (0.0, height))
     upper, lower = -(4 - height**2) / (4 * mu), -(height**2) / (4 * mu * contrast)
     return max(abs(edge / upper - 1), abs((bottom - edge) / lower - 1))
 
 
-def _stretch_ours(model: Model, height: float, contrast: float) -> float:
-    return stretch_error(model, static(model), height, contrast)
+def _stretch_here(model: Model, height: float, contrast: float) -> float:
+    return stretch_error(model.system.layout.nodes[:, 1], static(model), height, contrast)
 
 
 def _stretch_scipy(model: Model, height: float, contrast: float) -> Outcome:
-    load = model.system.G @ np.array([0.0, -1.0])
-    return solve_twice(sparse(model.system.K_ee), load, lambda z: stretch_error(model, z, height, contrast))
+    load, y = model.system.G @ np.array([0.0, -1.0]), model.system.layout.nodes[:, 1]
+    return solve_twice(to_scipy(model.system.K_ee), load, lambda z: stretch_error(y, z, height, contrast))
 
 
-def contrast_rows(quick: bool) -> list[Row]:
+def contrast_rows(quick: bool) -> Iterator[HardCase]:
     """A stiff and a soft layer hanging from each other; both stretches are known exactly."""
-    rows = []
     for power in thin([-6, -4, -2, 0, 2, 4, 6], quick):
         c = 10.0**power
         low = f"tissue.layers.low={{box=[[0.0, 0.0], [1.0, 1.0]], material={{lambda=0.0, mu={50 * c!r}, rho=1.0}}}}"
@@ -115,11 +112,8 @@ def contrast_rows(quick: bool) -> list[Row]:
         model = make("paper_forward", *COLUMN, *column)
         bound = EPS * scaled_condition(model.system.K_ee)
         reason = "eps times the condition of K scaled to a unit diagonal [VDS69]: what a direct factor may lose"
-        name = f"lower layer {c:g} times as stiff"
-        rows.append(
-            Row(name, c, ours(_stretch_ours, model, 1.0, c), plain(_stretch_scipy, model, 1.0, c), bound, reason)
-        )
-    return rows
+        answers = here(_stretch_here, model, 1.0, c), textbook(_stretch_scipy, model, 1.0, c)
+        yield HardCase(f"lower layer {c:g} times as stiff", c, *answers, bound, reason)
 
 
 # --- shape
@@ -137,19 +131,17 @@ def _beam_error(slender: float, order: int, check: bool) -> float:
     return abs(-tip(model, static(model) if check else unchecked(model)) / exact - 1)
 
 
-def slender_rows(quick: bool) -> list[Row]:
+def slender_rows(quick: bool) -> Iterator[HardCase]:
     """Tip of a slender cantilever under its weight against Timoshenko's beam, 32 cells along it."""
-    rows = []
     for slender in thin([5.0, 20.0, 100.0, 300.0, 1e3, 1e4, 1e5], quick):
-        mine, locked = ours(_beam_error, slender, 2, True), plain(_beam_error, slender, 1, False)
+        p2, locked = here(_beam_error, slender, 2, True), textbook(_beam_error, slender, 1, False)
         bound = 32**-2 + slender**-2
         reason = (
             "32 cells along the beam follow its curvature to 1/32^2 and beam theory leaves out (height / length)^2; "
             "the condition grows with the fourth power of the slenderness, past 100 rounding may leave too few digits"
         )
         may = slender > 100
-        rows.append(Row(f"length / height = {slender:g}", slender, mine, locked, bound, reason, may_refuse=may))
-    return rows
+        yield HardCase(f"length / height = {slender:g}", slender, p2, locked, bound, reason, may_refuse=may)
 
 
 def _medit(path: Path, gap: float, columns: int = 4) -> None:
@@ -179,9 +171,7 @@ def by_hand(path: Path) -> Outcome:
     def error(part: Array) -> float:
         z = np.zeros(2 * len(nodes))
         z[free] = part
-        u, y = z[1::2], nodes[:, 1]
-        bottom, edge = (float(u[np.abs(y - level) < 1e-9].mean()) for level in (0.0, 0.5))
-        return max(abs(edge / (-(4 - 0.25) / 200) - 1), abs((bottom - edge) / (-0.25 / 200) - 1))
+        return stretch_error(nodes[:, 1], z, 0.5)
 
     outcome = solve_twice(K[free][:, free], -f[free], error)
     return replace(outcome, text=f"P1 by hand; {outcome.text}")
@@ -191,25 +181,24 @@ def _sliver(mesh: str) -> Model:
     return make("paper_forward", mesh, *COLUMN[1:], "control=false")
 
 
-def sliver_rows(quick: bool) -> list[Row]:
+def sliver_rows(quick: bool) -> Iterator[HardCase]:
     """A row of ever flatter cells through a hanging column whose displacement is known exactly."""
-    rows = []
     with tempfile.TemporaryDirectory() as folder:
         for power in thin([-1, -3, -5, -7, -9, -11, -13, -15], quick):
             gap, path = 10.0**power, Path(folder) / f"sliver{-power:g}.mesh"
             _medit(path, gap)
             mesh = f"tissue={{mesh='{path}', order=2, material={{lambda=0.0, mu=50.0, rho=1.0}}}}"
-            mine = ours(lambda m: _stretch_ours(_sliver(m), 0.5, 1.0), mesh)
+            answer = here(lambda m: _stretch_here(_sliver(m), 0.5, 1.0), mesh)
             read = power > -12  # flatter than 1e-12 must be refused
-            textbook = plain(lambda m: _stretch_scipy(_sliver(m), 0.5, 1.0), mesh) if read else plain(by_hand, path)
+            assembled = textbook(lambda m: _stretch_scipy(_sliver(m), 0.5, 1.0), mesh) if read else None
             condition = scaled_condition(_sliver(mesh).system.K_ee) if read else 0.0
             bound = min(EPS * condition, 10 * REFUSED) if read else None
             reason = (
                 "eps times the condition of K scaled to a unit diagonal [VDS69], which grows as 1 / height, but at "
                 "most ten times the estimate at which a solve is refused; below 1e-12 the cells have no area in doubles"
             )
-            rows.append(Row(f"cells of height {gap:.0e}", gap, mine, textbook, bound, reason, may_refuse=power < -6))
-    return rows
+            answers = answer, assembled or textbook(by_hand, path)
+            yield HardCase(f"cells of height {gap:.0e}", gap, *answers, bound, reason, may_refuse=power < -6)
 
 
 FAMILIES = (
@@ -218,15 +207,15 @@ FAMILIES = (
            locking_rows),
     Family("contrast", "Stiffness contrast between layers", "stiffness of the lower layer over the upper",
            "relative error of the layers' stretch", "SciPy's direct solve",
-           "Digits are lost in the stiff layer only, which hardly stretches, and by every solver alike: ours, SciPy's "
-           "direct one and CG with the diagonal as preconditioner.",
+           "Digits are lost in the stiff layer only, which hardly stretches, and by every solver alike: this one, "
+           "SciPy's direct one and CG with the diagonal as preconditioner.",
            contrast_rows),
     Family("slender", "Slender body", "length / height", "relative error of the tip", "P1 on the same mesh",
            "P1 cells lock in bending; P2 follows beam theory until rounding ends it, and then the run is refused.",
            slender_rows),
     Family("sliver", "Sliver cells", "height of the flattest cells [m]", "relative error of the displacement",
            "SciPy's direct solve",
-           "Flat cells spoil the condition number for every solver. Ours says when too few digits are left, and "
-           "refuses cells that have no area in doubles.",
+           "Flat cells spoil the condition number for every solver. Here a sentence says when too few digits are left, "
+           "and cells that have no area in doubles are refused.",
            sliver_rows),
 )  # fmt: skip

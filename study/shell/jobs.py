@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -14,31 +13,28 @@ from typing import Any
 
 from mpi4py import MPI
 
-from softgrasp import PACKAGE
-from softgrasp.study.shell.processes import find_mpiexec
+from softgrasp.study.shell.processes import child_environment, find_mpiexec
 
 
-def launch_worker(name: str, spec: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
-    """Run ``python -m softgrasp.study.bench NAME --worker SPEC`` on some ranks; its numbers, or ``error``.
+def launch_worker(name: str, spec: dict[str, Any], ranks: int, limit: float = 3600.0) -> dict[str, Any]:
+    """Run ``python -m softgrasp.study.bench worker NAME SPEC`` on some ranks; its numbers, or ``error``.
 
     Not collective.
 
     Args:
-        name: of the benchmark, whose command passes the specification to :func:`leave_result`.
-        spec: the job, fit for JSON.
+        name: of the benchmark.
+        spec: arguments of the function that measures a row, fit for JSON.
         ranks: MPI ranks.
         limit: longest time [s].
     """
     mpiexec = find_mpiexec()
     if mpiexec is None:
         return {"error": "no mpiexec found; `softgrasp doctor` says what to do"}
-    root = str(PACKAGE.parent)
-    path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": path}
+    environment = child_environment() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "row.json"
         text = json.dumps(spec | {"file": str(file)})
-        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "softgrasp.study.bench", name, "--worker", text]
+        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "softgrasp.study.bench", "worker", name, text]
         try:
             done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
         except subprocess.TimeoutExpired:

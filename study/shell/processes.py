@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from softgrasp import PACKAGE
+
 IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
 
 
@@ -18,13 +20,24 @@ def find_mpiexec() -> str | None:
     return str(beside) if os.access(beside, os.X_OK) else shutil.which("mpiexec")
 
 
-def run_limited(command: list[str], limit: float) -> tuple[int | None, str]:
+def child_environment() -> dict[str, str]:
+    """Environment in which another Python finds this very package. Not collective."""
+    path = os.pathsep.join(p for p in (str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")) if p)
+    return os.environ | {"PYTHONPATH": path}
+
+
+def run_limited(command: list[str], limit: float, environment: dict[str, str] | None = None) -> tuple[int | None, str]:
     """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough.
 
     Not collective.
     """
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        env=environment,
     ) as process:
         try:
             output, _ = process.communicate(timeout=limit)

@@ -17,7 +17,7 @@ from softgrasp.reduction.svd_like import balanced, form, svd_like_pairs
 from softgrasp.reduction.truncation import Columns, Part, Truncation, allocate, counts_of, needed
 from softgrasp.study.bench import bases as bench_bases
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.bases import known_matrix, parse_shapes, reach, spectrum_of
+from softgrasp.study.bench.bases import known_matrix, parse_shapes, right_down_to, spectrum_of
 from softgrasp.study.shell.processes import IN_MPI_JOB
 from tests.helpers.models import Array, close, same_everywhere
 
@@ -58,14 +58,14 @@ def test_singular_values_are_right_down_to_the_stated_limit(
     f = factor(comm, np.asfortranarray(np.hstack([X.real, X.imag])) if complex_valued else X, engine)
     s = small_svd(comm, f.R[:, :m] + 1j * f.R[:, m:] if complex_valued else f.R)[1] * f.scale
     limit = 1e-6 if engine == "gram" else 1e-9  # the 1e-10 at its 600 columns: see the next test
-    assert reach(s, spectrum_of(m), 1e-8) <= limit  # 8 digits
+    assert right_down_to(s, spectrum_of(m), 1e-8) <= limit  # 8 digits
     assert same_everywhere(comm, s)
 
 
 def test_default_is_right_to_1e_8_down_to_1e_10(comm: MPI.Intracomm) -> None:
     X = known_matrix(comm, 6000, 400, False)
     f = factor(comm, X)
-    assert reach(f.scale * small_svd(comm, f.R)[1], spectrum_of(400), 1e-8) <= 1e-10  # the numbers
+    assert right_down_to(f.scale * small_svd(comm, f.R)[1], spectrum_of(400), 1e-8) <= 1e-10  # the numbers
 
 
 def test_gram_keeps_nothing_below_its_floor(comm: MPI.Intracomm) -> None:
@@ -354,7 +354,7 @@ def test_shapes_of_the_benchmark() -> None:
 
 
 def test_benchmark_measures_every_engine(comm: MPI.Intracomm) -> None:
-    row = bench_bases.measure(comm, 900, 200, 1)
+    row = bench_bases.measure(900, 200, 1, comm)
     names = {"tsqr", "svd", "svd_all", "gram", "psd_tsqr", "psd_gram"}
     assert set(row["engines"]) == (names | {"numpy", "psd_numpy"} if comm.size == 1 else names)
     for name, found in row["engines"].items():
@@ -370,9 +370,7 @@ def test_benchmark_measures_every_engine(comm: MPI.Intracomm) -> None:
 def test_benchmark_prints_one_table_and_fails_with_its_workers(
     mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        bench_bases, "launch", lambda n, m, k, repeats: {"rows": n, "columns": m, "ranks": k, "error": "no"}
-    )
+    monkeypatch.setattr(bench_bases, "launch_worker", lambda name, spec, ranks: {"error": "no"})
     for variable in IN_MPI_JOB:
         monkeypatch.delenv(variable, raising=False)
     folder = mpi_tmp_path / str(MPI.COMM_WORLD.rank)

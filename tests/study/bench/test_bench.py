@@ -12,13 +12,15 @@ from mpi4py import MPI
 from typer.testing import CliRunner
 
 from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.study.bench import forward as bench_forward
 from softgrasp.study.bench import forward_rows as bench_worker
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, to_scipy
+from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop
+from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.processes import IN_MPI_JOB
 
 TINY: dict[str, Any] = {"size": 150, "repeats": 3, "repeat_seconds": 0.005}
@@ -66,7 +68,7 @@ def test_all_methods_end_in_the_same_state(comm: MPI.Intracomm) -> None:
     idle = Run(model, RunOptions())
     assert isinstance(idle.drive, TableDrive)
     loads = idle.drive.c
-    K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
+    K, M = to_scipy(system.K_ee)(system.M_ee)
     # relative; 60 steps of rounding leave about 1e-13, a load one step off would leave 1e-2
     near = {"rtol": 0, "atol": 1e-9 * np.abs(run.final).max()}
     plain = PlainCholesky(midpoint_matrix(system, bench_worker.DT))
@@ -142,12 +144,12 @@ def test_goals_are_told_apart_by_size() -> None:
 
 @pytest.mark.serial
 def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def launch(spec: dict[str, Any], ranks: int) -> dict[str, Any]:
+    def launch(name: str, spec: dict[str, Any], ranks: int) -> dict[str, Any]:
         if spec["size"] == 300:
             return {"error": "exit status 1: broken", "ranks": ranks}
         return made_up(spec["size"], ranks=ranks)
 
-    monkeypatch.setattr(bench_forward, "launch", launch)
+    monkeypatch.setattr(bench_forward, "launch_worker", launch)
     for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     arguments = ["forward", "--sizes", "2d:2000,40000,3d:300", "--out", str(tmp_path)]
@@ -171,11 +173,11 @@ def test_driver_gets_numbers_from_two_ranks(monkeypatch: pytest.MonkeyPatch) -> 
     for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     spec = {"dimension": 2, "large": False} | TINY
-    row = bench_forward.launch(spec, 2)
+    row = launch_worker("forward", spec, 2)
     assert row.get("ranks") == 2, row
     assert "ts" in row["step_us"]
     for ranks in (1, 2):
-        assert "ZeroDivisionError" in bench_forward.launch(spec | {"dimension": 0}, ranks)["error"]
+        assert "ZeroDivisionError" in launch_worker("forward", spec | {"dimension": 0}, ranks)["error"]
 
 
 @pytest.mark.parametrize("text", ["4d:100", "2d:many", "2d:3", ""])

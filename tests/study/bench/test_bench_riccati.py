@@ -20,7 +20,7 @@ METHOD = {
 
 
 def fake(calls: list[dict[str, Any]], fail: tuple[int, ...] = ()) -> Any:
-    def worker(module: str, spec: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
+    def worker(module: str, spec: dict[str, Any], ranks: int) -> dict[str, Any]:
         calls.append(spec | {"ranks": ranks})
         if "peer" in spec:
             return {"seconds": 1.0, "rank": 1, "residual": 1e-3, "gain_difference": 1.0, "states": 880}

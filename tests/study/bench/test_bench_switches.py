@@ -34,7 +34,7 @@ def test_command_writes_what_the_workers_measured(
 ) -> None:
     made = Row("batch", "TOGETHER = 1 MB", "3 models", 1, 2.0, 3.0)
     found = {1: {"rows": [vars(made)]}, 2: {"error": "exit status 1: no more"}}
-    monkeypatch.setattr(bench_switches, "launch_worker", lambda name, spec, ranks, limit: found[ranks])
+    monkeypatch.setattr(bench_switches, "launch_worker", lambda name, spec, ranks: found[ranks])
     for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     runner = CliRunner()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -15,8 +15,8 @@ from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.study.hardcases import riccati as hard_riccati
-from softgrasp.study.hardcases.cases import Row
-from softgrasp.study.hardcases.exact import exact_gain, gain_error
+from softgrasp.study.hardcases.cases import HardCase
+from softgrasp.study.hardcases.exact import exact_gain, worst_part_error
 from softgrasp.study.hardcases.riccati import problem_of
 
 pytestmark = pytest.mark.serial
@@ -51,7 +51,7 @@ def test_exact_gain_against_eigenvectors_in_256_bits(beta: float, r: float) -> N
     finally:
         ctx.prec = precision
     # both are rounded to doubles at their very end
-    assert gain_error(exact_gain(problem), K, problem.layout.n_s) <= np.finfo(float).eps
+    assert worst_part_error(exact_gain(problem), K, problem.layout.n_s) <= np.finfo(float).eps
 
 
 def without_tissue(solve: Callable[..., RiccatiSolution]) -> Callable[..., RiccatiSolution]:
@@ -65,20 +65,22 @@ def without_tissue(solve: Callable[..., RiccatiSolution]) -> Callable[..., Ricca
 
 @pytest.mark.parametrize("rows", [hard_riccati.weight_rows, hard_riccati.output_rows, hard_riccati.lqr_damping_rows])
 def test_a_gain_that_leaves_the_tissue_out_fails(
-    rows: Callable[[bool], list[Row]], monkeypatch: pytest.MonkeyPatch
+    rows: Callable[[bool], Iterator[HardCase]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The gain for the hand is right to the last digit, the gain for the tissue is zero."""
     for method in (DenseRiccati, NewtonADI):
         monkeypatch.setattr(method, "solve", without_tissue(method.solve))
-    judged = [row for row in rows(True) if row.ours.value is not None]
+    judged = [row for row in rows(True) if row.here.value is not None]
     assert judged
     assert [row.case for row in judged if row.ok] == []
 
 
 def test_error_of_a_gain_is_that_of_its_worst_part() -> None:
     exact = np.array([[1e6, 1e5, 1e-3, 1e-4]])  # gains for q_s, v_s, z, v_z
-    assert gain_error(exact, exact, 1) == 0
-    assert gain_error(exact * [1, 1, 1.5, 1], exact, 1) == pytest.approx(0.5)
-    assert gain_error(exact * [1, 1, 0, 0], exact, 1) == 1
+    assert worst_part_error(exact, exact, 1) == 0
+    assert worst_part_error(exact * [1, 1, 1.5, 1], exact, 1) == pytest.approx(0.5)
+    assert worst_part_error(exact * [1, 1, 0, 0], exact, 1) == 1
     bare = np.array([[3.0, 4.0, 0.0, 0.0]])
-    assert gain_error(np.array([[3.0, 4.0, 1e-3, 0.0]]), bare, 1) == pytest.approx(2e-4)  # over the norm of all, 5
+    assert worst_part_error(np.array([[3.0, 4.0, 1e-3, 0.0]]), bare, 1) == pytest.approx(
+        2e-4
+    )  # over the norm of all, 5

@@ -20,7 +20,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.hardcases import carex as hard_carex
 from softgrasp.study.hardcases import numbers as hard_numbers
 from softgrasp.study.hardcases import ranks as hard_rank
-from softgrasp.study.hardcases.cases import Family, Outcome, Row, ours, plain
+from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, textbook
 from softgrasp.study.hardcases.run import FAMILIES, choose, run_hardcases
 from softgrasp.study.hardcases.textbook import leapfrog, newmark, solve_twice, staggered_hand, textbook_midpoint
 from tests.helpers.browser import look
@@ -93,8 +93,8 @@ def test_pictures(tmp_path: Path, name: str) -> None:
         assert (tmp_path / f"hard_{name}.{suffix}").stat().st_size > 5000
 
 
-def number(value: float | None, bound: float | None, **more: Any) -> Row:
-    return Row("a case", 1.0, Outcome(value), Outcome(1.0), bound, "a reason", **more)
+def number(value: float | None, bound: float | None, **more: Any) -> HardCase:
+    return HardCase("a case", 1.0, Outcome(value), Outcome(1.0), bound, "a reason", **more)
 
 
 @pytest.mark.parametrize(
@@ -106,12 +106,12 @@ def number(value: float | None, bound: float | None, **more: Any) -> Row:
         (number(math.inf, 1e-2), "fail", False),
         (number(None, 1e-2), "fail", False),
         (number(1e-3, None), "fail", False),  # had to be refused and was not
-        (Row("a case", 1.0, Outcome(None, "no", True), Outcome(1.0), 1e-2, ""), "refused", False),
-        (Row("a case", 1.0, Outcome(None, "no", True), Outcome(1.0), 1e-2, "", may_refuse=True), "refused", True),
-        (Row("a case", 1.0, Outcome(None, "no", True), Outcome(1.0), None, ""), "refused", True),
+        (HardCase("a case", 1.0, Outcome(None, "no", True), Outcome(1.0), 1e-2, ""), "refused", False),
+        (HardCase("a case", 1.0, Outcome(None, "no", True), Outcome(1.0), 1e-2, "", may_refuse=True), "refused", True),
+        (HardCase("a case", 1.0, Outcome(None, "no", True), Outcome(1.0), None, ""), "refused", True),
     ],
 )
-def test_verdicts(row: Row, verdict: str, ok: bool) -> None:
+def test_verdicts(row: HardCase, verdict: str, ok: bool) -> None:
     assert (row.verdict, row.ok) == (verdict, ok)
 
 
@@ -136,11 +136,11 @@ def test_only_our_own_errors_are_refusals() -> None:
     def bug() -> float:
         raise ZeroDivisionError("a bug")
 
-    assert ours(refuse) == Outcome(None, "no number", refused=True)
+    assert here(refuse) == Outcome(None, "no number", refused=True)
     with pytest.raises(ZeroDivisionError):
-        ours(bug)
-    assert plain(bug) == Outcome(None, "ZeroDivisionError: a bug")
-    assert plain(lambda: math.nan).text == "not a number"
+        here(bug)
+    assert textbook(bug) == Outcome(None, "ZeroDivisionError: a bug")
+    assert textbook(lambda: math.nan).text == "not a number"
 
 
 def leaves(annotation: Any) -> int:
@@ -232,8 +232,8 @@ def test_a_loaded_machine_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None
         monkeypatch.delenv(variable, raising=False)
     (row,) = hard_rank.rank_rows(True)
     assert row.ok
-    assert row.ours.value == pytest.approx(0.9)
-    assert row.plain.value == math.inf
+    assert row.here.value == pytest.approx(0.9)
+    assert row.textbook.value == math.inf
     assert limits[1:] == [200.0 * hard_rank.PATIENCE, 200.0 * hard_rank.BARE_PATIENCE]
 
 

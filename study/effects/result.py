@@ -1,0 +1,244 @@
+"""What `softgrasp effects` finds: change, cost, verdict and proof of each effect, and result.json of all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from softgrasp.study.forward.explain import EffectReport, Explanation
+
+
+@dataclass(frozen=True)
+class Change:
+    """Largest change of the outputs over the run.
+
+    Attributes:
+        outputs: max |y - y'| over max |y|, y the displacements of all outputs [1].
+        deformation: the same of the outputs relative to the rigid motion of the hand [1].
+        absolute: max |y - y'| [m].
+    """
+
+    outputs: float
+    deformation: float
+    absolute: float
+
+
+@dataclass(frozen=True)
+class Company:
+    """One effect judged beside all others that are advised.
+
+    Attributes:
+        change: of the outputs when it alone is switched, the others as advised.
+        control: the same under a force [1]; None when that is no question.
+        partners: effects whose switching makes it show, though it does not show in the scene as it is.
+        either: it and its partner are on, each can go, but not both.
+        together: change that made it count beside the partners [1].
+        forced: it shows only when a force moves the hand.
+    """
+
+    change: Change
+    control: float | None
+    partners: tuple[str, ...] = ()
+    either: bool = False
+    together: float = 0.0
+    forced: bool = False
+
+
+COUNTED = 1e-3  # relative growth of work or memory that counts as a cost; gravity's n_s numbers do not
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the effect adds: the scene with it minus the scene without it.
+
+    Attributes:
+        assembly, setup, step: seconds, medians of paired samples; setup is factor and solves before the first step.
+        assembly_range, setup_range: smallest and largest paired sample [s].
+        step_relative: added share of a step's time [1].
+        step_low, step_high: smallest and largest paired share [1].
+        step_noise: share that a step of the scene differs from itself by [1].
+        step_quartiles: lower and upper quartile of the paired shares [1].
+        flops: added operations of PETSc in a step [1]; flops_relative: their share.
+        memory: added memory [byte]; memory_relative: its share.
+        holds: names of what only the scene with the effect holds.
+        objects: what PETSc counts as created more, by class.
+    """
+
+    assembly: float
+    setup: float
+    assembly_range: tuple[float, float]
+    setup_range: tuple[float, float]
+    step: float
+    step_relative: float
+    step_low: float
+    step_high: float
+    step_noise: float
+    step_quartiles: tuple[float, float]
+    flops: float
+    flops_relative: float
+    memory: float
+    memory_relative: float
+    holds: tuple[str, ...]
+    objects: dict[str, int]
+
+    @property
+    def any(self) -> bool:
+        """Whether counted work or memory grows; times are too noisy to decide."""
+        return self.flops_relative > COUNTED or self.memory_relative > COUNTED
+
+    @property
+    def step_shows(self) -> bool:
+        """Whether all paired samples agree that a step takes longer, or shorter, by more than the noise."""
+        return (self.step_low > 0 or self.step_high < 0) and abs(self.step_relative) > self.step_noise
+
+
+@dataclass(frozen=True)
+class OffProof:
+    """What is counted to show that an effect that is off costs nothing; times are too noisy for it.
+
+    Attributes:
+        same_operators: the hashes of all operators are the same before the effect was tried, after it, and with the
+            effect named at strength zero, where it has one.
+        same_objects: PETSc's log counts the same objects in these three, by class, and none in the steps.
+        same_work: as many operations in a step after the trial as before.
+    """
+
+    same_operators: bool
+    same_objects: bool
+    same_work: bool
+
+    @property
+    def holds(self) -> bool:
+        """Whether all are the same."""
+        return all(asdict(self).values())
+
+
+@dataclass(frozen=True)
+class Elements:
+    """What quadratic elements on the same mesh change where linear ones may lock.
+
+    Attributes:
+        nu: largest ratio of Poisson in the tissue [1].
+        change: of the outputs of the run, P2 against P1.
+        unknowns: n_e with P2 over n_e with P1 [1].
+        needed: the change is above the tolerance.
+        advice: one sentence.
+    """
+
+    nu: float
+    change: Change
+    unknowns: float
+    needed: bool
+    advice: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One effect.
+
+    Attributes:
+        name: the effect.
+        on: the scene has it on.
+        value: in the scene, or the trial value.
+        gate: number, threshold and sentence of its gate, with what explain says.
+        verdict: needed, optional, wasted, or not tried.
+        advice: one sentence.
+        change: of the outputs of the run; None when not tried.
+        control: change of the outputs when a force moves the hand; None when that is no question, or not needed to
+            judge.
+        company: the same judged again beside all other advised effects; None when not tried.
+        cost: None when not tried.
+        proof: for an effect that is off.
+    """
+
+    name: str
+    on: bool
+    value: str
+    gate: EffectReport
+    verdict: str
+    advice: str
+    change: Change | None
+    control: float | None
+    company: Company | None
+    cost: Cost | None
+    proof: OffProof | None
+
+    @property
+    def label(self) -> str:
+        """The verdict as a reader takes it: an effect that is off is not, but would be wasted."""
+        return "would be wasted" if self.verdict == "wasted" and not self.on else self.verdict
+
+    @property
+    def together(self) -> float | None:
+        """Change of the outputs beside the effects that bring it out [1]; None when it needs none."""
+        return self.company.together if self.company is not None and self.company.partners else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its entry in result.json."""
+        entry = asdict(self) | {"gate": asdict(self.gate.gate)}
+        del entry["name"]
+        if self.cost is not None:
+            entry["cost"]["any"] = self.cost.any
+        if self.proof is not None:
+            entry["proof"]["holds"] = self.proof.holds
+        return entry
+
+
+@dataclass(frozen=True)
+class EffectsStudy:
+    """All findings of a scene.
+
+    Attributes:
+        findings: in the order of `fem.effects.EFFECTS`.
+        advised: effects that are on when every advice is followed, for control alone included.
+        explanation: of the scene as it is; its warnings are repeated in the report.
+        tolerance: relative change that counts [1].
+        repeats: samples behind each median of a step; builds may have fewer.
+        builds: samples behind each median of assembly and factor.
+        noise: step times of the scene against itself, smallest and largest paired ratio less 1 [1].
+        noise_quartiles: the middle half of them [1].
+        base: medians of the scene as it is: assembly, setup, step [s], and memory [byte].
+        sizes: n_s, n_e, states, steps and cells of the scene.
+        elements: what P2 changes; None unless P1 may lock.
+    """
+
+    findings: tuple[Finding, ...]
+    advised: tuple[str, ...]
+    explanation: Explanation
+    tolerance: float
+    repeats: int
+    builds: int
+    noise: tuple[float, float]
+    noise_quartiles: tuple[float, float]
+    base: dict[str, float]
+    sizes: dict[str, int]
+    elements: Elements | None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What explain warns of, and what was measured about it."""
+        return (*self.explanation.warnings, *([self.elements.advice] if self.elements else []))
+
+    def to_dict(self) -> dict[str, Any]:
+        """What result.json holds."""
+        return {
+            "tolerance": self.tolerance,
+            "repeats": self.repeats,
+            "builds": self.builds,
+            "noise": list(self.noise),
+            "base": self.base,
+            "effects": {f.name: f.to_dict() for f in self.findings},
+            "advised": list(self.advised),
+            "off_is_free": all(f.proof.holds for f in self.findings if f.proof is not None),
+            "missing": list(self.explanation.missing),
+            "idle": list(self.explanation.idle),
+            "warnings": list(self.warnings),
+            "elements": None if self.elements is None else asdict(self.elements),
+            "sizes": self.sizes,
+        }
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as one reads them: a, b and c."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]])) or "none"
