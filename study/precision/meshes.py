@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.points import Setting, least_steps
+from softgrasp.study.precision.settings import Setting, least_steps
 
 WORK = {2: 5e7, 3: 6e6}  # unknowns times steps of the finest run of a reference: 10 to 30 s on a quiet core
 UNKNOWNS = {2: 150_000, 3: 60_000}
