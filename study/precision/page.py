@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import rich.table
 from mpi4py import MPI
 from rich.console import Console
 
@@ -32,6 +34,7 @@ from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.files import plain
 from softgrasp.study.report.origin import command_line, made_with, origin, peak_memory_mb
 from softgrasp.study.report.page import EQUATION, Section
+from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
 
 PAPER = f"{PAPER_REDUCED} s and a state error of about 1e-3 at N = 14"
@@ -113,8 +116,8 @@ def show(console: Console, study: WorkStudy, commands: list[dict[str, str]]) -> 
             text = reference_text(question, paper_of(study.scene) == "control")
             if text:
                 console.print(text, markup=False)
-            console.print(question_table(name, question.points, front_only=True).terminal())
-    console.print(slope_table(study).terminal())
+            console.print(_narrow(question_table(name, question.points, front_only=True)))
+    console.print(_narrow(slope_table(study)))
     for titles, reason in _left_out(study):
         console.print(f"{titles}: left out, {reason}", markup=False)
     for full in _paper_run(study):
@@ -126,6 +129,12 @@ def show(console: Console, study: WorkStudy, commands: list[dict[str, str]]) -> 
         for command in lines.values():
             console.print(f"  {command}", markup=False, soft_wrap=True)
     console.print(f"{study.measured} runs measured, {study.cached} from the cache", style="dim")
+
+
+def _narrow(table: Table) -> rich.table.Table:
+    """Three digits, and lines that a narrow terminal may break."""
+    rows = [[f"{cell:.3g}" if isinstance(cell, float) else cell for cell in row] for row in table.rows]
+    return replace(table, rows=rows).terminal(wrap=range(len(table.header)))
 
 
 def _paper_run(study: WorkStudy) -> list[TimedRun]:
