@@ -184,11 +184,7 @@ class Answers:
     # --- answers
 
     def tolerance(self, tolerance: float) -> Answer:
-        """The cheapest setting within a relative tolerance of the outputs.
-
-        Raises:
-            SolverError: a run failed.
-        """
+        """The cheapest setting within a relative tolerance of the outputs."""
         words: list[str] = []
         pair = self.cheapest(tolerance)
         full = None if pair is None else self.choice(pair[1], (pair[0].error, pair[0].seconds))
@@ -276,9 +272,6 @@ class Answers:
         """The most accurate setting whose steps fit a budget: 99 % of them have to.
 
         Reduced models of the most accurate mesh are tried as well, since their steps do not get slower with the mesh.
-
-        Raises:
-            SolverError: a run failed.
         """
         words: list[str] = []
         choices: dict[str, Choice] = {}

@@ -45,7 +45,7 @@ class Cache:
         self.hits = self.misses = 0
 
     def path(self, kind: str, key: dict[str, Any]) -> Path:
-        """File of some values."""
+        """File of the values of a key."""
         whole = {"scene": self.scene, "ranks": self.comm.size, "version": package_version(), "format": FORMAT} | key
         digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
         return self.folder / f"{kind}-{digest[:20]}.json"

@@ -67,8 +67,8 @@ def reference_text(question: Question, paper: bool) -> str:
             if r.error is not None:
                 text += f"; the tightest solution of another method differs by {r.error:.1e}"
             text += f". The optimal cost from the scene's start is {r.optimal:.6g}."
-            small = f" The paper: {1e3 * PAPER_SMALL:.0f} ms at N = {PAPER_N} with the POD of P, on its own machine."
-            return text + (small if paper else "")
+            theirs = f" The paper: {1e3 * PAPER_SMALL:.0f} ms at N = {PAPER_N} with the POD of P, on its own machine."
+            return text + (theirs if paper else "")
         case LoopReference() as r:
             own = f"all {r.modes} modes, exact but for rounding"
             if not r.complete:

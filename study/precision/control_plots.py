@@ -47,10 +47,7 @@ def figure_riccati(
     """Error of the gain and true residual against time, one line a method along its tolerances; PNG and PDF.
 
     Args:
-        points: of the question.
         error: estimated error of the reference.
-        paper: draw the paper's time.
-        out_png: name of the picture; the PDF gets its stem.
     """
     good = usable(points)
 
@@ -89,8 +86,6 @@ def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, o
 
     Args:
         points: of the question; gains that are not ok are crossed out.
-        paper: draw the paper's time.
-        out_png: name of the picture; the PDF gets its stem.
     """
     good = usable(points)
 
@@ -166,9 +161,7 @@ def figure_loop(points: Sequence[LoopPoint], error: float | None, out_png: Path)
     """Error of the trajectory against time, error in time against the steps, time of a step; PNG and PDF.
 
     Args:
-        points: of the question.
         error: estimated error of the reference.
-        out_png: name of the picture; the PDF gets its stem.
     """
     lines = series_of(points)
     gains = list(dict.fromkeys(_gain(p) for p in points))

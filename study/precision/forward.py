@@ -85,12 +85,7 @@ def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | N
 
 
 def ask_forward(scene: Scene, runs: FullRuns, truth: Truth) -> Question:
-    """Run all settings of the diagram. Collective.
-
-    Raises:
-        SolverError: a run failed.
-        Interrupted: by Ctrl-C.
-    """
+    """Run all settings of the diagram. Collective."""
     points: list[ForwardPoint] = []
     finest: dict[Group, TimedRun] = {}
     for setting in forward_settings(scene, truth.series.dimension):

@@ -331,7 +331,6 @@ def ask_loop(runs: ControlRuns) -> Question:
     Raises:
         SolverError: the optimal loop cannot be made.
         ControlError: no output moves against the hand.
-        Interrupted: by Ctrl-C.
     """
     loops = LoopSweep(runs)
     reference = loops.reference()

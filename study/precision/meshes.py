@@ -48,8 +48,8 @@ def smallest_mesh(scene: Scene) -> tuple[int, ...]:
     """
     cells, lines = scene.tissue.cells or [], edges(scene)
     for part in range(PARTS, 0, -1):
-        tried = [fitted(n / part, shares) for n, shares in zip(cells, lines, strict=True)]
-        unit = tuple(n for n in tried if n is not None)
+        counts = [fitted(n / part, shares) for n, shares in zip(cells, lines, strict=True)]
+        unit = tuple(n for n in counts if n is not None)
         stretch = [u * part / n for u, n in zip(unit, cells, strict=False)]
         if len(unit) == len(cells) and max(stretch) <= STRETCH * min(stretch):
             return unit

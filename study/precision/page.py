@@ -86,7 +86,7 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
     files: list[Path] = []
     paper = paper_of(study.scene)
     forward, reduced, bases = study.of(ForwardPoint), study.of(ReducedPoint), study.of(BasisPoint)
-    riccati, small, loop = study.of(RiccatiPoint), study.of(ReducedRiccatiPoint), study.of(LoopPoint)
+    riccati, small_riccati, loop = study.of(RiccatiPoint), study.of(ReducedRiccatiPoint), study.of(LoopPoint)
     references = {name: question.reference for name, question in study.questions.items()}
     if forward and study.truth is not None:
         slopes, png = study.questions["forward"].slopes, out / "work_forward.png"
@@ -97,8 +97,8 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
         files += figure_series(bases, "time of the basis [s]", "left of the snapshots", out / "work_bases.png")
     if riccati and isinstance(tight := references["riccati"], RiccatiReference):
         files += figure_riccati(riccati, tight.error, paper == "control", out / "work_riccati.png")
-    if small:
-        files += figure_reduced_riccati(small, paper == "control", out / "work_reduced_riccati.png")
+    if small_riccati:
+        files += figure_reduced_riccati(small_riccati, paper == "control", out / "work_reduced_riccati.png")
     if loop and isinstance(optimal := references["loop"], LoopReference):
         files += figure_loop(loop, optimal.error, out / "work_loop.png")
     if budget is not None:

@@ -77,11 +77,8 @@ def figure_forward(
     """Error of the deformation against the time of a whole run; beside it orders in space and time; PNG and PDF.
 
     Args:
-        points: of the forward question.
         slopes: fitted, for the labels.
         truth_error: below it nothing can be told.
-        paper: draw the paper's time.
-        out_png: name of the picture; the PDF gets its stem.
     """
     good = [p for p in usable(points) if p.series != "solver"]
     with paper_style():
@@ -147,10 +144,8 @@ def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out
     """Error of the deformation against the online time, and against that from nothing; PNG and PDF.
 
     Args:
-        points: of the reduced question.
         full: seconds of the full run on the same mesh and steps.
         paper: draw the paper's times; its error is one of the state.
-        out_png: name of the picture; the PDF gets its stem.
     """
     names = list(series_of(points))
     others = [n for n in names if n not in LOOKS]

@@ -158,7 +158,6 @@ def ask_reduced(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Q
     Raises:
         BasisError: a basis is unknown.
         SolverError: a solve or a factorisation failed.
-        Interrupted: by Ctrl-C.
     """
     reduced = ReducedRuns(scene, own_setting(scene), runs, truth)
     points = [p for name in chosen_methods(scene.reduction) for p in reduced.points(name, scene.reduction.N, full)]
@@ -178,7 +177,6 @@ def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Que
 
     Raises:
         SolverError: a solve or a factorisation failed.
-        Interrupted: by Ctrl-C.
     """
     reduced, comm = ReducedRuns(scene, own_setting(scene), runs, truth), runs.cache.comm
     points: list[BasisPoint] = []

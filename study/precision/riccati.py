@@ -9,11 +9,13 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.lqr.diagnosis import Diagnosis
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.coordinates import gain_of
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
@@ -24,7 +26,7 @@ from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import CONTROL, RiccatiPoint
 from softgrasp.study.precision.result import Question, RiccatiReference
-from softgrasp.study.shell.timing import timed
+from softgrasp.study.shell.timing import repeated
 
 METHODS: tuple[Method, ...] = ("newton_adi", "radi", "galerkin", "dense")
 TITLES: dict[str, str] = {"newton_adi": "Newton-ADI", "radi": "RADI", "galerkin": "Galerkin", "dense": "dense"}
@@ -84,9 +86,6 @@ class ControlRuns:
         self.scene, self.layout = model.scene, model.system.layout
         self.repeats = self.scene.study.repeats
         self.large = self.layout.n_e > LARGE[self.layout.dimension]
-        self._problem: RiccatiProblem | None = None
-        self._reference: GainReference | None = None
-        self._design: Design | None = None
 
     def refused(self) -> str:
         """Why the questions of control cannot be asked of this scene, in one sentence; empty when they can."""
@@ -101,35 +100,33 @@ class ControlRuns:
 
     def _diagnose(self) -> Refusal:
         try:
-            self._problem, _, modal = check(self.model)
+            modal = self._checked[2]
         except (ControlError, SceneError) as error:
             return Refusal(str(error))
         return Refusal("control.method = 'modal' leaves no P of the whole plant to compare with" if modal else "")
 
+    @cached_property
+    def _checked(self) -> tuple[RiccatiProblem, Diagnosis, bool]:
+        return check(self.model)
+
     @property
     def problem(self) -> RiccatiProblem:
         """Plant, outputs, weights."""
-        if self._problem is None:
-            self._problem = check(self.model)[0]
-        return self._problem
+        return self._checked[0]
 
-    @property
+    @cached_property
     def design(self) -> Design:
         """The optimal feedback as ``softgrasp control`` makes it, with its judge."""
-        if self._design is None:
-            self._design = design(self.model, Stopwatch(self.layout.comm))
-        return self._design
+        return design(self.model, Stopwatch(self.layout.comm))
 
-    @property
+    @cached_property
     def reference(self) -> GainReference:
         """The tightest solutions of two methods.
 
         Raises:
             SolverError: no method reaches any of :data:`TIGHT`.
         """
-        if self._reference is None:
-            self._reference = make_reference(self.problem)
-        return self._reference
+        return make_reference(self.problem)
 
     def reference_names(self) -> RiccatiReference:
         """Names and error of the reference, from the cache when they are there."""
@@ -189,7 +186,6 @@ def ask_riccati(runs: ControlRuns) -> Question:
 
     Raises:
         SolverError: there is no reference.
-        Interrupted: by Ctrl-C.
     """
     reference, points = runs.reference_names(), []
     for method, tol in settings_of(runs):
@@ -208,15 +204,14 @@ def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> Ricca
     """Gain error, true residual, counts and median seconds of one solver at one tolerance. Collective."""
     problem = runs.problem
     tight = gain_of(runs.reference.judge_of(method))
-    times: list[float] = []
     solutions: list[RiccatiSolution] = []
+    repeats = 1 if runs.large else runs.repeats
 
     def once() -> None:
         solutions[:] = [solve(problem, method, tol)]
 
     try:
-        while not times or (len(times) < (1 if runs.large else runs.repeats) and sum(times) < REPEAT_SECONDS):
-            times.append(timed(runs.layout.comm, once))
+        times = repeated(runs.layout.comm, once, repeats, REPEAT_SECONDS)
     except (SolverError, ResourceError) as error:
         lost = float("inf")
         return RiccatiPoint(method, label, lost, lost, False, method=method, tolerance=tol,

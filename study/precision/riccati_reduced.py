@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from functools import partial
 
 from mpi4py import MPI
 
@@ -18,7 +19,7 @@ from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import ReducedRiccatiPoint
 from softgrasp.study.precision.result import Question, ReducedReference
 from softgrasp.study.precision.riccati import ControlRuns, above
-from softgrasp.study.shell.timing import timed
+from softgrasp.study.shell.timing import repeated, timed
 
 A_PRIORI = "structured"  # the basis that is made without P
 REPEAT_SECONDS = 0.2  # a small equation is repeated while it has taken less
@@ -31,7 +32,6 @@ def ask_reduced_riccati(runs: ControlRuns) -> Question:
 
     Raises:
         SolverError: the full equation cannot be solved.
-        Interrupted: by Ctrl-C.
     """
     runs.guard.next("gain of reference")
     reference = runs.cache.get("reduced_riccati", {"reference": True}, ReducedReference, lambda: [_reference(runs)])[0]
@@ -69,10 +69,8 @@ def _order(runs: ControlRuns, family: BasisFamily, N: int, time_basis: float, be
         lift = max(whole - 3 * reduced.seconds, 0.0)  # it solves three times
 
         def median() -> float:
-            times: list[float] = []
-            while not times or (len(times) < runs.repeats and sum(times) < REPEAT_SECONDS):
-                times.append(timed(MPI.COMM_SELF, lambda: solve_reduced(reduced.matrices)))
-            return statistics.median(times)
+            once = partial(solve_reduced, reduced.matrices)
+            return statistics.median(repeated(MPI.COMM_SELF, once, runs.repeats, REPEAT_SECONDS))
 
         seconds = on_root(runs.layout.comm, median)
     name = family.name
