@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import usable
-from softgrasp.study.precision.forward import SAFETY, Prediction, Predictor, setting_of, to_point
+from softgrasp.study.precision.forward import SAFETY, Prediction, Predictor, to_point
 from softgrasp.study.precision.full import FullRuns
-from softgrasp.study.precision.points import Row, Setting, WorkPoint
+from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RunPoint
 from softgrasp.study.precision.reduced import ReducedRuns
-from softgrasp.study.precision.reference import Reference
-from softgrasp.study.report.files import plain
+from softgrasp.study.precision.result import Answer, Choice, Truth
+from softgrasp.study.precision.settings import Group, Setting
 
 TRIES = 4  # settings that are run to check a prediction
 MARGIN = 0.75  # of the tolerance that the full run behind a reduced model may use
@@ -54,34 +53,6 @@ def parse_tolerance(text: str | float) -> float:
     return value
 
 
-@dataclass(frozen=True)
-class Answer:
-    """What was asked and found.
-
-    Attributes:
-        kind: "tolerance" or "budget".
-        asked: the tolerance [1] or the budget [s].
-        met: something meets it.
-        sentences: the answer in words.
-        found: by kind of model, "full" and "reduced": setting, predicted and measured numbers.
-        closest: when nothing meets it.
-    """
-
-    kind: str
-    asked: float
-    met: bool
-    sentences: tuple[str, ...]
-    found: dict[str, Row] = field(default_factory=dict)
-    closest: Row | None = None
-
-    def to_dict(self) -> Row:
-        """For JSON. Not collective."""
-        return {
-            "kind": self.kind, "asked": self.asked, "met": self.met, "sentences": list(self.sentences),
-            **self.found, "closest": self.closest,
-        }  # fmt: skip
-
-
 def seconds_text(value: float | None) -> str:
     """A time with a fitting unit. Not collective."""
     if value is None:
@@ -92,17 +63,18 @@ def seconds_text(value: float | None) -> str:
     return f"{value / 1e-6:.3g} us"
 
 
-def advice(shares: Row, details: Row) -> str:
-    """What to refine first: that which carries the largest share of an error. Not collective.
+def advice(shares: dict[str, float], group: Group) -> str:
+    """What to refine first: that which carries the largest share of an error.
 
     Args:
         shares: of space, time and maybe reduction.
-        details: cells and order of the mesh.
+        group: cells and order of the mesh.
     """
-    largest = max(shares, key=lambda name: float(shares[name]))
+    cells, order = group
+    largest = max(shares, key=lambda name: shares[name])
     better = {
-        "space": ("a finer mesh, tissue.cells" if details["cells"] else "a finer mesh file")
-        + (", or tissue.order = 2" if details["order"] == 1 else ""),
+        "space": ("a finer mesh, tissue.cells" if cells else "a finer mesh file")
+        + (", or tissue.order = 2" if order == 1 else ""),
         "time": "more time.steps",
         "reduction": "a larger N, reduction.N",
     }[largest]
@@ -110,8 +82,8 @@ def advice(shares: Row, details: Row) -> str:
     return f"Of its error, {largest} carries the largest share ({parts}): {better} would help first."
 
 
-class Asker:
-    """Answers for one study; ``tried`` are the points that were measured for them. Its methods are collective.
+class Answers:
+    """Answers for one study; ``measured`` are the points that were made for them. Its methods are collective.
 
     Args:
         scene: the study's scene.
@@ -121,42 +93,47 @@ class Asker:
     """
 
     def __init__(
-        self, scene: Scene, runs: FullRuns, truth: Reference, forward: list[WorkPoint], reduced: list[WorkPoint]
+        self,
+        scene: Scene,
+        runs: FullRuns,
+        truth: Truth,
+        forward: Sequence[ForwardPoint],
+        reduced: Sequence[ReducedPoint],
     ) -> None:
         self.scene, self.runs, self.truth = scene, runs, truth
         self.forward, self.reduced = forward, reduced
         self.predictor = Predictor(scene, forward)
-        self.tried: list[WorkPoint] = []
+        self.measured: list[RunPoint] = []
 
-    def meets(self, point: WorkPoint, tolerance: float) -> bool:
+    def meets(self, point: RunPoint, tolerance: float) -> bool:
         """Whether a measured error holds with the error of the reference on top."""
         return point.ok and self.truth.range_of(point.error)[1] <= tolerance
 
-    def measure(self, setting: Setting) -> WorkPoint:
+    def measure(self, setting: Setting) -> ForwardPoint:
         """Run a setting that the diagram does not hold."""
-        point = to_point(setting, self.runs.run(setting), self.runs, self.truth)
-        self.tried.append(point)
+        point = to_point(setting, self.runs.run(setting), self.truth)
+        self.measured.append(point)
         return point
 
-    def cheapest(self, tolerance: float) -> tuple[Prediction, WorkPoint] | None:
+    def cheapest(self, tolerance: float) -> tuple[Prediction, ForwardPoint] | None:
         """The cheapest full run within a tolerance, predicted and then measured; None when nothing meets it."""
-        held: list[tuple[Prediction, WorkPoint]] = []
+        held: list[tuple[Prediction, ForwardPoint]] = []
         runs = 0
         room = tolerance - self.truth.error
-        for found in sorted(self.predictor.candidates(), key=lambda p: (p.seconds, p.error)):
-            if held and found.seconds > min(point.seconds for _, point in held):
+        for prediction in sorted(self.predictor.candidates(), key=lambda p: (p.seconds, p.error)):
+            if held and prediction.seconds > min(point.seconds for _, point in held):
                 break
-            if found.point is not None:
-                if self.meets(found.point, tolerance):
-                    held.append((found, found.point))
-            elif found.error <= SAFETY * room and runs < TRIES and self.predictor.affordable(found):
+            point = prediction.point
+            if point is None and prediction.error <= SAFETY * room and runs < TRIES:
+                if not self.predictor.affordable(prediction):
+                    continue
                 runs += 1
-                point = self.measure(found.setting)
-                if self.meets(point, tolerance):
-                    held.append((found, point))
+                point = self.measure(prediction.setting)
+            if point is not None and self.meets(point, tolerance):
+                held.append((prediction, point))
         return min(held, key=lambda pair: pair[1].seconds) if held else None
 
-    def beyond(self, tolerance: float) -> Prediction | None:
+    def too_large(self, tolerance: float) -> Prediction | None:
         """The cheapest setting that is predicted to meet a tolerance but too large to be tried."""
         room = SAFETY * (tolerance - self.truth.error)
         large = [p for p in self.predictor.candidates() if p.error <= room and not self.predictor.affordable(p)]
@@ -164,201 +141,176 @@ class Asker:
 
     # --- reduced models
 
-    def small(self, tolerance: float) -> tuple[Row, WorkPoint] | None:
-        """The fastest reduced model within a tolerance, prediction and point; None when nothing tried meets it."""
-        held = [({"error": p.error, "seconds": p.seconds}, p) for p in self.reduced if self.meets(p, tolerance)]
+    def fastest_model(self, tolerance: float) -> Choice | None:
+        """The fastest reduced model within a tolerance; None when nothing tried meets it."""
+        held = [self.choice(p, (p.error, p.seconds)) for p in self.reduced if self.meets(p, tolerance)]
         if not held:
             full = self.cheapest(MARGIN * tolerance) or self.cheapest(tolerance)
-            if full is not None and self._fits(full[1]):
-                held = self._on(full[0].setting, full[1], tolerance)
-        return min(held, key=lambda pair: pair[1].seconds) if held else None
+            if full is not None and _fits(full[1]):
+                held = self._models_on(full[0].setting, full[1], tolerance)
+        return min(held, key=lambda choice: choice.point.seconds) if held else None
 
-    def _fits(self, full: WorkPoint) -> bool:
-        return bool(2 * full.details["n_e"] * full.details["steps"] <= SNAPSHOTS)
-
-    def _on(self, setting: Setting, full: WorkPoint, tolerance: float) -> list[tuple[Row, WorkPoint]]:
+    def _models_on(self, setting: Setting, full: ForwardPoint, tolerance: float) -> list[Choice]:
         """Reduced models of the two fastest bases on another mesh; N as the scene's own mesh predicts it."""
         room = tolerance - self.truth.error - full.error
-        wanted: dict[str, WorkPoint] = {}
+        expected: dict[str, ReducedPoint] = {}
         for p in sorted(usable(self.reduced), key=lambda p: p.seconds):
-            if p.details["error_outputs_full"] <= SAFETY * room and p.series not in wanted:
-                wanted[p.series] = p
-        found = []
-        reduced = ReducedRuns(self.scene, setting, self.runs, self.truth)
-        row = self.runs.run(setting)
-        for name, expected in sorted(wanted.items(), key=lambda pair: pair[1].seconds)[:2]:
-            N = expected.details["N"]
-            sizes = [n for n in sorted(self.scene.reduction.N) if n >= N][: MORE + 1]
-            points = reduced.points(name, sizes, row)
-            self.tried += points
-            predicted = {"error": full.error + expected.details["error_outputs_full"], "seconds": expected.seconds}
-            found += [(predicted, p) for p in points if self.meets(p, tolerance)]
-        return found
+            if p.error_outputs_full <= SAFETY * room:
+                expected.setdefault(p.series, p)
+        choices: list[Choice] = []
+        reduced, run = ReducedRuns(self.scene, setting, self.runs, self.truth), self.runs.run(setting)
+        for name, own in list(expected.items())[:2]:
+            sizes = [n for n in sorted(self.scene.reduction.N) if n >= own.N][: MORE + 1]
+            points = reduced.points(name, sizes, run)
+            self.measured += points
+            predicted = full.error + own.error_outputs_full, own.seconds
+            choices += [self.choice(p, predicted) for p in points if self.meets(p, tolerance)]
+        return choices
 
-    def _finer(self, budget: float) -> list[WorkPoint]:
+    def _models_on_the_best_mesh(self, budget: float) -> list[ReducedPoint]:
         """The two bases nearest to the full run within a budget, on the most accurate mesh of the diagram."""
-        full = min((p for p in usable(self.forward) if self._fits(p)), key=lambda p: p.error, default=None)
-        fit = [p for p in usable(self.reduced) if p.details["p99"] is not None and p.details["p99"] <= budget]
+        full = min((p for p in usable(self.forward) if _fits(p)), key=lambda p: p.error, default=None)
+        fit = [p for p in usable(self.reduced) if p.p99 <= budget]
         if full is None or not fit or full.error >= min(p.error for p in fit):
             return []
-        best: dict[str, WorkPoint] = {}
-        for p in sorted(fit, key=lambda p: p.details["error_outputs_full"]):
+        best: dict[str, ReducedPoint] = {}
+        for p in sorted(fit, key=lambda p: p.error_outputs_full):
             best.setdefault(p.series, p)
-        setting = setting_of(full)
-        reduced, row = ReducedRuns(self.scene, setting, self.runs, self.truth), self.runs.run(setting)
-        points = [q for name, p in list(best.items())[:2] for q in reduced.points(name, [p.details["N"]], row)]
-        self.tried += points
+        reduced, run = ReducedRuns(self.scene, full.setting, self.runs, self.truth), self.runs.run(full.setting)
+        points = [q for name, p in list(best.items())[:2] for q in reduced.points(name, [p.N], run)]
+        self.measured += points
         return points
 
     # --- answers
 
     def tolerance(self, tolerance: float) -> Answer:
-        """The cheapest setting within a relative tolerance of the outputs.
-
-        Raises:
-            SolverError: a run failed.
-        """
-        words, found = [], {}
-        full = self.cheapest(tolerance)
-        small = self.small(tolerance) if self.reduced else None
-        if full is not None:
-            found["full"] = self.row(full[1], full[0].error, full[0].seconds)
-            words.append(
-                f"Cheapest full run within {tolerance:g}: {full[1].label}: predicted error {full[0].error:.1e} in "
-                f"{seconds_text(full[0].seconds)}, measured {full[1].error:.1e} of the deformation "
-                f"({full[1].details['error_displacement']:.1e} of the displacement) in {seconds_text(full[1].seconds)}."
-            )
-        if small is not None:
-            predicted, point = small
-            found["reduced"] = self.row(point, predicted["error"], predicted["seconds"])
-            words.append(
-                f"For many runs: {point.label}: predicted error {predicted['error']:.1e} in "
-                f"{seconds_text(predicted['seconds'])} a run, measured {point.error:.1e} in "
-                f"{seconds_text(point.seconds)}; from nothing, with the full run behind it, "
-                f"{seconds_text(point.details['scratch'])}."
-            )
+        """The cheapest setting within a relative tolerance of the outputs."""
+        words: list[str] = []
+        pair = self.cheapest(tolerance)
+        full = None if pair is None else self.choice(pair[1], (pair[0].error, pair[0].seconds))
+        reduced = self.fastest_model(tolerance) if self.reduced else None
         closest = None
-        if not found:
+        if full is not None:
+            words.append(
+                f"Cheapest full run within {tolerance:g}: {full.point.label}: {_prediction(full)}, measured "
+                f"{full.point.error:.1e} of the deformation ({full.point.error_displacement:.1e} of the displacement) "
+                f"in {seconds_text(full.point.seconds)}."
+            )
+        if reduced is not None and isinstance(reduced.point, ReducedPoint):
+            point = reduced.point
+            words.append(
+                f"For many runs: {point.label}: {_prediction(reduced)} a run, measured {point.error:.1e} in "
+                f"{seconds_text(point.seconds)}; from nothing, with the full run behind it, "
+                f"{seconds_text(point.scratch)}."
+            )
+        if full is None and reduced is None:
             closest, more = self._missed(tolerance)
             words += more
-        elif self.reduced and small is None:
+        elif self.reduced and reduced is None:
             words.append("No reduced model that was tried meets it.")
         words.append(
             f"Errors are those of the deformation, the outputs against the hand, over the largest such output. The "
             f"reference's own error, {self.truth.error:.1e}, is added to every measured one before comparing."
         )
         words += self._against_own_mesh(tolerance)
-        return Answer("tolerance", tolerance, bool(found), tuple(words), found, closest)
+        return Answer("tolerance", tolerance, tuple(words), full, reduced, closest)
 
-    def _missed(self, tolerance: float) -> tuple[Row, list[str]]:
+    def _missed(self, tolerance: float) -> tuple[Choice, list[str]]:
         """What came closest, and what would be needed."""
-        every = [*usable(self.forward), *usable(self.reduced), *usable(self.tried)]
+        every: list[RunPoint] = [*usable(self.forward), *usable(self.reduced), *usable(self.measured)]
         best = min(every, key=lambda p: p.error)
         words = [
             f"Nothing tried meets {tolerance:g}; closest is {best.label} with the error {best.error:.1e}, give or take "
             f"{self.truth.error:.1e}, in {seconds_text(best.seconds)}."
         ]
-        words.append(advice(self.shares(best), best.details))
+        words.append(advice(self.shares(best), best.setting.group))
+        large = self.too_large(tolerance)
         if self.truth.error >= tolerance:
             part = self.truth.largest_part
             words.append(
                 "The reference itself is not known that well, so that nothing can be shown to meet it: most of its "
                 f"own error is the {part} part, and would need {self.truth.need}."
             )
-        else:
-            large = self.beyond(tolerance)
-            if large is not None:
-                words.append(
-                    f"Predicted to meet it, but too large to be tried here: {large.setting.label}, error "
-                    f"{large.error:.1e} in {seconds_text(large.seconds)}."
-                )
-        return self.row(best), words
+        elif large is not None:
+            words.append(
+                f"Predicted to meet it, but too large to be tried here: {large.setting.label}, error "
+                f"{large.error:.1e} in {seconds_text(large.seconds)}."
+            )
+        return self.choice(best), words
 
-    def shares(self, point: WorkPoint) -> Row:
-        """About how much of a point's error space, the time step and the reduced model carry. Not collective.
+    def shares(self, point: RunPoint) -> dict[str, float]:
+        """About how much of a point's error space, the time step and the reduced model carry.
 
         What the reference does not know about space counts with space.
         """
-        d = point.details
-        cells = None if d["cells"] is None else tuple(d["cells"])
         predict = self.predictor
-        space = predict.space_error((cells, d["order"])) + self.truth.space[0]
-        parts = {"space": space, "time": predict.time_error(d["steps"])}
-        return parts | ({"reduction": d["error_outputs_full"]} if point.question == "reduced" else {})
+        space = predict.space_error(point.setting.group) + self.truth.space[0]
+        parts = {"space": space, "time": predict.time_error(point.steps)}
+        return parts | ({"reduction": point.error_outputs_full} if isinstance(point, ReducedPoint) else {})
 
-    def row(self, point: WorkPoint, error: float | None = None, seconds: float | None = None) -> Row:
-        """A setting with its predicted and measured numbers, and the ``--set`` that repeat it. Not collective."""
-        d: dict[str, Any] = point.details
-        names = ("cells", "order", "steps", "solver", "method", "N")
-        measured = ("error_deformation", "error_displacement", "error_range", "p50", "p99", "max", "scratch",
-                    "per_step", "error_outputs_full", "error_full")  # fmt: skip
-        sets = setting_of(point).overrides
+    def choice(self, point: RunPoint, predicted: tuple[float, float] | None = None) -> Choice:
+        """A setting with its predicted error and seconds, and the ``--set`` that repeat it."""
+        sets = point.setting.overrides
         if self.runs.reference is not None:
             sets.append(f"hand.reference={self.runs.reference}")  # the default moves a little with the mesh
-        if point.question == "reduced":
-            sets += [f"reduction.methods=['{d['method']}']", f"reduction.N=[{d['N']}]"]
-        row: Row = plain(
-            {
-                "label": point.label,
-                "command": "reduce" if point.question == "reduced" else "simulate",
-                "setting": {k: d[k] for k in names if d.get(k) is not None},
-                "set": sets,
-                "predicted": None if error is None else {"error": error, "seconds": seconds},
-                "measured": {"error": point.error, "seconds": point.seconds, **{k: d[k] for k in measured if k in d}},
-                "shares": self.shares(point),
-            }
-        )
-        return row
+        if isinstance(point, ReducedPoint):
+            sets += [f"reduction.methods=['{point.method}']", f"reduction.N=[{point.N}]"]
+        return Choice(point, self.shares(point), tuple(sets), predicted)
 
     def _against_own_mesh(self, tolerance: float) -> list[str]:
         """The paper's question: the fastest reduced model of the scene's own mesh against its own full run."""
-        good = [p for p in usable(self.reduced) if p.details["error_outputs_full"] <= tolerance]
+        good = [p for p in usable(self.reduced) if p.error_outputs_full <= tolerance]
         if not good:
             return []
         p = min(good, key=lambda p: p.seconds)
         return [
             f"Against the full run on the scene's own mesh alone, whose error is not counted then, {p.label} has the "
-            f"error {p.details['error_outputs_full']:.1e} in {seconds_text(p.seconds)} a run."
+            f"error {p.error_outputs_full:.1e} in {seconds_text(p.seconds)} a run."
         ]
 
     def budget(self, seconds: float) -> Answer:
         """The most accurate setting whose steps fit a budget: 99 % of them have to.
 
         Reduced models of the most accurate mesh are tried as well, since their steps do not get slower with the mesh.
-
-        Raises:
-            SolverError: a run failed.
         """
-        words, found = [], {}
-        for kind, points in (("full", self.forward), ("reduced", [*self.reduced, *self._finer(seconds)])):
-            timed = [p for p in usable(points) if p.details.get("p99") is not None]
-            fit = [p for p in timed if p.details["p99"] <= seconds]
+        words: list[str] = []
+        choices: dict[str, Choice] = {}
+        models = [*self.reduced, *self._models_on_the_best_mesh(seconds)]
+        groups: dict[str, tuple[str, Sequence[RunPoint]]] = {
+            "full": ("full run", self.forward), "reduced": ("reduced model", models),
+        }  # fmt: skip
+        for kind, (name, points) in groups.items():
+            timed = usable(points)
+            fit = [p for p in timed if p.p99 <= seconds]
             if fit:
-                best = min(fit, key=lambda p: (p.error, p.details["p99"]))
-                found[kind] = self.row(best)
-                words.append(f"{_name(kind)} within {seconds_text(seconds)} a step: {best.label}: {_step_words(best)}.")
-            elif timed:
-                best = min(timed, key=lambda p: p.details["p99"])
+                best = min(fit, key=lambda p: (p.error, p.p99))
+                choices[kind] = self.choice(best)
                 words.append(
-                    f"No {_name(kind).lower()} fits {seconds_text(seconds)}; "
-                    f"nearest is {best.label}: {_step_words(best)}."
+                    f"{name.capitalize()} within {seconds_text(seconds)} a step: {best.label}: {_step_words(best)}."
                 )
-        timed = [p for p in [*self.forward, *self.reduced] if p.details.get("p99") is not None]
-        closest = None if found or not timed else self.row(min(timed, key=lambda p: p.details["p99"]))
-        over = [k for k, row in found.items() if row["measured"]["max"] > seconds]
+            elif timed:
+                best = min(timed, key=lambda p: p.p99)
+                words.append(f"No {name} fits {seconds_text(seconds)}; nearest is {best.label}: {_step_words(best)}.")
+        fastest = min((*self.forward, *self.reduced), key=lambda p: p.p99, default=None)
+        closest = None if choices or fastest is None else self.choice(fastest)
+        over = [kind for kind, choice in choices.items() if choice.point.max > seconds]
         if over:
             words.append(
-                f"Single steps of the {' and '.join(over)} model took longer than the line; on a robot, give the "
+                f"Single steps of the {' and '.join(over)} model took longer than the budget; on a robot, give the "
                 "loop a core of its own."
             )
-        return Answer("budget", seconds, bool(found), tuple(words), found, closest)
+        return Answer("budget", seconds, tuple(words), choices.get("full"), choices.get("reduced"), closest)
 
 
-def _name(kind: str) -> str:
-    return "Full run" if kind == "full" else "Reduced model"
+def _fits(full: ForwardPoint) -> bool:
+    return 2 * full.n_e * full.steps <= SNAPSHOTS
 
 
-def _step_words(point: WorkPoint) -> str:
-    d = point.details
-    times = ", ".join(f"{name} {seconds_text(d[name])}" for name in ("p50", "p99", "max"))
+def _prediction(choice: Choice) -> str:
+    error, seconds = choice.predicted or (0.0, 0.0)
+    return f"predicted error {error:.1e} in {seconds_text(seconds)}"
+
+
+def _step_words(point: RunPoint) -> str:
+    times = ", ".join(f"{name} {seconds_text(getattr(point, name))}" for name in ("p50", "p99", "max"))
     return f"error {point.error:.1e}, step {times}"

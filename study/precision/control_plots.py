@@ -15,12 +15,12 @@ from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.study.control.plots import LOOKS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
-from softgrasp.study.precision.fit import usable
-from softgrasp.study.precision.plots import FRONT, LINE, axes_log, draw_front
-from softgrasp.study.precision.points import WorkPoint
+from softgrasp.study.precision.captions import PAPER_ARE, PAPER_N, PAPER_SMALL
+from softgrasp.study.precision.fit import error_of, series_of, usable
+from softgrasp.study.precision.plots import LINE, axes_log, band_handle, draw_front, front_handle
+from softgrasp.study.precision.points import LoopPoint, ReducedRiccatiPoint, RiccatiPoint
 from softgrasp.study.precision.riccati import TITLES
 
-PAPER_ARE, PAPER_SMALL, PAPER_N = 84.53, 0.053, 8  # [s], [s]: the paper, section 4.2, 2n = 880
 METHOD_LOOK = {"newton_adi": (BLUE, "o"), "radi": (ORANGE, "s"), "galerkin": (GREEN, "^"), "dense": (HAND, "D")}
 GAIN_COLOURS = (HAND, ORANGE, BLUE, GREEN, PURPLE)
 BAND: dict[str, Any] = {"color": "#bbbbbb", "alpha": 0.35, "zorder": 0, "lw": 0}
@@ -28,41 +28,41 @@ TOP, LOW = 1.0, 1e-13  # errors and excess costs above are on the edge, below ar
 NEAR = 1e-2  # of the lowest point: a reference that is better still is not drawn, the text tells its error
 TICK = 1e-3  # [s], of a robot's control loop
 EDGE: dict[str, Any] = {"clip_on": False, "in_layout": False}
-Value = Callable[[WorkPoint], float]
+Value = Callable[[ReducedRiccatiPoint], float]
 
 
-def _band(ax: Any, error: float) -> bool:
+def _band(ax: Any, error: float | None) -> bool:
     """Grey below the error of the reference, where it is near the points; whether it was drawn."""
     low, high = ax.get_ylim()
-    if not (np.isfinite(error) and error > NEAR * low):
+    if error is None or not error > NEAR * low:
         return False
     ax.axhspan(1e-300, error, **BAND)
     ax.set_ylim(min(low, 0.3 * error), high)
     return True
 
 
-def figure_riccati(points: Sequence[WorkPoint], error: float, paper: bool, out_png: Path) -> tuple[Path, Path]:
+def figure_riccati(
+    points: Sequence[RiccatiPoint], error: float | None, paper: bool, out_png: Path
+) -> tuple[Path, Path]:
     """Error of the gain and true residual against time, one line a method along its tolerances; PNG and PDF.
 
     Args:
-        points: of the question.
         error: estimated error of the reference.
-        paper: draw the paper's time.
-        out_png: name of the picture; the PDF gets its stem.
     """
     good = usable(points)
-    values: tuple[tuple[Value, str], ...] = (
-        (lambda p: p.error, "relative error of the gain"),
-        (lambda p: float(p.details["residual"]), "relative residual"),
-    )
+
+    def residual(p: RiccatiPoint) -> float:
+        return p.residual
+
+    values = ((error_of, "relative error of the gain"), (residual, "relative residual"))
     with paper_style():
         figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.2), layout="constrained")
         for ax, (value, label) in zip(axes, values, strict=True):
             for name, (colour, marker) in METHOD_LOOK.items():
-                mine = [p for p in good if p.series == name and value(p) > 0]
-                ax.plot([p.seconds for p in mine], [value(p) for p in mine], color=colour, marker=marker, ms=3.4,
+                line = [p for p in good if p.series == name and value(p) > 0]
+                ax.plot([p.seconds for p in line], [value(p) for p in line], color=colour, marker=marker, ms=3.4,
                         lw=0.7)  # fmt: skip
-            draw_front(ax, good, lambda p: p.seconds, value)
+            draw_front(ax, good, y=value)
             if paper:
                 ax.axvline(PAPER_ARE, **LINE)
             axes_log(ax, "time of the solution [s]", label)
@@ -72,44 +72,37 @@ def figure_riccati(points: Sequence[WorkPoint], error: float, paper: bool, out_p
             for n, (c, m) in METHOD_LOOK.items()
             if any(p.series == n for p in good)
         ]
-        handles.append(Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT))
+        handles.append(front_handle())
         if band:
-            handles.append(Line2D([], [], color="#bbbbbb", lw=5, alpha=0.5, label="error of the reference"))
+            handles.append(band_handle())
         if paper:
             handles.append(Line2D([], [], label=f"paper, {PAPER_ARE} s (no error given)", **LINE))
         figure.legend(handles=handles, loc="outside upper center", ncols=4)
         return save(figure, out_png)
 
 
-def figure_reduced_riccati(points: Sequence[WorkPoint], paper: bool, out_png: Path) -> tuple[Path, Path]:
+def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, out_png: Path) -> tuple[Path, Path]:
     """Error of the gain and excess cost, each against N and against the time of the equation; PNG and PDF.
 
     Args:
         points: of the question; gains that are not ok are crossed out.
-        paper: draw the paper's time.
-        out_png: name of the picture; the PDF gets its stem.
     """
     good = usable(points)
 
-    def cost(p: WorkPoint) -> float:
-        value = p.details["cost_excess"]
-        return float("inf") if value is None else float(value)
-
-    def gain(p: WorkPoint) -> float:
-        return p.error
+    def cost(p: ReducedRiccatiPoint) -> float:
+        return p.cost_excess
 
     with paper_style():
         figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.0), sharey="row", sharex="col", layout="constrained")
-        for row, (value, label) in zip(grid, ((gain, "error of the gain $K$"), (cost, "excess cost")), strict=True):
-            for name in [n for n in BASES if any(p.series == n for p in points)]:
-                mine = sorted((p for p in good if p.series == name), key=lambda p: p.details["N"])
-                _basis_lines(row, mine, value, LOOKS.get(name, (HAND, ":", "x")))
-            bad = [p for p in points if not p.ok and not p.details["reason"]]
+        for row, (value, label) in zip(grid, ((error_of, "error of the gain $K$"), (cost, "excess cost")), strict=True):
+            for name, line in series_of(sorted(good, key=lambda p: p.N)).items():
+                _basis_lines(row, line, value, LOOKS.get(name, (HAND, ":", "x")))
+            bad = [p for p in points if not p.ok and not p.reason]
             height = [min(value(p), TOP) for p in bad]
-            for ax, x in zip(row, ([p.details["N"] for p in bad], [p.seconds for p in bad]), strict=True):
+            for ax, x in zip(row, ([p.N for p in bad], [p.seconds for p in bad]), strict=True):
                 ax.plot(x, height, ls="", marker="x", ms=5, mew=1.1, color=UNSTABLE, zorder=4, **EDGE)
             inside = [p for p in good if value(p) <= TOP]
-            draw_front(row[1], inside, lambda p: p.seconds, _at_least(value))
+            draw_front(row[1], inside, y=_at_least(value))
             if paper:
                 row[1].axvline(PAPER_SMALL, **LINE)
             axes_log(row[1], "time of the reduced equation [s]", "")
@@ -126,13 +119,13 @@ def _at_least(value: Value) -> Value:
     return lambda p: max(value(p), LOW)
 
 
-def _basis_lines(row: Any, mine: Sequence[WorkPoint], value: Value, look: tuple[str, str, str]) -> None:
+def _basis_lines(row: Any, line: Sequence[ReducedRiccatiPoint], value: Value, look: tuple[str, str, str]) -> None:
     """One basis in both panels of a row; above the top the line is broken and a mark stays on the edge."""
     colour, dashes, marker = look
     style: dict[str, Any] = {"color": colour, "marker": marker, "ms": 3.4, "mfc": "none", "mew": 0.9}
-    y = [max(value(p), LOW) for p in mine]
+    y = [max(value(p), LOW) for p in line]
     inside = [v if v <= TOP else float("nan") for v in y]
-    for ax, x in zip(row, ([p.details["N"] for p in mine], [p.seconds for p in mine]), strict=True):
+    for ax, x in zip(row, ([float(p.N) for p in line], [p.seconds for p in line]), strict=True):
         ax.plot(x, inside, ls=dashes if ax is row[0] else "", lw=1.0, **style)
         above = [a for a, v in zip(x, y, strict=True) if v > TOP]
         ax.plot(above, [TOP] * len(above), ls="", **EDGE, **style)
@@ -149,13 +142,13 @@ def _against_order(ax: Any, label: str) -> None:
     ax.set_axisbelow(True)
 
 
-def _reduced_handles(points: Sequence[WorkPoint], paper: bool) -> list[Line2D]:
+def _reduced_handles(points: Sequence[ReducedRiccatiPoint], paper: bool) -> list[Line2D]:
     handles = []
     for name in [n for n in BASES if any(p.series == n for p in points)]:
         colour, dashes, marker = LOOKS.get(name, (HAND, ":", "x"))
         label = BASIS_TITLES.get(name, name)
         handles.append(Line2D([], [], color=colour, ls=dashes, marker=marker, ms=3.4, mfc="none", lw=1.0, label=label))
-    handles.append(Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT))
+    handles.append(front_handle())
     if any(not p.ok for p in points):
         cross: dict[str, Any] = {"ls": "", "marker": "x", "ms": 5, "mew": 1.1, "color": UNSTABLE}
         handles.append(Line2D([], [], label="full loop not stable", **cross))
@@ -164,52 +157,48 @@ def _reduced_handles(points: Sequence[WorkPoint], paper: bool) -> list[Line2D]:
     return handles
 
 
-def figure_loop(points: Sequence[WorkPoint], error: float, out_png: Path) -> tuple[Path, Path]:
+def figure_loop(points: Sequence[LoopPoint], error: float | None, out_png: Path) -> tuple[Path, Path]:
     """Error of the trajectory against time, error in time against the steps, time of a step; PNG and PDF.
 
     Args:
-        points: of the question.
         error: estimated error of the reference.
-        out_png: name of the picture; the PDF gets its stem.
     """
-    names = list(dict.fromkeys(p.series for p in points))
+    lines = series_of(points)
     gains = list(dict.fromkeys(_gain(p) for p in points))
     colours = {g: GAIN_COLOURS[k % len(GAIN_COLOURS)] for k, g in enumerate(gains)}
-    good = usable(points)
     with paper_style():
         figure = plt.figure(figsize=(WIDTH, 4.6), layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
         ax, order, step = (figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))
         handles = []
-        for k, name in enumerate(names):
-            mine = [p for p in good if p.series == name]
-            d = next(p.details for p in points if p.series == name)
+        for k, (name, (first, *rest)) in enumerate(lines.items()):
+            line = usable([first, *rest])
             style: dict[str, Any] = {
-                "color": colours[_gain(next(p for p in points if p.series == name))], "ls": "--" if d["held"] else "-",
-                "marker": "s" if d["held"] else "o", "ms": 3.4, "mew": 0.9, "lw": 0.8,
-                "mfc": "none" if d["reduced_plant"] else None,
+                "color": colours[_gain(first)], "ls": "--" if first.held else "-",
+                "marker": "s" if first.held else "o", "ms": 3.4, "mew": 0.9, "lw": 0.8,
+                "mfc": "none" if first.reduced_plant else None,
             }  # fmt: skip
             handles.append(Line2D([], [], label=name, **style))
-            ax.plot([p.seconds for p in mine], [p.error for p in mine], **style)
-            if not d["reduced_plant"]:
-                order.plot([p.details["steps"] for p in mine], [p.details["error_time"] for p in mine], **style)
-            per_step = [p.details["per_step"] for p in mine]
+            ax.plot([p.seconds for p in line], [p.error for p in line], **style)
+            if not first.reduced_plant:
+                order.plot([p.steps for p in line], [p.error_time for p in line], **style)
+            per_step = [p.per_step for p in line]
             if per_step:
                 step.plot([min(per_step), max(per_step)], [-k, -k], color=style["color"], lw=0.8)
                 step.plot([np.median(per_step)], [-k], **(style | {"ls": ""}))
-        draw_front(ax, good, lambda p: p.seconds, lambda p: p.error)
+        draw_front(ax, points)
         axes_log(ax, "time of a run [s]", "relative error of the deformation")
         axes_log(order, "time steps", "error in time")
-        _steps_axes(step, names)
+        _steps_axes(step, list(lines))
         if _band(ax, error):
-            handles.append(Line2D([], [], color="#bbbbbb", lw=5, alpha=0.5, label="error of the reference"))
-        handles.append(Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT))
+            handles.append(band_handle())
+        handles.append(front_handle())
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
         return save(figure, out_png)
 
 
-def _gain(p: WorkPoint) -> tuple[str, int]:
-    return str(p.details["basis"]), int(p.details["N"])
+def _gain(p: LoopPoint) -> tuple[str, int]:
+    return p.basis, p.N
 
 
 def _steps_axes(ax: Any, names: Sequence[str]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,25 +30,49 @@ class Slope:
     count: int
 
 
-def usable(points: Sequence[WorkPoint]) -> list[WorkPoint]:
-    """Points that may be used and have a finite error and time. Not collective."""
+def seconds_of(point: WorkPoint) -> float:
+    """What a point costs [s]."""
+    return point.seconds
+
+
+def error_of(point: WorkPoint) -> float:
+    """What a point leaves."""
+    return point.error
+
+
+def usable[P: WorkPoint](points: Sequence[P]) -> list[P]:
+    """Points that may be used and have a finite error and time."""
     return [p for p in points if p.ok and np.isfinite(p.error) and np.isfinite(p.seconds) and p.seconds > 0]
 
 
-def pareto(points: Sequence[WorkPoint]) -> list[WorkPoint]:
-    """Points that no other beats in time and error at once, by time; less than :data:`GAIN` counts as none.
-
-    Not collective.
-    """
-    front: list[WorkPoint] = []
-    for p in sorted(usable(points), key=lambda p: (p.seconds, p.error)):
-        if not front or p.error < (1 - GAIN) * front[-1].error:
+def pareto[P: WorkPoint](
+    points: Sequence[P], x: Callable[[P], float] = seconds_of, y: Callable[[P], float] = error_of
+) -> list[P]:
+    """Points that no other beats in x and y at once, by x; less than :data:`GAIN` counts as none."""
+    front: list[P] = []
+    good = (p for p in points if p.ok and np.isfinite(y(p)) and np.isfinite(x(p)) and x(p) > 0)
+    for p in sorted(good, key=lambda p: (x(p), y(p))):
+        if not front or y(p) < (1 - GAIN) * y(front[-1]):
             front.append(p)
     return front
 
 
+def series_of[P: WorkPoint](points: Sequence[P]) -> dict[str, list[P]]:
+    """Points by their line, in the order of the first ones."""
+    lines: dict[str, list[P]] = {}
+    for p in points:
+        lines.setdefault(p.series, []).append(p)
+    return lines
+
+
+def slope(question: str, series: str, against: str, x: Sequence[float], y: Sequence[float]) -> list[Slope]:
+    """The slope of y against x; nothing where they do not tell one."""
+    power = power_law(x, y)
+    return [] if power is None else [Slope(question, series, against, power, len(x))]
+
+
 def power_law(x: Sequence[float], y: Sequence[float]) -> float | None:
-    """Exponent of y ~ x^power; None with fewer than two different x or values that are not positive. Not collective."""
+    """Exponent of y ~ x^power; None with fewer than two different x or values that are not positive."""
     a, b = np.array(x, dtype=float), np.array(y, dtype=float)
     good = (a > 0) & (b > 0) & np.isfinite(a) & np.isfinite(b)
     if len(set(a[good])) < 2:

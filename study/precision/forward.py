@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.fit import Slope, interpolate, power_law
-from softgrasp.study.precision.full import FullRuns, errors_of, largest
+from softgrasp.study.precision.fit import Slope, interpolate, series_of, slope
+from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.meshes import halved_meshes, nested_meshes, smallest_mesh
-from softgrasp.study.precision.points import LEAST_STEPS, Row, Setting, WorkPoint, least_steps, scene_setting
-from softgrasp.study.precision.reference import Reference
+from softgrasp.study.precision.points import ForwardPoint
+from softgrasp.study.precision.result import Question, Truth
+from softgrasp.study.precision.series import TimedRun, errors_of
+from softgrasp.study.precision.settings import LEAST_STEPS, Group, Setting, least_steps, scene_setting
 
 SHARES = (2.0, 1.0, 0.5, 0.25, 0.125)  # of the scene's steps
 CG_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
@@ -21,7 +23,6 @@ MESHES = 5  # of each order, besides the scene's own
 FINEST = 3  # numbers of steps behind a slope in time: coarser ones may not resolve the motion
 CLEAR = 2.0  # times the error of the reference, from which on an error has an order
 SAFETY = 0.9  # of the tolerance that a predicted error may use
-Group = tuple[tuple[int, ...] | None, int]
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Prediction:
     setting: Setting
     error: float
     seconds: float
-    point: WorkPoint | None
+    point: ForwardPoint | None
 
 
 def step_counts(steps: int, least: int = LEAST_STEPS) -> list[int]:
@@ -51,96 +52,81 @@ def forward_settings(scene: Scene, d: int) -> list[Setting]:
     own = scene_setting(scene)
     groups: list[Group] = [(own.cells, own.order)]
     groups += [(cells, order) for order in (1, 2) for cells in (halved_meshes(scene, MESHES) or (None,))]
-    found = []
+    settings = []
     for cells, order in dict.fromkeys(groups):
         for steps in step_counts(scene.time.steps, least_steps(scene)):
             setting = Setting(cells, order, steps)
-            small = setting.unknowns(d) * steps <= POINT_WORK[d] or steps <= scene.time.steps / 4
-            if small or (cells, order) == groups[0]:
-                found.append(setting)
+            quick = setting.unknowns(d) * steps <= POINT_WORK[d] or steps <= scene.time.steps / 4
+            if quick or (cells, order) == groups[0]:
+                settings.append(setting)
     base = replace(own, solver="auto")
     solvers = [replace(base, solver=name) for name in ("cholesky", "mumps")]
-    return found + solvers + [replace(base, solver="cg", rtol=rtol) for rtol in CG_TOLERANCES]
+    return settings + solvers + [replace(base, solver="cg", rtol=rtol) for rtol in CG_TOLERANCES]
 
 
-def to_point(setting: Setting, row: Row, runs: FullRuns, reference: Reference, series: str = "") -> WorkPoint:
-    """A run as a point of the diagram; its error may be anything in ``error_range``. Not collective."""
-    error, displacement = errors_of(runs.series(row), reference.series)
-    kept = ("n_e", "states", "steps", "dt", "mesh", "assembly", "factor", "per_step", "p50", "p99", "max")
-    details = {
-        "cells": None if setting.cells is None else list(setting.cells), "order": setting.order,
-        "solver": setting.solver, "rtol": setting.rtol if setting.solver == "cg" else None,
-        "error_deformation": error, "error_displacement": displacement, "error_range": reference.range_of(error),
-        **{key: row[key] for key in kept},
-    }  # fmt: skip
-    return WorkPoint("forward", series or setting.mesh, setting.label, row["seconds"], error, True, details)
+def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | None = None) -> ForwardPoint:
+    """A run as a point of the diagram; its error may be anything in ``error_range``.
 
-
-def sweep_forward(scene: Scene, runs: FullRuns, reference: Reference) -> list[WorkPoint]:
-    """Run all settings of the diagram. Collective.
-
-    Each point also carries ``error_time``, the change of the outputs against the most steps on its mesh.
-
-    Raises:
-        SolverError: a run failed.
-        Interrupted: somebody asked to stop.
+    Args:
+        setting: of the run.
+        run: measured.
+        truth: what its outputs are compared with.
+        finest: the run with the most steps on the same mesh, when this is not it.
     """
-    points: list[WorkPoint] = []
-    finest: dict[Group, Row] = {}
-    for setting in forward_settings(scene, reference.series.dimension):
-        row = runs.run(setting)
-        group = (setting.cells, setting.order)
-        if setting.solver != "auto":
-            points.append(to_point(setting, row, runs, reference, "solver"))
-            continue
-        best = finest.setdefault(group, row)
-        point = to_point(setting, row, runs, reference)
-        if best is not row:
-            series, true = runs.series(row), runs.series(best)
-            gap = largest(series.values - true.at(series.times), series.dimension)[0]
-            scale = largest(true.values, true.dimension)[0]
-            point.details["error_time"] = gap / scale if scale > 0 else 0.0
-        points.append(point)
-    return points
+    error, displacement = errors_of(run.series, truth.series)
+    names = ("n_e", "states", "steps", "dt", "mesh", "assembly", "factor", "per_step", "p50", "p99", "max")
+    return ForwardPoint(
+        setting.mesh if setting.solver == "auto" else "solver", setting.label, run.seconds, error, cells=setting.cells,
+        order=setting.order, solver=setting.solver, rtol=setting.rtol if setting.solver == "cg" else None,
+        error_deformation=error, error_displacement=displacement, error_range=truth.range_of(error),
+        error_time=None if finest is None else errors_of(run.series, finest.series)[0],
+        **{name: getattr(run, name) for name in names},
+    )  # fmt: skip
 
 
-def setting_of(point: WorkPoint) -> Setting:
-    """The setting of the full run of a point, or behind a reduced one. Not collective."""
-    d = point.details
-    cells = None if d["cells"] is None else tuple(d["cells"])
-    return Setting(cells, d["order"], d["steps"], d["solver"], d["rtol"] or 1e-10)
+def ask_forward(scene: Scene, runs: FullRuns, truth: Truth) -> Question:
+    """Run all settings of the diagram. Collective."""
+    points: list[ForwardPoint] = []
+    finest: dict[Group, TimedRun] = {}
+    for setting in forward_settings(scene, truth.series.dimension):
+        run = runs.run(setting)
+        best = run if setting.solver != "auto" else finest.setdefault(setting.group, run)
+        points.append(to_point(setting, run, truth, None if best is run else best))
+    return Question(tuple(points), tuple(forward_slopes(points, truth.error)), truth)
 
 
-def forward_slopes(points: Sequence[WorkPoint], reference_error: float) -> list[Slope]:
+def on_meshes(points: Sequence[ForwardPoint], order: int) -> list[ForwardPoint]:
+    """Points with the most steps on each structured mesh of an element order, coarse to fine."""
+    fine = [p for p in points if p.series != "solver" and p.order == order and p.cells and p.error_time is None]
+    return sorted(fine, key=lambda p: p.n_e)
+
+
+def over_steps(points: Sequence[ForwardPoint]) -> dict[str, list[ForwardPoint]]:
+    """Points with a change in time on each mesh, few steps to many."""
+    timed = [p for p in points if p.series != "solver" and p.error_time]
+    return {name: sorted(line, key=lambda p: p.steps) for name, line in series_of(timed).items()}
+
+
+def forward_slopes(points: Sequence[ForwardPoint], truth_error: float) -> list[Slope]:
     """Orders: of the error in the cells (most steps), of the change in the steps, of time in the unknowns.
 
-    Errors nearer than :data:`CLEAR` times that of the reference tell no order. Not collective.
+    Errors nearer than :data:`CLEAR` times that of the reference tell no order.
     """
-    found: list[Slope] = []
-    plain = [p for p in points if p.series != "solver"]
+    slopes: list[Slope] = []
     for order in (1, 2):
-        mine = [
-            p for p in plain if p.details["order"] == order and p.details["cells"] and "error_time" not in p.details
-        ]
-        mine = sorted((p for p in mine if p.error > CLEAR * reference_error), key=lambda p: p.details["n_e"])
-        name = f"P{order}"
-        for against, x, y in (
-            ("cells along an edge", [p.details["cells"][0] for p in mine], [p.error for p in mine]),
-            ("seconds", [p.seconds for p in mine], [p.error for p in mine]),
-        ):
-            power = power_law(x, y)
-            if power is not None:
-                found.append(Slope("forward", name, f"error against {against}", power, len(mine)))
-    timed = [p for p in plain if p.details.get("error_time", 0) > 0]
-    for series in dict.fromkeys(p.series for p in timed):
-        mine = sorted((p for p in timed if p.series == series), key=lambda p: p.details["steps"])[-FINEST:]
-        power = power_law([p.details["steps"] for p in mine], [p.details["error_time"] for p in mine])
-        if power is not None:
-            found.append(Slope("forward", series, "change in time against steps", power, len(mine)))
-    power = power_law([p.details["n_e"] for p in plain], [p.details["per_step"] for p in plain])
-    if power is not None:
-        found.append(Slope("forward", "all", "seconds of a step against unknowns", power, len(plain)))
-    return found
+        line = [p for p in on_meshes(points, order) if p.error > CLEAR * truth_error]
+        name, errors = f"P{order}", [p.error for p in line]
+        slopes += slope(
+            "forward", name, "error against cells along an edge", [(p.cells or (0,))[0] for p in line], errors
+        )
+        slopes += slope("forward", name, "error against seconds", [p.seconds for p in line], errors)
+    for name, line in over_steps(points).items():
+        last = line[-FINEST:]
+        changes = [p.error_time or 0.0 for p in last]
+        slopes += slope("forward", name, "change in time against steps", [p.steps for p in last], changes)
+    runs = [p for p in points if p.series != "solver"]
+    sizes, per_step = [p.n_e for p in runs], [p.per_step for p in runs]
+    return slopes + slope("forward", "all", "seconds of a step against unknowns", sizes, per_step)
 
 
 class Predictor:
@@ -154,25 +140,18 @@ class Predictor:
         points: of the forward diagram.
     """
 
-    def __init__(self, scene: Scene, points: Sequence[WorkPoint]) -> None:
+    def __init__(self, scene: Scene, points: Sequence[ForwardPoint]) -> None:
         self.scene = scene
-        self.plain = [p for p in points if p.series != "solver"]
-        self.tried = {setting_of(p): p for p in self.plain}
-        self.space: dict[Group, WorkPoint] = {}
-        for p in self.plain:
-            s = setting_of(p)
-            best = self.space.setdefault((s.cells, s.order), p)
-            if p.details["steps"] > best.details["steps"]:
-                self.space[(s.cells, s.order)] = p
-        changing = [p for p in self.plain if p.details.get("error_time", 0) > 0]
-        names = [p.series for p in changing]
+        runs = [p for p in points if p.series != "solver"]
+        self.runs = {p.setting: p for p in runs}
+        self.space: dict[Group, ForwardPoint] = {}  # the most steps on every mesh
+        for p in sorted(runs, key=lambda p: p.steps):
+            self.space[p.setting.group] = p
+        changing = over_steps(runs)
         # the mesh with the most steps tried tells about time, the finest of those
-        best_name = max(names, key=lambda n: (names.count(n), n), default="")
-        most = max((p.details["steps"] for p in self.plain if p.series == best_name), default=1)
-        self.time = {
-            int(p.details["steps"]): p.details["error_time"] / (1 - (p.details["steps"] / most) ** 2)
-            for p in changing if p.series == best_name
-        }  # fmt: skip
+        name = max(changing, key=lambda n: (len(changing[n]), n), default="")
+        most = max((p.steps for p in runs if p.series == name), default=1)
+        self.time = {p.steps: (p.error_time or 0.0) / (1 - (p.steps / most) ** 2) for p in changing.get(name, ())}
 
     def space_error(self, group: Group) -> float:
         """Error of a mesh at its most steps; of others by the slope of their element order."""
@@ -194,24 +173,20 @@ class Predictor:
         """Error and times of a setting. Not collective."""
         cells, order = setting.cells, setting.order
         error = self.space_error((cells, order)) + self.time_error(setting.steps)
-        mine = self.space.get((cells, order))
-        if mine is None:
-            d = len(cells or ())
-            others = [p for (c, o), p in self.space.items() if o == order]
-            sizes = [p.details["n_e"] for p in others]
-            n = float(setting.unknowns(d))
+        known = self.space.get((cells, order))
+        others = [p for (c, o), p in self.space.items() if o == order]
 
-            def grown(key: str) -> float:
-                return interpolate(n, sizes, [p.details[key] for p in others])
+        def seconds(stage: str) -> float:
+            if known is not None:
+                return float(getattr(known, stage))
+            n = float(setting.unknowns(len(cells or ())))
+            return interpolate(n, [p.n_e for p in others], [getattr(p, stage) for p in others])
 
-            stages, per_step = sum(grown(key) for key in ("mesh", "assembly", "factor")), grown("per_step")
-        else:
-            stages = sum(mine.details[key] for key in ("mesh", "assembly", "factor"))
-            per_step = mine.details["per_step"]
-        return Prediction(setting, error, stages + setting.steps * per_step, self.tried.get(setting))
+        stages = sum(seconds(stage) for stage in ("mesh", "assembly", "factor"))
+        return Prediction(setting, error, stages + setting.steps * seconds("per_step"), self.runs.get(setting))
 
     def candidates(self) -> list[Prediction]:
-        """All settings worth a thought: tried ones, other steps on their meshes, and finer meshes. Not collective."""
+        """Settings of the diagram, other steps on their meshes, and finer meshes."""
         groups = list(self.space)
         if self.scene.tissue.cells is not None:
             coarse = smallest_mesh(self.scene)
@@ -227,8 +202,8 @@ class Predictor:
         settings = [Setting(cells, order, steps) for cells, order in groups for steps in counts]
         return [self.predict(s) for s in settings]
 
-    def affordable(self, found: Prediction) -> bool:
-        """Whether a setting may be run to measure it. Not collective."""
-        s, d = found.setting, len(found.setting.cells or ()) or self.scene.dimension or 3
-        small = s.unknowns(d) <= LARGEST[d] and s.unknowns(d) * s.steps <= GROWTH * POINT_WORK[d]
-        return found.point is not None or small
+    def affordable(self, prediction: Prediction) -> bool:
+        """Whether a setting may be run to measure it."""
+        s, d = prediction.setting, len(prediction.setting.cells or ()) or self.scene.dimension or 3
+        quick = s.unknowns(d) <= LARGEST[d] and s.unknowns(d) * s.steps <= GROWTH * POINT_WORK[d]
+        return prediction.point is not None or quick

@@ -1,7 +1,7 @@
 """The question of the closed loop: controller x time step against the error of the trajectory, its cost and time.
 
 The reference has no time step: with y - y_bar = C exp(F t) e(0), F = A + B K on the modes of the tissue, the optimal
-loop is known at every instant up to the modes left out, and halving their number shows what those are worth. Errors are
+loop is known at every instant up to the modes left out, and halving their number shows how much they matter. Errors are
 those of the outputs against the hand, y - C_s q_s, over the largest such output on the way; beside them stand those of
 y itself, over the way to go, in which the motion of the hand hides the tissue.
 """
@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -32,16 +31,18 @@ from softgrasp.lqr.reduced.bases import BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import reduce_riccati
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.study.control.result import TITLES
-from softgrasp.study.precision.fit import Slope, power_law
-from softgrasp.study.precision.points import LEAST_STEPS, Row, WorkPoint, number
-from softgrasp.study.precision.riccati import SECOND, ControlRuns
+from softgrasp.study.precision.fit import Slope, series_of, slope
+from softgrasp.study.precision.points import LoopPoint
+from softgrasp.study.precision.result import LoopReference, Question
+from softgrasp.study.precision.riccati import ControlRuns
 from softgrasp.study.precision.riccati_reduced import A_PRIORI
+from softgrasp.study.precision.settings import LEAST_STEPS
 
 SHARES = (16.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # of the scene's steps
 LOOP_WORK = {2: 5e6, 3: 2e6}  # unknowns times steps of one run of the full plant
 BURST_SECONDS = 0.02  # of the steps in each repeat after the first, which is the whole run
 PAPER_BASIS, PAPER_N = "pod", 8  # of the paper's controller
-CONTROLLERS = 7  # about so many on the full plant
+CONTROLLERS = 7  # about so many
 FINEST = 2  # numbers of steps behind an order in time: longer steps do not resolve what the start excites
 GONE = 10.0  # times the way to go: a run that is farther from the reference is lost
 
@@ -63,15 +64,11 @@ class Feedback:
         """In words."""
         if not self.basis:
             return "optimal gain"
-        return (
-            f"a priori N = {self.N}"
-            if self.basis == A_PRIORI
-            else f"{TITLES.get(self.basis, self.basis)}, N = {self.N}"
-        )
+        return f"a priori N = {self.N}" if self.basis == A_PRIORI else f"{TITLES[self.basis]}, N = {self.N}"
 
 
 @dataclass(frozen=True)
-class Controller:
+class LoopSetting:
     """What closes the loop.
 
     Attributes:
@@ -100,11 +97,11 @@ def step_counts(shares: Sequence[float], steps: int, n_e: int = 1, most: float =
         n_e: unknowns.
         most: unknowns times steps that a run may have; the scene's own and fewer steps always may.
     """
-    found = [round(steps * s) for s in shares if float(steps * s).is_integer()]
-    return [n for n in found if n >= LEAST_STEPS and (n <= steps or n * n_e <= most)]
+    whole = [round(steps * s) for s in shares if float(steps * s).is_integer()]
+    return [n for n in whole if n >= LEAST_STEPS and (n <= steps or n * n_e <= most)]
 
 
-class LoopRuns:
+class LoopSweep:
     """Closed loops of one scene; gains and reference are made when the first point is not in the cache. Collective.
 
     Limits and delay of the scene's loop are left out: the law is linear.
@@ -120,7 +117,7 @@ class LoopRuns:
         self._exact: dict[Feedback, Array] = {}
         self._families: dict[str, BasisFamily] = {}
         self._gains: dict[Feedback, Gain] = {}
-        self._ending: Row = {}
+        self._reference: LoopReference | None = None
 
     def gain(self, what: Feedback) -> Gain:
         """The gain as blocks."""
@@ -146,69 +143,66 @@ class LoopRuns:
             self._exact[what] = exact_outputs(self.runs, self.runs.design.judge.loop, self.gain(what), most)
         return self._exact[what][:: most // steps]
 
-    def reference_row(self) -> Row:
+    def reference(self) -> LoopReference:
         """Error estimate of the reference, cost and what is to come at the end, from the cache when they are there.
-
-        Keys: error, modes, complete, optimal, to_come.
 
         Raises:
             ControlError: no output moves against the hand.
         """
+        if self._reference is not None:
+            return self._reference
         if not self.layout.comm.allreduce(bool(np.any(self.runs.problem.C_z)), MPI.LOR):
             raise ControlError("no output moves against the hand, so that there is no deformation whose error counts")
 
-        def measure() -> Row:
+        def measure() -> list[LoopReference]:
             design, most, best = self.runs.design, self.counts[0], Feedback()
             true, loop, names = self.exact(best, most), design.judge.loop, design.problem.names
             modes, error = len(loop.plant.omega), 0.0
             if not loop.complete:
                 coarse = exact_outputs(self.runs, ModalLoop(design.problem, modes // 2), self.gain(best), most)
                 error = errors_of(coarse, true, names)[0]
-            run = self._full(Controller(best), most)[0]
+            run = self._full(LoopSetting(best), most)[0]
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
-            return {"error": error, "modes": modes, "complete": loop.complete, "optimal": design.judge.optimal,
-                    "to_come": rest}  # fmt: skip
+            return [LoopReference(error, modes, loop.complete, design.judge.optimal, rest)]
 
-        if not self._ending:
-            self.runs.guard.next("closed loop, reference", self.runs.work + SECOND)
-            self._ending = self.cache.get("loop", {"reference": self.counts}, measure)
-        return self._ending
+        self.runs.guard.next("closed loop, reference")
+        self._reference = self.cache.get("loop", {"reference": self.counts}, LoopReference, measure)[0]
+        return self._reference
 
     # --- controllers
 
     def gains(self) -> list[Feedback]:
         """Reduced gains: a priori with the hand alone, with a little and with more tissue; the paper's. Cached."""
 
-        def measure() -> Row:
-            wanted = orders(self.runs.design)[0]
-            there = self.family(A_PRIORI).orders(wanted)
-            small = [N for N in there if fast_order(self.layout.n_s) >= N]
-            rows = [[A_PRIORI, N] for N in dict.fromkeys([*small[:2], *small[-1:]])]
+        def measure() -> list[Feedback]:
+            sizes = orders(self.runs.design)[0]
+            fast = [N for N in self.family(A_PRIORI).orders(sizes) if fast_order(self.layout.n_s) >= N]
             try:
-                paper = self.family(PAPER_BASIS).orders(wanted)
+                paper = self.family(PAPER_BASIS).orders(sizes)
             except ControlError:
                 paper = []
-            rows += [[PAPER_BASIS, N] for N in sorted(paper, key=lambda N: abs(N - PAPER_N))[:1]]
-            return {"gains": rows}
+            nearest = sorted(paper, key=lambda N: abs(N - PAPER_N))[:1]
+            own = [Feedback(A_PRIORI, N) for N in dict.fromkeys([*fast[:2], *fast[-1:]])]
+            return own + [Feedback(PAPER_BASIS, N) for N in nearest]
 
         key = {"gains": list(self.scene.control.N) if self.scene.control else []}
-        return [Feedback(name, N) for name, N in self.cache.get("loop", key, measure)["gains"]]
+        return self.cache.get("loop", key, Feedback, measure)
 
-    def controllers(self) -> list[Controller]:
+    def controllers(self) -> list[LoopSetting]:
         """The optimal and the reduced gains on the full plant; a-priori gains with tissue on their own plant."""
         gains = self.gains()
-        small = [g for g in gains if g.basis == A_PRIORI and self.layout.n_s < g.N / 2]
-        found = [Controller(g) for g in (Feedback(), *gains)]
-        found += [Controller(g, held=True) for g in (Feedback(), *small[:1])]
-        found += [Controller(g, reduced=True) for g in small]
-        return found + [Controller(g, held=True, reduced=True) for g in small[:1]]
+        tissue = [g for g in gains if g.basis == A_PRIORI and self.layout.n_s < g.N / 2]
+        settings = [LoopSetting(g) for g in (Feedback(), *gains)]
+        settings += [LoopSetting(g, held=True) for g in (Feedback(), *tissue[:1])]
+        settings += [LoopSetting(g, reduced=True) for g in tissue]
+        return settings + [LoopSetting(g, held=True, reduced=True) for g in tissue[:1]]
 
     # --- runs
 
     def _law(self, held: bool, steps: int) -> Actuation:
         return Actuation(steps / self.scene.time_end) if held else Actuation()
 
-    def _full(self, what: Controller, steps: int) -> tuple[LoopTrajectory, list[float]]:
+    def _full(self, what: LoopSetting, steps: int) -> tuple[LoopTrajectory, list[float]]:
         """One run of the full plant and the mean seconds of its steps, by repeats."""
         design, comm, gain = self.runs.design, self.layout.comm, self.gain(what.gain)
         loop = ClosedLoop(self.runs.problem, self.scene.time_end / steps, self.scene.time.solver, self.scene.time.rtol)
@@ -224,16 +218,16 @@ class LoopRuns:
             loop.destroy()
         return first, means
 
-    def _small(self, what: Feedback) -> tuple[SmallPlant, Array]:
+    def _reduced_plant(self, what: Feedback) -> tuple[SmallPlant, Array]:
         """The reduced plant of an a-priori gain, and the gain on it."""
         problem, n_s, n = self.runs.problem, self.layout.n_s, self.layout.n_local
         V = self.family(what.basis).at(what.N).U.tall[n:, -((what.N - 2 * n_s) // 2) :]
         plant, shapes = galerkin(problem, V)
         return plant, shapes.reduce_gain(problem, self.gain(what))
 
-    def _reduced(self, what: Controller, steps: int) -> tuple[ReducedTrajectory, list[float]]:
+    def _reduced(self, what: LoopSetting, steps: int) -> tuple[ReducedTrajectory, list[float]]:
         """Runs of the reduced plant on rank 0."""
-        plant, K = self._small(what.gain)
+        plant, K = self._reduced_plant(what.gain)
         design, problem, n_s = self.runs.design, self.runs.problem, self.layout.n_s
         start = plant.rest_at(np.zeros(n_s))[0]
         if self.scene.time.start != "equilibrium":
@@ -242,53 +236,51 @@ class LoopRuns:
 
         def run() -> tuple[ReducedTrajectory, list[float]]:
             loop = ReducedLoop(plant, self.scene.time_end / steps)
-            found = [loop.run(K, rest, steps, (problem.Q, problem.R), law, start) for _ in range(self.runs.repeats)]
-            return found[0], [r.seconds["steps"] / steps for r in found]
+            runs = [loop.run(K, rest, steps, (problem.Q, problem.R), law, start) for _ in range(self.runs.repeats)]
+            return runs[0], [r.seconds["steps"] / steps for r in runs]
 
         return on_root(self.layout.comm, run)
 
-    def rows(self, what: Controller) -> Row:
-        """All steps of one controller, and whether its gain is certified to stabilise the full plant."""
+    def points(self, what: LoopSetting) -> list[LoopPoint]:
+        """All steps of one controller; not ok unless its gain is certified to stabilise the full plant."""
 
-        def measure() -> Row:
-            gain, stable = what.gain, True
-            if gain.basis:
-                stable = self.runs.design.judge.report(self.family(gain.basis).at(gain.N)).stable
-            return {"rows": [self._row(what, steps) for steps in self.counts], "stable": stable}
+        def measure() -> list[LoopPoint]:
+            gain = what.gain
+            stable = not gain.basis or self.runs.design.judge.report(self.family(gain.basis).at(gain.N)).stable
+            return [self._point(what, steps, stable) for steps in self.counts]
 
+        self.runs.guard.next(f"closed loop, {what.label}")
         key = {"controller": what.label, "counts": self.counts, "repeats": self.runs.repeats}
-        return self.cache.get("loop", key, measure)
+        return self.cache.get("loop", key, LoopPoint, measure)
 
-    def _row(self, what: Controller, steps: int) -> Row:
-        """Errors, cost and seconds of one controller and step.
-
-        Keys: error of the deformation and error_displacement against the optimal loop, error_time of the deformation
-        against the same gain without time step, cost_error.
-        """
-        ending = self.reference_row()
-        row: Row = {"steps": steps, "dt": self.scene.time_end / steps, "basis": what.gain.basis, "N": what.gain.N,
-                    "held": what.held, "reduced_plant": what.reduced, "reason": "", "error": None, "seconds": None,
-                    "per_step": None, "error_displacement": None, "error_time": None, "cost_error": None}  # fmt: skip
-        run: Any
+    def _point(self, what: LoopSetting, steps: int, stable: bool) -> LoopPoint:
+        """Errors, cost and seconds of one controller and step."""
+        reference, infinite = self.reference(), float("inf")
+        lost = LoopPoint(
+            what.label, f"{what.label}, {steps} steps", infinite, infinite, False, steps=steps,
+            dt=self.scene.time_end / steps, basis=what.gain.basis, N=what.gain.N, held=what.held,
+            reduced_plant=what.reduced,
+            per_step=infinite, error_displacement=infinite, error_time=infinite, cost_error=infinite,
+        )  # fmt: skip
+        run: LoopTrajectory | ReducedTrajectory
         try:
             run, means = self._reduced(what, steps) if what.reduced else self._full(what, steps)
         except (SolverError, ControlError) as failed:
-            return row | {"reason": str(failed)}
+            return replace(lost, reason=str(failed))
         problem, target = self.runs.problem, self.runs.design.target
         names, y = problem.names, run.outputs - target.y
         both = np.hstack([y - (run.q_s - target.state.q_s) @ problem.C_s.T, y])
         error, displacement = errors_of(both, self.exact(Feedback(), steps), names)
         if not displacement <= GONE:
-            return row | {"reason": "far from the reference"}
-        per_step = statistics.median(means)
+            return replace(lost, reason="far from the reference")
+        per_step, cost = statistics.median(means), float(run.cost[-1])
         setup = run.seconds["prepare" if what.reduced else "factor"]
-        due = ending["optimal"] - ending["to_come"]
-        return row | {
-            "error": error, "error_displacement": displacement, "per_step": per_step,
-            "seconds": setup + steps * per_step, "setup": setup,
-            "error_time": errors_of(both, self.exact(what.gain, steps), names)[0],
-            "cost": float(run.cost[-1]), "cost_error": abs(float(run.cost[-1]) - due) / ending["optimal"],
-        }  # fmt: skip
+        due = reference.optimal - reference.to_come
+        return replace(
+            lost, seconds=setup + steps * per_step, error=error, ok=stable, per_step=per_step, setup=setup,
+            error_displacement=displacement, error_time=errors_of(both, self.exact(what.gain, steps), names)[0],
+            cost=cost, cost_error=abs(cost - due) / reference.optimal,
+        )  # fmt: skip
 
 
 def largest(values: Array, names: Sequence[str]) -> float:
@@ -317,52 +309,37 @@ def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -
 
     def march() -> Array:
         step = scipy.linalg.expm(dt * (modal.A + modal.B @ K))
-        found, x = np.empty((steps + 1, len(C))), e
-        found[0] = C @ x
+        values, x = np.empty((steps + 1, len(C))), e
+        values[0] = C @ x
         with np.errstate(over="ignore", invalid="ignore"):  # of a gain that does not stabilise
             for n in range(steps):
                 x = step @ x
-                found[n + 1] = C @ x
-        return found
+                values[n + 1] = C @ x
+        return values
 
     return on_root(runs.layout.comm, march)
 
 
-def sweep_loop(loops: LoopRuns) -> list[WorkPoint]:
+def ask_loop(runs: ControlRuns) -> Question:
     """All controllers at all steps. Collective.
 
     A loop that is lost, or whose gain is not certified, stays as a point that is not ok.
 
     Raises:
         SolverError: the optimal loop cannot be made.
-        Interrupted: somebody asked to stop.
+        ControlError: no output moves against the hand.
     """
-    points = []
-    for what in loops.controllers():
-        loops.runs.guard.next(f"closed loop, {what.label}", controller_work(loops, what))
-        found = loops.rows(what)
-        for row in found["rows"]:
-            ok = found["stable"] and not row["reason"]
-            details = {k: v for k, v in row.items() if k not in ("error", "seconds")}
-            label = f"{what.label}, {row['steps']} steps"
-            points.append(
-                WorkPoint("loop", what.label, label, number(row["seconds"]), number(row["error"]), ok, details)
-            )
-    return points
+    loops = LoopSweep(runs)
+    reference = loops.reference()
+    points = [p for what in loops.controllers() for p in loops.points(what)]
+    return Question(tuple(points), tuple(loop_slopes(points)), reference)
 
 
-def controller_work(loops: LoopRuns, what: Controller) -> float:
-    """Expected work of one controller at all steps, in the unit of the guard. Not collective."""
-    return float(sum(loops.counts) * (50 if what.reduced else loops.layout.n_e + 200))
-
-
-def loop_slopes(points: Sequence[WorkPoint]) -> list[Slope]:
-    """Order in time of every controller on the full plant, against the same gain without time step. Not collective."""
-    found = []
-    for name in dict.fromkeys(p.series for p in points):
-        mine = [p for p in points if p.series == name and p.ok and not p.details["reduced_plant"]]
-        mine = sorted(mine, key=lambda p: -p.details["steps"])[:FINEST]
-        power = power_law([p.details["steps"] for p in mine], [p.details["error_time"] for p in mine])
-        if power is not None:
-            found.append(Slope("loop", name, "error in time against steps", power, len(mine)))
-    return found
+def loop_slopes(points: Sequence[LoopPoint]) -> list[Slope]:
+    """Order in time of every controller on the full plant, against the same gain without time step."""
+    slopes: list[Slope] = []
+    for name, line in series_of([p for p in points if p.ok and not p.reduced_plant]).items():
+        last = sorted(line, key=lambda p: -p.steps)[:FINEST]
+        errors = [p.error_time for p in last]
+        slopes += slope("loop", name, "error in time against steps", [p.steps for p in last], errors)
+    return slopes

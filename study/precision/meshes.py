@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.points import Setting, least_steps
+from softgrasp.study.precision.settings import Setting, least_steps
 
 WORK = {2: 5e7, 3: 6e6}  # unknowns times steps of the finest run of a reference: 10 to 30 s on a quiet core
 UNKNOWNS = {2: 150_000, 3: 60_000}
@@ -48,8 +48,8 @@ def smallest_mesh(scene: Scene) -> tuple[int, ...]:
     """
     cells, lines = scene.tissue.cells or [], edges(scene)
     for part in range(PARTS, 0, -1):
-        tried = [fitted(n / part, shares) for n, shares in zip(cells, lines, strict=True)]
-        unit = tuple(n for n in tried if n is not None)
+        counts = [fitted(n / part, shares) for n, shares in zip(cells, lines, strict=True)]
+        unit = tuple(n for n in counts if n is not None)
         stretch = [u * part / n for u, n in zip(unit, cells, strict=False)]
         if len(unit) == len(cells) and max(stretch) <= STRETCH * min(stretch):
             return unit

@@ -13,8 +13,10 @@ from matplotlib.ticker import Formatter, LogLocator
 
 from softgrasp.reduction.registry import METHODS
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, WIDTH, paper_style, save
-from softgrasp.study.precision.fit import Slope, pareto, usable
-from softgrasp.study.precision.points import WorkPoint
+from softgrasp.study.precision.fit import Slope, error_of, pareto, seconds_of, series_of, usable
+from softgrasp.study.precision.forward import on_meshes, over_steps
+from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RunPoint, WorkPoint
+from softgrasp.study.precision.tables import error_outputs
 from softgrasp.study.reduce.plots import LOOKS, SPARE
 from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 
@@ -23,7 +25,6 @@ SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "
 FRONT: dict[str, Any] = {"color": HAND, "lw": 1.6, "alpha": 0.35, "zorder": 1}
 THIN: dict[str, Any] = {"lw": 0.6, "alpha": 0.6, "zorder": 2}
 LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
-Value = Callable[[WorkPoint], float]
 
 
 class Between(Formatter):
@@ -52,98 +53,84 @@ def axes_log(ax: Any, x: str, y: str) -> None:
     ax.set_axisbelow(True)
 
 
-def draw_front(ax: Any, points: Sequence[WorkPoint], x: Value, y: Value) -> None:
+def draw_front[P: WorkPoint](
+    ax: Any, points: Sequence[P], x: Callable[[P], float] = seconds_of, y: Callable[[P], float] = error_of
+) -> None:
     """The points that no other beats, as a thick pale line."""
-    moved = [WorkPoint(p.question, p.series, p.label, x(p), y(p), p.ok) for p in points]
-    front = pareto(moved)
-    ax.plot([p.seconds for p in front], [p.error for p in front], marker="o", ms=7, mfc="none", **FRONT)
+    front = pareto(points, x, y)
+    ax.plot([x(p) for p in front], [y(p) for p in front], marker="o", ms=7, mfc="none", **FRONT)
 
 
-def _error(p: WorkPoint) -> float:
-    return p.error
+def front_handle() -> Line2D:
+    """Of the front, for a legend."""
+    return Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)
 
 
-def _seconds(p: WorkPoint) -> float:
-    return p.seconds
+def band_handle() -> Line2D:
+    """Of the grey band below the error of the reference, for a legend."""
+    return Line2D([], [], color="#bbbbbb", lw=5, alpha=0.5, label="error of the reference")
 
 
 def figure_forward(
-    points: Sequence[WorkPoint], slopes: Sequence[Slope], reference_error: float, paper: bool, out_png: Path
+    points: Sequence[ForwardPoint], slopes: Sequence[Slope], truth_error: float, paper: bool, out_png: Path
 ) -> tuple[Path, Path]:
     """Error of the deformation against the time of a whole run; beside it orders in space and time; PNG and PDF.
 
     Args:
-        points: of the forward question.
         slopes: fitted, for the labels.
-        reference_error: below it nothing can be told.
-        paper: draw the paper's time.
-        out_png: name of the picture; the PDF gets its stem.
+        truth_error: below it nothing can be told.
     """
-    plain = [p for p in usable(points) if p.series != "solver"]
+    good = [p for p in usable(points) if p.series != "solver"]
     with paper_style():
         figure = plt.figure(figsize=(WIDTH, 4.3), layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
         ax, space, time = (figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))
-        for name in dict.fromkeys(p.series for p in plain):
-            mine = sorted((p for p in plain if p.series == name), key=lambda p: p.details["steps"])
-            colour, marker = ORDER_LOOK[mine[0].details["order"]]
-            ax.plot([p.seconds for p in mine], [p.error for p in mine], color=colour, marker=marker, ms=3.2, **THIN)
-            cells = mine[-1].details["cells"]
-            if cells is not None:
+        for line in series_of(sorted(good, key=lambda p: p.steps)).values():
+            last = line[-1]
+            colour, marker = ORDER_LOOK[last.order]
+            ax.plot([p.seconds for p in line], [p.error for p in line], color=colour, marker=marker, ms=3.2, **THIN)
+            if last.cells is not None:
                 ax.annotate(
-                    "x".join(map(str, cells)), (mine[-1].seconds, mine[-1].error), (4, -2), textcoords="offset points",
+                    "x".join(map(str, last.cells)), (last.seconds, last.error), (4, -2), textcoords="offset points",
                     fontsize=6, color=colour,
                 )  # fmt: skip
         solvers = [p for p in usable(points) if p.series == "solver"]
         ax.plot([p.seconds for p in solvers], [p.error for p in solvers], ls="", marker="x", ms=4, color=GREEN)
-        draw_front(ax, points, _seconds, _error)
+        draw_front(ax, points)
         axes_log(ax, "time of a run [s]", "relative error of the deformation")
-        handles = [_order_handle(order, plain) for order in (1, 2)]
-        handles += [Line2D([], [], ls="", marker="x", ms=4, color=GREEN, label="other solvers")]
-        handles += [Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)]
+        handles = [
+            Line2D([], [], color=colour, marker=marker, ms=3.2, label=f"P{order}; along a line: steps", **THIN)
+            for order, (colour, marker) in ORDER_LOOK.items()
+            if any(p.order == order for p in good)
+        ]
+        handles += [Line2D([], [], ls="", marker="x", ms=4, color=GREEN, label="other solvers"), front_handle()]
         if paper:
             ax.axvline(PAPER_FULL, **LINE)
             handles.append(Line2D([], [], label=f"paper, {PAPER_FULL} s (no error given)", **LINE))
-        if reference_error > 0:
-            ax.axhspan(ax.get_ylim()[0] * 1e-6, reference_error, color="#bbbbbb", alpha=0.35, zorder=0, lw=0)
-            low = min([p.error for p in plain if p.error > 0], default=reference_error)
-            ax.set_ylim(bottom=min(0.5 * reference_error, 0.5 * low))
-            handles.append(Line2D([], [], color="#bbbbbb", lw=5, alpha=0.5, label="error of the reference"))
-        shown = [h for h in handles if h is not None]
-        figure.legend(handles=shown, loc="outside upper center", ncols=3, fontsize=6.5)
-        _orders(space, time, plain, slopes)
+        if truth_error > 0:
+            ax.axhspan(ax.get_ylim()[0] * 1e-6, truth_error, color="#bbbbbb", alpha=0.35, zorder=0, lw=0)
+            low = min([p.error for p in good if p.error > 0], default=truth_error)
+            ax.set_ylim(bottom=min(0.5 * truth_error, 0.5 * low))
+            handles.append(band_handle())
+        figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=6.5)
+        _orders(space, time, good, slopes)
         return save(figure, out_png)
 
 
-def _order_handle(order: int, points: Sequence[WorkPoint]) -> Line2D | None:
-    if all(p.details["order"] != order for p in points):
-        return None
-    colour, marker = ORDER_LOOK[order]
-    return Line2D([], [], color=colour, marker=marker, ms=3.2, label=f"P{order}; along a line: steps", **THIN)
-
-
-def _orders(space: Any, time: Any, plain: Sequence[WorkPoint], slopes: Sequence[Slope]) -> None:
+def _orders(space: Any, time: Any, points: Sequence[ForwardPoint], slopes: Sequence[Slope]) -> None:
     """Error against the cells at the most steps, and change against the steps."""
-    for order in (1, 2):
-        mine = [
-            p for p in plain if p.details["order"] == order and p.details["cells"] and "error_time" not in p.details
-        ]
-        mine.sort(key=lambda p: p.details["cells"][0])
-        if not mine:
+    for order, (colour, marker) in ORDER_LOOK.items():
+        line = on_meshes(points, order)
+        if not line:
             continue
-        colour, marker = ORDER_LOOK[order]
         power = next((s.power for s in slopes if s.series == f"P{order}" and "cells" in s.against), None)
         label = f"P{order}" + ("" if power is None else f", slope {power:.2f}")
-        x, y = [p.details["cells"][0] for p in mine], [p.error for p in mine]
+        x, y = [(p.cells or (0,))[0] for p in line], [p.error for p in line]
         space.plot(x, y, color=colour, marker=marker, ms=3.2, lw=0.9, label=label)
     axes_log(space, "cells along an edge", "error")
-    timed = [p for p in plain if p.details.get("error_time", 0) > 0]
-    names = list(dict.fromkeys(p.series for p in timed))
-    for name in names:
-        mine = sorted((p for p in timed if p.series == name), key=lambda p: p.details["steps"])
-        colour, marker = ORDER_LOOK[mine[0].details["order"]]
-        x, y = [p.details["steps"] for p in mine], [p.details["error_time"] for p in mine]
-        time.plot(x, y, color=colour, marker=marker, ms=2.4, **THIN)
+    for line in over_steps(points).values():
+        colour, marker = ORDER_LOOK[line[0].order]
+        time.plot([p.steps for p in line], [p.error_time for p in line], color=colour, marker=marker, ms=2.4, **THIN)
     powers = [s.power for s in slopes if s.against == "change in time against steps"]
     if powers:
         time.plot([], [], color=BLUE, label=f"slope {np.median(powers):.2f}", **THIN)
@@ -153,41 +140,35 @@ def _orders(space: Any, time: Any, plain: Sequence[WorkPoint], slopes: Sequence[
             ax.legend(loc="best", fontsize=6.5, handlelength=1.4)
 
 
-def figure_reduced(points: Sequence[WorkPoint], full: float, paper: bool, out_png: Path) -> tuple[Path, Path]:
+def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out_png: Path) -> tuple[Path, Path]:
     """Error of the deformation against the online time, and against that from nothing; PNG and PDF.
 
     Args:
-        points: of the reduced question.
         full: seconds of the full run on the same mesh and steps.
         paper: draw the paper's times; its error is one of the state.
-        out_png: name of the picture; the PDF gets its stem.
     """
-    names = list(dict.fromkeys(p.series for p in points))
+    names = list(series_of(points))
     others = [n for n in names if n not in LOOKS]
     look = {**LOOKS, **{key: SPARE[i % len(SPARE)] for i, key in enumerate(others)}}
 
-    def error(p: WorkPoint) -> float:
-        return float(p.details["error_outputs_full"])
+    def scratch(p: ReducedPoint) -> float:
+        return p.scratch
 
-    def scratch(p: WorkPoint) -> float:
-        return float(p.details["scratch"])
-
-    good = usable(points)
+    lines = series_of(sorted(usable(points), key=lambda p: p.N))
     with paper_style():
         figure, axes = plt.subplots(1, 2, figsize=(WIDTH, 3.7), sharey=True)
         for ax, x, label in zip(
-            axes, (_seconds, scratch), ("online time of a run [s]", "time from nothing: full run, basis, online [s]"),
+            axes, (seconds_of, scratch), ("online time of a run [s]", "time from nothing: full run, basis, online [s]"),
             strict=True,
         ):  # fmt: skip
-            for name in names:
-                mine = sorted((p for p in good if p.series == name), key=lambda p: p.details["N"])
+            for name, line in lines.items():
                 colour, dashes, marker = look[name]
                 fill = "full" if dashes == "-" else "none"
                 ax.plot(
-                    [x(p) for p in mine], [error(p) for p in mine], color=colour, ls=dashes, marker=marker, ms=3.2,
-                    fillstyle=fill, **THIN,
+                    [x(p) for p in line], [error_outputs(p) for p in line], color=colour, ls=dashes, marker=marker,
+                    ms=3.2, fillstyle=fill, **THIN,
                 )  # fmt: skip
-            draw_front(ax, points, x, error)
+            draw_front(ax, points, x, error_outputs)
             axes_log(ax, label, "relative error of the deformation" if ax is axes[0] else "")
             ax.axvline(full, color="#888888", lw=0.9, ls=(0, (4, 3)), zorder=0)
         if paper:
@@ -197,8 +178,7 @@ def figure_reduced(points: Sequence[WorkPoint], full: float, paper: bool, out_pn
             Line2D([], [], color=look[n][0], ls=look[n][1], marker=look[n][2], ms=3.2, lw=0.6, label=_title(n))
             for n in names
         ]
-        handles += [Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)]
-        handles += [Line2D([], [], color="#888888", lw=0.9, ls=(0, (4, 3)), label="full run")]
+        handles += [front_handle(), Line2D([], [], color="#888888", lw=0.9, ls=(0, (4, 3)), label="full run")]
         if paper:
             handles += [Line2D([], [], label=f"paper, N = 14: {PAPER_REDUCED} s", **(LINE | {"ls": ":"}))]
             handles += [Line2D([], [], label=f"paper, full: {PAPER_FULL} s", **LINE)]
@@ -216,36 +196,32 @@ def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) ->
     """One line a series, error against time; PNG and PDF."""
     with paper_style():
         figure, ax = plt.subplots(figsize=(0.62 * WIDTH, 2.9), layout="constrained")
-        for k, name in enumerate(dict.fromkeys(p.series for p in points)):
-            mine = [p for p in points if p.series == name and np.isfinite(p.error) and p.error > 0]
+        for k, (name, points_of) in enumerate(series_of(points).items()):
+            line = [p for p in points_of if np.isfinite(p.error) and p.error > 0]
             colour, marker = SERIES_LOOK[k % len(SERIES_LOOK)]
-            ax.plot([p.seconds for p in mine], [p.error for p in mine], color=colour, lw=0.8, label=_title(name))
-            for p in mine:
+            ax.plot([p.seconds for p in line], [p.error for p in line], color=colour, lw=0.8, label=_title(name))
+            for p in line:
                 face = colour if p.ok else "none"
                 ax.plot([p.seconds], [p.error], ls="", marker=marker, ms=3.6, color=colour, mfc=face)
-        draw_front(ax, points, _seconds, _error)
+        draw_front(ax, points)
         ax.plot([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)
         axes_log(ax, x, y)
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
         return save(figure, out_png)
 
 
-def figure_budget(
-    forward: Sequence[WorkPoint], reduced: Sequence[WorkPoint], budget: float, out_png: Path
-) -> tuple[Path, Path]:
+def figure_budget(points: Sequence[WorkPoint], budget: float, out_png: Path) -> tuple[Path, Path]:
     """Time of a step, median to 99 % and the largest, against the error of the deformation; PNG and PDF."""
-    groups = (("full model", BLUE, forward), ("reduced models", ORANGE, reduced))
     with paper_style():
         figure, ax = plt.subplots(figsize=(0.75 * WIDTH, 3.3), layout="constrained")
-        for name, colour, points in groups:
-            good = [p for p in usable(points) if p.details.get("p99") is not None and p.error > 0]
+        for name, colour, kind in (("full model", BLUE, ForwardPoint), ("reduced models", ORANGE, ReducedPoint)):
+            good: list[RunPoint] = [p for p in usable(points) if isinstance(p, kind) and p.error > 0]
             for p in good:
-                d = p.details
-                ax.plot([d["p50"], d["p99"]], [p.error] * 2, color=colour, lw=1.4, alpha=0.6, zorder=2)
-                ax.plot([d["p99"], d["max"]], [p.error] * 2, color=colour, lw=0.5, alpha=0.35, zorder=1)
+                ax.plot([p.p50, p.p99], [p.error] * 2, color=colour, lw=1.4, alpha=0.6, zorder=2)
+                ax.plot([p.p99, p.max], [p.error] * 2, color=colour, lw=0.5, alpha=0.35, zorder=1)
             y = [p.error for p in good]
-            ax.plot([p.details["p50"] for p in good], y, ls="", marker="o", ms=2.8, color=colour, label=name)
-            ax.plot([p.details["max"] for p in good], y, ls="", marker="|", ms=4, color=colour, alpha=0.6)
+            ax.plot([p.p50 for p in good], y, ls="", marker="o", ms=2.8, color=colour, label=name)
+            ax.plot([p.max for p in good], y, ls="", marker="|", ms=4, color=colour, alpha=0.6)
         ax.axvline(budget, label="the budget", **(LINE | {"zorder": 5}))
         axes_log(
             ax, "time of a step [s]: median, bar to 99 %, thin to the largest", "relative error of the deformation"

@@ -1,31 +1,14 @@
-"""What a work-precision study collects: settings, points, the cache that lets it resume, and how it is stopped."""
+"""What a work-precision study measures: one class of points for each of its questions."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from math import ceil
-from pathlib import Path
-from typing import Any
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, ClassVar
 
-import numpy as np
-from mpi4py import MPI
-
-from softgrasp import package_version
-from softgrasp.fem.errors import Interrupted, SceneError, agree
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.petsc import Array
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.switch import changed
+from softgrasp.fem.errors import SceneError
+from softgrasp.study.precision.settings import Setting
 from softgrasp.study.report.files import plain
 
-FORMAT = 2  # of the cached files
-LEAST_STEPS = 4  # of a run
 QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati", "loop")
 CONTROL = ("riccati", "reduced_riccati", "loop")  # of these, the ones about feedback
 TITLES = {
@@ -37,240 +20,15 @@ TITLES = {
     "loop": "Closed loop: controller and step",
 }
 
-Row = dict[str, Any]
-
 
 @dataclass(frozen=True)
-class Setting:
-    """How the full model is solved.
-
-    Attributes:
-        cells: of the structured box; None on a mesh file.
-        order: of the displacement, 1 or 2.
-        steps: equal time steps.
-        solver: linear solver.
-        rtol: tolerance of an iterative one.
-    """
-
-    cells: tuple[int, ...] | None
-    order: int
-    steps: int
-    solver: str = "auto"
-    rtol: float = 1e-10
-
-    @property
-    def mesh(self) -> str:
-        """Mesh and order in words."""
-        shape = "mesh file" if self.cells is None else " x ".join(map(str, self.cells))
-        return f"{shape}, P{self.order}"
-
-    @property
-    def label(self) -> str:
-        """All in words."""
-        tail = "" if self.solver == "auto" else f", {self.solver}" + (f" {self.rtol:g}" if self.solver == "cg" else "")
-        return f"{self.mesh}, {self.steps} steps{tail}"
-
-    @property
-    def overrides(self) -> list[str]:
-        """Arguments of ``--set`` that give this setting."""
-        found = [] if self.cells is None else [f"tissue.cells={list(self.cells)}"]
-        found += [f"tissue.order={self.order}", f"time.steps={self.steps}", f"time.solver={self.solver}"]
-        return found + ([f"time.rtol={self.rtol:g}"] if self.solver == "cg" else [])
-
-    def unknowns(self, d: int) -> int:
-        """About how many tissue unknowns a structured mesh has. Not collective."""
-        return 0 if self.cells is None else d * int(np.prod([self.order * n + 1 for n in self.cells]))
-
-
-def scene_setting(scene: Scene) -> Setting:
-    """The scene's own setting. Not collective."""
-    cells = None if scene.tissue.cells is None else tuple(scene.tissue.cells)
-    return Setting(cells, scene.tissue.order, scene.time.steps, scene.time.solver, scene.time.rtol)
-
-
-def least_steps(scene: Scene) -> int:
-    """Fewest steps of a run: a prescribed move needs two over its duration. Not collective."""
-    motion = scene.motion
-    if motion.drive == "motion" and motion.profile == "quintic":
-        return max(LEAST_STEPS, ceil(2 * scene.time_end / motion.duration))
-    return LEAST_STEPS
-
-
-def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: Sequence[float] | None = None) -> Scene:
-    """The scene under another setting. Not collective.
-
-    Args:
-        scene: the scene.
-        setting: mesh, order, steps and solver.
-        snapshots: where they go.
-        reference: point that the hand turns about, which by default moves a little with the mesh.
-    """
-
-    def edit(table: dict[str, Any]) -> None:
-        if setting.cells is not None:
-            table["tissue"]["cells"] = list(setting.cells)
-            table["tissue"].pop("refine", None)  # which may choose cells of its own: the series is one of even meshes
-        table["tissue"]["order"] = setting.order
-        table["time"] |= {"steps": setting.steps, "solver": setting.solver, "rtol": setting.rtol}
-        table["output"] = table.get("output", {}) | {"snapshots": snapshots, "every": 1}
-        if reference is not None:
-            table["hand"]["reference"] = list(reference)
-
-    return changed(scene, edit)
-
-
-@dataclass(frozen=True)
-class WorkPoint:
-    """One point of one diagram.
-
-    Attributes:
-        question: one of :data:`QUESTIONS`.
-        series: points that are one line.
-        label: the setting in words.
-        seconds: what it costs.
-        error: relative, of what the question is about.
-        ok: a setting that may be used; unstable models may not.
-        details: everything else that was measured.
-    """
-
-    question: str
-    series: str
-    label: str
-    seconds: float
-    error: float
-    ok: bool = True
-    details: Row = field(default_factory=dict)
-
-    def to_row(self) -> Row:
-        """A flat table row; numbers that are not finite become None. Not collective."""
-        row = asdict(self)
-        return {k: plain(v) for k, v in (row | row.pop("details")).items()}
-
-
-def number(value: float | None) -> float:
-    """A number out of JSON, where None stands for one that is not finite. Not collective."""
-    return float("inf") if value is None else float(value)
-
-
-class Cache:
-    """Measured points as JSON files by hash, so that an interrupted study goes on where it stopped.
-
-    The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
-    of ranks and the version. Collective.
-
-    Args:
-        folder: where the files are.
-        comm: ranks.
-        scene: the study's scene.
-    """
-
-    def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene) -> None:
-        self.folder, self.comm = folder, comm
-        self.scene = ""  # rank 0 looks for the files
-        with agree(comm):
-            if comm.rank == 0:
-                self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
-        self.hits = self.misses = 0
-
-    def path(self, kind: str, key: Row) -> Path:
-        """File of a point."""
-        whole = {"scene": self.scene, "ranks": self.comm.size, "version": package_version(), "format": FORMAT} | key
-        return (
-            self.folder / f"{kind}-{hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:20]}.json"
-        )
-
-    def get(self, kind: str, key: Row, measure: Callable[[], Row]) -> Row:
-        """The cached value, or the measured one, which is then kept; both as they come out of JSON."""
-        found: Row | None = None
-        if self.comm.rank == 0:
-            try:
-                found = json.loads(self.path(kind, key).read_text())["value"]
-            except (OSError, ValueError, KeyError):
-                found = None
-        found = self.comm.bcast(found)
-        if found is not None:
-            self.hits += 1
-            return found
-        self.misses += 1
-        value = json.loads(json.dumps(plain(measure())))
-        with agree(self.comm):
-            if self.comm.rank == 0:
-                self._write(self.path(kind, key), {"kind": kind, "key": key, "value": value})
-        return dict(self.comm.bcast(value))
-
-    def _write(self, path: Path, data: Row) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part")
-        part.write_text(json.dumps(data))
-        os.replace(part, path)  # a file is there whole or not at all
-
-
-def as_array(rows: Any) -> Array:
-    """An array out of JSON."""
-    return np.array(rows, dtype=float)
-
-
-@dataclass
-class Guard:
-    """Says between two points whether to go on, and how far the study is.
-
-    Attributes:
-        comm: ranks.
-        progress: called with the name of the point that comes and the share of work done.
-        work: expected work in all, any unit.
-        done: of it.
-        stop: filled by the first Ctrl-C.
-    """
-
-    comm: MPI.Intracomm
-    progress: Callable[[str, float], None] | None = None
-    work: float = 1.0
-    done: float = 0.0
-    stop: list[bool] = field(default_factory=list)
-
-    def next(self, label: str, work: float = 0.0) -> None:
-        """Before a point. Collective.
-
-        Raises:
-            Interrupted: somebody asked to stop.
-        """
-        if self.comm.allreduce(bool(self.stop), MPI.LOR):
-            raise Interrupted(
-                f"stopped before '{label}' with {100 * min(self.done / self.work, 1):.0f} % done; the same command "
-                "goes on from there"
-            )
-        if self.progress is not None:
-            self.progress(label, min(self.done / self.work, 1.0))
-        self.done += work
-
-
-@contextmanager
-def interruptible(guard: Guard) -> Iterator[None]:
-    """Turn the first Ctrl-C into a flag that is looked at between points; a second one interrupts at once."""
-
-    def note(number: int, frame: Any) -> None:
-        guard.stop.append(True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    try:
-        previous = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not the main thread: leave signals alone
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What is asked of a study.
+class Request:
+    """What a study shall answer.
 
     Attributes:
         tolerance: relative error of the deformation to answer for, or None.
         budget: seconds of a step to answer for, or None.
-        names: arguments of ``--question``, each one or several with commas; empty asks all questions.
+        names: arguments of ``--question``, each one or several with commas; empty stands for all questions.
     """
 
     tolerance: float | None = None
@@ -290,3 +48,215 @@ class Asked:
     def questions(self) -> tuple[str, ...]:
         """In the order of :data:`QUESTIONS`."""
         return tuple(q for q in QUESTIONS if q in self.names or not self.names)
+
+    @property
+    def options(self) -> str:
+        """As they are typed."""
+        tolerance = "" if self.tolerance is None else f" --tolerance {self.tolerance!r}"
+        budget = "" if self.budget is None else f" --budget {self.budget!r}s"
+        return tolerance + budget + (f" --question {','.join(self.names)}" if self.names else "")
+
+
+@dataclass(frozen=True)
+class WorkPoint:
+    """One point of a diagram.
+
+    Attributes:
+        series: points that are one line.
+        label: the setting in words.
+        seconds: what it costs.
+        error: relative, of what the question is about.
+        ok: a setting that may be used; unstable models may not.
+    """
+
+    question: ClassVar[str] = ""
+    series: str
+    label: str
+    seconds: float
+    error: float
+    ok: bool = True
+
+    def to_row(self) -> dict[str, Any]:
+        """A flat table row; what is not finite becomes None, and None of an optional attribute is left out."""
+        values = {
+            f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None or f.default is MISSING
+        }
+        return {"question": self.question, **{name: plain(value) for name, value in values.items()}}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPoint(WorkPoint):
+    """A run of the full model, or of a reduced one that was made of it.
+
+    Attributes:
+        error_deformation, error_displacement: largest error of the outputs against the hand, and of the outputs, over
+            the largest value.
+        error_range: between what the error of the deformation lies, given that of the reference.
+        p50, p99, max: quantiles of the seconds of a step; inf for an unstable model.
+        cells, order, steps, solver, rtol: of the full model.
+    """
+
+    cells: tuple[int, ...] | None
+    order: int
+    steps: int
+    solver: str
+    rtol: float | None
+    error_deformation: float
+    error_displacement: float
+    error_range: tuple[float, float]
+    p50: float
+    p99: float
+    max: float
+
+    @property
+    def setting(self) -> Setting:
+        """Of the full run, or of that behind a reduced model."""
+        return Setting(self.cells, self.order, self.steps, self.solver, self.rtol or 1e-10)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What names the run in result.json."""
+        return {"cells": self.cells, "order": self.order, "steps": self.steps, "solver": self.solver}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForwardPoint(RunPoint):
+    """A run of the full model.
+
+    Attributes:
+        n_e, states: unknowns.
+        dt, mesh, assembly, factor, per_step: step of the scheme, and seconds of the stages [s].
+        error_time: change of the deformation against the most steps on the same mesh; None for the most steps.
+    """
+
+    question: ClassVar[str] = "forward"
+    n_e: int
+    states: int
+    dt: float
+    mesh: float
+    assembly: float
+    factor: float
+    per_step: float
+    error_time: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReducedPoint(RunPoint):
+    """A run of a reduced model; the attributes not named here are those of :class:`study.reduce.sweep.Point`.
+
+    Attributes:
+        error_full, error_full_deformation: of the states against the full run behind the model.
+        error_outputs_full: of the deformation of the outputs against that run.
+        scratch: seconds with everything before it.
+        mesh: mesh and order of the full run in words.
+    """
+
+    question: ClassVar[str] = "reduced"
+    method: str
+    N: int
+    N_tissue: int
+    split: tuple[int, ...]
+    error_canonical: float
+    error_energy: float
+    projection_error_deformation: float
+    projection_error: float
+    time_offline: float
+    time_setup: float
+    time_online: float
+    spectral_abscissa: float
+    stable: bool
+    error_full: float
+    error_full_deformation: float
+    error_outputs_full: float
+    scratch: float
+    mesh: str
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What names the run in result.json."""
+        return super().parameters | {"method": self.method, "N": self.N}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BasisPoint(WorkPoint):
+    """A factorisation of the snapshots at a tolerance; orthonormality is the largest entry of ``|U'U - I|``."""
+
+    question: ClassVar[str] = "bases"
+    tolerance: float
+    columns: int
+    orthonormality: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiccatiPoint(WorkPoint):
+    """A solution of the Riccati equation by a method at a tolerance; ``reason`` when it was not reached."""
+
+    question: ClassVar[str] = "riccati"
+    method: str
+    tolerance: float
+    reason: str = ""
+    residual: float
+    repeats: int | None = None
+    rank: int | None = None
+    newton_steps: int | None = None
+    solves: int | None = None
+    factorisations: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReducedRiccatiPoint(WorkPoint):
+    """A reduced gain on the full plant; the attributes not named here are those of ``lqr``'s GainReport.
+
+    Attributes:
+        time_lift: seconds to project the equation and to lift its gain.
+        time_basis: seconds of the basis, all orders together.
+        scratch: seconds with everything before it.
+    """
+
+    question: ClassVar[str] = "reduced_riccati"
+    method: str
+    N: int
+    error_P: float  # noqa: N815
+    error_K: float  # noqa: N815
+    cost_excess: float
+    abscissa_full: float
+    time_are: float
+    stable: bool
+    certified: bool
+    reason: str
+    sampled_radius: float
+    time_lift: float
+    time_basis: float
+    scratch: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopPoint(WorkPoint):
+    """A closed loop with one controller and step.
+
+    Attributes:
+        steps, dt: of the run.
+        basis, N: of the gain; an empty basis is the optimal gain.
+        held: sampled at the start of every step and held, else inside the midpoint rule.
+        reduced_plant: on the reduced plant that the gain was made for.
+        reason: why the loop has no error.
+        per_step, setup: seconds.
+        error_displacement: of the outputs against the optimal loop, over the way to go.
+        error_time: of the deformation against the same gain without time step.
+        cost, cost_error: of the run, and how far from the optimal one [1].
+    """
+
+    question: ClassVar[str] = "loop"
+    steps: int
+    dt: float
+    basis: str
+    N: int
+    held: bool
+    reduced_plant: bool
+    reason: str = ""
+    per_step: float
+    error_displacement: float
+    error_time: float
+    cost_error: float
+    setup: float | None = None
+    cost: float | None = None

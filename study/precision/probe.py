@@ -69,25 +69,25 @@ def find_places(scene: Scene, model: Model) -> Places:
     Raises:
         SceneError: an output lies outside the body.
     """
-    wanted = scene.control.outputs if scene.control is not None else []
-    if all(output.kind == "hand" for output in wanted):
-        scene, wanted = scene.model_copy(update={"control": None}), []
-    found = make_outputs(scene, model.system)
+    outputs = scene.control.outputs if scene.control is not None else []
+    if all(output.kind == "hand" for output in outputs):
+        scene, outputs = scene.model_copy(update={"control": None}), []
+    nodes = make_outputs(scene, model.system)
     low, high = model.system.layout.bounds()
     points = []
-    for i, output in enumerate(found):
-        kind = wanted[i].kind if wanted else "farthest"
+    for i, node in enumerate(nodes):
+        kind = outputs[i].kind if outputs else "farthest"
         if kind == "hand":
             points.append(np.zeros((0, model.system.layout.dimension)))
         elif kind == "region":
-            box = np.clip(np.asarray(wanted[i].box, dtype=float), low, high)
+            box = np.clip(np.asarray(outputs[i].box, dtype=float), low, high)
             share = (np.arange(REGION_POINTS) + 0.5) / REGION_POINTS
             axes = [a + (b - a) * share for a, b in box.T]
             points.append(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, box.shape[1]))
         else:
-            named = wanted[i].point if wanted else None
-            points.append(np.array([output.point if named is None else named], dtype=float))
-    return Places(tuple(o.name for o in found), tuple(points))
+            named = outputs[i].point if outputs else None
+            points.append(np.array([node.point if named is None else named], dtype=float))
+    return Places(tuple(o.name for o in nodes), tuple(points))
 
 
 class ProbedRun(Run):

@@ -1,83 +1,131 @@
-"""Tables of ``softgrasp study`` about the full model, reduced models and slopes, for the terminal and the report."""
+"""Tables of ``softgrasp study``: the points of every question, slopes, and points.csv."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from softgrasp.reduction.registry import METHODS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
-from softgrasp.study.precision.fit import Slope, pareto
-from softgrasp.study.precision.points import WorkPoint
-from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
-
-FORWARD_HEADER = (
-    "setting",
-    "unknowns",
-    "error",
-    "displacement",
-    "assembly [s]",
-    "factor [s]",
-    "step [us]",
-    "run [s]",
-    "front",
+from softgrasp.study.precision.fit import pareto
+from softgrasp.study.precision.points import (
+    TITLES,
+    BasisPoint,
+    ForwardPoint,
+    LoopPoint,
+    ReducedPoint,
+    ReducedRiccatiPoint,
+    RiccatiPoint,
+    RunPoint,
+    WorkPoint,
 )
-REDUCED_HEADER = (
-    "setting", "N", "error", "state error", "error with the mesh", "online [s]", "from nothing [s]", "front",
-)  # fmt: skip
+from softgrasp.study.precision.result import WorkStudy
+from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
+from softgrasp.study.report.tables import Table
+
+HEADERS: dict[str, tuple[str, ...]] = {
+    "forward": (
+        "setting", "unknowns", "error", "displacement", "assembly [s]", "factor [s]", "step [us]", "run [s]", "front",
+    ),
+    "reduced": (
+        "setting", "N", "error", "state error", "error with the mesh", "online [s]", "from nothing [s]", "front",
+    ),
+    "bases": ("engine", "tolerance", "vectors", "left of the snapshots", "|U'U - I|", "time [s]", "front"),
+    "riccati": ("method", "tolerance", "gain error", "residual", "rank", "solves", "time [s]", "front"),
+    "reduced_riccati": (
+        "basis", "N", "gain error", "excess cost", "abscissa [1/s]", "equation [ms]", "from nothing [s]", "front",
+    ),
+    "loop": (
+        "controller", "steps", "error", "displacement", "error in time", "error of the cost", "step [us]", "run [s]",
+        "front",
+    ),
+}  # fmt: skip
+SERIES_TITLES: dict[str, dict[str, str]] = {
+    "reduced": {key: method.title for key, method in METHODS.items()},
+    "riccati": METHOD_TITLES,
+    "reduced_riccati": BASIS_TITLES,
+}
 
 
-def error_text(point: WorkPoint) -> float | str:
-    """The error, or below what it is where that of the reference is the larger one. Not collective."""
-    low, high = point.details["error_range"]
+def error_outputs(point: ReducedPoint) -> float:
+    """Error against the full run on the same mesh and steps."""
+    return point.error_outputs_full
+
+
+def front_of(points: Sequence[WorkPoint]) -> list[WorkPoint]:
+    """The Pareto front; of reduced models, that of the error against their own full run."""
+    return [*pareto([p for p in points if isinstance(p, ReducedPoint)], y=error_outputs)] or pareto(points)
+
+
+def question_table(name: str, points: Sequence[WorkPoint], front_only: bool = False) -> Table:
+    """Points of a question; the front alone needs no column that marks it."""
+    front = front_of(points)
+    if front_only:
+        return Table(HEADERS[name][:-1], [_cells(p) for p in front], f"{TITLES[name]}, Pareto front")
+    marks = ["*" if p in front else "" if p.ok else _why(p) for p in points]
+    return Table(HEADERS[name], [(*_cells(p), mark) for p, mark in zip(points, marks, strict=True)])
+
+
+def _cells(p: WorkPoint) -> tuple[Any, ...]:
+    """A row without its mark; what is not finite is a dash."""
+    cells: tuple[Any, ...]
+    title = SERIES_TITLES.get(p.question, {}).get(p.series, p.series)
+    match p:
+        case ForwardPoint():
+            times = p.assembly, p.factor, 1e6 * p.per_step, p.seconds
+            cells = p.label, p.n_e, _error(p), p.error_displacement, *times
+        case ReducedPoint():
+            cells = title, p.N, p.error_outputs_full, p.error_full, _error(p), p.seconds, p.scratch
+        case BasisPoint():
+            cells = title, p.tolerance, p.columns, p.error, p.orthonormality, p.seconds
+        case RiccatiPoint():
+            tolerance = None if p.series == "dense" else p.tolerance
+            cells = title, tolerance, p.error, p.residual, p.rank, p.solves, p.seconds
+        case ReducedRiccatiPoint():
+            cells = title, p.N, p.error, p.cost_excess, p.abscissa_full, 1e3 * p.seconds, p.scratch
+        case LoopPoint():
+            errors = p.error, p.error_displacement, p.error_time, p.cost_error
+            cells = title, p.steps, *errors, 1e6 * p.per_step, p.seconds
+        case _:
+            raise TypeError(f"no table of {type(p).__name__}")
+    return tuple("-" if c is None or (isinstance(c, float) and not np.isfinite(c)) else c for c in cells)
+
+
+def _error(point: RunPoint) -> float | str:
+    """The error, or below what it is where that of the reference is the larger one."""
+    low, high = point.error_range
     return f"< {high:.2g}" if low == 0 and np.isfinite(high) else point.error
 
 
-def forward_rows(points: Sequence[WorkPoint], front_only: bool = False) -> list[tuple[Any, ...]]:
-    """Rows under ``FORWARD_HEADER``. Not collective."""
-    front, rows = pareto(points), []
-    for p in front if front_only else points:
-        d = p.details
-        numbers = (d["assembly"], d["factor"], 1e6 * d["per_step"], p.seconds)
-        rows.append((p.label, d["n_e"], error_text(p), d["error_displacement"], *numbers, "*" if p in front else ""))
-    return rows
+def _why(p: WorkPoint) -> str:
+    """What is wrong with a point, in a word or two."""
+    match p:
+        case RiccatiPoint():
+            return "not reached"
+        case ReducedRiccatiPoint():
+            return "no solution" if p.reason else "unstable" if p.certified else "not certified"
+        case LoopPoint():
+            return "lost" if p.reason else "full plant not stable"
+    return "missed" if isinstance(p, BasisPoint) else "unstable"
 
 
-def reduced_rows(points: Sequence[WorkPoint], front_only: bool = False) -> list[tuple[Any, ...]]:
-    """Rows under ``REDUCED_HEADER``; the front is that of the error against the own full run. Not collective."""
-    front = own_front(points)
-    rows = []
-    for p in sorted(front, key=lambda p: p.seconds) if front_only else points:
-        d = p.details
-        name = METHODS[p.series].title if p.series in METHODS else p.series
-        mark = "*" if p in front else "" if p.ok else "unstable"
-        rows.append(
-            (name, d["N"], d["error_outputs_full"], d["error_full"], error_text(p), p.seconds, d["scratch"], mark)
-        )
-    return rows
-
-
-def own_front(points: Sequence[WorkPoint]) -> list[WorkPoint]:
-    """Front of the error against the full run on the same mesh and steps against online time. Not collective."""
-    moved = {
-        id(p): WorkPoint(p.question, p.series, p.label, p.seconds, p.details["error_outputs_full"], p.ok)
-        for p in points
-    }
-    front = pareto(list(moved.values()))
-    return [p for p in points if moved[id(p)] in front]
-
-
-def slope_rows(slopes: Sequence[Slope]) -> list[tuple[Any, ...]]:
-    """Question, series, what against what, power, points. Not collective."""
-    names: dict[str, dict[str, str]] = {
-        "reduced": {key: method.title for key, method in METHODS.items()},
-        "riccati": METHOD_TITLES,
-        "reduced_riccati": BASIS_TITLES,
-    }
-    return [
-        (s.question.replace("_", " "), names.get(s.question, {}).get(s.series, s.series), s.against,
+def slope_table(study: WorkStudy) -> Table:
+    """Question, series, what against what, power, points."""
+    rows = [
+        (s.question.replace("_", " "), SERIES_TITLES.get(s.question, {}).get(s.series, s.series), s.against,
          f"{s.power:+.2f}", s.count)
-        for s in slopes
+        for s in study.slopes
     ]  # fmt: skip
+    return Table(("question", "series", "of", "power", "points"), rows, "slopes, x^power")
+
+
+def points_table(study: WorkStudy) -> Table:
+    """All points of all questions; no mark for the front where there is no diagram."""
+    rows = [*chain.from_iterable(question.rows for question in study.questions.values())]
+    rows += [p.to_row() for p in study.measured_for_the_answers]
+    first = ("question", "series", "label", "seconds", "error", "ok", "pareto")
+    names = tuple(dict.fromkeys((*first, *chain.from_iterable(rows))))
+    return Table(names, [[row.get(name) for name in names] for row in rows])

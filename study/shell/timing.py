@@ -20,6 +20,14 @@ def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
     return float(comm.allreduce(time.perf_counter() - begin, MPI.MAX))
 
 
+def repeated(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int, seconds: float) -> list[float]:
+    """Seconds of a call, once and again while it was called fewer times and took less time in all. Collective."""
+    times: list[float] = []
+    while not times or (len(times) < repeats and sum(times) < seconds):
+        times.append(timed(comm, call))
+    return times
+
+
 def warm(count: int) -> int:
     """Steps before the timed ones: the method before left the caches full of its own factor. Not collective."""
     return max(1, count // 20)

@@ -25,7 +25,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import read_manifest, write_arrays, write_manifest
 from softgrasp.study.cli import app
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.precision.points import Cache
+from softgrasp.study.precision.cache import Cache
+from softgrasp.study.precision.riccati import Refusal
 from tests.helpers.models import make_scene
 
 HDF5 = {"snapshots": "hdf5"}
@@ -179,17 +180,19 @@ def test_a_mesh_that_changed_in_its_second_file_does_not_go_on(comm: MPI.Intraco
     """Neither a run nor the points of a study."""
     scene = mesh_scene(comm, mpi_tmp_path, 0.0)
     named, kept = (mpi_tmp_path / "block.xdmf").read_bytes(), Cache(mpi_tmp_path / "cache", comm, scene)
-    assert kept.get("point", {}, lambda: {"value": 1}) == {"value": 1}
+    assert kept.get("point", {}, Refusal, lambda: [Refusal("1")]) == [Refusal("1")]
     with pytest.raises(Interrupted):
         simulate(build(scene, comm=comm), RunOptions(mpi_tmp_path, until=6))
     again = mesh_scene(comm, mpi_tmp_path, 0.0)
     assert simulate(build(again, comm=comm), RunOptions(mpi_tmp_path, resume=True)).steps_timed == 6
-    assert Cache(mpi_tmp_path / "cache", comm, again).get("point", {}, lambda: {"value": 2}) == {"value": 1}
+    kept = Cache(mpi_tmp_path / "cache", comm, again)
+    assert kept.get("point", {}, Refusal, lambda: [Refusal("2")]) == [Refusal("1")]
     other = mesh_scene(comm, mpi_tmp_path, 0.5)
     assert (mpi_tmp_path / "block.xdmf").read_bytes() == named
     with pytest.raises(CheckpointError, match="a file that the scene names is not what it was"):
         simulate(build(other, comm=comm), RunOptions(mpi_tmp_path, resume=True))
-    assert Cache(mpi_tmp_path / "cache", comm, other).get("point", {}, lambda: {"value": 2}) == {"value": 2}
+    fresh = Cache(mpi_tmp_path / "cache", comm, other)
+    assert fresh.get("point", {}, Refusal, lambda: [Refusal("2")]) == [Refusal("2")]
 
 
 @pytest.fixture

@@ -33,13 +33,14 @@ from softgrasp.study.precision import reduced as wp_reduced
 from softgrasp.study.precision.answer import advice, parse_budget, parse_tolerance
 from softgrasp.study.precision.fit import interpolate, pareto, power_law
 from softgrasp.study.precision.forward import forward_settings
-from softgrasp.study.precision.full import largest
 from softgrasp.study.precision.meshes import corner_exponent, fitted, nested_meshes, singular_order
-from softgrasp.study.precision.page import rows_of
-from softgrasp.study.precision.points import Asked, Setting, WorkPoint, least_steps, variant
+from softgrasp.study.precision.points import Request, WorkPoint
 from softgrasp.study.precision.probe import find_places, run_probed
-from softgrasp.study.precision.reference import space_limit
-from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
+from softgrasp.study.precision.result import WorkStudy
+from softgrasp.study.precision.run import run_study, study_scene
+from softgrasp.study.precision.series import largest
+from softgrasp.study.precision.settings import Setting, least_steps, variant
+from softgrasp.study.precision.truth import space_limit
 from softgrasp.study.reduce.run import run_reduce
 from tests.helpers.browser import look
 from tests.helpers.models import Array, graded_model, make_scene, rough_save, write_scene
@@ -87,7 +88,7 @@ def result(folder: Path) -> dict[str, Any]:
 def again(folder: Path) -> WorkStudy:
     """The same study out of the cache."""
     scene = make_scene(SMALL)
-    return study_scene(scene, MPI.COMM_WORLD, folder / "cache", Asked(TOLERANCE, BUDGET))
+    return study_scene(scene, MPI.COMM_WORLD, folder / "cache", Request(TOLERANCE, BUDGET))
 
 
 def tip(comm: MPI.Intracomm, setting: Setting, model: Model | None = None) -> Array:
@@ -140,7 +141,7 @@ def test_every_point_lies_where_it_is_said_to(comm: MPI.Intracomm, result: dict[
 def test_reference_is_as_good_as_it_says_and_not_much_better(
     comm: MPI.Intracomm, folder: Path, result: dict[str, Any], truth: Array
 ) -> None:
-    reference = again(folder).reference
+    reference = again(folder).truth
     assert reference is not None
     error = apart(reference.series.at(np.linspace(0, 3, len(truth)))[:, :2], truth)
     assert error <= reference.error + TRUTH
@@ -181,7 +182,7 @@ def test_answers_carry_a_command_that_repeats_them(
     ],
 )
 def test_advice_names_what_carries_the_largest_share(shares: dict[str, float], words: str) -> None:
-    text = advice(shares, {"cells": [4, 8], "order": 1})
+    text = advice(shares, ((4, 8), 1))
     assert words in text
     assert text.startswith(f"Of its error, {max(shares, key=lambda name: shares[name])} carries the largest share")
 
@@ -197,15 +198,15 @@ def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dic
 def test_what_nothing_meets_is_said_with_what_came_closest(
     comm: MPI.Intracomm, result: dict[str, Any], folder: Path
 ) -> None:
-    study = study_scene(make_scene(SMALL), comm, folder / "cache", Asked(1e-9))
+    study = study_scene(make_scene(SMALL), comm, folder / "cache", Request(1e-9))
     answer = study.answers[0]
     assert not answer.met
     assert "Nothing tried meets 1e-09" in answer.sentences[0]
     assert answer.closest is not None
     errors = [p.error for points in study.points.values() for p in points if p.question != "bases" and p.ok]
-    assert answer.closest["measured"]["error"] == min(errors)
+    assert answer.closest.point.error == min(errors)
     # 16 x 32 cells with 64 steps: space is off by 0.06, time by less
-    shares = answer.closest["shares"]
+    shares = answer.closest.shares
     assert shares["space"] > shares["time"] > 0
     assert any(text.startswith("Of its error, space carries the largest share") for text in answer.sentences)
 
@@ -219,7 +220,7 @@ def test_budget_takes_the_most_accurate_that_fits(result: dict[str, Any]) -> Non
 
 
 def test_a_budget_that_nothing_fits_is_said(comm: MPI.Intracomm, result: dict[str, Any], folder: Path) -> None:
-    answer = study_scene(make_scene(SMALL), comm, folder / "cache", Asked(None, 1e-9)).answers[0]
+    answer = study_scene(make_scene(SMALL), comm, folder / "cache", Request(None, 1e-9)).answers[0]
     assert not answer.met
     assert answer.closest is not None
     assert answer.sentences[0].startswith("No full run fits")
@@ -231,7 +232,7 @@ def test_a_budget_that_nothing_fits_is_said(comm: MPI.Intracomm, result: dict[st
 def test_study_out_of_the_cache_is_the_same_table(result: dict[str, Any], folder: Path) -> None:
     study = again(folder)
     assert study.measured == 0
-    assert {k: rows_of(v) for k, v in study.points.items()} == result["points"]
+    assert {k: study.questions[k].rows for k in study.points} == result["points"]
 
 
 def test_interrupted_study_goes_on_to_the_same_errors(
@@ -258,7 +259,7 @@ def test_interrupted_study_goes_on_to_the_same_errors(
     assert {name: (mpi_tmp_path / name).read_text() for name in kept} == kept
     for name in ("forward", "reduced"):
         old = {r["label"]: r for r in result["points"][name]}
-        for row in rows_of(study.points[name]):
+        for row in study.questions[name].rows:
             # the same numbers but for the order of sums in parallel
             assert row["error"] == pytest.approx(old[row["label"]]["error"], rel=1e-6)
         assert len(old) == len({p.label for p in study.points[name]})
@@ -268,10 +269,9 @@ def test_interrupted_study_goes_on_to_the_same_errors(
 def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: dict[str, Any], tmp_path: Path) -> None:
     """The real command, with the limits of these tests, is killed in the middle, without a chance to clean up."""
     file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
-    limits = f"meshes.UNKNOWNS, forward.MESHES = {UNKNOWNS}, {MESHES}"
-    code = (
-        f"from softgrasp.study.precision import forward, meshes; {limits}; from softgrasp.study.cli import main; main()"
-    )
+    limits = f"wp_meshes.UNKNOWNS, wp_forward.MESHES = {UNKNOWNS}, {MESHES}"
+    rooms = "from softgrasp.study.precision import forward as wp_forward, meshes as wp_meshes"
+    code = f"{rooms}; {limits}; from softgrasp.study.cli import main; main()"
     command = [sys.executable, "-c", code, "study", str(file), "--out", str(tmp_path), "--question", "forward"]
     with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL) as process:
         while len(list(cache.glob("run-*.json"))) < 8 and process.poll() is None:
@@ -279,11 +279,11 @@ def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: d
         process.kill()
     assert process.returncode == -signal.SIGKILL  # before its end
     kept = {f.name: f.read_text() for f in cache.glob("*.json")}
-    study = study_scene(make_scene(SMALL), comm, cache, Asked(names=("forward",)))
+    study = study_scene(make_scene(SMALL), comm, cache, Request(names=("forward",)))
     assert study.cached >= len(kept) >= 8
     assert study.measured > 0
     assert {name: (cache / name).read_text() for name in kept} == kept
-    table = [(r["label"], r["error"], r["ok"]) for r in rows_of(study.points["forward"])]
+    table = [(r["label"], r["error"], r["ok"]) for r in study.questions["forward"].rows]
     assert table == [(r["label"], r["error"], r["ok"]) for r in result["points"]["forward"]]
 
 
@@ -390,7 +390,7 @@ def test_probe_is_exact_for_polynomials_of_its_order(comm: MPI.Intracomm, order:
 def test_outputs_that_move_with_the_hand_have_no_error(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     held = {"outputs": [{"kind": "node", "point": [0.0, 1.75], "name": "held"}]}
     with pytest.raises(SceneError, match=r"^control\.outputs: no output moves against the hand"):
-        study_scene(make_scene(SMALL, {"control": held}), comm, mpi_tmp_path, Asked(names=("forward",)))
+        study_scene(make_scene(SMALL, {"control": held}), comm, mpi_tmp_path, Request(names=("forward",)))
 
 
 def test_meshes_meet_the_ends_of_the_contact_zone_and_know_no_scene_cells() -> None:
@@ -435,7 +435,7 @@ def test_an_order_that_no_theory_explains_is_not_extrapolated() -> None:
 
 def test_pareto_and_power_law() -> None:
     points = [
-        WorkPoint("forward", "a", str(k), s, e, ok)
+        WorkPoint("a", str(k), s, e, ok)
         for k, (s, e, ok) in enumerate(
             [(1, 1, True), (2, 0.5, True), (3, 0.6, True), (0.5, 0.1, False), (4, 0.1, True)]
         )

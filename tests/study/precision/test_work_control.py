@@ -6,6 +6,7 @@ import csv
 import json
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,13 @@ from softgrasp.lqr.riccati import solve
 from softgrasp.study.precision import control_plots as work_control_plots
 from softgrasp.study.precision import loop as wp_loop
 from softgrasp.study.precision import riccati as wp_riccati
-from softgrasp.study.precision.control_page import notes, rows_of_control
+from softgrasp.study.precision.cache import Cache, Guard
+from softgrasp.study.precision.captions import paper_of, reference_text
 from softgrasp.study.precision.loop import step_counts
-from softgrasp.study.precision.page import rows_of
-from softgrasp.study.precision.points import CONTROL, Asked, Cache, Guard, WorkPoint
-from softgrasp.study.precision.run import WorkStudy, run_study, study_scene
+from softgrasp.study.precision.points import CONTROL, LoopPoint, ReducedRiccatiPoint, Request, RiccatiPoint
+from softgrasp.study.precision.result import Question, RiccatiReference, WorkStudy
+from softgrasp.study.precision.run import run_study, study_scene
+from softgrasp.study.precision.tables import question_table
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene, rough_save, write_scene
 
@@ -72,7 +75,7 @@ def the_problem(comm: MPI.Intracomm) -> RiccatiProblem:
 
 
 def asked(comm: MPI.Intracomm, cache: Path, changes: dict[str, Any], names: str = ALL) -> WorkStudy:
-    return study_scene(make_scene(SMALL, changes), comm, cache, Asked(names=(names,)))
+    return study_scene(make_scene(SMALL, changes), comm, cache, Request(names=(names,)))
 
 
 # --- Riccati equation
@@ -102,9 +105,9 @@ def test_no_method_is_its_own_judge(result: dict[str, Any]) -> None:
 
 
 def test_a_tolerance_below_rounding_is_a_point_that_is_not_reached() -> None:
-    bad = WorkPoint("riccati", "radi", "RADI", np.inf, np.inf, False, {"tolerance": 1e-16, "residual": None})
-    good = WorkPoint("riccati", "radi", "RADI", 0.1, 1e-9, True, {"tolerance": 1e-8, "residual": 1e-9})
-    rows = rows_of_control("riccati", [good, bad])
+    bad = RiccatiPoint("radi", "RADI", np.inf, np.inf, False, method="radi", tolerance=1e-16, residual=np.inf)
+    good = RiccatiPoint("radi", "RADI", 0.1, 1e-9, method="radi", tolerance=1e-8, residual=1e-9)
+    rows = question_table("riccati", [good, bad]).rows
     assert rows[0][-1] == "*"
     assert rows[1][-1] == "not reached"
     assert rows[1][2] == "-"
@@ -144,11 +147,14 @@ def test_excess_cost_is_what_the_closed_loop_pays(result: dict[str, Any]) -> Non
 
 
 def test_unstable_gains_are_marked_and_never_on_the_front() -> None:
-    d = {"N": 8, "cost_excess": None, "abscissa_full": 0.4, "reason": "", "certified": True, "scratch": 1.0}
-    bad = WorkPoint("reduced_riccati", "pod", "POD", 1e-4, 1e-9, False, d)
-    good = WorkPoint("reduced_riccati", "pod", "POD", 1e-3, 1e-2, True, d | {"cost_excess": 0.1})
-    assert [r[-1] for r in rows_of_control("reduced_riccati", [bad, good])] == ["unstable", "*"]
-    assert [r["pareto"] for r in rows_of([bad, good])] == [False, True]
+    good = ReducedRiccatiPoint(
+        "pod", "POD", 1e-3, 1e-2, method="pod", N=8, error_P=1e-2, error_K=1e-2, cost_excess=0.1, abscissa_full=-0.4,
+        time_are=1e-3, stable=True, certified=True, reason="", sampled_radius=0.9, time_lift=0.0, time_basis=0.0,
+        scratch=1.0,
+    )  # fmt: skip
+    bad = replace(good, seconds=1e-4, error=1e-9, ok=False, cost_excess=np.inf, abscissa_full=0.4, stable=False)
+    assert [r[-1] for r in question_table("reduced_riccati", [bad, good]).rows] == ["unstable", "*"]
+    assert [r["pareto"] for r in Question((bad, good)).rows] == [False, True]
 
 
 # --- closed loop
@@ -194,9 +200,10 @@ def test_reduced_plants_are_in_the_diagram(result: dict[str, Any]) -> None:
 
 
 def test_a_lost_loop_is_said(comm: MPI.Intracomm) -> None:
-    missing = dict.fromkeys(("error_displacement", "error_time", "cost_error", "per_step"))
-    d = {"steps": 4, **missing, "reason": "diverged", "N": 0}
-    rows = rows_of_control("loop", [WorkPoint("loop", "held", "held", np.inf, np.inf, False, d)])
+    missing = dict.fromkeys(("error_displacement", "error_time", "cost_error", "per_step"), np.inf)
+    lost = LoopPoint("held", "held", np.inf, np.inf, False, steps=4, dt=0.1, basis="", N=0, held=True,
+                     reduced_plant=False, reason="diverged", **missing)  # fmt: skip
+    rows = question_table("loop", [lost]).rows
     assert rows[0][-1] == "lost"
     assert rows[0][2:8] == ("-",) * 6
 
@@ -225,15 +232,15 @@ def test_interrupted_study_of_feedback_gives_the_same_table(
             signal.raise_signal(signal.SIGINT)  # Ctrl-C
 
     with pytest.raises(Interrupted, match="goes on from there"):
-        study_scene(scene, comm, mpi_tmp_path, Asked(names=(ALL,)), stop_later)
+        study_scene(scene, comm, mpi_tmp_path, Request(names=(ALL,)), stop_later)
     comm.Barrier()
     kept = {f.name: f.read_text() for f in mpi_tmp_path.glob("*.json")}
     comm.Barrier()
-    study = study_scene(scene, comm, mpi_tmp_path, Asked(names=(ALL,)))
+    study = study_scene(scene, comm, mpi_tmp_path, Request(names=(ALL,)))
     assert study.cached >= len(kept)
     assert {name: (mpi_tmp_path / name).read_text() for name in kept} == kept
     for name in CONTROL:
-        old, new = result["points"][name], rows_of(study.points[name])
+        old, new = result["points"][name], study.questions[name].rows
         assert [r["label"] for r in new] == [r["label"] for r in old]
         assert [r["ok"] for r in new] == [r["ok"] for r in old]
         if name == "riccati":
@@ -242,9 +249,9 @@ def test_interrupted_study_of_feedback_gives_the_same_table(
             # solutions made again differ by rounding, which errors of 1e-6 see to a few digits
             assert (a["error"] is None) == (b["error"] is None)
             assert a["error"] is None or a["error"] == pytest.approx(b["error"], rel=1e-3, abs=1e-9)
-    again = study_scene(scene, comm, mpi_tmp_path, Asked(names=(ALL,)))
+    again = study_scene(scene, comm, mpi_tmp_path, Request(names=(ALL,)))
     assert again.measured == 0
-    assert {k: rows_of(v) for k, v in again.points.items()} == {k: rows_of(v) for k, v in study.points.items()}
+    assert again.questions == study.questions
 
 
 @pytest.mark.parametrize(
@@ -267,7 +274,7 @@ def test_scenes_without_an_answer_are_told_why(
 def test_a_scene_without_control_has_the_other_questions_only(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     study = study_scene(
         make_scene({k: v for k, v in SMALL.items() if k != "control"}, {"control": None}), comm, mpi_tmp_path,
-        Asked(names=("riccati", "loop")),
+        Request(names=("riccati", "loop")),
     )  # fmt: skip
     assert study.skipped == dict.fromkeys(("riccati", "loop"), "the scene has no [control] section")
 
@@ -284,12 +291,12 @@ def test_large_scenes_are_asked_by_name_only(
 
 
 def test_questions_are_checked() -> None:
-    assert Asked().questions == ("forward", "reduced", "bases", *CONTROL)
-    assert Asked(names=("loop, riccati",)).questions == ("riccati", "loop")
+    assert Request().questions == ("forward", "reduced", "bases", *CONTROL)
+    assert Request(names=("loop, riccati",)).questions == ("riccati", "loop")
     with pytest.raises(SceneError, match=r"^--question what: it must be one of forward, .*loop$"):
-        Asked(names=("what",))
+        Request(names=("what",))
     with pytest.raises(SceneError, match=r"^--tolerance and --budget need the questions forward and reduced"):
-        Asked(tolerance=1e-3, names=("riccati",))
+        Request(tolerance=1e-3, names=("riccati",))
 
 
 def test_files_hold_the_questions_of_control(result: dict[str, Any], folder: Path) -> None:
@@ -315,9 +322,9 @@ def test_page_in_a_browser(result: dict[str, Any], folder: Path) -> None:
 
 
 def test_the_paper_is_named_for_its_own_scene_only() -> None:
-    reference = {"riccati": {"names": ["RADI to 1e-12"], "error": None, "residuals": [1e-12]}}
-    told = [notes(make_scene(SMALL, {"name": n, "tissue": {"cells": [10, 20]}}), reference)["riccati"]
-            for n in ("paper_lqr", "other")]  # fmt: skip
+    question = Question(reference=RiccatiReference(("RADI to 1e-12",), None, (1e-12,)))
+    scenes = [make_scene(SMALL, {"name": n, "tissue": {"cells": [10, 20]}}) for n in ("paper_lqr", "other")]
+    told = [reference_text(question, paper_of(scene) == "control") for scene in scenes]
     assert "84.53 s" in told[0]
     assert "84.53 s" not in told[1]
     assert "no second method" in told[1]
@@ -326,7 +333,7 @@ def test_the_paper_is_named_for_its_own_scene_only() -> None:
 def test_numbers_do_not_depend_on_the_rank_count(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     study = asked(comm, mpi_tmp_path, {"control": SMALL["control"] | {"N": [4, 6]}}, "reduced_riccati")
     whole = make_scene(SMALL, {"control": SMALL["control"] | {"N": [4, 6]}})
-    alone = study_scene(whole, MPI.COMM_SELF, mpi_tmp_path / f"alone{comm.rank}", Asked(names=("reduced_riccati",)))
+    alone = study_scene(whole, MPI.COMM_SELF, mpi_tmp_path / f"alone{comm.rank}", Request(names=("reduced_riccati",)))
     pairs = zip(study.points["reduced_riccati"], alone.points["reduced_riccati"], strict=True)
     for a, b in pairs:
         assert a.label == b.label

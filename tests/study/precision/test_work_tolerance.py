@@ -18,10 +18,10 @@ from softgrasp.study.precision import forward as wp_forward
 from softgrasp.study.precision import full as wp_full
 from softgrasp.study.precision import meshes as wp_meshes
 from softgrasp.study.precision import reduced as wp_reduced
-from softgrasp.study.precision.points import Asked, Setting, variant
+from softgrasp.study.precision.points import Request
 from softgrasp.study.precision.probe import find_places, run_probed
-from softgrasp.study.precision.reduced import own_setting
 from softgrasp.study.precision.run import study_scene
+from softgrasp.study.precision.settings import Setting, own_setting, variant
 from tests.helpers.models import Array, graded_model
 
 FORWARD = ("forward", "reduced")
@@ -86,21 +86,15 @@ def outputs(comm: MPI.Intracomm, scene: Scene, setting: Setting, graded: bool = 
     return run_probed(model, make_probe(model.space, find_places(scene, own).points, scene.effects.rotation)).own
 
 
-def _setting(d: dict[str, object]) -> Setting:
-    cells = d["cells"]
-    if not isinstance(cells, list) or not isinstance(d["order"], int) or not isinstance(d["steps"], int):
-        raise TypeError(f"no setting in {sorted(d)}")
-    return Setting(tuple(cells), d["order"], d["steps"])
-
-
 def check(comm: MPI.Intracomm, case: Case, folder: Path) -> dict[str, float]:
     """Ask, then measure the answer against a graded mesh with more steps than any run of the study."""
     scene = case.load(comm)
-    study = study_scene(scene, comm, folder, Asked(case.tolerance, names=FORWARD))
-    answer, truth = study.answers[0], study.reference
+    study = study_scene(scene, comm, folder, Request(case.tolerance, names=FORWARD))
+    answer, truth = study.answers[0], study.truth
     assert answer.met
     assert truth is not None
-    used, measured = _setting(answer.found["full"]["setting"]), answer.found["full"]["measured"]
+    assert answer.full is not None
+    used, point = answer.full.point.setting, answer.full.point
     multiple = max(s.steps for s in truth.settings) // used.steps + 1
     values = outputs(comm, scene, used)
     exact = outputs(comm, scene, Setting(case.cells, 2, multiple * used.steps), graded=True)[::multiple]
@@ -111,9 +105,9 @@ def check(comm: MPI.Intracomm, case: Case, folder: Path) -> dict[str, float]:
 
     error = length(values - exact) / length(exact)
     assert error <= case.tolerance
-    low, high = measured["error_range"]
+    low, high = point.error_range
     assert low - case.off <= error <= high + case.off
-    return {"asked": case.tolerance, "told": measured["error"], "true": error, "reference": truth.error}
+    return {"asked": case.tolerance, "told": point.error, "true": error, "reference": truth.error}
 
 
 @pytest.mark.usefixtures("_few_samples")

@@ -24,7 +24,7 @@ import numpy as np
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.full import FullRuns, Series, largest
+from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.meshes import (
     WORK,
     edges,
@@ -35,97 +35,28 @@ from softgrasp.study.precision.meshes import (
     observed_order,
     singular_order,
 )
-from softgrasp.study.precision.points import Setting
+from softgrasp.study.precision.result import Limit, Truth
+from softgrasp.study.precision.series import Series, largest
+from softgrasp.study.precision.settings import Setting
 
 ROUGH = 0.05  # error of a reference that is worth a warning
 NEAR = 0.5  # between the order that meshes show and the one that the singular ends leave
 APART = (0.5, 0.75)  # of the finest mesh, cells along an edge of the two others that show the order with it
 STILL = 1e-12  # of the displacement: an output that moves less against the hand moves with it
-ADVICE = {
-    "space": "finer meshes than the time allows here",
-    "time": "more steps, time.steps",
-    "mixed": "more steps, time.steps, on finer meshes",
-}
-
-
-@dataclass(frozen=True)
-class Limit:
-    """Outputs in the limit of fine meshes.
-
-    Attributes:
-        values: (steps + 1, 2 p) [m].
-        gap: what they may be off, same shape.
-        order: that the meshes show, None without one.
-        expected: order that the singular ends leave; None where there is one mesh only.
-        extrapolated: the values are not those of the finest mesh.
-    """
-
-    values: Array
-    gap: Array
-    order: float | None
-    expected: float | None
-    extrapolated: bool
-
-
-@dataclass(frozen=True)
-class Reference:
-    """The reference solution with its error estimate, relative to the largest deformation and displacement.
-
-    Attributes:
-        series: the solution.
-        space, time, mixed: parts of the estimate, each (deformation, displacement).
-        limit: in space.
-        settings: that were run.
-        note: one sentence or more.
-    """
-
-    series: Series
-    space: tuple[float, float]
-    time: tuple[float, float]
-    mixed: tuple[float, float]
-    limit: Limit
-    settings: tuple[Setting, ...]
-    note: str
-
-    @property
-    def error(self) -> float:
-        """Estimated relative error of the deformation."""
-        return self.space[0] + self.time[0] + self.mixed[0]
-
-    @property
-    def error_displacement(self) -> float:
-        """Estimated relative error of the displacement."""
-        return self.space[1] + self.time[1] + self.mixed[1]
-
-    def range_of(self, error: float) -> tuple[float, float]:
-        """Between what the true error of a setting lies, when so much was measured against this reference."""
-        return max(error - self.error, 0.0), error + self.error
-
-    @property
-    def largest_part(self) -> str:
-        """Name of the part that carries most of the error: space, time or mixed."""
-        parts = {"space": self.space[0], "time": self.time[0], "mixed": self.mixed[0]}
-        return max(parts, key=lambda name: parts[name])
-
-    @property
-    def need(self) -> str:
-        """What would make that part smaller."""
-        part = self.largest_part
-        return "a finer mesh" if part == "space" and self.limit.expected is None else ADVICE[part]
 
 
 def space_limit(sizes: list[float], values: list[Array], expected: float, d: int) -> Limit:
     """Limit of values on two meshes or more with cells of size h, coarse to fine. Not collective."""
-    plain = sum(w * v for w, v in zip(limit_weights(sizes[-2:], [expected]), values[-2:], strict=True))
+    two = sum(w * v for w, v in zip(limit_weights(sizes[-2:], [expected]), values[-2:], strict=True))
     shown = None
     if len(values) >= 3:
         changes = [largest(b - a, d)[0] for a, b in zip(values[-3:-1], values[-2:], strict=True)]
         shown = observed_order(sizes[-3:], changes)
     if shown is None or abs(shown - expected) > NEAR:
-        return Limit(values[-1], plain - values[-1], shown, expected, False)
+        return Limit(values[-1], two - values[-1], shown, expected, False)
     weights = limit_weights(sizes[-3:], [expected, expected + 1])
     limit = sum(w * v for w, v in zip(weights, values[-3:], strict=True))
-    return Limit(np.asarray(limit), limit - plain, shown, expected, True)
+    return Limit(np.asarray(limit), limit - two, shown, expected, True)
 
 
 @dataclass(frozen=True)
@@ -176,7 +107,7 @@ def make_plan(scene: Scene) -> Plan:
     return Plan(space, middle, below, scene.time.steps)
 
 
-def make_reference(scene: Scene, runs: FullRuns) -> Reference:
+def make_truth(scene: Scene, runs: FullRuns) -> Truth:
     """Run the reference meshes and steps. Collective.
 
     Raises:
@@ -184,7 +115,7 @@ def make_reference(scene: Scene, runs: FullRuns) -> Reference:
         SceneError: the outputs move with the hand, so that there is no deformation to measure.
     """
     plan = make_plan(scene)
-    series = {s: runs.series(runs.run(s, 1)) for s in plan.settings}
+    series = {s: runs.run(s, 1).series for s in plan.settings}
     d = series[plan.middle].dimension
     values = [series[s].values for s in plan.space]
     if plan.space[0].order == 1:
@@ -195,7 +126,7 @@ def make_reference(scene: Scene, runs: FullRuns) -> Reference:
     return combine(scene, plan, series, limit)
 
 
-def combine(scene: Scene, plan: Plan, series: dict[Setting, Series], limit: Limit) -> Reference:
+def combine(scene: Scene, plan: Plan, series: dict[Setting, Series], limit: Limit) -> Truth:
     """y* and its error estimate from the runs. Not collective.
 
     Raises:
@@ -218,16 +149,16 @@ def combine(scene: Scene, plan: Plan, series: dict[Setting, Series], limit: Limi
     def relative(values: Array) -> tuple[float, float]:
         return tuple(g / s if s > 0 else 0.0 for g, s in zip(largest(values, d), scale, strict=True))  # type: ignore[return-value]
 
-    reference = Reference(
+    truth = Truth(
         Series(t, total, d), relative(limit.gap), relative(time_part), relative(change - lower), limit,
         tuple(series), "",
     )  # fmt: skip
-    return replace(reference, note=_note(scene, plan, reference))
+    return replace(truth, note=_note(scene, plan, truth))
 
 
-def _note(scene: Scene, plan: Plan, reference: Reference) -> str:
+def _note(scene: Scene, plan: Plan, truth: Truth) -> str:
     """What the reference is built from, how good it is, and what is wrong with it."""
-    limit, meshes = reference.limit, [s.mesh for s in plan.space]
+    limit, meshes = truth.limit, [s.mesh for s in plan.space]
     seen = "no order" if limit.order is None else f"the order {limit.order:.2f}"
     if limit.expected is None:
         how = f"from {' to '.join(meshes)}, whose difference is all that is known in space, since the mesh is given"
@@ -243,12 +174,12 @@ def _note(scene: Scene, plan: Plan, reference: Reference) -> str:
         )
     words = (
         f"Reference: {how}; in time with {4 * plan.base} steps on {plan.middle.mesh}. Its own relative error of the "
-        f"deformation is estimated as {reference.error:.1e} (displacement {reference.error_displacement:.1e}); the "
+        f"deformation is estimated as {truth.error:.1e} (displacement {truth.error_displacement:.1e}); the "
         "measured errors may be wrong by as much either way."
     )
-    if reference.error > ROUGH:
-        part = reference.largest_part
-        words += f" That is too much to judge by: most of it is the {part} part, and would need {reference.need}."
+    if truth.error > ROUGH:
+        part = truth.largest_part
+        words += f" That is too much to judge by: most of it is the {part} part, and would need {truth.need}."
     if not all(fits(n, shares) for n, shares in zip(scene.tissue.cells or (), edges(scene), strict=False)):
         words += " The scene's own mesh has no lines at the ends of its contact zone or layers, which adds error."
     return words

@@ -1,0 +1,126 @@
+"""Measured points as JSON files, so that an interrupted study resumes where it stopped; and how it is stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp import package_version
+from softgrasp.fem.errors import Interrupted, agree
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.report.files import plain
+
+FORMAT = 3  # of the cached files
+
+
+class Cache:
+    """Frozen dataclasses by hash, each file one list of a class.
+
+    The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
+    of ranks and the version. Collective.
+
+    Args:
+        folder: where the files are.
+        comm: ranks.
+        scene: the study's scene.
+    """
+
+    def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene) -> None:
+        self.folder, self.comm = folder, comm
+        self.scene = ""  # rank 0 looks for the files
+        with agree(comm):
+            if comm.rank == 0:
+                self.scene = scene_hash(scene, ("name", "description", "reduction", "output"))
+        self.hits = self.misses = 0
+
+    def path(self, kind: str, key: dict[str, Any]) -> Path:
+        """File of the values of a key."""
+        whole = {"scene": self.scene, "ranks": self.comm.size, "version": package_version(), "format": FORMAT} | key
+        digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
+        return self.folder / f"{kind}-{digest[:20]}.json"
+
+    def get[T](self, kind: str, key: dict[str, Any], of: type[T], measure: Callable[[], Sequence[T]]) -> list[T]:
+        """The cached values of a class, or the measured ones, which are then kept; both as they come out of JSON."""
+        rows = None
+        if self.comm.rank == 0:
+            try:
+                rows = json.loads(self.path(kind, key).read_text())["value"]
+            except (OSError, ValueError, KeyError):
+                rows = None
+        rows = self.comm.bcast(rows)
+        if rows is not None:
+            self.hits += 1
+            return [_revived(of, row) for row in rows]
+        self.misses += 1
+        rows = json.loads(json.dumps([plain(asdict(value)) for value in measure()]))  # type: ignore[call-overload]
+        with agree(self.comm):
+            if self.comm.rank == 0:
+                self._write(self.path(kind, key), {"kind": kind, "key": key, "value": rows})
+        return [_revived(of, row) for row in self.comm.bcast(rows)]
+
+    def _write(self, path: Path, data: dict[str, Any]) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(data))
+        os.replace(part, path)  # a file is there whole or not at all
+
+
+def _revived[T](of: type[T], row: dict[str, Any]) -> T:
+    """A dataclass out of JSON, where null stands for a float that is not finite."""
+    hints = get_type_hints(of)
+    return of(**{name: _value(hints[name], value) for name, value in row.items()})
+
+
+def _value(kind: Any, value: Any) -> Any:
+    if kind is float:
+        return float("inf") if value is None else float(value)
+    if get_origin(kind) is UnionType and value is not None:
+        kind = get_args(kind)[0]
+    if get_origin(kind) is tuple and value is not None:
+        return tuple(value)
+    return np.array(value, dtype=float) if kind == Array else value
+
+
+@dataclass
+class Guard:
+    """Says between two points whether to go on, and how far the study is.
+
+    Attributes:
+        comm: ranks.
+        progress: called with the name of the point that comes and the share of points done.
+        count: points in all, as far as they are known.
+        done: of them.
+        stop: filled by the first Ctrl-C.
+    """
+
+    comm: MPI.Intracomm
+    progress: Callable[[str, float], None] | None = None
+    count: int = 1
+    done: int = 0
+    stop: list[bool] = field(default_factory=list)
+
+    def next(self, label: str) -> None:
+        """Before a point. Collective.
+
+        Raises:
+            Interrupted: by Ctrl-C.
+        """
+        share = min(self.done / self.count, 1.0)
+        if self.comm.allreduce(bool(self.stop), MPI.LOR):
+            raise Interrupted(
+                f"stopped before '{label}' with {100 * share:.0f} % done; the same command goes on from there"
+            )
+        if self.progress is not None:
+            self.progress(label, share)
+        self.done += 1

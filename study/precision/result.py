@@ -1,0 +1,302 @@
+"""What a work-precision study finds: points, slopes and the reference of every question, and the answers."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from itertools import chain
+from typing import Any
+
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.precision.fit import Slope, pareto
+from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
+from softgrasp.study.precision.series import Series, TimedRun
+from softgrasp.study.precision.settings import Setting
+from softgrasp.study.report.files import plain
+
+ADVICE = {
+    "space": "finer meshes than the time allows here",
+    "time": "more steps, time.steps",
+    "mixed": "more steps, time.steps, on finer meshes",
+}
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Outputs in the limit of fine meshes.
+
+    Attributes:
+        values: (steps + 1, 2 p) [m].
+        gap: what they may be off, same shape.
+        order: that the meshes show, None without one.
+        expected: order that the singular ends leave; None where there is one mesh only.
+        extrapolated: the values are not those of the finest mesh.
+    """
+
+    values: Array
+    gap: Array
+    order: float | None
+    expected: float | None
+    extrapolated: bool
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The reference solution with its error estimate, relative to the largest deformation and displacement.
+
+    Attributes:
+        series: the solution.
+        space, time, mixed: parts of the estimate, each (deformation, displacement).
+        limit: in space.
+        settings: that were run.
+        note: one sentence or more.
+    """
+
+    series: Series
+    space: tuple[float, float]
+    time: tuple[float, float]
+    mixed: tuple[float, float]
+    limit: Limit
+    settings: tuple[Setting, ...]
+    note: str
+
+    @property
+    def error(self) -> float:
+        """Estimated relative error of the deformation."""
+        return self.space[0] + self.time[0] + self.mixed[0]
+
+    @property
+    def error_displacement(self) -> float:
+        """Estimated relative error of the displacement."""
+        return self.space[1] + self.time[1] + self.mixed[1]
+
+    def range_of(self, error: float) -> tuple[float, float]:
+        """Between what the true error of a setting lies, when so much was measured against this reference."""
+        return max(error - self.error, 0.0), error + self.error
+
+    @property
+    def largest_part(self) -> str:
+        """Name of the part that carries most of the error: space, time or mixed."""
+        parts = {"space": self.space[0], "time": self.time[0], "mixed": self.mixed[0]}
+        return max(parts, key=lambda name: parts[name])
+
+    @property
+    def need(self) -> str:
+        """What would make that part smaller."""
+        part = self.largest_part
+        return "a finer mesh" if part == "space" and self.limit.expected is None else ADVICE[part]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "note": self.note, "error": self.error, "error_displacement": self.error_displacement,
+            "space": self.space, "time": self.time, "mixed": self.mixed, "order": self.limit.order,
+            "expected_order": self.limit.expected, "extrapolated": self.limit.extrapolated,
+            "settings": [s.label for s in self.settings],
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RiccatiReference:
+    """What gains are compared with: tight solutions by two methods.
+
+    Attributes:
+        names: methods and tolerances in words.
+        error: relative difference of their gains; None with one method.
+        residuals: of both.
+    """
+
+    names: tuple[str, ...]
+    error: float | None
+    residuals: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ReducedReference:
+    """What reduced gains are compared with.
+
+    Attributes:
+        method: of the optimal gain.
+        residual: of its solution.
+        error: relative difference to the tightest gain of another method.
+        optimal: cost from the scene's start.
+    """
+
+    method: str
+    residual: float
+    error: float | None
+    optimal: float
+
+
+@dataclass(frozen=True)
+class LoopReference:
+    """The optimal loop without a time step.
+
+    Attributes:
+        error: change of the outputs with half of the modes.
+        modes: of the tissue.
+        complete: all there are.
+        optimal: cost from the scene's start.
+        to_come: of it, after the end of the run.
+    """
+
+    error: float | None
+    modes: int
+    complete: bool
+    optimal: float
+    to_come: float
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question of a study.
+
+    Attributes:
+        points: measured.
+        slopes: fitted to them.
+        reference: what the points are compared with; of reduced models and bases, the full run behind them.
+        skipped: why there are no points; empty when there are some.
+    """
+
+    points: tuple[WorkPoint, ...] = ()
+    slopes: tuple[Slope, ...] = ()
+    reference: Truth | TimedRun | RiccatiReference | ReducedReference | LoopReference | None = None
+    skipped: str = ""
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """Table rows with a mark for the front."""
+        front = pareto(self.points)
+        return [p.to_row() | {"pareto": p in front} for p in self.points]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A setting that answers.
+
+    Attributes:
+        point: measured.
+        shares: about how much of its error space, time step and reduced model carry.
+        sets: arguments of ``--set`` that run it again.
+        predicted: error and seconds; None without a prediction.
+    """
+
+    point: RunPoint
+    shares: dict[str, float]
+    sets: tuple[str, ...]
+    predicted: tuple[float, float] | None = None
+
+    @property
+    def command(self) -> str:
+        """Name of the command that runs it again."""
+        return "reduce" if isinstance(self.point, ReducedPoint) else "simulate"
+
+    def to_dict(self, command: str) -> dict[str, Any]:
+        """For JSON, with the whole command that runs it again."""
+        row, names = self.point.to_row(), (
+            "error_deformation", "error_displacement", "error_range", "p50", "p99", "max", "scratch", "per_step",
+            "error_outputs_full", "error_full",
+        )  # fmt: skip
+        return {
+            "label": self.point.label,
+            "command": command,
+            "setting": {name: value for name, value in self.point.parameters.items() if value is not None},
+            "set": self.sets,
+            "predicted": self.predicted and dict(zip(("error", "seconds"), self.predicted, strict=True)),
+            "measured": {name: row[name] for name in ("error", "seconds", *names) if name in row},
+            "shares": self.shares,
+        }
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to a tolerance or a budget.
+
+    Attributes:
+        kind: "tolerance" or "budget".
+        limit: the tolerance [1] or the budget [s].
+        sentences: the answer in words.
+        full, reduced: the best run of the full model and of a reduced one; None where none meets the limit.
+        closest: when nothing does.
+    """
+
+    kind: str
+    limit: float
+    sentences: tuple[str, ...]
+    full: Choice | None = None
+    reduced: Choice | None = None
+    closest: Choice | None = None
+
+    @property
+    def met(self) -> bool:
+        """Whether something meets the limit."""
+        return bool(self.full or self.reduced)
+
+    @property
+    def choices(self) -> dict[str, Choice]:
+        """What the sentences name, in their order."""
+        every = {"full": self.full, "reduced": self.reduced, "closest": self.closest}
+        return {name: choice for name, choice in every.items() if choice is not None}
+
+
+@dataclass(frozen=True)
+class WorkStudy:
+    """All that one study found.
+
+    Attributes:
+        scene: the scene.
+        truth: solution that outputs are compared with; None when no question needed it.
+        questions: by name, in the order of :data:`study.precision.points.QUESTIONS`.
+        answers: to a tolerance and a budget.
+        measured_for_the_answers: points beside those of the questions.
+        measured, cached: runs made now and taken from the cache.
+    """
+
+    scene: Scene
+    truth: Truth | None
+    questions: dict[str, Question]
+    answers: tuple[Answer, ...]
+    measured_for_the_answers: tuple[WorkPoint, ...]
+    measured: int
+    cached: int
+
+    @property
+    def points(self) -> dict[str, tuple[WorkPoint, ...]]:
+        """Of every question that was answered."""
+        return {name: question.points for name, question in self.questions.items() if not question.skipped}
+
+    def of[P: WorkPoint](self, kind: type[P]) -> list[P]:
+        """Points of one class."""
+        return [p for question in self.questions.values() for p in question.points if isinstance(p, kind)]
+
+    @property
+    def slopes(self) -> tuple[Slope, ...]:
+        """Of all questions."""
+        return tuple(chain.from_iterable(question.slopes for question in self.questions.values()))
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """Questions without points, with the reason."""
+        return {name: question.skipped for name, question in self.questions.items() if question.skipped}
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, without the answers."""
+        references = {
+            name: asdict(q.reference)
+            for name, q in self.questions.items()
+            if isinstance(q.reference, RiccatiReference | ReducedReference | LoopReference)
+        }
+        result: dict[str, Any] = plain(
+            {
+                "repeats": self.scene.study.repeats,
+                "reference": None if self.truth is None else self.truth.to_dict(),
+                "references": references,
+                "points": {name: self.questions[name].rows for name in self.points},
+                "pareto": {name: [p.label for p in pareto(points)] for name, points in self.points.items()},
+                "slopes": [asdict(s) for s in self.slopes],
+                "skipped": self.skipped,
+                "measured_for_the_answers": [p.to_row() for p in self.measured_for_the_answers],
+                "runs": {"measured": self.measured, "cached": self.cached},
+            }
+        )
+        return result
