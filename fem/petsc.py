@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc as PETSc
@@ -74,6 +75,12 @@ def whole_copy(A: PETSc.Mat) -> PETSc.Mat:
     copy.setOption(PETSc.Mat.Option.SPD, bool(A.isSymmetricKnown()[1]))
     every.destroy()
     return copy
+
+
+def to_scipy(A: PETSc.Mat) -> Any:
+    """This rank's rows of a matrix as SciPy's CSR, (n_local, n); a copy."""
+    indptr, columns, values = A.getValuesCSR()
+    return scipy.sparse.csr_matrix((values, columns, indptr), shape=(A.getLocalSize()[0], A.getSize()[1]))
 
 
 def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:

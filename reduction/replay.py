@@ -11,8 +11,8 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.simulate import Trajectory
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.engines import factor
 from softgrasp.reduction.errors import full_energy, shown_rows, state_rows, with_hand

@@ -5,28 +5,31 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import Interrupted, ResourceError, SceneError, SolverError, agree
+from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError, agree
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.checkpoint import read_checkpoint, write_checkpoint
+from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.motion import driven_table, force_values, motion_table
-from softgrasp.fem.run.snapshots import Snapshots, make_store
+from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.sealed import AGAIN
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
+STOPPING = "stopping as soon as the restart file is written; Ctrl-C again stops at once"
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
 
@@ -52,43 +55,6 @@ class RunOptions:
     frame: Observer | None = None
     begin: Observer | None = None
     keep: Observer | None = None
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """What a run returns.
-
-    Attributes:
-        times: time grid [s], shape (steps + 1,).
-        q_s, v_s: hand, shape (steps + 1, n_s), on every rank.
-        outputs: named outputs [m], shape (steps + 1, components), on every rank.
-        outputs_rigid: what the outputs would be if the tissue moved rigidly with the hand, same shape.
-        output_names: one per component.
-        snapshots: stored states, or None.
-        final: local [z; v_z] at the end.
-        energy_drift: |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless.
-        residuals: relative residual of the first and the last solve.
-        solver: name and reason.
-        seconds: stages of the run.
-        steps_timed: steps taken since the run was started or resumed.
-        force: mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with
-            two-way coupling what a prescribed motion takes; None when one-way coupling leaves it unknown.
-    """
-
-    times: Array
-    q_s: Array
-    v_s: Array
-    outputs: Array
-    outputs_rigid: Array
-    output_names: tuple[str, ...]
-    snapshots: Snapshots | None
-    final: Array
-    energy_drift: float
-    residuals: tuple[float, float]
-    solver: tuple[str, str]
-    seconds: dict[str, float] = field(default_factory=dict)
-    steps_timed: int = 0
-    force: Array | None = None
 
 
 class Run(Stepped):
@@ -231,6 +197,59 @@ class Run(Stepped):
         scale = max(self.peak_energy, abs(work), abs(lost))
         return abs(defect) / scale if scale > 0 else 0.0
 
+    def restart_state(self) -> RestartState:
+        """What this rank needs to go on from here; views, not copies."""
+        midpoint, n = self.midpoint, self.reached
+        return RestartState(
+            run=self.name,
+            step=n,
+            legs=self.legs,
+            beside=self.beside,
+            state=self.state.array,
+            r=midpoint.held.leave(midpoint.r.array_r),
+            pending=midpoint.pending,
+            hand_q=self.drive.q[: n + 1],
+            hand_v=self.drive.v[: n + 1],
+            outputs=self.local_outputs[: n + 1],
+            snapshots=self.store.kept(n),
+            loads=self.drive.c[:n],
+            pulls=self.pulls[: n + 1],
+            energies=np.array([midpoint.dissipated, self.initial_energy, self.peak_energy]),
+            residual_first=self.residual_first,
+            forces=None if self.drive.u is None else self.drive.u[:n],
+        )
+
+    def restore(self, saved: RestartState) -> None:
+        """Go back to where a run was stopped. Collective.
+
+        Raises:
+            CheckpointError: the state is of another mesh numbering, or the streamed snapshots do not fit to it.
+        """
+        n, midpoint = saved.step, self.midpoint
+        with agree(self.layout.comm):
+            self.store.restore(saved.snapshots, n, saved.run)
+            if len(saved.r) != len(midpoint.r_array):
+                raise CheckpointError(
+                    f"the restart file holds {len(saved.r)} rows of the right-hand side, this run "
+                    f"{len(midpoint.r_array)}; {AGAIN}"
+                )
+        self.name, self.beside = saved.run, saved.beside
+        self.state = self.store.target(n)
+        self.state.array[:] = saved.state
+        midpoint.r.array_w[:] = midpoint.held.enter(saved.r)
+        midpoint.pending = saved.pending
+        self.drive.q[: n + 1], self.drive.v[: n + 1] = saved.hand_q, saved.hand_v
+        self.local_outputs[: n + 1], self.pulls[: n + 1] = saved.outputs, saved.pulls
+        self.drive.c[:n] = saved.loads
+        if self.drive.u is not None and saved.forces is not None:
+            self.drive.u[:n] = saved.forces
+        midpoint.dissipated, self.initial_energy, self.peak_energy = saved.energies.tolist()
+        self.residual_first, self.reached, self.begun = saved.residual_first, n, n
+        self.legs = [*(leg for leg in saved.legs if leg < n), n]
+        for vector in (self.state.z, self.state.v, midpoint.r):
+            vector.stateIncrease()
+        midpoint.join(self.state)
+
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
         system, outputs = self.model.system, self.outputs
@@ -301,13 +320,13 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
     ts = make_ts(run)
     try:
         if options.resume:
-            read_checkpoint(run, options.directory / "checkpoint")
+            run.restore(read_checkpoint(model.scene, run.layout, options.directory / "checkpoint"))
             ts.setStepNumber(run.reached)
         else:
             run.start()
         if options.begin is not None:
             options.begin(run)
-        with interruptible(model.system.layout.comm.rank == 0) as stop:
+        with interruptible(STOPPING if run.layout.comm.rank == 0 else "") as stop:
             _run_segments(run, ts, options, stop)
         return run.trajectory()
     finally:
@@ -358,7 +377,8 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
         if run.reached in checkpoints or stopped or full or (run.reached == last < run.steps):
             if options.keep is not None:
                 options.keep(run)
-            manifest = write_checkpoint(run, options.directory / "checkpoint")
+            folder = options.directory / "checkpoint"
+            manifest = write_checkpoint(run.restart_state(), run.model.scene, run.layout, folder)
             if full:
                 raise ResourceError(f"{full}; {manifest} lets --resume go on from step {run.reached}")
             if stopped or run.reached == last:

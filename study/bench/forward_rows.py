@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import Array, whole_copy
+from softgrasp.fem.petsc import Array, to_scipy, whole_copy
 from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
@@ -29,7 +29,6 @@ from softgrasp.study.bench.peers import (
     ScipyLoop,
     TextbookLoop,
     has_pymor,
-    to_scipy,
 )
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.jobs import leave_result

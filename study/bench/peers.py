@@ -87,12 +87,6 @@ class PlainCholesky(BareSolve):
         S.destroy()  # the ksp holds it
 
 
-def to_scipy(A: PETSc.Mat) -> Any:
-    """A matrix of one rank as SciPy CSR. Not collective."""
-    indptr, columns, values = A.getValuesCSR()
-    return scipy.sparse.csr_matrix((values, columns, indptr), shape=A.getSize())
-
-
 class ScipyLoop:
     """Sparse LU of S and the second-order loop in NumPy, on one rank.
 

@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.lqr.design import make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
@@ -28,7 +28,6 @@ from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_of, gain_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.study.bench.peers import to_scipy
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.jobs import leave_result
 

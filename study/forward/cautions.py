@@ -12,7 +12,7 @@ from softgrasp.fem.scene.materials import young_poisson
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
-    from softgrasp.fem.run.simulate import Trajectory
+    from softgrasp.fem.run.trajectory import Trajectory
     from softgrasp.fem.system import BlockSystem
 
 LOCKING = 0.49  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu)

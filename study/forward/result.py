@@ -16,7 +16,7 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import hand_axes, make_outputs, unit
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.simulate import Trajectory
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.study.report.origin import peak_memory_mb
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.petsc import PETSc, to_scipy
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 
 Array = NDArray[np.float64]
@@ -163,21 +163,13 @@ def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Mod
     return build(load_scene(shipped_scenes()[name], overrides), comm)
 
 
-def sparse(A: PETSc.Mat) -> Any:
-    """A matrix of one rank as SciPy CSR. Not collective."""
-    import scipy.sparse
-
-    indptr, columns, values = A.getValuesCSR()
-    return scipy.sparse.csr_matrix((values, columns, indptr), shape=A.getSize())
-
-
 def scaled_condition(A: PETSc.Mat) -> float:
     """Condition of a symmetric positive definite matrix with its diagonal scaled to one [VDS69]. Not collective.
 
     Up to the size of the matrix it is the least that any diagonal scaling reaches, and what Cholesky's error depends
     on. For matrices of hundreds of rows.
     """
-    dense = np.asarray(sparse(A).toarray())
+    dense = np.asarray(to_scipy(A).toarray())
     scale = 1 / np.sqrt(np.diag(dense))
     values = np.linalg.eigvalsh(scale[:, None] * dense * scale)
     return float(values[-1] / values[0])

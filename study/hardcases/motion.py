@@ -12,13 +12,14 @@ import numpy as np
 
 from softgrasp.fem.errors import Interrupted
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
-from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem, Damping
-from softgrasp.study.hardcases.cases import EPS, Family, Row, make, ours, plain, scaled_condition, sparse, thin
+from softgrasp.study.hardcases.cases import EPS, Family, Row, make, ours, plain, scaled_condition, thin
 from softgrasp.study.hardcases.textbook import implicit_and_explicit, in_turn, textbook_midpoint
 
 SMALL = ("tissue.cells=[3, 6]", "control=false")
@@ -93,7 +94,7 @@ def step_rows(quick: bool) -> list[Row]:
     """Energy of a free vibration for steps from a thousandth to a thousand first periods."""
     system = make("paper_forward", *SMALL, REST).system
     z, period, steps = mixed_state(system), first_period(system), 400 if quick else 2000
-    M, K = sparse(system.M_ee), sparse(system.K_ee)
+    M, K = to_scipy(system.M_ee), to_scipy(system.K_ee)
     rows = []
     for ratio in thin([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e3], quick):
         dt = ratio * period
@@ -109,7 +110,7 @@ def long_rows(quick: bool) -> list[Row]:
     """Energy after 1e5 steps of free vibration."""
     system = make("paper_forward", *SMALL, REST).system
     z, period, steps = mixed_state(system), first_period(system), 3000 if quick else 100_000
-    M, K = sparse(system.M_ee), sparse(system.K_ee)
+    M, K = to_scipy(system.M_ee), to_scipy(system.K_ee)
     rows = []
     for ratio in [1e-3] if quick else [1e-3, 1e-2, 1.0, 100.0]:
         dt = ratio * period
@@ -124,7 +125,7 @@ def damping_rows(quick: bool) -> list[Row]:
     system = make("paper_forward", *SMALL, REST).system
     z, period, steps = mixed_state(system), first_period(system), 200 if quick else 1000
     omega, dt = 2 * math.pi / period, period / 500
-    M, K = sparse(system.M_ee), sparse(system.K_ee)
+    M, K = to_scipy(system.M_ee), to_scipy(system.K_ee)
     rows = []
     for zeta in thin([0.0, 1e-14, 1e-8, 1e-2, 1.0, 1e3, 1e6], quick):
         beta = 2 * zeta / omega
@@ -155,7 +156,7 @@ def mass_rows(quick: bool) -> list[Row]:
         scene = (f"hand.mass={tissue * ratio!r}", "effects={reaction=true}", "motion={profile='hold', drive='force'}")
         model = make("paper_forward", *SMALL, *scene, f"time={{steps={steps}, end={dt * steps!r}}}")
         system = model.system
-        operators = sparse(system.M_ee), sparse(system.K_ee), system.G, system.M_rigid, system.M_hand
+        operators = to_scipy(system.M_ee), to_scipy(system.K_ee), system.G, system.M_rigid, system.M_hand
         turns = plain(in_turn, *operators, push, dt, steps)
         reason = "without outer force the momentum is constant: ten sums and products a step, each rounded once"
         bound = 10 * steps * EPS

@@ -14,10 +14,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import scene_schema
-from softgrasp.study.hardcases.cases import Family, Outcome, Row, make, ours, plain, sparse
+from softgrasp.study.hardcases.cases import Family, Outcome, Row, make, ours, plain
 from softgrasp.study.hardcases.textbook import textbook_midpoint
 
 BAD = ("nan", "inf", "-inf")
@@ -163,7 +164,7 @@ def _force_row(at: int) -> Row:
 
     def loop() -> float:
         z = np.full(model.system.layout.n_e, np.nan)
-        return textbook_midpoint(sparse(model.system.M_ee), sparse(model.system.K_ee), z, 0.1, 5)
+        return textbook_midpoint(to_scipy(model.system.M_ee), to_scipy(model.system.K_ee), z, 0.1, 5)
 
     return Row("feedback that turns NaN at step 30", at, ours(run), plain(loop), None,
                "the run must stop and not write NaN as a result")  # fmt: skip

@@ -64,7 +64,7 @@ def inject(fault: str) -> None:
         return
     if fault == "disk":
         if MPI.COMM_WORLD.rank == 1:
-            softgrasp.fem.run.checkpoint._write_rank = disk  # type: ignore[assignment]
+            vars(softgrasp.fem.run.checkpoint)["write_arrays"] = disk
     else:
         Run.step = faulty  # type: ignore[method-assign,assignment]
 

@@ -11,11 +11,11 @@ import scipy.sparse.linalg
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.scene import materials
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
-from softgrasp.study.hardcases.cases import EPS, Family, Outcome, Row, make, ours, plain, scaled_condition, sparse, thin
+from softgrasp.study.hardcases.cases import EPS, Family, Outcome, Row, make, ours, plain, scaled_condition, thin
 from softgrasp.study.hardcases.textbook import linear_triangles, solve_twice
 
 CELLS = 4  # over the height 1 of the beam
@@ -38,7 +38,7 @@ def static(model: Model) -> Array:
 def unchecked(model: Model) -> Array:
     """The same by SuperLU, believed as it is. Not collective."""
     load = model.system.G @ np.array([0.0, -1.0])
-    return np.asarray(scipy.sparse.linalg.spsolve(sparse(model.system.K_ee).tocsc(), load))
+    return np.asarray(scipy.sparse.linalg.spsolve(to_scipy(model.system.K_ee).tocsc(), load))
 
 
 def tip(model: Model, z: Array) -> float:
@@ -102,7 +102,7 @@ def _stretch_ours(model: Model, height: float, contrast: float) -> float:
 
 def _stretch_scipy(model: Model, height: float, contrast: float) -> Outcome:
     load = model.system.G @ np.array([0.0, -1.0])
-    return solve_twice(sparse(model.system.K_ee), load, lambda z: stretch_error(model, z, height, contrast))
+    return solve_twice(to_scipy(model.system.K_ee), load, lambda z: stretch_error(model, z, height, contrast))
 
 
 def contrast_rows(quick: bool) -> list[Row]:

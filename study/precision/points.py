@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from math import ceil
 from pathlib import Path
@@ -241,25 +239,6 @@ class Guard:
         if self.progress is not None:
             self.progress(label, min(self.done / self.work, 1.0))
         self.done += work
-
-
-@contextmanager
-def interruptible(guard: Guard) -> Iterator[None]:
-    """Turn the first Ctrl-C into a flag that is looked at between points; a second one interrupts at once."""
-
-    def note(number: int, frame: Any) -> None:
-        guard.stop.append(True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    try:
-        previous = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not the main thread: leave signals alone
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 @dataclass(frozen=True)

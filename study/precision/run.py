@@ -14,6 +14,7 @@ from rich.progress import TaskProgressColumn
 
 from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.model.build import build
+from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
@@ -39,7 +40,6 @@ from softgrasp.study.precision.points import (
     Guard,
     Row,
     WorkPoint,
-    interruptible,
     number,
     variant,
 )
@@ -177,7 +177,7 @@ def study_scene(
     found = Found()
     if refused:
         found.skipped |= {q: refused for q in wanted if q in CONTROL}
-    with interruptible(guard):
+    with interruptible() as guard.stop:
         if set(wanted) - set(CONTROL):
             guard.work += _expected(scene, runs, len(chosen_methods(scene.reduction)), model.system.layout.dimension)
             guard.work += sum(engine_work(scene, engine) for engine in ENGINES) if "bases" in wanted else 0.0

@@ -17,7 +17,8 @@ from rich.table import Table
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save_model
 from softgrasp.reduction.replay import Reference, reference

@@ -12,13 +12,14 @@ from mpi4py import MPI
 from typer.testing import CliRunner
 
 from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.study.bench import forward as bench_forward
 from softgrasp.study.bench import forward_rows as bench_worker
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, to_scipy
+from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop
 from softgrasp.study.shell.processes import IN_MPI_JOB
 
 TINY: dict[str, Any] = {"size": 150, "repeats": 3, "repeat_seconds": 0.005}
