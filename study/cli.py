@@ -107,18 +107,9 @@ def explain(
     set_: Overrides = None,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
-    from mpi4py import MPI
+    from softgrasp.study.forward.explain_page import run_explain
 
-    from softgrasp.fem.scene.file import load_scene_collective
-    from softgrasp.study.forward.explain import run_explain
-    from softgrasp.study.forward.explain_page import write_explanation
-    from softgrasp.study.shell.session import list_files
-
-    comm = MPI.COMM_WORLD
-    made = load_scene_collective(comm, scene, set_ or [])
-    found = run_explain(made, comm, console())
-    if out is not None and comm.rank == 0:
-        list_files(console(), write_explanation(out, found, made, scene, set_ or []))
+    run_explain(scene, out, set_ or [], console())
 
 
 @app.command()

@@ -8,9 +8,9 @@ import dolfinx.fem
 import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError, agree
+from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.check import counted, place_text
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     mesh.topology.create_connectivity(fdim, fdim + 1)
     facets = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology))
     midpoints = dolfinx.mesh.compute_midpoints(mesh, fdim, facets)[:, : tissue.dimension]
-    low, high = bounding_box(tissue)
+    low, high = bounding_box(mesh.comm, mesh.geometry.x[:, : tissue.dimension])
     tolerance = BOX_TOLERANCE * float(np.max(high - low))
     chosen = np.ones(len(facets), dtype=np.bool_)
     keys = []
@@ -247,16 +247,6 @@ def cell_midpoints(tissue: TissueMesh) -> Floats:
     cells = np.arange(owned, dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, cells)
     return np.asarray(midpoints[:, : tissue.dimension], dtype=np.float64)
-
-
-def bounding_box(tissue: TissueMesh) -> tuple[Floats, Floats]:
-    """Lower and upper corner of the mesh over all ranks [m]. Collective."""
-    x = tissue.mesh.geometry.x[:, : tissue.dimension]
-    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
-    comm = tissue.mesh.comm
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    return low, high
 
 
 def _tagged_facets(tissue: TissueMesh, tag: int | str) -> Ints:

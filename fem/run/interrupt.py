@@ -10,20 +10,20 @@ from typing import Any
 
 
 @contextmanager
-def interruptible(note: str = "") -> Iterator[list[bool]]:
+def interruptible(speaks: bool = False) -> Iterator[list[bool]]:
     """Turn the first Ctrl-C into an entry of the list; a second one interrupts at once.
 
     Args:
-        note: written to the standard error at the first one.
+        speaks: say on the standard error that the first one was seen.
     """
     flag: list[bool] = []
 
     def stop(number: int, frame: Any) -> None:
         flag.append(True)
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        if note:
+        if speaks:
             with suppress(OSError):  # nobody listens; print may not be called while another print is under way
-                os.write(2, f"\n{note}\n".encode())
+                os.write(2, b"\nstopping as soon as the restart file is written; Ctrl-C again stops at once\n")
 
     try:
         previous = signal.signal(signal.SIGINT, stop)

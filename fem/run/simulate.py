@@ -29,7 +29,6 @@ from softgrasp.fem.sealed import AGAIN
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
-STOPPING = "stopping as soon as the restart file is written; Ctrl-C again stops at once"
 Observer = Callable[["Run"], None]
 """Called between segments and at every frame; collective, may raise to end the run."""
 
@@ -257,7 +256,6 @@ class Run(Stepped):
         y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
         rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
         y += rigid
-        names = tuple(name for o in outputs for name in o.names)
         times = self.end * np.arange(self.steps + 1) / self.steps
         snapshots = self.store.finish(times, self.drive.q, self.drive.v)
         spent = comm.allreduce(self.seconds, MPI.MAX)
@@ -268,7 +266,7 @@ class Run(Stepped):
             v_s=self.drive.v,
             outputs=y,
             outputs_rigid=rigid,
-            output_names=names,
+            columns=tuple(column for o in outputs for column in o.columns),
             snapshots=snapshots,
             final=self.state.array.copy(),
             energy_drift=self.drift(),
@@ -326,7 +324,7 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
             run.start()
         if options.begin is not None:
             options.begin(run)
-        with interruptible(STOPPING if run.layout.comm.rank == 0 else "") as stop:
+        with interruptible(run.layout.comm.rank == 0) as stop:
             _run_segments(run, ts, options, stop)
         return run.trajectory()
     finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
 
@@ -17,7 +18,7 @@ class Trajectory:
         q_s, v_s: hand, shape (steps + 1, n_s), on every rank.
         outputs: named outputs [m], shape (steps + 1, components), on every rank.
         outputs_rigid: what the outputs would be if the tissue moved rigidly with the hand, same shape.
-        output_names: one per component.
+        columns: one per output component.
         snapshots: stored states, or None.
         final: local [z; v_z] at the end.
         energy_drift: |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless.
@@ -34,7 +35,7 @@ class Trajectory:
     v_s: Array
     outputs: Array
     outputs_rigid: Array
-    output_names: tuple[str, ...]
+    columns: Columns
     snapshots: Snapshots | None
     final: Array
     energy_drift: float
@@ -43,3 +44,8 @@ class Trajectory:
     seconds: dict[str, float] = field(default_factory=dict)
     steps_timed: int = 0
     force: Array | None = None
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Labels of the columns."""
+        return labels(self.columns)

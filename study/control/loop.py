@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.columns import farthest
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller, layout_hash, save_gain
@@ -280,7 +280,7 @@ def small_run(
 
 def distance(run: LoopTrajectory | ReducedTrajectory, found: Design) -> Array:
     """Distance of the farthest output to its target at every instant [m], (steps + 1,). Not collective."""
-    return farthest(run.outputs, found.target.y, found.problem.names)
+    return farthest(run.outputs, found.target.y, found.problem.columns)
 
 
 def open_loop(found: Design) -> Block:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.model.outputs import hand_axes
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
@@ -296,9 +296,9 @@ def write_tables(out: Path, found: Found) -> list[Path]:
     full, files = found.runs.full, []
     inputs = np.vstack([full.inputs, full.inputs[-1:]])
     n_s = full.q_s.shape[1]
-    names = trajectory_header(n_s, found.design.problem.layout.dimension, full.output_names, velocity=False)
-    forces = hand_axes(n_s, found.design.problem.layout.dimension)
-    names += [*(f"u_{axis} [{'N m' if axis.startswith('r') else 'N'}]" for axis in forces), "cost"]
+    names = trajectory_header(n_s, found.design.problem.layout.dimension, full.columns, velocity=False)
+    forces = hand_columns(n_s, found.design.problem.layout.dimension, "u")
+    names += [*(f"{u.label} [{u.load_unit}]" for u in forces), "cost"]
     data = np.column_stack([full.times, full.q_s, full.outputs, inputs, full.cost])
     tables: dict[str, tuple[Sequence[str], list[Row]]] = {"trajectory.csv": (names, [tuple(row) for row in data])}
     if found.swept:

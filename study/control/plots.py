@@ -189,7 +189,7 @@ def draw_all(
     full, d = runs.full, found.problem.layout.dimension
     others = compared(runs)
     files += figure_histories(
-        full.times, full.outputs, full.inputs, full.output_names, out / "histories.png", target=found.target.y,
+        full.times, full.outputs, full.inputs, full.columns, out / "histories.png", target=found.target.y,
         limits=runs.limits, others=others, settle=runs.plan.settle, dimension=d,
     )  # fmt: skip
     if any(s.reports for s in swept):

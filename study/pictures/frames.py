@@ -181,7 +181,7 @@ class Frames:
         files += figure_traces(
             run.times,
             run.outputs,
-            run.output_names,
+            run.columns,
             run.q_s,
             directory / "traces.png",
             rigid=run.outputs_rigid,

@@ -209,7 +209,7 @@ def save_models(out: Path, swept: Sequence[Swept]) -> list[Path]:
 
 def reduce_result(model: Model, run: Trajectory, found: Reduced, watch: Stopwatch) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
-    whole = simulate_result(model, run)
+    whole = simulate_result(model, run).to_json()
     kept = (
         "scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver",
     )  # fmt: skip

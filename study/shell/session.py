@@ -101,13 +101,16 @@ class Session:
         """Bars with the time left, in a terminal only. Not collective."""
         return progress_bar(self.console, count, quiet=self.quiet)
 
-    def write(self, scene: Scene, result: dict[str, Any], page: Callable[[], Page]) -> list[Path]:
+    def write(
+        self, scene: Scene, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True
+    ) -> list[Path]:
         """Write result.json, scene.toml, tables and report.html on rank 0. Collective.
 
         Args:
             scene: as it was run.
             result: what result.json holds, equal on all ranks; takes ``time.pictures`` and ``time.total`` on rank 0.
             page: draws and composes the rest; called on rank 0 only, so it must not communicate.
+            clock: add the times.
 
         Returns:
             The files, on rank 0.
@@ -122,7 +125,8 @@ class Session:
                 drawing = time.perf_counter()
                 made = page()
                 now = time.perf_counter()
-                result.setdefault("time", {}).update(pictures=now - drawing, total=now - self.begin)
+                if clock:
+                    result.setdefault("time", {}).update(pictures=now - drawing, total=now - self.begin)
                 files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
                 files += [table.write_csv(self.out / name) for name, table in made.tables.items()]
                 files += made.files
