@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from softgrasp.fem.effects.sag import Sag
-    from softgrasp.fem.scene.scene import Scene
-    from softgrasp.fem.system import LayerMaterial
+from softgrasp.fem.effects.sag import Sag
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.system import LayerMaterial
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ class Gradient:
     share: float
 
     @property
-    def small(self) -> bool:
+    def linear(self) -> bool:
         """Whether linear elasticity holds: only a small share of the volume is steep."""
         return self.share <= SMALL_SHARE
 

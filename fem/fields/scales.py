@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from softgrasp.fem.effects.damping import ratios
@@ -12,11 +10,9 @@ from softgrasp.fem.fields.sag import measure_sag
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns, total
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
-    from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.system import BlockSystem
 
 
 def measure(model: Model, omega: Array, Phi: Array) -> Problem:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from softgrasp.fem.effects.sag import SMALL_SHARE, Gradient
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
 
 SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from softgrasp.fem.mesh.arrays import MeshArrays, Sets
+from softgrasp.fem.mesh.arrays import MeshArrays, Sets
 
 
 def mesh_digest(arrays: MeshArrays) -> str:

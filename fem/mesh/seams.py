@@ -68,9 +68,9 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
         np.minimum.at(h, owners[:, j], length)
     nodes = np.unique(facets.nodes[facets.outer])
     tree = cKDTree(points[nodes])
-    reach = tolerance * h[nodes]
-    near = np.flatnonzero(tree.query_ball_point(points[nodes], reach, return_length=True) > 1)
-    lists = tree.query_ball_point(points[nodes[near]], reach[near])
+    radius = tolerance * h[nodes]
+    near = np.flatnonzero(tree.query_ball_point(points[nodes], radius, return_length=True) > 1)
+    lists = tree.query_ball_point(points[nodes[near]], radius[near])
     one = nodes[np.repeat(near, [len(entry) for entry in lists])]
     other = nodes[np.concatenate([*lists, []]).astype(np.int64)]
     close = np.linalg.norm(points[one] - points[other], axis=1) <= tolerance * h[other]

@@ -25,7 +25,7 @@ class TissueMesh:
         parts: what is known of these parts, or None.
         facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
         cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
-        notes: what of the file deserves a warning, one sentence each, on all ranks.
+        notes: warnings about the file, one sentence each, on all ranks.
         digest: SHA-256 of what was read from the file, on all ranks; empty without one.
     """
 

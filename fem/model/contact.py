@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import dolfinx.fem
 import dolfinx.mesh
@@ -12,11 +12,9 @@ import numpy.typing as npt
 from softgrasp.fem.errors import MeshError, SceneError, agree
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.check import counted, place_text
-
-if TYPE_CHECKING:
-    from softgrasp.fem.mesh.parts import Parts
-    from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-    from softgrasp.fem.scene.scene import Contact
+from softgrasp.fem.mesh.parts import Parts
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.scene.scene import Contact
 
 Ints = npt.NDArray[np.int32]
 Floats = npt.NDArray[np.float64]
@@ -178,10 +176,10 @@ def contact_blocks(space: dolfinx.fem.FunctionSpace, facets: Ints) -> tuple[Ints
     Collective. A node counts as contact node on its owner even if only another rank sees the facet.
     """
     mesh = space.mesh
-    found = dolfinx.fem.locate_dofs_topological(space, mesh.topology.dim - 1, facets, remote=True)
+    located = dolfinx.fem.locate_dofs_topological(space, mesh.topology.dim - 1, facets, remote=True)
     owned = space.dofmap.index_map.size_local
     on = np.zeros(owned, dtype=np.bool_)
-    on[found[found < owned]] = True
+    on[located[located < owned]] = True
     return np.flatnonzero(on).astype(np.int32), np.flatnonzero(~on).astype(np.int32)
 
 

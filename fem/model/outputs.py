@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +12,8 @@ from softgrasp.fem.columns import Columns, hand_columns, labels
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import BlockSystem
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -57,12 +55,12 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     Raises:
         SceneError: a node lies outside the body or a region holds no node.
     """
-    wanted = scene.control.outputs if scene.control is not None else []
-    if not wanted:
+    entries = scene.control.outputs if scene.control is not None else []
+    if not entries:
         tip = _node(system, "tip", _farthest(system))
         return (replace(tip, place=f"node {_coordinates(tip.point)}, the free one farthest from the hand"),)
     result = []
-    for i, output in enumerate(wanted):
+    for i, output in enumerate(entries):
         name = output.name or f"y{i + 1}"
         if output.kind == "hand":
             result.append(_hand(system, name))
@@ -84,9 +82,9 @@ def _node(system: BlockSystem, name: str, point: Array) -> Output:
     layout = system.layout
     d = layout.dimension
     rank, first, where = layout.nearest_node(point)
-    mine = layout.comm.rank == rank
-    dofs = np.arange(first, first + d)[None, :] if mine else np.zeros((0, d), int)
-    C_s = layout.comm.bcast(system.T[first : first + d].copy() if mine else None, root=rank)
+    owns = layout.comm.rank == rank
+    dofs = np.arange(first, first + d)[None, :] if owns else np.zeros((0, d), int)
+    C_s = layout.comm.bcast(system.T[first : first + d].copy() if owns else None, root=rank)
     return Output(name, hand_columns(d, d, name), dofs, 1.0, C_s, tuple(where.tolist()), _taken(system, point, where))
 
 

@@ -41,10 +41,10 @@ class RunOptions:
         directory: where checkpoints and streamed snapshots go.
         resume: continue from the checkpoint in ``directory``.
         until: stop after this step and leave a checkpoint; None runs to the end.
-        progress: called about five times a second.
-        frame: called at the start, at the end and at ``output.frames`` steps between.
-        begin: called once before the first step, when a checkpoint has been read.
-        keep: called before every checkpoint is written, to keep with it what the run has seen so far.
+        progress: called with the :class:`Run` about five times a second.
+        frame: called with it at the start, at the end and at ``output.frames`` steps between.
+        begin: called with it once before the first step, when a checkpoint has been read.
+        keep: called with it before every checkpoint is written, to add files to :attr:`Run.beside`.
     """
 
     directory: Path = Path("out")
@@ -300,12 +300,21 @@ def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set
 
 
 def simulate(model: Model, options: RunOptions | None = None, force: Force | None = None) -> Trajectory:
-    """Run a scene from its start to its end. Collective.
+    """Run a scene from its start to its end by the implicit midpoint rule [HLW06]. Collective.
+
+    With z the displacement relative to the hand's rigid motion, s = 2 / dt, w = z_mid - z_n and h the load, one solve a
+    step with one factor:
+
+        (K + s D + s^2 M) w = h_mid - K z_n + s M v_n,    z_{n+1} = z_n + 2 w,    v_{n+1} = 2 s w - v_n.
 
     Args:
         model: from :func:`fem.model.build.build`.
         options: files, resume and observers.
-        force: feedback force on the hand instead of the scene's motion.
+        force: instead of the scene's motion, called as force(n, t_mid, q_s, v_s) for the force on the hand in step n,
+            (n_s,) [N, N m]; q_s and v_s are the hand at the start of the step.
+
+    Returns:
+        The trajectory: times, hand and outputs on every rank, tissue states distributed.
 
     Raises:
         SolverError: a solve failed or missed its tolerance.

@@ -15,16 +15,16 @@ class Trajectory:
 
     Attributes:
         times: time grid [s], shape (steps + 1,).
-        q_s, v_s: hand, shape (steps + 1, n_s), on every rank.
-        outputs: named outputs [m], shape (steps + 1, components), on every rank.
+        q_s, v_s: displacement and velocity of the hand [m, rad; m/s, rad/s], shape (steps + 1, n_s), on every rank.
+        outputs: y = C_s q_s + C_z' z [m, rad], shape (steps + 1, components), on every rank.
         outputs_rigid: what the outputs would be if the tissue moved rigidly with the hand, same shape.
         columns: one per output component.
         snapshots: stored states, or None.
-        final: local [z; v_z] at the end.
+        final: [z; v_z] of this rank's nodes at the end [m; m/s], shape (2 n_local,).
         energy_drift: |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless.
         residuals: relative residual of the first and the last solve.
         solver: name and reason.
-        seconds: stages of the run.
+        seconds: wall time of each stage, "steps" and "per_step" on the slowest rank [s].
         steps_timed: steps taken since the run was started or resumed.
         force: mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with
             two-way coupling what a prescribed motion takes; None when one-way coupling leaves it unknown.

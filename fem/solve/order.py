@@ -81,10 +81,10 @@ def dissect(A: PETSc.Mat, d: int) -> Dissection:
     count = len(blocks.indices)
     size = (len(blocks.indptr) - 1,) * 2
     graph = PETSc.Mat().createAIJ(size, csr=(*before, np.ones(count)), comm=PETSc.COMM_SELF)
-    found, same = graph.getOrdering("nd")
-    nodes = found.getIndices().astype(np.intp)
-    for thing in (found, same, graph):
-        thing.destroy()
+    by_row, by_column = graph.getOrdering("nd")
+    nodes = by_row.getIndices().astype(np.intp)
+    for item in (by_row, by_column, graph):
+        item.destroy()
     numbered = scipy.sparse.csr_matrix((np.arange(count), blocks.indices, blocks.indptr), shape=size)
     moved = numbered[nodes][:, nodes]
     moved.sort_indices()

@@ -236,8 +236,7 @@ def _report(
         out / "report.html",
         title=f"{scene.name}: effects",
         subtitle=scene.description,
-        sections=sections,
-        figures=[(out / "effects.png", CAPTION)],
+        sections=[Section("", figures=[(out / "effects.png", CAPTION)]), *sections],
         scene=resolved_toml(scene),
         reproduce=command_line("effects", path, overrides, result["ranks"]),
     )

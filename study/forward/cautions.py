@@ -1,19 +1,15 @@
-"""What deserves a warning in a scene or in its result: `explain` asks before a run, `simulate` after it."""
+"""Warnings about a scene, which `explain` gives before a run, and about its result, which `simulate` gives after it."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softgrasp.fem.fields.strain import SMALL_STRAIN, gradient
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
-    from softgrasp.fem.run.trajectory import Trajectory
-    from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.system import BlockSystem
 
 LOCKING = 0.49  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu)
 COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
@@ -56,7 +52,7 @@ def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
 
 
 def turned(angle: float) -> list[str]:
-    """A hand angle [rad] beyond the linearised rotation. Not collective."""
+    """A hand angle [rad] too large for the linearised rotation. Not collective."""
     if angle <= SMALL_ANGLE:
         return []
     return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
@@ -121,24 +117,24 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     scene, system, d = model.scene, model.system, model.space.mesh.dimension
     poisson = poisson_ratios(system)
     Z, times = _instants(run, system)
-    found = locking(poisson, scene.tissue.order)
+    texts = locking(poisson, scene.tissue.order)
     omega = slowest(system, Z)
     if omega > 0:
         period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"
-        found += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
+        texts += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
     sizes = total(system.layout.comm, np.einsum("ij,ij->j", Z, Z))
     z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]
     if most is not None and total(system.layout.comm, np.array([np.dot(most[1], most[1])]))[0] > sizes.max():
         t, z = most
     steep = gradient(model, z)
-    if not steep.small:
-        found.append(
+    if not steep.linear:
+        texts.append(
             f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
             f"body at t = {t:.3g} s, at most {steep.largest:.2g}: linear elasticity assumes small strains and "
             "rotations."
         )
-    found += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
-    return found + inexact(
+    texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
+    return texts + inexact(
         run.energy_drift, max(run.residuals), run.solver[0], max(poisson.values()), magnified(system, z)
     )
 

@@ -164,15 +164,15 @@ def explain_model(model: Model) -> Explanation:
 def _warnings(
     scene: Scene, poisson: dict[str, float], omega: Any, dt: float, d: int, effects: dict[str, EffectReport], sag: Sag
 ) -> list[str]:
-    found = locking(poisson, scene.tissue.order)
+    texts = locking(poisson, scene.tissue.order)
     if len(omega):
-        found += coarse(float(omega[0]), dt, scene.time_end, "the first period")
-    if effects["gravity"].on and not sag.gradient.small:
-        found.append(
+        texts += coarse(float(omega[0]), dt, scene.time_end, "the first period")
+    if effects["gravity"].on and not sag.gradient.linear:
+        texts.append(
             f"At rest under its weight the tissue would sag by {sag.largest:.2g} m and |grad z| would be above "
             f"{SMALL_STRAIN} in {sag.gradient.share:.0%} of the body, at most {sag.gradient.largest:.2g}: linear "
             "elasticity assumes small strains and rotations."
         )
     if scene.effects.rotation:
-        found += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))
-    return found
+        texts += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))
+    return texts

@@ -103,7 +103,7 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
         ("g", "(" + ", ".join(f"{x:g}" for x in sag.g) + f") m/s2{assumed}"),
         ("largest |z|", f"{sag.largest:.4g} m"),
         ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {SMALL_SHARE:.0%} of the body"),
-        ("linear elasticity", f"{'holds' if steep.small else 'does not hold'}: |grad z| is above {SMALL_STRAIN} in "
+        ("linear elasticity", f"{'holds' if steep.linear else 'does not hold'}: |grad z| is above {SMALL_STRAIN} in "
          f"{steep.share:.2%} of the body, at most {SMALL_SHARE:.0%} may be"),
     ]  # fmt: skip
 

@@ -75,14 +75,14 @@ def speed_up(times: Array) -> float:
 
 def _timing(times: Array) -> tuple[list[int], list[int]]:
     """Frames to show and how long each but the last [1/100 s]; rounding errors do not add up."""
-    some = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
+    chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
     at = np.round(100 * (times - times[0]) / speed_up(times)).astype(int)  # GIF counts in hundredths of a second
-    kept = some[:1]
-    for i in some[1:]:
+    kept = chosen[:1]
+    for i in chosen[1:]:
         if at[i] - at[kept[-1]] >= TICKS:
             kept.append(i)
-    if len(some) > 1 and kept[-1] != some[-1]:
-        kept = [*(kept[:-1] if len(kept) > 1 else kept), some[-1]]
+    if len(chosen) > 1 and kept[-1] != chosen[-1]:
+        kept = [*(kept[:-1] if len(kept) > 1 else kept), chosen[-1]]
     return kept, [max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)]
 
 

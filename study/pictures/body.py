@@ -305,10 +305,10 @@ def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> 
     length = power * max(m for m in (1, 2, 5) if m * power <= length * 1.001)
     ends = seen(length * np.eye(3))
     low = np.minimum(ends.min(axis=0), 0.0)
-    reach = np.maximum(ends.max(axis=0), 0.0) - low
-    y = size[1] - 0.25 - scale * reach[1] if top else 0.4
-    ax = figure.add_axes((0.08 / size[0], y / size[1], *(scale * reach / size)))
-    ax.set(xlim=(low[0], low[0] + reach[0]), ylim=(low[1], low[1] + reach[1]))
+    extent = np.maximum(ends.max(axis=0), 0.0) - low
+    y = size[1] - 0.25 - scale * extent[1] if top else 0.4
+    ax = figure.add_axes((0.08 / size[0], y / size[1], *(scale * extent / size)))
+    ax.set(xlim=(low[0], low[0] + extent[0]), ylim=(low[1], low[1] + extent[1]))
     ax.set_axis_off()
     for name, end in zip("xyz", ends, strict=True):
         ax.annotate("", end, (0.0, 0.0), arrowprops={"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0})

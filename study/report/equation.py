@@ -7,12 +7,9 @@ z = q_e - T q_s against the rigid motion of the hand.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from softgrasp.fem.effects.damping import layered
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene
 
 
 @dataclass(frozen=True)

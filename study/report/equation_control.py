@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.page import equation_text
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 FEEDBACK = """controlled by:
   state:  E x' = A x + B u, x = [q_s, q_s', z, z']

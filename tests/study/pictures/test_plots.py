@@ -266,8 +266,8 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
         "Errors", "First.\n\nSecond <b>.", header=("N", "error", "ok"), rows=[(4, 1.25e-7, True), (6, None, False)]
     )
     path = write_report(
-        tmp_path / "r.html", title="A & B", subtitle="s", tables=[("Short", [("a", 1)])], figures=[(png, "caption")],
-        sections=[table], scene=SCENE, reproduce="softgrasp reduce x.toml",
+        tmp_path / "r.html", title="A & B", subtitle="s", scene=SCENE, reproduce="softgrasp reduce x.toml",
+        sections=[Section("", figures=[(png, "caption")]), Section("Short", rows=[("a", 1)]), table],
     )  # fmt: skip
     page = Page(path.read_text())
     assert not page.open
