@@ -17,9 +17,9 @@ SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
 # Largest problem of each solver on two ranks with 24 GiB. PETSc Cholesky in blocks is fastest per solve, but its
-# factorisation is the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (study.bench.switches), but
-# not the few solves of an equilibrium or of modes, nor when single entries must do. Beyond the last limits the factor
-# itself no longer fits.
+# factorisation is the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back
+# (study.bench.switches), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
+# limits the factor itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
