@@ -138,11 +138,12 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
         key = "tissue.cells" if scene.tissue.cells else "tissue.mesh"
         given = f"{scene.tissue.cells}" if scene.tissue.cells else f"'{scene.tissue.mesh}'"
         fits = _fitting(scene, comm, run, dimension, cells, share, ranks, free)
-        parts = f"mesh and matrices {_size(share * estimate.mesh)}, factor {_size(share * estimate.factor)}"
+        parts = f"mesh and matrices {size_text(share * estimate.mesh)}, factor {size_text(share * estimate.factor)}"
     where = f"{ranks} rank{'s' if ranks > 1 else ''} of {comm.size} on one node"
+    needs = size_text(estimate.of(share, ranks))
     raise ResourceError(
-        f"{key} = {_short(given)} needs about {_size(estimate.of(share, ranks))} ({parts}) for {where}, where "
-        f"{_size(free)} may be taken; take about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
+        f"{key} = {_short(given)} needs about {needs} ({parts}) for {where}, where {size_text(free)} may be taken; "
+        f"take about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
     )
 
 
@@ -171,12 +172,13 @@ def _digits(value: float) -> int:
     return whole // step * step
 
 
-def _size(size: float) -> str:
-    for unit in ("MiB", "GiB", "TiB"):
-        size /= 1024 if unit != "MiB" else 2**20
+def size_text(size: float) -> str:
+    """Bytes in a unit that suits."""
+    for unit in ("byte", "KiB", "MiB", "GiB"):
         if size < 1000:
-            break
-    return f"{size:.3g} {unit}"
+            return f"{size:.3g} {unit}"
+        size /= 1024
+    return f"{size:.3g} TiB"
 
 
 def _short(text: str) -> str:

@@ -11,6 +11,7 @@ from rich.padding import Padding
 
 from softgrasp.fem.effects.sag import SMALL_SHARE
 from softgrasp.fem.fields.strain import SMALL_STRAIN
+from softgrasp.fem.model.memory import size_text
 from softgrasp.study.forward.explain import EffectReport, Explanation, explain
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import EQUATION, Section, equation_text
@@ -122,12 +123,3 @@ def remarks(result: Explanation) -> list[str]:
         texts.append(f"{name} is off, but the scene seems to call for it{', ' + proviso if proviso else ''}.")
     texts += [f"{name} is on, but does not matter here." for name in result.idle]
     return [*texts, *result.warnings]
-
-
-def size_text(size: float) -> str:
-    """Bytes in a unit that suits. Not collective."""
-    for unit in ("byte", "KiB", "MiB"):
-        if size < 1024:
-            return f"{size:.3g} {unit}" if unit != "byte" else f"{size:.0f} byte"
-        size /= 1024
-    return f"{size:.3g} GiB"

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.report.equation import Equation, equation
+from softgrasp.study.report.equation import Equation, Rows, equation
 from softgrasp.study.report.origin import versions
 from softgrasp.study.report.typeset import equation_html
 
@@ -62,11 +62,12 @@ class Section:
 
 def equation_text(rows: Equation) -> str:
     """An equation as lines of text: in blocks, as it is stepped, and what the symbols are."""
-    lines = ["in blocks:", *_lines(rows.blocks), "", "stepped as:", *_lines(rows.stepped), "", "with:"]
-    return "\n".join([*lines, *(f"  {text}" for text in rows.where)])
+    lines = ["in blocks:", *_lines(rows.blocks), "", "stepped as:", *_lines(rows.stepped), ""]
+    lines += ["controlled by:", *_lines(rows.feedback), ""] if rows.feedback else []
+    return "\n".join([*lines, "with:", *(f"  {text}" for text in rows.where)])
 
 
-def _lines(rows: Sequence[tuple[str, Sequence[str], Sequence[str]]]) -> list[str]:
+def _lines(rows: Rows) -> list[str]:
     sides = [[" + ".join(terms).replace("+ -", "-") for terms in (left, right)] for _, left, right in rows]
     wide = max(len(name) for name, _, _ in rows)
     return [f"  {row[0] + ':':<{wide + 1}} {left} = {right}" for row, (left, right) in zip(rows, sides, strict=True)]
