@@ -13,13 +13,13 @@ import numpy.typing as npt
 from matplotlib.colors import to_rgb
 from PIL import Image
 
+from softgrasp.fem.columns import Array
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
 
 if TYPE_CHECKING:
     from softgrasp.fem.fields.picture import PictureMesh
 
-Array = npt.NDArray[np.float64]
 
 MOST_FRAMES = 60
 SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them the animation runs slower or faster than the move

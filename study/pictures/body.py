@@ -19,6 +19,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
+from softgrasp.fem.columns import Array
 from softgrasp.study.pictures.shapes import (
     AZIMUTH,
     chained,
@@ -49,7 +50,6 @@ from softgrasp.study.pictures.style import (
 if TYPE_CHECKING:
     from softgrasp.fem.fields.picture import PictureMesh
 
-Array = npt.NDArray[np.float64]
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]

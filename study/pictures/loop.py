@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.lines import Line2D
 
-from softgrasp.fem.columns import AXES, Columns, farthest
+from softgrasp.fem.columns import AXES, Array, Columns, farthest
 from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.shapes import pick_instants
 from softgrasp.study.pictures.style import CYCLE, OUTLINE, SKY, TARGET, WIDTH, length_unit, paper_style, save
@@ -22,7 +22,6 @@ from softgrasp.study.pictures.style import CYCLE, OUTLINE, SKY, TARGET, WIDTH, l
 if TYPE_CHECKING:
     from softgrasp.fem.fields.picture import PictureMesh
 
-Array = npt.NDArray[np.float64]
 Poles = npt.NDArray[np.complex128]
 
 COLOURS = (*CYCLE, "#E69F00", SKY, "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six

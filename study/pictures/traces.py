@@ -7,13 +7,10 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-import numpy.typing as npt
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.fem.columns import AXES, Columns, hand_columns
+from softgrasp.fem.columns import AXES, Array, Columns, hand_columns
 from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style, save
-
-Array = npt.NDArray[np.float64]
 
 
 def figure_traces(

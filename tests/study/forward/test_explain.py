@@ -12,7 +12,7 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.effects.sag import SMALL_SHARE
-from softgrasp.fem.fields.strain import gradient
+from softgrasp.fem.fields.strain import gradient, slowest
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import factor_bytes
 from softgrasp.fem.petsc import PETSc
@@ -22,7 +22,7 @@ from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
-from softgrasp.study.forward.cautions import inexact, run_warnings, slowest
+from softgrasp.study.forward.cautions import inexact, run_warnings
 from softgrasp.study.forward.explain import Explanation, explain
 from softgrasp.study.forward.explain_page import render, run_explain, sections
 from softgrasp.study.report.equation import equation
