@@ -1,4 +1,4 @@
-"""Where the unknowns live: the hand on every rank, the tissue distributed."""
+"""Sizes and ownership of the unknowns: the hand's on every rank, the tissue's distributed."""
 
 from __future__ import annotations
 

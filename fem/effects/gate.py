@@ -1,4 +1,4 @@
-"""What every effect states about itself, and the numbers its gate is computed from."""
+"""The data of an effect, and the numbers that its gate is computed from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gravity: a uniform acceleration, which enters through the coupling G that is there anyway."""
+"""Gravity: a uniform acceleration, which needs no operator but the coupling G."""
 
 from __future__ import annotations
 

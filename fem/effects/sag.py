@@ -1,4 +1,4 @@
-"""The tissue at rest under its weight, as numbers: what the gate of gravity sees."""
+"""The tissue at rest under its weight: the numbers that the gate of gravity is computed from."""
 
 from __future__ import annotations
 

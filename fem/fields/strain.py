@@ -1,4 +1,4 @@
-"""What a displacement says: how steep it is, its lowest frequency, and how much rounding magnifies."""
+"""Measures of a displacement: its gradient, its lowest frequency, and how much it magnifies rounding."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ _SERENDIPITY = {("quad", 8), ("hexahedron", 20), ("hexahedron", 24), ("wedge", 1
 
 
 def shape_of(kind: str) -> str | None:
-    """The straight shape behind a cell type of meshio ("tetra" of "tetra10"), or None if it is none of ours."""
+    """The straight shape behind a cell type of meshio ("tetra" of "tetra10"), or None for other types."""
     if kind.startswith("VTK_LAGRANGE_"):
         name = kind.removeprefix("VTK_LAGRANGE_")
         kind = _LAGRANGE.get(name, name.lower())

@@ -1,4 +1,4 @@
-"""What a mesh says, as one number: of the arrays that were read, which some formats spread over several files."""
+"""One hash of the arrays of a mesh, which some formats spread over several files."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 
 
 def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool, name: str) -> list[str]:
-    """What to say of doubled nodes, from :func:`doubled_nodes`; nothing if there are none."""
+    """The warning about doubled nodes, from :func:`doubled_nodes`; empty if there are none."""
     nodes = np.flatnonzero(first != np.arange(len(first)))
     if not nodes.size:
         return []
@@ -125,7 +125,7 @@ def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool
 
 
 def hanging_text(points: Floats, nodes: Integers, name: str) -> list[str]:
-    """What to say of hanging nodes, from :func:`hanging_nodes`; nothing if there are none."""
+    """The warning about hanging nodes, from :func:`hanging_nodes`; empty if there are none."""
     if not nodes.size:
         return []
     return [

@@ -1,4 +1,4 @@
-"""What a mesh is to the model: cells, tags, parts, and how its file was read."""
+"""The mesh of the tissue: cells, tags, parts, and how its file was read."""
 
 from __future__ import annotations
 

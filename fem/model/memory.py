@@ -173,7 +173,7 @@ def _digits(value: float) -> int:
 
 
 def size_text(size: float) -> str:
-    """Bytes in a unit that suits."""
+    """A number of bytes with its unit."""
     for unit in ("byte", "KiB", "MiB", "GiB"):
         if size < 1000:
             return f"{size:.3g} {unit}"

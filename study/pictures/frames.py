@@ -1,4 +1,4 @@
-"""What a run leaves for the eye: field files for ParaView while it runs, figures and animation afterwards."""
+"""Pictures of a run: field files for ParaView while it runs, figures and animation afterwards."""
 
 from __future__ import annotations
 

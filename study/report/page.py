@@ -83,7 +83,7 @@ def of_scene(scene: str) -> Section:
 
 
 def outside(page: str) -> list[str]:
-    """Whatever in the marks of a page would load something else: scripts, links, addresses. Not collective."""
+    """Everything in the tags of a page that would load another file: scripts, links, addresses. Not collective."""
     style = "".join(re.findall(r"<style>.*?</style>", page, re.DOTALL))
     marks = re.findall(r"<[^>]*>", re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL))
     return [address[0] for text in (*marks, style) for address in ADDRESS.finditer(text)]

@@ -1,4 +1,4 @@
-"""Does this installation work: solver stack, MPI launcher, threads, compiler, cache; a cure for each fault.
+"""Checks of the installation: solver stack, MPI launcher, threads, compiler, cache; with a cure for each fault.
 
 Needs neither DOLFINx nor MPI to be imported, so that it can say that they are missing.
 """
@@ -200,7 +200,7 @@ CHECKS: tuple[tuple[str, Callable[[], Check]], ...] = (
 
 
 def checks() -> list[Check]:
-    """Look at everything; a look that fails is a finding, not an error.
+    """Run all checks; one that raises has failed.
 
     Not collective: call on one rank.
     """

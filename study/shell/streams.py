@@ -1,4 +1,4 @@
-"""What a shell does to the command: the reader of its output leaves, and Ctrl-C comes while modules load.
+"""Standard streams whose reader may leave, and Ctrl-C while modules load.
 
 Imports nothing but the standard library, so that it can come first.
 """
