@@ -1,4 +1,4 @@
-"""Room for files that grow: libraries that write fields end the program on a full disk, so it is looked at before."""
+"""Free disk space, checked before fields are written: the libraries that write them end the program on a full disk."""
 
 from __future__ import annotations
 

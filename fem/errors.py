@@ -1,4 +1,4 @@
-"""Errors that a user meets, and how all ranks agree on them.
+"""Errors for users, and how all ranks agree on them.
 
 Every message is one sentence that names the file, key or value and says what would be right.
 """

@@ -1,4 +1,4 @@
-"""Where the unknowns live: the hand on every rank, the tissue distributed."""
+"""Sizes and ownership of the unknowns: the hand's on every rank, the tissue's distributed."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ class BlockLayout:
                 self.comm.rank,
                 int(first) * self.dimension,
             )
-        found = min(b for b in self.comm.allgather(best) if b is not None)
-        return found[2], found[3], np.array(found[1])
+        nearest = min(b for b in self.comm.allgather(best) if b is not None)
+        return nearest[2], nearest[3], np.array(nearest[1])
 
 
 def bounding_box(comm: MPI.Intracomm, nodes: Array) -> tuple[Array, Array]:

@@ -140,5 +140,5 @@ def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:
     result, failure = comm.bcast(answer) if comm.size > 1 else answer
     if failure is not None:
         raise failure
-    found: R = result
-    return found
+    value: R = result
+    return value

@@ -72,19 +72,22 @@ class Damping:
 
 @dataclass(frozen=True)
 class BlockSystem:
-    """All operators of one scene. Matrices are distributed over ``layout.comm``, small arrays replicated.
+    """All operators of one scene, in z = q_e - T q_s, the displacement relative to the hand [SBRH21].
+
+    K_ee = sum over layers of mu K_mu + lambda K_lambda, M_ee = sum of rho M_1; the equations stand at the top of this
+    module. Matrices are distributed over ``layout.comm``, small arrays are the same on every rank.
 
     Attributes:
         layout: sizes and ownership.
         layers: affine components and the materials they carry.
         materials: one per layer.
-        M_ee, K_ee: tissue mass and stiffness (n_e, n_e).
-        T: rigid modes of the hand at the free nodes, local rows (n_local, n_s).
-        G: M_es + M_ee T, local rows (n_local, n_s).
-        M_hand: hand mass matrix (n_s, n_s) [kg, kg m^2].
-        M_rigid: inertia of the tissue moved rigidly with the hand (n_s, n_s).
+        M_ee, K_ee: tissue mass [kg] and stiffness [N/m], (n_e, n_e), symmetric positive definite.
+        T: rigid modes of the hand at the free nodes, local rows (n_local, n_s) [1, m].
+        G: M_es + M_ee T, local rows (n_local, n_s) [kg, kg m].
+        M_hand: hand mass matrix, (n_s, n_s) [kg, kg m^2].
+        M_rigid: inertia of the tissue moved rigidly with the hand, (n_s, n_s) [kg, kg m, kg m^2].
         damping: tissue damping.
-        gravity: acceleration of free fall in the hand's degrees of freedom (n_s,), or None.
+        gravity: acceleration of free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None.
         hand_weight: gravity acts on the hand's own mass too.
         two_way: the hand feels the tissue.
     """

@@ -140,9 +140,8 @@ def _outputs(problem: RiccatiProblem) -> list[Finding]:
                 "a weight in control.Q",
             )
         )
-    names = problem.names if len(problem.names) == len(problem.Q) else tuple(f"y{i + 1}" for i in range(len(problem.Q)))
     rows = np.abs(problem.Q).sum(axis=1)
-    idle = [name for name, row in zip(names, rows, strict=True) if row == 0]
+    idle = [name for name, row in zip(problem.names, rows, strict=True) if row == 0]
     if idle and not len(hidden):
         findings.append(
             Finding("warning", "outputs", f"control.Q gives no weight to {', '.join(idle)}: the cost ignores it")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.run.simulate import Trajectory
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.basis import Basis
 from softgrasp.reduction.engines import EngineName
 from softgrasp.reduction.inner import InnerName

@@ -12,8 +12,8 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.simulate import Trajectory
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction import online
 from softgrasp.reduction.engines import factor

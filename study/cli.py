@@ -45,8 +45,8 @@ NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fie
 SceneFile = Annotated[Path, typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship")]
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(show: bool) -> None:
+    if show:
         from softgrasp import package_version
 
         typer.echo(f"softgrasp {package_version()}")
@@ -77,14 +77,14 @@ def scenes() -> None:
 
     from softgrasp.fem.scene.file import load_scene, shipped_scenes
 
-    found = shipped_scenes()
-    if not found:
+    shipped = shipped_scenes()
+    if not shipped:
         raise SceneError("no scenes here: they ship with the checkout, in demos/scenes")
     table = Table("scene", "what it shows", box=None, pad_edge=False)
-    for name, path in found.items():
+    for name, path in shipped.items():
         table.add_row(name, load_scene(path).description)
     console().print(table)
-    folder = next(iter(found.values())).parent
+    folder = next(iter(shipped.values())).parent
     here = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
     console().print(f"in {here}/, each as NAME.toml", soft_wrap=True)
 
@@ -107,18 +107,9 @@ def explain(
     set_: Overrides = None,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
-    from mpi4py import MPI
+    from softgrasp.study.forward.explain_page import run_explain
 
-    from softgrasp.fem.scene.file import load_scene_collective
-    from softgrasp.study.forward.explain import run_explain
-    from softgrasp.study.forward.explain_page import write_explanation
-    from softgrasp.study.shell.session import list_files
-
-    comm = MPI.COMM_WORLD
-    made = load_scene_collective(comm, scene, set_ or [])
-    found = run_explain(made, comm, console())
-    if out is not None and comm.rank == 0:
-        list_files(console(), write_explanation(out, found, made, scene, set_ or []))
+    run_explain(scene, out, set_ or [], console())
 
 
 @app.command()
@@ -203,8 +194,8 @@ def study(
     from softgrasp.study.precision.run import run_study
 
     limit = None if budget is None else parse_budget(budget)
-    wanted = None if tolerance is None else parse_tolerance(tolerance)
-    run_study(scene, out, set_ or [], console(), tolerance=wanted, budget=limit, questions=question, quiet=quiet)
+    accuracy = None if tolerance is None else parse_tolerance(tolerance)
+    run_study(scene, out, set_ or [], console(), tolerance=accuracy, budget=limit, questions=question, quiet=quiet)
 
 
 @app.command()

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from softgrasp.fem.effects.gate import Gate, Problem
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import Damping as DampingOperator
 from softgrasp.fem.system import LayerBlocks, LayerMaterial, layered_viscosity
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 
 def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> DampingOperator:
     """D = alpha M + beta K, or with a matrix when the layers differ in beta. Collective."""
-    wanted = scene.effects.damping
-    if wanted is None:
+    law = scene.effects.damping
+    if law is None:
         return DampingOperator()
     matrix = layered_viscosity(layers, materials)
     return DampingOperator(
-        alpha=wanted.alpha,
+        alpha=law.alpha,
         beta=materials[0].beta if matrix is None else 0.0,
-        in_space=wanted.drag == "space",
+        in_space=law.drag == "space",
         matrix=matrix,
     )
 
@@ -73,10 +69,10 @@ class Damping:
         threshold = 0.05 / (omega * end)
         if scene.effects.damping is None:
             sentence = f"Off: undamped ring-down, nothing decays in the {end * omega / (2 * np.pi):.3g} first periods"
-            wanted = scene.control is not None
-            sentence += "; feedback alone cannot stabilise the high modes." if wanted else " of the run."
-            condition = "counts whatever the number: the control problem needs it" if wanted else ""
-            return Gate(0.0, symbol, threshold, wanted, sentence, condition=condition)
+            controlled = scene.control is not None
+            sentence += "; feedback alone cannot stabilise the high modes." if controlled else " of the run."
+            condition = "counts whatever the number: the control problem needs it" if controlled else ""
+            return Gate(0.0, symbol, threshold, controlled, sentence, condition=condition)
         zeta = problem.zeta[0]
         left = float(np.exp(-zeta * omega * end))
         sentence = (

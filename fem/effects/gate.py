@@ -1,15 +1,14 @@
-"""What every effect states about itself, and the numbers its gate is computed from."""
+"""The data of an effect, and the numbers that its gate is computed from."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from softgrasp.fem.effects.sag import Sag
-    from softgrasp.fem.scene.scene import Scene
-    from softgrasp.fem.system import LayerMaterial
+from softgrasp.fem.effects.sag import Sag
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.system import LayerMaterial
 
 
 @dataclass(frozen=True)

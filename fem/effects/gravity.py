@@ -1,16 +1,12 @@
-"""Gravity: a uniform acceleration, which enters through the coupling G that is there anyway."""
+"""Gravity: a uniform acceleration, which needs no operator but the coupling G."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softgrasp.fem.effects.gate import Gate, Problem
 from softgrasp.fem.petsc import Array
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene
 
 EARTH = 9.81  # [m/s2], assumed when the scene leaves gravity off
 
@@ -53,7 +49,7 @@ class Gravity:
         begin = (
             f"Off; in SI units and with g = {EARTH} the tissue would" if off else "Under its weight the tissue would"
         )
-        holds = "holds" if sag.gradient.small else f"does not hold, {sag.gradient.share:.0%} of the body is above 0.1"
+        holds = "holds" if sag.gradient.linear else f"does not hold, {sag.gradient.share:.0%} of the body is above 0.1"
         sentence = f"{begin} {bends}, by linear elasticity; {steep}: the theory {holds}."
         proviso = "if its numbers are in SI units" if off else ""
         return Gate(number, "|grad z| of its sag", threshold, number > threshold, sentence, proviso)

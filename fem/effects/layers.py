@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from softgrasp.fem.effects.gate import Gate, Problem
 from softgrasp.fem.scene.materials import young_poisson
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene
 
 THRESHOLD = 1.05  # stiffness within 5 % is one material for any purpose here
 

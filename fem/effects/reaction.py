@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from softgrasp.fem.effects.gate import Gate, Problem, force_drives
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene
 
 THRESHOLD = 0.05  # the hand's acceleration under a given force changes by about this much
 
@@ -34,15 +30,15 @@ class Reaction:
         scene = problem.scene
         number = problem.tissue_mass / scene.hand.mass
         change = number / (1 + number)
-        on, felt = self.active(scene), force_drives(scene)
+        on, driven = self.active(scene), force_drives(scene)
         where = "" if scene.motion.drive == "force" else " in the control problem"
-        if felt and on:
+        if driven and on:
             sentence = f"The tissue takes about {change:.1%} off the acceleration that a force gives the hand{where}."
-        elif felt:
+        elif driven:
             sentence = f"Off; it would take about {change:.1%} off the acceleration a force gives the hand{where}."
         else:
             sentence = "The motion of the hand is prescribed, so the reaction moves nothing."
-        proviso = where.removeprefix(" ") if felt else ""
+        proviso = where.removeprefix(" ") if driven else ""
         large = number > THRESHOLD
-        condition = "counts only where a force drives the hand" if large and not felt else ""
-        return Gate(number, "tissue mass / hand mass", THRESHOLD, felt and large, sentence, proviso, condition)
+        condition = "counts only where a force drives the hand" if large and not driven else ""
+        return Gate(number, "tissue mass / hand mass", THRESHOLD, driven and large, sentence, proviso, condition)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from softgrasp.fem.effects import reaction as reaction_gate
 from softgrasp.fem.effects.gate import Gate, Problem, force_drives
 from softgrasp.fem.petsc import Array
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene
 
 THRESHOLD = 0.05  # the hand's angular acceleration under a given torque changes by about this much
 

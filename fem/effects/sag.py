@@ -1,4 +1,4 @@
-"""The tissue at rest under its weight, as numbers: what the gate of gravity sees."""
+"""The tissue at rest under its weight: the numbers that the gate of gravity is computed from."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Gradient:
     share: float
 
     @property
-    def small(self) -> bool:
+    def linear(self) -> bool:
         """Whether linear elasticity holds: only a small share of the volume is steep."""
         return self.share <= SMALL_SHARE
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import dolfinx.mesh
 import numpy as np
@@ -12,11 +12,9 @@ import numpy.typing as npt
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.petsc import Array, rows_on_root
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
 
 Integers = npt.NDArray[np.int64]
 

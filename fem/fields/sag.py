@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softgrasp.fem.effects.gravity import EARTH, acceleration
 from softgrasp.fem.effects.sag import Sag
 from softgrasp.fem.fields.strain import gradient
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
 
 
 def measure_sag(model: Model) -> Sag:

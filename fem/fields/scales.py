@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import Problem
 from softgrasp.fem.fields.sag import measure_sag
+from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import cells_of_layers
-from softgrasp.fem.model.contact import bounding_box
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns, total
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
-    from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.system import BlockSystem
 
 
 def measure(model: Model, omega: Array, Phi: Array) -> Problem:
@@ -31,7 +27,7 @@ def measure(model: Model, omega: Array, Phi: Array) -> Problem:
         SolverError: the static problem cannot be solved.
     """
     mesh, system = model.space.mesh, model.system
-    low, high = bounding_box(mesh)
+    low, high = bounding_box(mesh.mesh.comm, mesh.mesh.geometry.x[:, : mesh.dimension])
     mass, inertia = rigid_inertia(model)
     return Problem(
         scene=model.scene,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import dolfinx
 import dolfinx.fem
@@ -12,10 +12,8 @@ import numpy as np
 
 from softgrasp.fem.disk import check_room
 from softgrasp.fem.errors import ResourceError, agree
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
 
 FORMATS = ("auto", "vtx", "xdmf")
 

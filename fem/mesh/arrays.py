@@ -33,7 +33,7 @@ class MeshArrays:
         parts: what is known of these parts, or None.
         facet_sets: marks in ``facet_tags`` of each tag number and named set.
         cell_sets: marks in ``cell_tags`` of each tag number and named set.
-        notes: what deserves a warning, one sentence each.
+        notes: warnings, one sentence each.
     """
 
     points: Floats

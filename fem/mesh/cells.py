@@ -46,12 +46,12 @@ _SERENDIPITY = {("quad", 8), ("hexahedron", 20), ("hexahedron", 24), ("wedge", 1
 
 
 def shape_of(kind: str) -> str | None:
-    """The straight shape behind a cell type of meshio ("tetra" of "tetra10"), or None if it is none of ours."""
+    """The straight shape behind a cell type of meshio ("tetra" of "tetra10"), or None for other types."""
     if kind.startswith("VTK_LAGRANGE_"):
         name = kind.removeprefix("VTK_LAGRANGE_")
         kind = _LAGRANGE.get(name, name.lower())
-    found = re.fullmatch(r"([a-z]+)\d*", kind)
-    return found[1] if found and found[1] in _FACES else None
+    known = re.fullmatch(r"([a-z]+)\d*", kind)
+    return known[1] if known and known[1] in _FACES else None
 
 
 def dimension_of(shape: str) -> int:
@@ -133,7 +133,7 @@ def simplices(cells: Integers, shape: str, turn: int = 0) -> tuple[Integers, Int
     if cells.shape[1] == _DIMENSIONS[shape] + 1:
         return cells, np.arange(len(cells))
     first = (cells.argmin(axis=1) + turn) % cells.shape[1]
-    found = [np.zeros((0, _DIMENSIONS[shape] + 1), dtype=np.int64)]
+    pieces = [np.zeros((0, _DIMENSIONS[shape] + 1), dtype=np.int64)]
     parents = [np.zeros(0, dtype=np.int64)]
     for i in range(cells.shape[1]):
         rows = np.flatnonzero(first == i)
@@ -141,9 +141,9 @@ def simplices(cells: Integers, shape: str, turn: int = 0) -> tuple[Integers, Int
             if i in face:
                 continue
             base, sub = simplices(cells[rows][:, face], _FACE_SHAPES[len(face)])
-            found.append(np.column_stack([cells[rows[sub], i], base]))
+            pieces.append(np.column_stack([cells[rows[sub], i], base]))
             parents.append(rows[sub])
-    cut, parent = np.concatenate(found), np.concatenate(parents)
+    cut, parent = np.concatenate(pieces), np.concatenate(parents)
     order = np.argsort(parent, kind="stable")
     cut, parent = cut[order], parent[order]
     ordered = np.sort(cut, axis=1)

@@ -1,14 +1,12 @@
-"""What a mesh says, as one number: of the arrays that were read, which some formats spread over several files."""
+"""One hash of the arrays of a mesh, which some formats spread over several files."""
 
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from softgrasp.fem.mesh.arrays import MeshArrays, Sets
+from softgrasp.fem.mesh.arrays import MeshArrays, Sets
 
 
 def mesh_digest(arrays: MeshArrays) -> str:

@@ -102,13 +102,13 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
         MeshError: see `read_mesh`.
     """
     raw = _read(path, limit)
-    found = sorted({block.type for block in raw.cells})
+    kinds = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]
     filled = [shape for shape, block in zip(shapes, raw.cells, strict=True) if shape and len(block.data)]
     dimension = max((dimension_of(shape) for shape in filled), default=0)
     if None in shapes or dimension < 2:
         raise MeshError(
-            f"{path} holds cells of type {', '.join(found) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
+            f"{path} holds cells of type {', '.join(kinds) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
             "hexahedra, wedges and pyramids are taken, export the mesh with these."
         )
     for block in raw.cells:
@@ -240,7 +240,7 @@ def _named(
 
     A set must have one list of cells a block; others (sets of sets) are left out, and so are unknown names then.
     """
-    found = {}
+    holds = {}
     for name, lists in raw.cell_sets.items():
         if name.startswith("gmsh:"):  # numbers of CAD entities, not of cells
             continue
@@ -253,8 +253,8 @@ def _named(
                 inside[np.asarray(lists[i], dtype=np.int64)] = True
             members.append(inside[parents])
         if (member := np.concatenate(members)).any():
-            found[name] = member
-    return found
+            holds[name] = member
+    return holds
 
 
 def _is_cell_list(part: object) -> bool:

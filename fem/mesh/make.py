@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import dolfinx.mesh
 import numpy as np
@@ -11,9 +10,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene
 
 
 def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:

@@ -68,9 +68,9 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
         np.minimum.at(h, owners[:, j], length)
     nodes = np.unique(facets.nodes[facets.outer])
     tree = cKDTree(points[nodes])
-    reach = tolerance * h[nodes]
-    near = np.flatnonzero(tree.query_ball_point(points[nodes], reach, return_length=True) > 1)
-    lists = tree.query_ball_point(points[nodes[near]], reach[near])
+    radius = tolerance * h[nodes]
+    near = np.flatnonzero(tree.query_ball_point(points[nodes], radius, return_length=True) > 1)
+    lists = tree.query_ball_point(points[nodes[near]], radius[near])
     one = nodes[np.repeat(near, [len(entry) for entry in lists])]
     other = nodes[np.concatenate([*lists, []]).astype(np.int64)]
     close = np.linalg.norm(points[one] - points[other], axis=1) <= tolerance * h[other]
@@ -110,7 +110,7 @@ def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 
 
 def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool, name: str) -> list[str]:
-    """What to say of doubled nodes, from :func:`doubled_nodes`; nothing if there are none."""
+    """The warning about doubled nodes, from :func:`doubled_nodes`; empty if there are none."""
     nodes = np.flatnonzero(first != np.arange(len(first)))
     if not nodes.size:
         return []
@@ -125,7 +125,7 @@ def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool
 
 
 def hanging_text(points: Floats, nodes: Integers, name: str) -> list[str]:
-    """What to say of hanging nodes, from :func:`hanging_nodes`; nothing if there are none."""
+    """The warning about hanging nodes, from :func:`hanging_nodes`; empty if there are none."""
     if not nodes.size:
         return []
     return [

@@ -1,4 +1,4 @@
-"""What a mesh is to the model: cells, tags, parts, and how its file was read."""
+"""The mesh of the tissue: cells, tags, parts, and how its file was read."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TissueMesh:
         parts: what is known of these parts, or None.
         facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
         cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
-        notes: what of the file deserves a warning, one sentence each, on all ranks.
+        notes: warnings about the file, one sentence each, on all ranks.
         digest: SHA-256 of what was read from the file, on all ranks; empty without one.
         contact: facets of the contact zone that a refined mesh inherits; None: they are selected on this mesh.
         layers: number of the layer of each cell that a refined mesh inherits, -1 for none; None likewise.

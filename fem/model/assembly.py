@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import dolfinx.fem
 import numpy as np
@@ -17,10 +17,8 @@ from softgrasp.fem.layout import BlockLayout, bounding_box
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import Component, LayerBlocks
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 
 @dataclass

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import dolfinx.fem
 import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError, agree
+from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.check import counted, place_text
-
-if TYPE_CHECKING:
-    from softgrasp.fem.mesh.parts import Parts
-    from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-    from softgrasp.fem.scene.scene import Contact
+from softgrasp.fem.mesh.parts import Parts
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.scene.scene import Contact
 
 Ints = npt.NDArray[np.int32]
 Floats = npt.NDArray[np.float64]
@@ -44,7 +42,7 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     if tissue.contact is not None:
         return np.asarray(facets[np.isin(facets, tissue.contact.indices)], dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(mesh, fdim, facets)[:, : tissue.dimension]
-    low, high = bounding_box(tissue)
+    low, high = bounding_box(mesh.comm, mesh.geometry.x[:, : tissue.dimension])
     tolerance = BOX_TOLERANCE * float(np.max(high - low))
     chosen = np.ones(len(facets), dtype=np.bool_)
     keys = []
@@ -181,10 +179,10 @@ def contact_blocks(space: dolfinx.fem.FunctionSpace, facets: Ints) -> tuple[Ints
     Collective. A node counts as contact node on its owner even if only another rank sees the facet.
     """
     mesh = space.mesh
-    found = dolfinx.fem.locate_dofs_topological(space, mesh.topology.dim - 1, facets, remote=True)
+    located = dolfinx.fem.locate_dofs_topological(space, mesh.topology.dim - 1, facets, remote=True)
     owned = space.dofmap.index_map.size_local
     on = np.zeros(owned, dtype=np.bool_)
-    on[found[found < owned]] = True
+    on[located[located < owned]] = True
     return np.flatnonzero(on).astype(np.int32), np.flatnonzero(~on).astype(np.int32)
 
 
@@ -250,16 +248,6 @@ def cell_midpoints(tissue: TissueMesh) -> Floats:
     cells = np.arange(owned, dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, cells)
     return np.asarray(midpoints[:, : tissue.dimension], dtype=np.float64)
-
-
-def bounding_box(tissue: TissueMesh) -> tuple[Floats, Floats]:
-    """Lower and upper corner of the mesh over all ranks [m]. Collective."""
-    x = tissue.mesh.geometry.x[:, : tissue.dimension]
-    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
-    comm = tissue.mesh.comm
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    return low, high
 
 
 def _tagged_facets(tissue: TissueMesh, tag: int | str) -> Ints:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
@@ -12,10 +11,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import choose_solver, factor_on_every_rank
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 # Peak of mesh, forms and matrices, those of a step included [byte a cell], by dimension and order, measured on boxes
 # of 5e4 to 7e5 simplices; then what each layer adds. With the factor they give 0.8 to 1.04 of what was measured.
@@ -126,26 +123,27 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
     ranks, free = node.size, node.bcast(free_bytes(scene))
     node.Free()
-    found = need(scene, dimension, cells, comm, run)
-    nodes = comm.allgather((found.of(ranks / comm.size, ranks) / max(free, 1.0), ranks, free))
+    estimate = need(scene, dimension, cells, comm, run)
+    nodes = comm.allgather((estimate.of(ranks / comm.size, ranks) / max(free, 1.0), ranks, free))
     worst, ranks, free = max(nodes)
     if worst <= 1:
         return
     share = ranks / comm.size
-    tissue = share * (found.mesh + found.factor)
-    if ranks * found.tables > tissue:
+    tissue = share * (estimate.mesh + estimate.factor)
+    if ranks * estimate.tables > tissue:
         key, given = "time.steps", f"{scene.time.steps}"
-        fits = f"time.steps = {_digits(scene.time.steps * max(free - tissue, 0.0) / (ranks * found.tables))}"
+        fits = f"time.steps = {_digits(scene.time.steps * max(free - tissue, 0.0) / (ranks * estimate.tables))}"
         parts = "tables of hand, loads and outputs"
     else:
         key = "tissue.cells" if scene.tissue.cells else "tissue.mesh"
         given = f"{scene.tissue.cells}" if scene.tissue.cells else f"'{scene.tissue.mesh}'"
         fits = _fitting(scene, comm, run, dimension, cells, share, ranks, free)
-        parts = f"mesh and matrices {_size(share * found.mesh)}, factor {_size(share * found.factor)}"
+        parts = f"mesh and matrices {size_text(share * estimate.mesh)}, factor {size_text(share * estimate.factor)}"
     where = f"{ranks} rank{'s' if ranks > 1 else ''} of {comm.size} on one node"
+    needs = size_text(estimate.of(share, ranks))
     raise ResourceError(
-        f"{key} = {_short(given)} needs about {_size(found.of(share, ranks))} ({parts}) for {where}, where "
-        f"{_size(free)} may be taken; take about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
+        f"{key} = {_short(given)} needs about {needs} ({parts}) for {where}, where {size_text(free)} may be taken; "
+        f"take about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
     )
 
 
@@ -174,12 +172,13 @@ def _digits(value: float) -> int:
     return whole // step * step
 
 
-def _size(size: float) -> str:
-    for unit in ("MiB", "GiB", "TiB"):
-        size /= 1024 if unit != "MiB" else 2**20
+def size_text(size: float) -> str:
+    """A number of bytes with its unit."""
+    for unit in ("byte", "KiB", "MiB", "GiB"):
         if size < 1000:
-            break
-    return f"{size:.3g} {unit}"
+            return f"{size:.3g} {unit}"
+        size /= 1024
+    return f"{size:.3g} TiB"
 
 
 def _short(text: str) -> str:

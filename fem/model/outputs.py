@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.columns import Columns, hand_columns, labels
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import BlockSystem
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -23,42 +22,31 @@ class Output:
 
     Attributes:
         name: label in tables and files.
-        size: number of components.
+        columns: one per component.
         dofs: local tissue dofs that enter, shape (k, size); empty on ranks that own none.
         weight: every listed dof enters with this factor.
         C_s: rigid part, (size, n_s), on every rank.
         point: coordinates [m] of the node, or of the centre of the region.
-        axes: of the components, see :func:`hand_axes`.
         place: the node that is taken, or the nodes of the mean, in words; empty for the hand.
     """
 
     name: str
-    size: int
+    columns: Columns
     dofs: np.ndarray
     weight: float
     C_s: Array
     point: tuple[float, ...] = ()
-    axes: tuple[str, ...] = ("x", "y", "z")
     place: str = ""
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+        return len(self.columns)
 
     @property
     def names(self) -> tuple[str, ...]:
         """One per component: the label and its axis."""
-        return tuple(f"{self.name}_{axis}" for axis in self.axes[: self.size])
-
-
-def hand_axes(n_s: int, dimension: int) -> tuple[str, ...]:
-    """Axes of the hand's degrees of freedom: x, y (z), then the rotations rz in the plane, rx, ry, rz in space.
-
-    Not collective.
-    """
-    turns = ("rz",) if dimension == 2 else ("rx", "ry", "rz")
-    return (*("x", "y", "z")[:dimension], *turns)[:n_s]
-
-
-def unit(name: str, rate: bool = False) -> str:
-    """Unit of a component by the axis that ends its name; of its rate of change on request. Not collective."""
-    return ("rad" if name.rsplit("_", 1)[-1].startswith("r") else "m") + ("/s" if rate else "")
+        return labels(self.columns)
 
 
 def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
@@ -67,12 +55,12 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     Raises:
         SceneError: a node lies outside the body or a region holds no node.
     """
-    wanted = scene.control.outputs if scene.control is not None else []
-    if not wanted:
+    entries = scene.control.outputs if scene.control is not None else []
+    if not entries:
         tip = _node(system, "tip", _farthest(system))
         return (replace(tip, place=f"node {_coordinates(tip.point)}, the free one farthest from the hand"),)
     result = []
-    for i, output in enumerate(wanted):
+    for i, output in enumerate(entries):
         name = output.name or f"y{i + 1}"
         if output.kind == "hand":
             result.append(_hand(system, name))
@@ -86,18 +74,18 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
 
 def _hand(system: BlockSystem, name: str) -> Output:
     n_s = system.layout.n_s
-    none = np.zeros((0, n_s), int)
-    return Output(name, n_s, none, 0.0, np.eye(n_s), axes=hand_axes(n_s, system.layout.dimension))
+    columns = hand_columns(n_s, system.layout.dimension, name)
+    return Output(name, columns, np.zeros((0, n_s), int), 0.0, np.eye(n_s))
 
 
 def _node(system: BlockSystem, name: str, point: Array) -> Output:
     layout = system.layout
     d = layout.dimension
     rank, first, where = layout.nearest_node(point)
-    mine = layout.comm.rank == rank
-    dofs = np.arange(first, first + d)[None, :] if mine else np.zeros((0, d), int)
-    C_s = layout.comm.bcast(system.T[first : first + d].copy() if mine else None, root=rank)
-    return Output(name, d, dofs, 1.0, C_s, tuple(where.tolist()), place=_taken(system, point, where))
+    owns = layout.comm.rank == rank
+    dofs = np.arange(first, first + d)[None, :] if owns else np.zeros((0, d), int)
+    C_s = layout.comm.bcast(system.T[first : first + d].copy() if owns else None, root=rank)
+    return Output(name, hand_columns(d, d, name), dofs, 1.0, C_s, tuple(where.tolist()), _taken(system, point, where))
 
 
 def _taken(system: BlockSystem, point: Array, where: Array) -> str:
@@ -145,7 +133,7 @@ def _region(system: BlockSystem, name: str, box: Array, i: int) -> Output:
     R = rigid_modes(held, d, layout.n_s > d, layout.reference).reshape(-1, d, layout.n_s)
     C_s = total(layout.comm, system.T[dofs].sum(axis=0) + R.sum(axis=0)) / count
     place = f"mean of {count} nodes" + (f", {carried} of them held by the hand" if carried else "")
-    return Output(name, d, dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()), place=place)
+    return Output(name, hand_columns(d, d, name), dofs, 1.0 / count, C_s, tuple(box.mean(axis=0).tolist()), place)
 
 
 def _inside(system: BlockSystem, point: list[float], i: int) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,8 @@ from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import AGAIN, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
-
-if TYPE_CHECKING:
-    from softgrasp.fem.run.simulate import Run
-    from softgrasp.fem.scene.scene import Scene
 
 FORMAT = 4
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
@@ -25,7 +23,56 @@ FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless
 
 
-def write_checkpoint(run: Run, directory: Path) -> Path:
+@dataclass(frozen=True)
+class RestartState:
+    """What a run needs to go on bit by bit: this rank's share of its arrays, and a few numbers.
+
+    Attributes:
+        run: name of the run.
+        step: last step taken, n.
+        legs: steps at which it was started and resumed.
+        beside: names and SHA-256 of further files in the checkpoint's folder; rank 0's count.
+        state: local [z; v_z].
+        r: local rows of the right-hand side of the next step.
+        pending: load that it still lacks.
+        hand_q, hand_v: hand so far, shape (n + 1, n_s).
+        outputs: this rank's share of the outputs so far, shape (n + 1, components).
+        snapshots: stored columns.
+        loads, pulls: what the work of the loads needs, shapes (n, n_s) and (n + 1, n_s).
+        energies: dissipated, at the start, largest [J].
+        residual_first: relative residual of the first solve.
+        forces: on the hand so far, shape (n, n_s); None where the motion is prescribed.
+    """
+
+    run: str
+    step: int
+    legs: list[int]
+    beside: dict[str, str]
+    state: Array
+    r: Array
+    pending: Array
+    hand_q: Array
+    hand_v: Array
+    outputs: Array
+    snapshots: Array
+    loads: Array
+    pulls: Array
+    energies: Array
+    residual_first: float
+    forces: Array | None = None
+
+    def arrays(self) -> dict[str, Any]:
+        """What goes into this rank's file, by its name there."""
+        names = [field.name for field in fields(self)[4:]]
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+    @property
+    def size(self) -> int:
+        """About what this rank's file takes [byte]."""
+        return sum(np.asarray(array).nbytes for array in self.arrays().values())
+
+
+def write_checkpoint(state: RestartState, scene: Scene, layout: BlockLayout, directory: Path) -> Path:
     """Write everything that a bitwise restart needs; older files are removed afterwards. Collective.
 
     The files carry the name of the run, so that no other run in the folder writes over one that a manifest names.
@@ -36,12 +83,12 @@ def write_checkpoint(run: Run, directory: Path) -> Path:
     Raises:
         CheckpointError: the folder cannot be written.
     """
-    comm = run.model.system.layout.comm
+    comm = layout.comm
     manifest = directory / "checkpoint.json"
-    name, sha256 = f"{run.name}-step{run.reached}-rank{comm.rank}.npz", ""
+    name, sha256 = f"{state.run}-step{state.step}-rank{comm.rank}.npz", ""
     with agree(comm):
         try:
-            sha256 = _write_rank(run, directory / name)
+            sha256 = write_arrays(directory / name, {"numbering": _numbering(layout), **state.arrays()})
         except OSError as error:
             raise CheckpointError(
                 f"{directory}: the restart file cannot be written ({error}); free the disk"
@@ -49,96 +96,57 @@ def write_checkpoint(run: Run, directory: Path) -> Path:
     files = comm.gather((name, sha256))
     with agree(comm):
         if files is not None:
-            _write_manifest(run, manifest, files)
+            _write_manifest(state, scene, manifest, files)
     return manifest
 
 
-def _write_manifest(run: Run, manifest: Path, files: list[tuple[str, str]]) -> None:
+def _write_manifest(state: RestartState, scene: Scene, manifest: Path, files: list[tuple[str, str]]) -> None:
     """Put the new manifest in place of the old one and remove older states. Rank 0 only."""
     entry = {
         "format": FORMAT,
-        "run": run.name,
-        "scene_hash": _numbers_hash(run.model.scene),
-        "scene": run.model.scene.model_dump(mode="json", by_alias=True),
-        "ranks": run.layout.comm.size,
-        "step": run.reached,
-        "legs": run.legs,
+        "run": state.run,
+        "scene_hash": _numbers_hash(scene),
+        "scene": scene.model_dump(mode="json", by_alias=True),
+        "ranks": len(files),
+        "step": state.step,
+        "legs": state.legs,
         "files": files,
-        "beside": run.beside,
+        "beside": state.beside,
     }
     try:
         write_manifest(manifest, entry)
     except OSError as error:
         raise CheckpointError(f"{manifest} cannot be written ({error}); free the disk") from error
-    remove_others(manifest.parent, OLD, [*dict(files), *run.beside])
+    remove_others(manifest.parent, OLD, [*dict(files), *state.beside])
 
 
-def restart_bytes(run: Run) -> int:
-    """About what a restart file takes, of all ranks. Collective."""
-    return int(run.layout.comm.allreduce(sum(np.asarray(array).nbytes for array in _arrays(run).values())))
-
-
-def _write_rank(run: Run, path: Path) -> str:
-    """Write this rank's file and return its SHA-256. Not collective."""
-    return write_arrays(path, _arrays(run))
-
-
-def _arrays(run: Run) -> dict[str, Any]:
-    """What this rank needs to go on. Not collective."""
-    midpoint, n = run.midpoint, run.reached
-    arrays: dict[str, Any] = {
-        "numbering": _numbering(run.layout),
-        "state": run.state.array,
-        "r": midpoint.held.leave(midpoint.r.array_r),
-        "pending": midpoint.pending,
-        "hand_q": run.drive.q[: n + 1],
-        "hand_v": run.drive.v[: n + 1],
-        "outputs": run.local_outputs[: n + 1],
-        "snapshots": run.store.kept(n),
-        "loads": run.drive.c[:n],
-        "pulls": run.pulls[: n + 1],
-        "energies": [midpoint.dissipated, run.initial_energy, run.peak_energy],
-        "residual_first": run.residual_first,
-    }
-    if run.drive.u is not None:
-        arrays["forces"] = run.drive.u[:n]
-    return arrays
-
-
-def read_checkpoint(run: Run, directory: Path) -> None:
-    """Put a run back where it was stopped. Collective.
+def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> RestartState:
+    """What a run of this scene left when it was stopped. Collective.
 
     Raises:
         CheckpointError: no restart file, a damaged one, or one of another scene, rank count, mesh numbering or format.
     """
-    comm = run.model.system.layout.comm
-    with agree(comm):
+    with agree(layout.comm):
         manifest = directory / "checkpoint.json"
-        entry = _fitting(run, manifest, read_manifest(manifest, FORMAT))
-        name, sha256 = entry["files"][comm.rank]
-        arrays = read_arrays(directory / name, sha256)
-        if not np.array_equal(arrays["numbering"], _numbering(run.layout)):
+        entry = _fitting(scene, layout.comm.size, manifest, read_manifest(manifest, FORMAT))
+        name, sha256 = entry["files"][layout.comm.rank]
+        arrays: dict[str, Any] = dict(read_arrays(directory / name, sha256))
+        if not np.array_equal(arrays.pop("numbering"), _numbering(layout)):
             raise CheckpointError(
-                f"{directory / name} was written with other nodes on rank {comm.rank}, as another version of DOLFINx "
-                f"deals them out; {AGAIN}"
+                f"{directory / name} was written with other nodes on rank {layout.comm.rank}, as another version of "
+                f"DOLFINx deals them out; {AGAIN}"
             )
-        run.name, run.beside = entry["run"], entry["beside"]
-        _restore(run, arrays, entry["step"])
-        legs = [leg for leg in entry["legs"] if leg < run.reached]
-        run.begun, run.legs = run.reached, [*legs, run.reached]
-    for vector in (run.state.z, run.state.v, run.midpoint.r):
-        vector.stateIncrease()
-    run.midpoint.join(run.state)
+        arrays["residual_first"] = float(arrays["residual_first"])
+        return RestartState(entry["run"], entry["step"], entry["legs"], entry["beside"], **arrays)
 
 
-def _fitting(run: Run, manifest: Path, entry: dict[str, Any]) -> dict[str, Any]:
+def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) -> dict[str, Any]:
     """The manifest's entry if it is of this scene and rank count. Not collective.
 
     Raises:
         CheckpointError: it is not; the message names the key.
     """
-    comm, scene = run.model.system.layout.comm, run.model.scene
-    before, now = {"ranks": entry["ranks"]}, {"ranks": comm.size}
+    before, now = {"ranks": entry["ranks"]}, {"ranks": ranks}
     same = entry["scene_hash"] == _numbers_hash(scene)
     if not same:
         before, now = _flat(entry["scene"]), _flat(scene.model_dump(mode="json", by_alias=True))
@@ -186,25 +194,3 @@ def _flat(value: dict[str, Any], path: str = "") -> dict[str, Any]:
 def _short(value: Any) -> str:
     text = "nothing" if value is None else json.dumps(value)
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _restore(run: Run, arrays: dict[str, Array], step: int) -> None:
-    n = step + 1
-    run.store.restore(arrays["snapshots"], step, run.name)
-    run.state = run.store.target(step)
-    run.state.array[:] = arrays["state"]
-    r, rows = arrays["r"], len(run.midpoint.r_array)
-    if len(r) != rows:
-        raise CheckpointError(f"the restart file holds {len(r)} rows of the right-hand side, this run {rows}; {AGAIN}")
-    run.midpoint.r.array_w[:] = run.midpoint.held.enter(r)
-    run.midpoint.pending = arrays["pending"]
-    run.drive.q[:n] = arrays["hand_q"]
-    run.drive.v[:n] = arrays["hand_v"]
-    run.local_outputs[:n] = arrays["outputs"]
-    run.drive.c[:step] = arrays["loads"]
-    run.pulls[:n] = arrays["pulls"]
-    if run.drive.u is not None:
-        run.drive.u[:step] = arrays["forces"]
-    run.midpoint.dissipated, run.initial_energy, run.peak_energy = (float(value) for value in arrays["energies"])
-    run.residual_first = float(arrays["residual_first"])
-    run.reached = step

@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.errors import SceneError, SolverError
-from softgrasp.fem.model.outputs import hand_axes
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import HandTable
@@ -123,7 +123,7 @@ class ForceDrive:
         """
         for i, j in np.argwhere(~np.isfinite(self.u[begin:end]))[:1]:
             layout = self.system.layout
-            n, axis = begin + int(i), hand_axes(layout.n_s, layout.dimension)[j]
+            n, axis = begin + int(i), hand_columns(layout.n_s, layout.dimension)[j].axis
             raise SolverError(
                 f"the force on the hand is {self.u[n, j]} in {axis} in step {n + 1}, at t = {(n + 0.5) * self.dt:.6g} "
                 "s; it must be finite"

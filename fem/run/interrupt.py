@@ -1,4 +1,4 @@
-"""Ctrl-C during a run."""
+"""Ctrl-C during a run or a study."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ from typing import Any
 
 
 @contextmanager
-def interruptible(speaks: bool) -> Iterator[list[bool]]:
-    """Turn the first Ctrl-C into a flag and say so on the standard error; a second one interrupts at once."""
+def interruptible(speaks: bool = False) -> Iterator[list[bool]]:
+    """Turn the first Ctrl-C into an entry of the list; a second one interrupts at once.
+
+    Args:
+        speaks: say on the standard error that the first one was seen.
+    """
     flag: list[bool] = []
 
-    def note(number: int, frame: Any) -> None:
+    def stop(number: int, frame: Any) -> None:
         flag.append(True)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         if speaks:
@@ -22,7 +26,7 @@ def interruptible(speaks: bool) -> Iterator[list[bool]]:
                 os.write(2, b"\nstopping as soon as the restart file is written; Ctrl-C again stops at once\n")
 
     try:
-        previous = signal.signal(signal.SIGINT, note)
+        previous = signal.signal(signal.SIGINT, stop)
     except ValueError:  # not the main thread: leave signals alone
         yield flag
         return

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.text import read_table
-
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -5,25 +5,27 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import Interrupted, ResourceError, SceneError, SolverError, agree
+from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError, agree
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.checkpoint import read_checkpoint, write_checkpoint
+from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.motion import driven_table, force_values, motion_table
-from softgrasp.fem.run.snapshots import Snapshots, make_store
+from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.sealed import AGAIN
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
@@ -39,10 +41,10 @@ class RunOptions:
         directory: where checkpoints and streamed snapshots go.
         resume: continue from the checkpoint in ``directory``.
         until: stop after this step and leave a checkpoint; None runs to the end.
-        progress: called about five times a second.
-        frame: called at the start, at the end and at ``output.frames`` steps between.
-        begin: called once before the first step, when a checkpoint has been read.
-        keep: called before every checkpoint is written, to keep with it what the run has seen so far.
+        progress: called with the :class:`Run` about five times a second.
+        frame: called with it at the start, at the end and at ``output.frames`` steps between.
+        begin: called with it once before the first step, when a checkpoint has been read.
+        keep: called with it before every checkpoint is written, to add files to :attr:`Run.beside`.
     """
 
     directory: Path = Path("out")
@@ -52,43 +54,6 @@ class RunOptions:
     frame: Observer | None = None
     begin: Observer | None = None
     keep: Observer | None = None
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """What a run returns.
-
-    Attributes:
-        times: time grid [s], shape (steps + 1,).
-        q_s, v_s: hand, shape (steps + 1, n_s), on every rank.
-        outputs: named outputs [m], shape (steps + 1, components), on every rank.
-        outputs_rigid: what the outputs would be if the tissue moved rigidly with the hand, same shape.
-        output_names: one per component.
-        snapshots: stored states, or None.
-        final: local [z; v_z] at the end.
-        energy_drift: |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless.
-        residuals: relative residual of the first and the last solve.
-        solver: name and reason.
-        seconds: stages of the run.
-        steps_timed: steps taken since the run was started or resumed.
-        force: mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with
-            two-way coupling what a prescribed motion takes; None when one-way coupling leaves it unknown.
-    """
-
-    times: Array
-    q_s: Array
-    v_s: Array
-    outputs: Array
-    outputs_rigid: Array
-    output_names: tuple[str, ...]
-    snapshots: Snapshots | None
-    final: Array
-    energy_drift: float
-    residuals: tuple[float, float]
-    solver: tuple[str, str]
-    seconds: dict[str, float] = field(default_factory=dict)
-    steps_timed: int = 0
-    force: Array | None = None
 
 
 class Run(Stepped):
@@ -231,6 +196,59 @@ class Run(Stepped):
         scale = max(self.peak_energy, abs(work), abs(lost))
         return abs(defect) / scale if scale > 0 else 0.0
 
+    def restart_state(self) -> RestartState:
+        """What this rank needs to go on from here; views, not copies."""
+        midpoint, n = self.midpoint, self.reached
+        return RestartState(
+            run=self.name,
+            step=n,
+            legs=self.legs,
+            beside=self.beside,
+            state=self.state.array,
+            r=midpoint.held.leave(midpoint.r.array_r),
+            pending=midpoint.pending,
+            hand_q=self.drive.q[: n + 1],
+            hand_v=self.drive.v[: n + 1],
+            outputs=self.local_outputs[: n + 1],
+            snapshots=self.store.kept(n),
+            loads=self.drive.c[:n],
+            pulls=self.pulls[: n + 1],
+            energies=np.array([midpoint.dissipated, self.initial_energy, self.peak_energy]),
+            residual_first=self.residual_first,
+            forces=None if self.drive.u is None else self.drive.u[:n],
+        )
+
+    def restore(self, saved: RestartState) -> None:
+        """Go back to where a run was stopped. Collective.
+
+        Raises:
+            CheckpointError: the state is of another mesh numbering, or the streamed snapshots do not fit to it.
+        """
+        n, midpoint = saved.step, self.midpoint
+        with agree(self.layout.comm):
+            self.store.restore(saved.snapshots, n, saved.run)
+            if len(saved.r) != len(midpoint.r_array):
+                raise CheckpointError(
+                    f"the restart file holds {len(saved.r)} rows of the right-hand side, this run "
+                    f"{len(midpoint.r_array)}; {AGAIN}"
+                )
+        self.name, self.beside = saved.run, saved.beside
+        self.state = self.store.target(n)
+        self.state.array[:] = saved.state
+        midpoint.r.array_w[:] = midpoint.held.enter(saved.r)
+        midpoint.pending = saved.pending
+        self.drive.q[: n + 1], self.drive.v[: n + 1] = saved.hand_q, saved.hand_v
+        self.local_outputs[: n + 1], self.pulls[: n + 1] = saved.outputs, saved.pulls
+        self.drive.c[:n] = saved.loads
+        if self.drive.u is not None and saved.forces is not None:
+            self.drive.u[:n] = saved.forces
+        midpoint.dissipated, self.initial_energy, self.peak_energy = saved.energies.tolist()
+        self.residual_first, self.reached, self.begun = saved.residual_first, n, n
+        self.legs = [*(leg for leg in saved.legs if leg < n), n]
+        for vector in (self.state.z, self.state.v, midpoint.r):
+            vector.stateIncrease()
+        midpoint.join(self.state)
+
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
         system, outputs = self.model.system, self.outputs
@@ -238,7 +256,6 @@ class Run(Stepped):
         y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
         rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
         y += rigid
-        names = tuple(name for o in outputs for name in o.names)
         times = self.end * np.arange(self.steps + 1) / self.steps
         snapshots = self.store.finish(times, self.drive.q, self.drive.v)
         spent = comm.allreduce(self.seconds, MPI.MAX)
@@ -249,7 +266,7 @@ class Run(Stepped):
             v_s=self.drive.v,
             outputs=y,
             outputs_rigid=rigid,
-            output_names=names,
+            columns=tuple(column for o in outputs for column in o.columns),
             snapshots=snapshots,
             final=self.state.array.copy(),
             energy_drift=self.drift(),
@@ -283,12 +300,21 @@ def _boundaries(run: Run, options: RunOptions) -> tuple[list[int], set[int], set
 
 
 def simulate(model: Model, options: RunOptions | None = None, force: Force | None = None) -> Trajectory:
-    """Run a scene from its start to its end. Collective.
+    """Run a scene from its start to its end by the implicit midpoint rule [HLW06]. Collective.
+
+    With z the displacement relative to the hand's rigid motion, s = 2 / dt, w = z_mid - z_n and h the load, one solve a
+    step with one factor:
+
+        (K + s D + s^2 M) w = h_mid - K z_n + s M v_n,    z_{n+1} = z_n + 2 w,    v_{n+1} = 2 s w - v_n.
 
     Args:
         model: from :func:`fem.model.build.build`.
         options: files, resume and observers.
-        force: feedback force on the hand instead of the scene's motion.
+        force: instead of the scene's motion, called as force(n, t_mid, q_s, v_s) for the force on the hand in step n,
+            (n_s,) [N, N m]; q_s and v_s are the hand at the start of the step.
+
+    Returns:
+        The trajectory: times, hand and outputs on every rank, tissue states distributed.
 
     Raises:
         SolverError: a solve failed or missed its tolerance.
@@ -301,13 +327,13 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
     ts = make_ts(run)
     try:
         if options.resume:
-            read_checkpoint(run, options.directory / "checkpoint")
+            run.restore(read_checkpoint(model.scene, run.layout, options.directory / "checkpoint"))
             ts.setStepNumber(run.reached)
         else:
             run.start()
         if options.begin is not None:
             options.begin(run)
-        with interruptible(model.system.layout.comm.rank == 0) as stop:
+        with interruptible(run.layout.comm.rank == 0) as stop:
             _run_segments(run, ts, options, stop)
         return run.trajectory()
     finally:
@@ -358,7 +384,8 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
         if run.reached in checkpoints or stopped or full or (run.reached == last < run.steps):
             if options.keep is not None:
                 options.keep(run)
-            manifest = write_checkpoint(run, options.directory / "checkpoint")
+            folder = options.directory / "checkpoint"
+            manifest = write_checkpoint(run.restart_state(), run.model.scene, run.layout, folder)
             if full:
                 raise ResourceError(f"{full}; {manifest} lets --resume go on from step {run.reached}")
             if stopped or run.reached == last:

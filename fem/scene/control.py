@@ -1,4 +1,4 @@
-"""Sections of a scene beyond the forward run: reduction, control, study."""
+"""Sections of a scene for reduction, control and studies."""
 
 from __future__ import annotations
 

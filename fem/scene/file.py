@@ -49,12 +49,12 @@ def find_scene(path: str | Path) -> Path:
 
 
 def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
-    """Read and validate a scene file.
+    """Read and validate a scene file, without MPI; under MPI use :func:`load_scene_collective`.
 
-    `overrides` are the arguments of `--set`, each `a.b.c=value` with a TOML value; a bare word is a string,
-    and `false` switches off an optional table.
-
-    Not collective: call it on one rank, or use `load_scene_collective`.
+    Args:
+        path: the TOML file, or the name of a scene that ships.
+        overrides: each ``a.b.c=value`` with a TOML value, as after ``--set``; a bare word is a string, and ``false``
+            switches off an optional table.
 
     Raises:
         SceneError: the file is missing, no TOML, or a key is unknown, missing, ill-typed or meaningless.
@@ -212,7 +212,7 @@ def _model(annotation: Any) -> type[BaseModel] | None:
     """The model inside an annotation such as `list[Model]` or `Model | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return next((found for part in get_args(annotation) if (found := _model(part))), None)
+    return next((model for part in get_args(annotation) if (model := _model(part))), None)
 
 
 def _fields(path: Sequence[str]) -> dict[str, tuple[Any, str]]:

@@ -268,10 +268,10 @@ class Contact(Model):
         names = {"left": "x-", "right": "x+", "bottom": "y-", "top": "y+"}
         if dimension == 3:
             names |= {"bottom": "z-", "top": "z+", "front": "y-", "back": "y+"}
-        found = []
+        planes = []
         for side in self.sides:
             code = names.get(side, side)
             if len(code) != 2 or "xyz".index(code[0]) >= dimension:
                 raise ValueError(f"contact.sides has '{side}'; a {dimension}D tissue has no such side")
-            found.append(("xyz".index(code[0]), 1 if code[1] == "+" else -1))
-        return found
+            planes.append(("xyz".index(code[0]), 1 if code[1] == "+" else -1))
+        return planes

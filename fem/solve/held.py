@@ -94,15 +94,15 @@ def held_operators(system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool
     if not ordered:
         K.convert("baij")
         return Held(layout, True, None, slice(first, last), K, np.asfortranarray(G), step, D, M)
-    found = dissect(K, layout.dimension)
-    K, step = _moved(found, K), _moved(found, step)
-    D, M = (None if A is None else _moved(found, A) for A in (D, M))
-    order = found.order
+    dissection = dissect(K, layout.dimension)
+    K, step = _moved(dissection, K), _moved(dissection, step)
+    D, M = (None if A is None else _moved(dissection, A) for A in (D, M))
+    order = dissection.order
     return Held(layout, True, order, order.rows_of(first, last), K, np.asfortranarray(order.enter(G)), step, D, M)
 
 
-def _moved(found: Dissection, A: PETSc.Mat) -> PETSc.Mat:
+def _moved(dissection: Dissection, A: PETSc.Mat) -> PETSc.Mat:
     """A in the order found; consumes A. Not collective."""
-    result = found.matrix(A)
+    result = dissection.matrix(A)
     A.destroy()
     return result

@@ -39,26 +39,26 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
         raise SolverError(f"{k} modes are asked for; it must be between 1 and n_e = {n_e}")
     solver = _factor(system)
     eps = _make_eps(system, solver)
-    found: list[PETSc.Vec] = []
+    vectors: list[PETSc.Vec] = []
     squares: list[float] = []
     try:
-        _solve(eps, system, k, found, squares)
-        while len(found) < n_e:
+        _solve(eps, system, k, vectors, squares)
+        while len(vectors) < n_e:
             last = sorted(squares)[k - 1]
-            _solve(eps, system, 1, found, squares, ROUGH)
+            _solve(eps, system, 1, vectors, squares, ROUGH)
             if squares[-1] >= last * (1 + 10 * ROUGH):
                 break
-            found.pop().destroy()
+            vectors.pop().destroy()
             squares.pop()
-            _solve(eps, system, 1, found, squares)
+            _solve(eps, system, 1, vectors, squares)
             if squares[-1] >= last * (1 - RESIDUAL):
                 break
         order = np.argsort(squares)[:k]
-        return _finish(eps, system, [found[i] for i in order])
+        return _finish(eps, system, [vectors[i] for i in order])
     finally:
         eps.destroy()
         solver.destroy()
-        for vector in found:
+        for vector in vectors:
             vector.destroy()
 
 
@@ -118,17 +118,17 @@ def _solve(
     eps: SLEPc.EPS,
     system: BlockSystem,
     k: int,
-    found: list[PETSc.Vec],
+    vectors: list[PETSc.Vec],
     squares: list[float],
     tolerance: float = TOLERANCE,
 ) -> None:
     """Append the k lowest modes M-orthogonal to those found. Collective."""
     eps.setDimensions(nev=k, ncv=min(max(2 * k, k + 15), system.layout.n_e))
     eps.setTolerances(tolerance, 500)
-    if found:
-        eps.setDeflationSpace(found)
+    if vectors:
+        eps.setDeflationSpace(vectors)
     start = system.K_ee.createVecRight()
-    start.array_w[:] = _generic(system, len(found))
+    start.array_w[:] = _generic(system, len(vectors))
     eps.setInitialSpace(start)
     try:
         eps.solve()
@@ -147,7 +147,7 @@ def _solve(
     for i in range(k):
         vector = system.K_ee.createVecRight()
         squares.append(float(eps.getEigenpair(i, vector).real))
-        found.append(vector)
+        vectors.append(vector)
 
 
 def _finish(eps: SLEPc.EPS, system: BlockSystem, modes: list[PETSc.Vec]) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.petsc import PETSc, to_scipy
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Dissection:
         Raises:
             ValueError: A has another pattern.
         """
-        blocks = _blocks(A, self.order.d)
+        blocks = to_scipy(A).tobsr((self.order.d, self.order.d))
         if not all(np.array_equal(a, b) for a, b in zip(self.before, (blocks.indptr, blocks.indices), strict=True)):
             raise ValueError("the matrix does not have the pattern that was dissected")
         csr = (*self.after, blocks.data[self.source])
@@ -76,26 +76,20 @@ class Dissection:
 
 def dissect(A: PETSc.Mat, d: int) -> Dissection:
     """Nested dissection of the nodes of a matrix on one rank, d rows a node, with symmetric pattern. Not collective."""
-    blocks = _blocks(A, d)
+    blocks = to_scipy(A).tobsr((d, d))
     before = blocks.indptr, blocks.indices
     count = len(blocks.indices)
     size = (len(blocks.indptr) - 1,) * 2
     graph = PETSc.Mat().createAIJ(size, csr=(*before, np.ones(count)), comm=PETSc.COMM_SELF)
-    found, same = graph.getOrdering("nd")
-    nodes = found.getIndices().astype(np.intp)
-    for thing in (found, same, graph):
-        thing.destroy()
+    by_row, by_column = graph.getOrdering("nd")
+    nodes = by_row.getIndices().astype(np.intp)
+    for item in (by_row, by_column, graph):
+        item.destroy()
     numbered = scipy.sparse.csr_matrix((np.arange(count), blocks.indices, blocks.indptr), shape=size)
     moved = numbered[nodes][:, nodes]
     moved.sort_indices()
     after = tuple(part.astype(PETSc.IntType) for part in (moved.indptr, moved.indices))
     return Dissection(NodeOrder(nodes, np.argsort(nodes), d), before, after, moved.data)
-
-
-def _blocks(A: PETSc.Mat, d: int) -> Any:
-    """A in blocks of d x d, as SciPy has them."""
-    indptr, columns, values = A.getValuesCSR()
-    return scipy.sparse.csr_matrix((values, columns, indptr), shape=A.getSize()).tobsr((d, d))
 
 
 def _rows(nodes: NDArray[np.intp], d: int) -> NDArray[np.intp]:

@@ -16,10 +16,10 @@ from softgrasp.fem.solve.order import dissect
 SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
-# Where each road ends on two ranks and 24 GiB: PETSc Cholesky in blocks is fastest per solve, but its factorisation is
-# the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back (study.bench.switches), but
-# not the few solves of an equilibrium or of modes, nor when single entries must do. Beyond the last limits the factor
-# itself no longer fits.
+# Largest problem of each solver on two ranks with 24 GiB. PETSc Cholesky in blocks is fastest per solve, but its
+# factorisation is the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back
+# (study.bench.switches), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
+# limits the factor itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
@@ -34,12 +34,12 @@ DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
 
 
-def choose_solver(layout: BlockLayout, wanted: str = "auto", few: bool = False) -> tuple[SolverName, str]:
+def choose_solver(layout: BlockLayout, requested: str = "auto", few: bool = False) -> tuple[SolverName, str]:
     """The solver for a size, with the reason in words; ``few`` solves with one factor. Not collective."""
     n, d = layout.n_e, layout.dimension
     limit = (FEW_LIMIT if few else CHOLESKY_LIMIT)[d]
-    if wanted != "auto":
-        return wanted, "asked for by the scene"  # type: ignore[return-value]
+    if requested != "auto":
+        return requested, "asked for by the scene"  # type: ignore[return-value]
     if n <= limit:
         return "cholesky", f"n_e = {n} <= {limit} in {d}D: fastest per solve"
     if n <= DIRECT_LIMIT[d]:
@@ -211,8 +211,8 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
     P, order = S, None
     if not ordered:
         every = whole_copy(S)
-        found = dissect(every, layout.dimension)
-        order, P = found.order, found.matrix(every)
+        dissection = dissect(every, layout.dimension)
+        order, P = dissection.order, dissection.matrix(every)
         every.destroy()
     try:
         with agree(S.comm.tompi4py()):

@@ -7,31 +7,39 @@ import numpy as np
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.scene.scene import Time
-from softgrasp.fem.solve.solvers import SolverName, choose_solver, make_solver
+from softgrasp.fem.solve.solvers import Reproducible, SolverName, choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem
 
 
-def equilibrium(system: BlockSystem, solver: SolverName, time: Time) -> Array:
-    """Static displacement relative to the hand, K_ee z = G g; local rows. Collective.
+def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Time | None = None) -> Array:
+    """Static displacement relative to the hand, K_ee z = G g; local rows (n_local,) [m]. Collective.
+
+    Args:
+        system: the operators.
+        solver: None takes the one that suits few solves.
+        time: tolerance and reproducibility of the scene.
 
     Raises:
         SolverError: the stiffness is singular or the residual too large.
     """
-    load = system.K_ee.createVecLeft()
-    z = system.K_ee.createVecRight()
-    load.array_w[:] = 0.0 if system.gravity is None else system.G @ system.gravity
-    static = make_solver(system.K_ee.copy(), solver, system.layout, "softgrasp_static_", time.rtol, time.reproducible)
-    static.solve(load, z)
-    static.check(load, z, "the static equilibrium")
-    result = z.array_r.copy()
-    static.destroy()
-    load.destroy()
-    z.destroy()
-    return np.asarray(result)
+    if system.gravity is None:
+        return np.zeros(system.layout.n_local)
+    load, where = (system.G @ system.gravity)[:, None], "the static equilibrium"
+    time = time or Time(steps=1, rtol=1e-12)
+    return solve_columns(
+        system.K_ee, system.layout, load, where, time.rtol, solver=solver, reproducible=time.reproducible
+    )[:, 0]
 
 
 def solve_columns(
-    A: PETSc.Mat, layout: BlockLayout, X: Array, where: str = "the inner product", rtol: float = 1e-12
+    A: PETSc.Mat,
+    layout: BlockLayout,
+    X: Array,
+    where: str = "the inner product",
+    rtol: float = 1e-12,
+    *,
+    solver: SolverName | None = None,
+    reproducible: Reproducible = "auto",
 ) -> Array:
     """Return the local rows of A^-1 X, A symmetric positive definite, Fortran order. Collective.
 
@@ -43,21 +51,24 @@ def solve_columns(
         X: local rows (n_local, k).
         where: what it is for, in messages.
         rtol: of cg, where no direct solver fits.
+        solver: None takes the one that suits few solves.
+        reproducible: as for :func:`make_solver`.
 
     Raises:
         SolverError: the factorisation fails, or the solution has a large residual.
     """
-    solver = make_solver(A.copy(), choose_solver(layout, few=True)[0], layout, "softgrasp_inner_", rtol)
+    name = solver or choose_solver(layout, few=True)[0]
+    static = make_solver(A.copy(), name, layout, "softgrasp_static_", rtol, reproducible)
     b, x = A.createVecs()
     result = np.zeros(X.shape, order="F")
     try:
         for j in np.flatnonzero(total(layout.comm, np.abs(X).sum(axis=0)) != 0):
             b.array_w[:] = X[:, j]
-            solver.solve(b, x)
-            solver.check(b, x, where)
+            static.solve(b, x)
+            static.check(b, x, where)
             result[:, j] = x.array_r
     finally:
-        solver.destroy()
+        static.destroy()
         b.destroy()
         x.destroy()
     return result

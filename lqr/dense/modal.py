@@ -10,7 +10,7 @@ import scipy.linalg
 
 from softgrasp.fem.errors import ResourceError, SolverError, agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns
+from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_scipy
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
 from softgrasp.lqr.dense.care import care as care
@@ -76,11 +76,7 @@ class ModalPlant:
 
 def gather_matrix(layout: BlockLayout, A: PETSc.Mat) -> Array | None:
     """A distributed tissue matrix, dense on rank 0, None elsewhere. Collective."""
-    indptr, columns, values = A.getValuesCSR()
-    local = np.zeros((layout.n_local, layout.n_e))
-    rows = np.repeat(np.arange(layout.n_local), np.diff(indptr))
-    local[rows, columns] = values
-    return rows_on_root(layout.comm, local)
+    return rows_on_root(layout.comm, to_scipy(A).toarray())
 
 
 def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:

@@ -49,17 +49,16 @@ def problem(model: Model) -> RiccatiProblem:
     outputs = make_outputs(scene, system)
     p = sum(output.size for output in outputs)
     C_z = np.zeros((system.layout.n_local, p), order="F")
-    first, names = 0, list[str]()
+    first = 0
     for output in outputs:
         for c in range(output.size):
             # every listed dof enters with the weight of the output; a dof is listed once
             C_z[output.dofs[:, c], first + c] = output.weight
-        names += output.names
         first += output.size
-    control = scene.control
+    control, columns = scene.control, tuple(column for output in outputs for column in output.columns)
     Q = weight(1.0 if control is None else control.Q, p, "control.Q")
     R = weight(1.0 if control is None else control.R, system.layout.n_s, "control.R")
-    return RiccatiProblem(system, np.vstack([o.C_s for o in outputs]), C_z, Q, R, tuple(names))
+    return RiccatiProblem(system, np.vstack([o.C_s for o in outputs]), C_z, Q, R, columns)
 
 
 def scene_target(model: Model) -> Array:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.midpoint import TissueMidpoint
@@ -62,7 +63,7 @@ class LoopTrajectory:
         inputs: u of each step [N, N m], (steps, n_s).
         outputs: y = C_s q_s + C_z' z [m, rad], (steps + 1, p).
         outputs_rigid: C_s q_s, the same without deformation, (steps + 1, p).
-        output_names: one per component.
+        columns: one per output component.
         cost: J up to each grid point, (steps + 1,).
         final: the state at the end.
         snapshots: stored states, or None.
@@ -78,7 +79,7 @@ class LoopTrajectory:
     inputs: Array
     outputs: Array
     outputs_rigid: Array
-    output_names: tuple[str, ...]
+    columns: Columns
     cost: Array
     final: PlantState
     snapshots: Snapshots | None
@@ -86,6 +87,11 @@ class LoopTrajectory:
     residuals: tuple[float, float]
     solver: tuple[str, str]
     seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Labels of the columns."""
+        return labels(self.columns)
 
 
 class ClosedLoop:
@@ -299,7 +305,7 @@ class LoopRun(Stepped):
             inputs=drive.u,
             outputs=outputs,
             outputs_rigid=rigid,
-            output_names=problem.names,
+            columns=problem.columns,
             cost=cost,
             final=PlantState(drive.q[-1].copy(), drive.v[-1].copy(), array[:n].copy(), array[n:].copy()),
             snapshots=self.store.finish(times, drive.q, drive.v),

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from softgrasp.fem.columns import labels
 from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
 from softgrasp.lqr.dense.modal import assemble_space
 from softgrasp.lqr.plant.checks import ControlError
@@ -123,7 +124,7 @@ def galerkin(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
         f[2 * n_s + k :] = G @ system.gravity
     f[n_s : 2 * n_s] = -steady_input(system)
     S = np.eye(2 * n_s, len(f))
-    plant = SmallPlant(space.E, space.A, space.B, space.C, f, S[:n_s], S[n_s:], problem.names)
+    plant = SmallPlant(space.E, space.A, space.B, space.C, f, S[:n_s], S[n_s:], labels(problem.columns))
     return plant, Shapes(V, np.linalg.solve(M, M_V.T).T)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import BlockSystem
@@ -33,7 +34,7 @@ class RiccatiProblem:
         C_z: outputs of the relative displacement, transposed, local rows (n_local, p).
         Q: (p, p), symmetric positive semidefinite [1/(m2 s)].
         R: (m, m), symmetric positive definite [1/(N2 s)], m = n_s.
-        names: one per output component.
+        columns: one per output component, or none.
         B_z: forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None.
     """
 
@@ -42,8 +43,13 @@ class RiccatiProblem:
     C_z: Array
     Q: Array
     R: Array
-    names: tuple[str, ...] = ()
+    columns: Columns = ()
     B_z: Array | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels of the outputs; y1, y2.. where they have none."""
+        return labels(self.columns) or tuple(f"y{i + 1}" for i in range(len(self.Q)))
 
     @property
     def inputs(self) -> int:

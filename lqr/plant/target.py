@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.solve.statics import solve_columns
+from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
@@ -36,18 +36,6 @@ class Target:
     y: Array
 
 
-def static_tissue(system: BlockSystem) -> Array:
-    """Static displacement relative to the hand, K_ee z = G g; local rows (n_local,). Collective.
-
-    Raises:
-        SolverError: the stiffness is singular or the residual too large.
-    """
-    if system.gravity is None:
-        return np.zeros(system.layout.n_local)
-    load = (system.G @ system.gravity)[:, None]
-    return solve_columns(system.K_ee, system.layout, load, "the equilibrium of the target")[:, 0]
-
-
 def steady_input(system: BlockSystem) -> Array:
     """u_bar that holds hand (and, two-way, tissue) against gravity [N, N m], (n_s,). Not collective."""
     u = np.zeros(system.layout.n_s)
@@ -63,7 +51,7 @@ def steady_input(system: BlockSystem) -> Array:
 def rest(system: BlockSystem, *, deformed: bool = True) -> PlantState:
     """The plant at rest with the hand at 0, in equilibrium or undeformed. Collective."""
     n_s, n = system.layout.n_s, system.layout.n_local
-    return PlantState(np.zeros(n_s), np.zeros(n_s), static_tissue(system) if deformed else np.zeros(n), np.zeros(n))
+    return PlantState(np.zeros(n_s), np.zeros(n_s), equilibrium(system) if deformed else np.zeros(n), np.zeros(n))
 
 
 def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
@@ -81,7 +69,7 @@ def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
         )
     q = np.zeros(layout.n_s)
     q[: len(given)] = given
-    return _at(problem, q, static_tissue(problem.system))
+    return _at(problem, q, equilibrium(problem.system))
 
 
 def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
@@ -97,7 +85,7 @@ def output_target(problem: RiccatiProblem, y_bar: Array) -> Target:
     C_s = problem.C_s
     if len(y) != len(C_s) or not np.isfinite(y).all():
         raise ControlError(f"the target {y.tolist()} of the outputs must have {len(C_s)} finite entries")
-    z = static_tissue(problem.system)
+    z = equilibrium(problem.system)
     right = y - total(problem.layout.comm, problem.C_z.T @ z)
     q = np.linalg.lstsq(C_s, right)[0]
     miss = float(np.abs(C_s @ q - right).max())

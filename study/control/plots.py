@@ -12,11 +12,12 @@ from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.orders import BasisGains, fast_order
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned, a_priori
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.pictures.loop import Array, Poles, figure_decay, figure_histories, figure_loop_move
+from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories, figure_loop_move
 from softgrasp.study.pictures.style import (
     BLUE,
     COLUMN,
@@ -186,7 +187,7 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
     design, loops, full = study.design, study.loops, study.loops.full
     files = _move(out, study, frames) if frames.picture is not None and frames.states else []
     files += figure_histories(
-        full.times, full.outputs, full.inputs, full.output_names, out / "histories.png", target=design.target.y,
+        full.times, full.outputs, full.inputs, full.columns, out / "histories.png", target=design.target.y,
         limits=loops.limits, others=compared(loops), settle=loops.plan.settle,
         dimension=design.problem.layout.dimension,
     )  # fmt: skip

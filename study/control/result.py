@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.outputs_named import farthest
+from softgrasp.fem.columns import farthest
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.duration import LoopPlan
@@ -129,7 +129,7 @@ class ControlStudy:
 
     def distance(self, run: LoopTrajectory) -> Array:
         """Distance of the farthest output to its target at every instant [m], (steps + 1,)."""
-        return farthest(run.outputs, self.design.target.y, self.design.problem.names)
+        return farthest(run.outputs, self.design.target.y, self.design.problem.columns)
 
 
 def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, Any]:

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.outputs import hand_axes
+from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation
 from softgrasp.lqr.reduced.retune import BoxPoint
 from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.result import TITLES, ControlStudy, Retuned, radius_of, settled
-from softgrasp.study.forward.result import force_unit, trajectory_header
+from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.report.tables import Table
 
 Row = tuple[Any, ...]
@@ -169,8 +169,8 @@ def trajectory_table(study: ControlStudy) -> Table:
     """Hand, outputs, load and cost at every instant under the optimal gain."""
     full, d = study.loops.full, study.design.problem.layout.dimension
     n_s = full.q_s.shape[1]
-    names = trajectory_header(n_s, d, full.output_names, velocity=False)
-    names += [*(f"u_{axis} [{force_unit(axis)}]" for axis in hand_axes(n_s, d)), "cost"]
+    names = trajectory_header(n_s, d, full.columns, velocity=False)
+    names += [*(f"{u.label} [{u.load_unit}]" for u in hand_columns(n_s, d, "u")), "cost"]
     inputs = np.vstack([full.inputs, full.inputs[-1:]])
     data = np.column_stack([full.times, full.q_s, full.outputs, inputs, full.cost])
     return Table(tuple(names), data.tolist())

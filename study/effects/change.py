@@ -13,7 +13,8 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.drive import Force
 from softgrasp.fem.run.motion import motion_table
-from softgrasp.fem.run.simulate import RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import RunOptions, simulate
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.result import Change, Company
 from softgrasp.study.effects.switch import Scales, switch

@@ -6,7 +6,8 @@ from typing import Any
 
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.run.simulate import RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import RunOptions, simulate
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import compare, shown

@@ -13,7 +13,7 @@ from softgrasp.fem.errors import SoftgraspError
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
     from softgrasp.fem.model.mesh_estimate import MeshEstimate
-    from softgrasp.fem.run.simulate import Trajectory
+    from softgrasp.fem.run.trajectory import Trajectory
 
 CHEAP = 1.0  # [s]; what costs less is done unasked
 # Seconds of an estimate, measured on one core: graded meshes to compare with (by dimension, and in 3D dearer for mesh

@@ -1,29 +1,23 @@
-"""What deserves a warning in a scene or in its result: `explain` asks before a run, `simulate` after it."""
+"""Warnings about a scene, which `explain` gives before a run, and about its result, which `simulate` gives after it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from softgrasp.fem.fields.strain import SMALL_STRAIN, gradient
-from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.fields.strain import SMALL_STRAIN, gradient, magnified, slowest
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson
-
-if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
-    from softgrasp.fem.run.simulate import Trajectory
-    from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.system import BlockSystem
 
 STIFF = 0.45  # P1 displacements lock above: the error grows like 1 / (1 - 2 nu) = lambda / mu + 1 [BS92]
 LOCKING = 0.49  # where `effects` measures it
 COARSE_STEP = 0.05  # dt / T_1: the midpoint rule lengthens a period by (omega dt)^2 / 12, here 0.8 %
 SMALL_ANGLE = 0.1  # [rad]: a linearised rotation stretches by angle^2 / 2, here 0.5 %
-EPS = float(np.finfo(float).eps)
 EXACT = 1e-9  # a well conditioned direct solve leaves a drift of 1e-16 to 1e-12 and a residual below 1e-13
 LOOKED_AT = 25  # stored instants that strain and frequency are taken from,
 LARGEST = 4_000_000  # fewer where they would be more numbers than this: their products need as much again
-SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to count: far above rounding
 
 
 def poisson_ratios(system: BlockSystem) -> dict[str, float]:
@@ -58,29 +52,10 @@ def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
 
 
 def turned(angle: float) -> list[str]:
-    """A hand angle [rad] beyond the linearised rotation. Not collective."""
+    """A hand angle [rad] too large for the linearised rotation. Not collective."""
     if angle <= SMALL_ANGLE:
         return []
     return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
-
-
-def magnified(system: BlockSystem, z: Array) -> float:
-    """Share by which one rounding of K_ee may change the deformation z: eps sum K_ii z_i^2 / z'Kz [1]. Collective.
-
-    Neither residual nor drift knows of it, since both take the rounded matrix for the true one; close to nu = 1/2 they
-    are ten to a hundred times smaller than the error.
-
-    Args:
-        system: the operators.
-        z: local rows of a displacement against the hand, (n_local,).
-    """
-    diagonal = system.K_ee.getDiagonal()
-    parts = np.array([np.dot(diagonal.array_r, z * z), np.dot(z, times_columns(system.K_ee, z[:, None])[:, 0])])
-    diagonal.destroy()
-    largest, energy = total(system.layout.comm, parts)
-    if largest == 0:
-        return 0.0
-    return float(EPS * largest / energy) if energy > 0 else np.inf
 
 
 def inexact(drift: float, residual: float, solver: str, nu: float, rounding: float = 0.0) -> list[str]:
@@ -123,24 +98,24 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     scene, system, d = model.scene, model.system, model.space.mesh.dimension
     poisson = poisson_ratios(system)
     Z, times = _instants(run, system)
-    found = locking(poisson, scene.tissue.order)
+    texts = locking(poisson, scene.tissue.order)
     omega = slowest(system, Z)
     if omega > 0:
         period = f"the slowest period that the tissue shows ({2 * np.pi / omega:.3g} s)"
-        found += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
+        texts += coarse(omega, float(run.times[1]), float(run.times[-1]), period)
     sizes = total(system.layout.comm, np.einsum("ij,ij->j", Z, Z))
     z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]
     if most is not None and total(system.layout.comm, np.array([np.dot(most[1], most[1])]))[0] > sizes.max():
         t, z = most
     steep = gradient(model, z)
-    if not steep.small:
-        found.append(
+    if not steep.linear:
+        texts.append(
             f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
             f"body at t = {t:.3g} s, at most {steep.largest:.2g}: linear elasticity assumes small strains and "
             "rotations."
         )
-    found += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
-    return found + inexact(
+    texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
+    return texts + inexact(
         run.energy_drift, max(run.residuals), run.solver[0], max(poisson.values()), magnified(system, z)
     )
 
@@ -159,22 +134,3 @@ def _instants(run: Trajectory, system: BlockSystem) -> tuple[Array, list[float]]
     columns = np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
     times = [*run.snapshots.times[columns].tolist(), float(run.times[-1])]
     return np.column_stack([run.snapshots.Z[:n, columns], run.final[:n]]), times
-
-
-def slowest(system: BlockSystem, Z: Array) -> float:
-    """Lowest frequency [1/s] of the clamped tissue in the span of Z - mean(Z), 0 when nothing moves. Collective.
-
-    A Ritz value, omega^2 = min_z z'K z / z'M z: at least the lowest frequency, near it if the run excites its mode.
-
-    Args:
-        system: the model's operators.
-        Z: displacements against the hand, local rows (n_local, k) [m].
-    """
-    comm, centre = system.layout.comm, np.eye(Z.shape[1]) - 1 / Z.shape[1]
-    M, K = (total(comm, Z.T @ times_columns(A, Z)) for A in (system.M_ee, system.K_ee))
-    squares, Q = np.linalg.eigh(centre @ (M + M.T) @ centre / 2)
-    kept = squares > SEEN * np.trace(M)
-    if not kept.any():
-        return 0.0
-    Q = centre @ (Q[:, kept] / np.sqrt(squares[kept]))
-    return float(np.sqrt(max(np.linalg.eigvalsh(Q.T @ (K + K.T) @ Q / 2)[0], 0.0)))

@@ -1,82 +1,127 @@
-"""``softgrasp explain --out``: what a scene is, as result.json and as a page."""
+"""``softgrasp explain``: what a scene is, in the terminal, as result.json and as a page."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from softgrasp.fem.effects import Gate
-from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.forward.explain import Explanation, remarks, sag_rows, size_text, verdict
+from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
+
+from softgrasp.fem.effects.sag import SMALL_SHARE
+from softgrasp.fem.fields.strain import SMALL_STRAIN
+from softgrasp.fem.model.memory import size_text
+from softgrasp.study.forward.explain import EffectReport, Explanation, explain
 from softgrasp.study.forward.explain_mesh import mesh_lines
-from softgrasp.study.report.files import write_json
-from softgrasp.study.report.origin import command_line, origin
-from softgrasp.study.report.page import EQUATION, Section, equation_text, write_report
+from softgrasp.study.report.origin import origin
+from softgrasp.study.report.page import EQUATION, Section, equation_text
+from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.session import Page, Session, list_files
+
+EFFECTS = ("effect", "verdict", "gate", "number", "matters from", "what it says")
 
 
-def write_explanation(
-    out: Path, found: Explanation, scene: Scene, path: Path, overrides: Sequence[str] = ()
-) -> tuple[Path, Path]:
-    """Write result.json and report.html. Not collective: call on one rank.
+def run_explain(path: Path, out: Path | None, overrides: Sequence[str], console: Console) -> Explanation:
+    """Explain a scene file, and write result.json and report.html if there is a folder for them. Collective.
 
-    Args:
-        out: folder, made if need be.
-        found: the explanation.
-        scene: the scene.
-        path, overrides: where it came from.
+    Raises:
+        SceneError, MeshError, SolverError: as :func:`study.forward.explain.explain`.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    ranks = found.sizes.ranks
-    result = write_json(out / "result.json", {"command": "explain", **origin(scene, ranks), **found.to_dict()})
-    report = write_report(
-        out / "report.html",
-        title=f"{scene.name}: what it simulates",
-        subtitle=scene.description,
-        sections=_sections(found),
-        scene=resolved_toml(scene),
-        reproduce=command_line("explain", path, overrides, ranks, " --out out"),
-    )
-    return result, report
+    session = Session("explain", path, overrides, out or Path(), console)
+    scene = session.scene()
+    explanation = explain(scene, session.comm)
+    parts = sections(explanation)
+    render(explanation, parts, console)
+    if out is not None:
+        result = {"command": "explain", **origin(scene, session.comm.size), **explanation.to_dict()}
+        page = Page(f"{scene.name}: what it simulates", parts, options=" --out out")
+        list_files(console, session.write(scene, result, lambda: page, clock=False))
+    return explanation
 
 
-def _said(gate: Gate) -> str:
-    return f"{gate.sentence} It {gate.condition}." if gate.condition else gate.sentence
+def render(result: Explanation, parts: Sequence[Section], console: Console) -> None:
+    """Write an explanation to a terminal, its remarks last; narrow ones wrap."""
+
+    def line(text: str, indent: int = 2) -> None:
+        console.print(Padding.indent(escape(text), indent), highlight=False)
+
+    for part in (*parts[1:], parts[0]):
+        console.print(f"\n[bold]{escape(part.title)}[/]")
+        if part.header == EFFECTS:
+            for name, e in result.effects.items():
+                line(f"{name}: {verdict(e)}")
+                line(e.gate.comparison, 4)
+                line(e.gate.sentence, 4)
+        elif part.header:
+            console.print(Padding.indent(Table(tuple(part.header), part.rows).terminal(wrap=range(9)), 2))
+        for text in (*part.text.split("\n\n"), *part.code.splitlines()):
+            if text:
+                line(text.strip(), 2 + len(text) - len(text.lstrip()))
+        for row in () if part.header else part.rows:
+            line(f"{row[0]}: {row[1]}")
 
 
-def _sections(found: Explanation) -> list[Section]:
-    s, t, solver = found.sizes, found.time, found.solver
+def sections(result: Explanation) -> list[Section]:
+    """The parts of the page; remarks come first."""
+    s, t, solver = result.sizes, result.time, result.solver
     sizes = [
         ("hand, tissue unknowns, states", f"n_s = {s.n_s}, n_e = {s.n_e}, 2n = {s.states}"),
         ("cells, nodes, non-zeros of K_ee", f"{s.cells}, {s.nodes}, {s.nonzeros}"),
-        *((f"output {name}", place) for name, place in found.outputs.items()),
-        ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in found.poisson.items())),
+        *((f"output {name}", place) for name, place in result.outputs.items()),
+        ("Poisson's ratio", ", ".join(f"{nu:.4g} ({name})" for name, nu in result.poisson.items())),
         ("solver", f"{solver.name}: {solver.reason}"),
         ("factor, estimated", size_text(solver.factor_bytes) if solver.factor_bytes else "none"),
-        ("mesh and matrices, estimated, over all ranks", size_text(found.memory.mesh)),
-        ("tables of the steps, on each rank", size_text(found.memory.tables)),
-        ("snapshots", f"{found.snapshot_columns} columns, {size_text(found.snapshot_bytes)}"),
+        ("mesh and matrices, estimated, over all ranks", size_text(result.memory.mesh)),
+        ("tables of the steps, on each rank", size_text(result.memory.tables)),
+        ("snapshots", f"{result.snapshot_columns} columns, {size_text(result.snapshot_bytes)}"),
         ("time", f"{t.steps} steps of {t.dt:.4g} s to {t.end:.4g} s"),
     ]
-    periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
     effects = [
-        (name, verdict(e), e.gate.symbol, e.gate.number, e.gate.threshold, _said(e.gate))
-        for name, e in found.effects.items()
-    ]
-    costs = [(name, e.term, ", ".join(e.operators) or "nothing", e.cost) for name, e in found.effects.items() if e.on]
-    sections = [
-        Section("Look at", text="\n\n".join(remarks(found)) or "Nothing stands out."),
-        Section(EQUATION, code=equation_text(found.equation)),
+        (name, verdict(e), e.gate.symbol, e.gate.number, e.gate.threshold,
+         f"{e.gate.sentence} It {e.gate.condition}." if e.gate.condition else e.gate.sentence)
+        for name, e in result.effects.items()
+    ]  # fmt: skip
+    costs = [(name, e.term, ", ".join(e.operators) or "nothing", e.cost) for name, e in result.effects.items() if e.on]
+    periods = [(k, w, T, t.dt / T) for k, (w, T) in enumerate(zip(t.omega, t.periods, strict=True), 1)]
+    modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
+    no_modes = "" if periods else "Not computed: the factor would not fit."
+    return [
+        Section("Look at", text="\n\n".join(remarks(result)) or "Nothing stands out."),
+        Section(EQUATION, code=equation_text(result.equation)),
         Section("Sizes", rows=sizes),
-        Section("At rest under its weight, the hand held still", rows=sag_rows(found)),
-        Section("Mesh", text="\n\n".join(mesh_lines(found.mesh, found.dimension))),
-        Section(
-            "Effects", header=("effect", "verdict", "gate", "number", "matters from", "what it says"), rows=effects
-        ),
+        Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
+        Section("Mesh", text="\n\n".join(mesh_lines(result.mesh, result.dimension))),
+        Section("Effects", header=EFFECTS, rows=effects),
+        *([Section("What is on", header=("effect", "adds", "allocates", "cost"), rows=costs)] if costs else []),
+        Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
     ]
-    if costs:
-        sections.append(Section("What is on", header=("effect", "adds", "allocates", "cost"), rows=costs))
-    if periods:
-        head = ("mode", "omega [1/s]", "period [s]", "dt / period")
-        sections.append(Section("First modes of the clamped tissue", header=head, rows=periods))
-    return sections
+
+
+def sag_rows(result: Explanation) -> list[tuple[str, str]]:
+    """Load, sag, gradient and validity of the static solution as label and text. Not collective."""
+    sag, assumed = result.sag, "" if result.effects["gravity"].on else " (assumed: gravity is off)"
+    steep = sag.gradient
+    return [
+        ("g", "(" + ", ".join(f"{x:g}" for x in sag.g) + f") m/s2{assumed}"),
+        ("largest |z|", f"{sag.largest:.4g} m"),
+        ("|grad z|", f"{steep.largest:.3g} at most, above {steep.typical:.3g} in {SMALL_SHARE:.0%} of the body"),
+        ("linear elasticity", f"{'holds' if steep.linear else 'does not hold'}: |grad z| is above {SMALL_STRAIN} in "
+         f"{steep.share:.2%} of the body, at most {SMALL_SHARE:.0%} may be"),
+    ]  # fmt: skip
+
+
+def verdict(effect: EffectReport) -> str:
+    """On or off, and whether that is right. Not collective."""
+    matters = ("matters" if effect.on else "would matter") if effect.gate.matters else ""
+    return f"{'on' if effect.on else 'off'}, {matters or ('does not matter' if effect.on else 'not needed')}"
+
+
+def remarks(result: Explanation) -> list[str]:
+    """What the reader should look at, one sentence each."""
+    texts = []
+    for name in result.missing:
+        proviso = result.effects[name].gate.proviso
+        texts.append(f"{name} is off, but the scene seems to call for it{', ' + proviso if proviso else ''}.")
+    texts += [f"{name} is on, but does not matter here." for name in result.idle]
+    return [*texts, *result.warnings]

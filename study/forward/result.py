@@ -1,118 +1,177 @@
-"""Numbers of a run as files: result.json, trajectories as CSV, the resolved scene."""
+"""What ``softgrasp simulate`` returns: sizes, trajectory and warnings, as result.json, table and text."""
 
 from __future__ import annotations
 
-import csv
-import json
-import platform
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from softgrasp import package_version
-from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.columns import Columns, hand_columns
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import hand_axes, make_outputs, unit
-from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.simulate import Trajectory
-from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.study.report.origin import peak_memory_mb
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.report.origin import origin, peak_memory_mb
+from softgrasp.study.report.tables import Table
 
 
-def simulate_result(model: Model, run: Trajectory) -> dict[str, Any]:
-    """The keys of ``result.json``. Collective."""
-    layout, comm = model.system.layout, model.system.layout.comm
-    steps = model.scene.time.steps
-    seconds = run.seconds
-    mesh = model.space.mesh.mesh
-    cells = mesh.topology.index_map(model.space.mesh.dimension).size_global
-    axes = hand_axes(layout.n_s, layout.dimension)
-    return {
-        "command": "simulate",
-        "scene": model.scene.name,
-        "scene_hash": scene_hash(model.scene),
-        "version": package_version(),
-        "ranks": comm.size,
-        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
-        "n_s": layout.n_s,
-        "n_e": layout.n_e,
-        "states": layout.states,
-        "cells": int(cells),
-        "steps": steps,
-        "dt": model.scene.time_end / steps,
-        "solver": {"name": run.solver[0], "reason": run.solver[1]},
-        "residual_first": run.residuals[0],
-        "residual_last": run.residuals[1],
-        "hand_final": run.q_s[-1].tolist(),
-        "output_names": list(run.output_names),
-        "output_final": run.outputs[-1].tolist(),
-        "output_places": {o.name: o.place for o in make_outputs(model.scene, model.system) if o.place},
-        "energy_drift": run.energy_drift,
-        **({} if run.force is None else {"force_peak": dict(zip(axes, _peaks(run.force), strict=True))}),
-        "time": {
-            **{key: value for key, value in seconds.items() if key not in ("steps", "per_step")},
-            "steps_timed": run.steps_timed,
-            "steps": seconds["steps"],
-            "per_step": seconds["per_step"],
-        },
-        "memory_peak_mb": peak_memory_mb(comm),
-        "forms": len(model.inventory.forms),
-        "operators": model.inventory.operators,
-    }
+@dataclass(frozen=True)
+class Sizes:
+    """Numbers of unknowns and entities; ``states`` is 2n of the first-order system."""
+
+    n_s: int
+    n_e: int
+    states: int
+    cells: int
+    nodes: int
+    nonzeros: int
+    ranks: int
 
 
-def _peaks(force: Array) -> list[float]:
-    return [float(x) for x in np.abs(force).max(axis=0)]
-
-
-def trajectory_header(
-    n_s: int, dimension: int, outputs: Sequence[str], velocity: bool, force: bool = False
-) -> list[str]:
-    """Columns of trajectory.csv with their units: time, hand, velocity on request, outputs, force on request.
-
-    Not collective.
-    """
-    hand = [f"hand_{axis}" for axis in hand_axes(n_s, dimension)]
-    columns = ["t [s]", *(f"{name} [{unit(name)}]" for name in hand)]
-    if velocity:
-        rates = [f"hand_velocity_{axis}" for axis in hand_axes(n_s, dimension)]
-        columns += [f"{name} [{unit(name, rate=True)}]" for name in rates]
-    for name in outputs:
-        column = f"{name} [{unit(name)}]"
-        columns.append(column if column not in columns else f"output_{column}")
-    if force:
-        columns += [f"force_{axis} [{force_unit(axis)}]" for axis in hand_axes(n_s, dimension)]
-    return columns
-
-
-def force_unit(axis: str) -> str:
-    """Unit of the load on a hand degree of freedom: N, or N m on a rotation. Not collective."""
-    return "N m" if axis.startswith("r") else "N"
-
-
-def write_results(directory: Path, model: Model, run: Trajectory, result: dict[str, Any]) -> list[Path]:
-    """Write result.json, trajectory.csv and scene.toml. Rank 0 only.
-
-    A row of the table has the state at its time, and the force in the step that ends there, nan in the first row.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    table = directory / "trajectory.csv"
-    n_s = run.q_s.shape[1]
-    header = trajectory_header(
-        n_s, model.system.layout.dimension, run.output_names, velocity=True, force=run.force is not None
+def model_sizes(model: Model) -> Sizes:
+    """Sizes of a built model. Collective."""
+    layout, space = model.system.layout, model.space
+    return Sizes(
+        n_s=layout.n_s,
+        n_e=layout.n_e,
+        states=layout.states,
+        cells=int(space.mesh.mesh.topology.index_map(layout.dimension).size_global),
+        nodes=space.V.dofmap.index_map.size_global,
+        nonzeros=int(model.system.K_ee.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]),
+        ranks=layout.comm.size,
     )
-    parts = [run.times, run.q_s, run.v_s, run.outputs]
-    if run.force is not None:
-        parts.append(np.vstack([np.full(n_s, np.nan), run.force]))
-    rows = np.column_stack(parts)
-    with table.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows([f"{x:.17g}" for x in row] for row in rows)
-    scene = directory / "scene.toml"
-    scene.write_text(resolved_toml(model.scene))
-    path = directory / "result.json"
-    path.write_text(json.dumps(result, indent=2) + "\n")
-    return [path, table, scene]
+
+
+def output_places(model: Model) -> dict[str, str]:
+    """The node that is taken for each output, or the nodes of its mean, in words. Collective."""
+    return {o.name: o.place for o in make_outputs(model.scene, model.system) if o.place}
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A run of the full model.
+
+    Attributes:
+        scene: as it was run.
+        sizes: unknowns and entities.
+        dimension: 2 or 3.
+        run: the trajectory.
+        places: where each output is taken, in words.
+        warnings: one sentence each.
+        memory_peak_mb: largest memory, over all ranks [MiB].
+        forms: number of compiled forms.
+        operators: names of the assembled operators.
+    """
+
+    scene: Scene
+    sizes: Sizes
+    dimension: int
+    run: Trajectory
+    places: dict[str, str]
+    warnings: tuple[str, ...]
+    memory_peak_mb: float
+    forms: int
+    operators: Sequence[str]
+
+    @property
+    def force_peak(self) -> dict[str, float]:
+        """Largest force on the hand along each axis [N, N m]; empty where it is not known."""
+        if self.run.force is None:
+            return {}
+        return {c.axis: float(x) for c, x in zip(self.hand(), np.abs(self.run.force).max(axis=0), strict=True)}
+
+    def hand(self, name: str = "hand") -> Columns:
+        """The hand's degrees of freedom."""
+        return hand_columns(self.sizes.n_s, self.dimension, name)
+
+    def to_json(self) -> dict[str, Any]:
+        """The keys of ``result.json``."""
+        scene, sizes, run = self.scene, self.sizes, self.run
+        stages = {key: value for key, value in run.seconds.items() if key not in ("steps", "per_step")}
+        return {
+            "command": "simulate",
+            **origin(scene, sizes.ranks),
+            "n_s": sizes.n_s,
+            "n_e": sizes.n_e,
+            "states": sizes.states,
+            "cells": sizes.cells,
+            "steps": scene.time.steps,
+            "dt": scene.time_end / scene.time.steps,
+            "solver": {"name": run.solver[0], "reason": run.solver[1]},
+            "residual_first": run.residuals[0],
+            "residual_last": run.residuals[1],
+            "hand_final": run.q_s[-1].tolist(),
+            "output_names": list(run.output_names),
+            "output_final": run.outputs[-1].tolist(),
+            "output_places": self.places,
+            "energy_drift": run.energy_drift,
+            **({"force_peak": self.force_peak} if run.force is not None else {}),
+            "time": {
+                **stages,
+                "steps_timed": run.steps_timed,
+                "steps": run.seconds["steps"],
+                "per_step": run.seconds["per_step"],
+            },
+            "memory_peak_mb": self.memory_peak_mb,
+            "forms": self.forms,
+            "operators": list(self.operators),
+            "warnings": list(self.warnings),
+        }
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The short table of a run as label and text."""
+        run, seconds, steps = self.run, self.run.seconds, self.scene.time.steps
+        loads = [f"{c.axis} {self.force_peak[c.axis]:.4g} {c.load_unit}" for c in self.hand() if self.force_peak]
+        timed = f"{steps}" if run.steps_timed == steps else f"{run.steps_timed} of {steps}, since the run was resumed,"
+        return [
+            ("hand at the end", "(" + ", ".join(f"{x:.6g}" for x in run.q_s[-1]) + ")"),
+            *((c.label, f"{y:.6g} {c.unit}") for c, y in zip(run.columns, run.outputs[-1], strict=True)),
+            *self.places.items(),
+            *([("largest force on the hand", ", ".join(loads))] if loads else []),
+            ("energy drift", f"{run.energy_drift:.1e}"),
+            ("residual, first and last", f"{run.residuals[0]:.1e}, {run.residuals[1]:.1e}"),
+            ("solver", run.solver[0]),
+            ("", run.solver[1]),
+            ("mesh, assembly, factor", ", ".join(f"{seconds[key]:.3g} s" for key in ("mesh", "assembly", "factor"))),
+            ("steps", f"{timed} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.4g} us each"),
+            ("peak memory, all ranks", f"{self.memory_peak_mb:.0f} MiB"),
+        ]
+
+    def trajectory(self) -> Table:
+        """State at each time, and the force in the step that ends there, nan in the first row."""
+        run, n_s = self.run, self.sizes.n_s
+        header = trajectory_header(n_s, self.dimension, run.columns, velocity=True)
+        parts = [run.times, run.q_s, run.v_s, run.outputs]
+        if run.force is not None:
+            header += [f"{c.label} [{c.load_unit}]" for c in self.hand("force")]
+            parts.append(np.vstack([np.full(n_s, np.nan), run.force]))
+        return Table(tuple(header), np.column_stack(parts).tolist())
+
+
+def simulate_result(model: Model, run: Trajectory, warnings: Sequence[str] = ()) -> Simulation:
+    """A run with the sizes of its model. Collective."""
+    return Simulation(
+        scene=model.scene,
+        sizes=model_sizes(model),
+        dimension=model.system.layout.dimension,
+        run=run,
+        places=output_places(model),
+        warnings=(*model.space.mesh.notes, *warnings),
+        memory_peak_mb=peak_memory_mb(model.system.layout.comm),
+        forms=len(model.inventory.forms),
+        operators=model.inventory.operators,
+    )
+
+
+def trajectory_header(n_s: int, dimension: int, outputs: Columns, velocity: bool) -> list[str]:
+    """Columns of trajectory.csv with their units: time, hand, velocity on request, outputs."""
+    header = ["t [s]", *(f"{c.label} [{c.unit}]" for c in hand_columns(n_s, dimension))]
+    if velocity:
+        header += [f"{c.label} [{c.unit}/s]" for c in hand_columns(n_s, dimension, "hand_velocity")]
+    for column in outputs:
+        text = f"{column.label} [{column.unit}]"
+        header.append(text if text not in header else f"output_{text}")
+    return header

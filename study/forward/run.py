@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
-from rich.table import Table
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, ResourceError
 from softgrasp.fem.mesh.check import counted
-from softgrasp.fem.model.outputs import unit
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.scene.file import resolved_toml
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward import accuracy
 from softgrasp.study.forward.cautions import run_warnings
-from softgrasp.study.forward.result import force_unit, simulate_result, write_results
+from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.equation import equation
-from softgrasp.study.report.origin import command_line, made_with
-from softgrasp.study.report.page import Section, equation_text, write_report
-from softgrasp.study.shell.session import list_files, open_model, open_scene, progress_bar, show_warnings
+from softgrasp.study.report.origin import made_with, origin
+from softgrasp.study.report.page import Section, equation_text
+from softgrasp.study.report.tables import pairs
+from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
 
-Rows = list[tuple[str, str]]
+CAPTIONS = {
+    "move.png": "The body at some instants of the move.",
+    "move.gif": "",
+    "mesh_error.png": "Outputs relative to the hand on this mesh and corrected, with the band of the error bound.",
+    "traces.png": "Hand and outputs against time; below, the outputs relative to the hand.",
+}
 
 
 def run_simulate(
@@ -45,26 +46,22 @@ def run_simulate(
 ) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective.
 
+    Returns:
+        What result.json holds.
+
     Raises:
         SoftgraspError: with one sentence.
     """
-    comm = MPI.COMM_WORLD
-    scene = open_scene(path, overrides, console)
-    model = open_model(scene, console)
-    frames = Frames(model, out, pictures)
+    session = Session("simulate", path, overrides, out, console, quiet, pictures)
+    model = session.model(session.scene())
+    scene, frames = model.scene, Frames(model, out, pictures)
 
     def join(run: Run) -> None:
         frames.begin(run)
         if resume:
-            lost = frames.lacking(run.begun)
-            missing = (
-                f"; {counted(lost, 'earlier frame')} {'is' if lost == 1 else 'are'} not kept, the pictures do without"
-            )
-            more = missing if lost else ""
-            more += "; the fields before are left out: another run has written in their place" if frames.foreign else ""
-            console.print(f"resumed from step {run.begun} of {run.steps}{more}", soft_wrap=True)
+            console.print(f"resumed from step {run.begun} of {run.steps}{_lost(frames, run)}", soft_wrap=True)
 
-    with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
+    with session.progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("steps", total=scene.time.steps)
 
         def progress(run: Run) -> None:
@@ -77,98 +74,64 @@ def run_simulate(
             if files := frames.close():
                 list_files(console, files)
             raise
-    files = frames.close()
-    result = simulate_result(model, run)
+    fields = frames.close()
     judged, unknown = accuracy.judge(model, run.seconds["steps"], certify)
-    result |= accuracy.keys(judged, run)
-    warnings = run_warnings(model, run, frames.most[1:])
-    result["warnings"] = [*model.space.mesh.notes, *warnings, *accuracy.warnings(judged), *unknown]
-    if comm.rank == 0:
-        begin = time.perf_counter()
-        files = write_results(out, model, run, result) + files + frames.draw(out, run)
+    warnings = [*run_warnings(model, run, frames.most[1:]), *accuracy.warnings(judged), *unknown]
+    result = simulate_result(model, run, warnings)
+    rows = [*result.rows(), *accuracy.rows(judged)]
+
+    def page() -> Page:
+        drawn = frames.draw(out, run)
         if pictures and judged is not None:
-            files += accuracy.draw(out / "mesh_error.png", run, judged)
-        rows = [*result_rows(result), *accuracy.rows(judged)]
-        files.append(_report(out, scene, result, rows, path, overrides))
-        result["time"]["pictures"] = time.perf_counter() - begin
-        show(console, rows)
-        show_warnings(console, warnings)
-        list_files(console, files)
-    comm.Barrier()
-    return result
+            drawn += accuracy.draw(out / "mesh_error.png", run, judged)
+        sections = _sections(result, rows, drawn)
+        return Page(scene.name, sections, {"trajectory.csv": result.trajectory()}, [*fields, *drawn])
+
+    numbers = result.to_json() | accuracy.keys(judged, run)
+    files = session.write(scene, numbers, page)
+    console.print(pairs(rows))
+    show_warnings(console, warnings)
+    list_files(console, files)
+    return numbers
 
 
-def result_rows(result: dict[str, Any]) -> Rows:
-    """The short table of a run as label and text."""
-    seconds = result["time"]
-    rows = [("hand at the end", "(" + ", ".join(f"{v:.6g}" for v in result["hand_final"]) + ")")]
-    rows += [
-        (name, f"{value:.6g} {unit(name)}")
-        for name, value in zip(result["output_names"], result["output_final"], strict=True)
-    ]
-    rows += [(name, place) for name, place in result["output_places"].items()]
-    if "force_peak" in result:
-        peak = ", ".join(f"{axis} {value:.4g} {force_unit(axis)}" for axis, value in result["force_peak"].items())
-        rows.append(("largest force on the hand", peak))
-    timed = seconds["steps_timed"]
-    steps = f"{timed}" if timed == result["steps"] else f"{timed} of {result['steps']}, since the run was resumed,"
-    return [
-        *rows,
-        ("energy drift", f"{result['energy_drift']:.1e}"),
-        ("residual, first and last", f"{result['residual_first']:.1e}, {result['residual_last']:.1e}"),
-        ("solver", result["solver"]["name"]),
-        ("", result["solver"]["reason"]),
-        ("mesh, assembly, factor", f"{seconds['mesh']:.3g} s, {seconds['assembly']:.3g} s, {seconds['factor']:.3g} s"),
-        ("steps", f"{steps} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.4g} us each"),
-        ("peak memory, all ranks", f"{result['memory_peak_mb']:.0f} MiB"),
-    ]
+def _lost(frames: Frames, run: Run) -> str:
+    """What the pictures and fields of a resumed run lack, in words; rank 0 only."""
+    text, lost = "", frames.lacking(run.begun)
+    if lost:
+        text = f"; {counted(lost, 'earlier frame')} {'is' if lost == 1 else 'are'} not kept, the pictures do without"
+    if frames.foreign:
+        text += "; the fields before are left out: another run has written in their place"
+    return text
 
 
-def show(console: Console, rows: Rows) -> None:
-    """Print the short table."""
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
-
-
-def _report(out: Path, scene: Scene, result: dict[str, Any], rows: Rows, path: Path, overrides: list[str]) -> Path:
+def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: list[Path]) -> list[Section]:
     from softgrasp.study.pictures.animation import speed_up  # brings Matplotlib, which only rank 0 needs
 
+    scene, sizes = result.scene, result.sizes
     faster = speed_up(np.array([0.0, scene.time_end]))
-    captions = {
-        "move.png": "The body at some instants of the move.",
-        "move.gif": "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed.",
-        "mesh_error.png": "Outputs relative to the hand on this mesh and corrected, with the band of the error bound.",
-        "traces.png": "Hand and outputs against time; below, the outputs relative to the hand.",
-    }
-    figures = [(out / name, text) for name, text in captions.items() if (out / name).exists()]
-    sizes = [
-        ("hand n_s", result["n_s"]),
-        ("tissue n_e", result["n_e"]),
-        ("states 2n", result["states"]),
-        ("cells", result["cells"]),
-        ("steps", result["steps"]),
-        ("time step", f"{result['dt']:.6g} s"),
+    move = "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed."
+    shown = {path.name: path for path in drawn}
+    figures = [(shown[name], text or move) for name, text in CAPTIONS.items() if name in shown]
+    rows = [
+        ("hand n_s", sizes.n_s),
+        ("tissue n_e", sizes.n_e),
+        ("states 2n", sizes.states),
+        ("cells", sizes.cells),
+        ("steps", scene.time.steps),
+        ("time step", f"{scene.time_end / scene.time.steps:.6g} s"),
         ("end", f"{scene.time_end:.6g} s"),
     ]
     effects = [
         (name, effect.active(scene), *((effect.term, effect.cost) if effect.active(scene) else ("", "")))
         for name, effect in EFFECTS.items()
     ]
-    return write_report(
-        out / "report.html",
-        title=scene.name,
-        subtitle=scene.description,
-        sections=[
-            Section("", figures=figures),
-            Section("Result", rows=rows),
-            *([Section("Look at", text="\n\n".join(result["warnings"]))] if result["warnings"] else []),
-            Section("Equation", code=equation_text(equation(scene))),
-            Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
-            Section("Size", rows=sizes),
-            Section("Made with", rows=made_with(result)),
-        ],
-        scene=resolved_toml(scene),
-        reproduce=command_line("simulate", path, overrides, result["ranks"]),
-    )
+    return [
+        Section("", figures=figures),
+        Section("Result", rows=numbers),
+        *([Section("Look at", text="\n\n".join(result.warnings))] if result.warnings else []),
+        Section("Equation", code=equation_text(equation(scene))),
+        Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
+        Section("Size", rows=rows),
+        Section("Made with", rows=made_with(origin(scene, sizes.ranks))),
+    ]

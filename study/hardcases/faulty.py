@@ -39,7 +39,7 @@ def inject(fault: str) -> None:
         step(run, ts)
 
     if fault == "disk":
-        softgrasp.fem.run.checkpoint._write_rank = disk  # type: ignore[assignment]
+        vars(softgrasp.fem.run.checkpoint)["write_arrays"] = disk
     elif fault:
         Run.step = faulty  # type: ignore[method-assign,assignment]
 

@@ -16,8 +16,9 @@ from softgrasp.fem.errors import Interrupted
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
-from softgrasp.fem.run.simulate import Run, RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem, Damping
 from softgrasp.study.hardcases.cases import EPS, Family, HardCase, here, make, scaled_condition, textbook, thin

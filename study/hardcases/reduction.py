@@ -17,8 +17,9 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import force_values
-from softgrasp.fem.run.simulate import Trajectory, simulate
+from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.engines import factor
 from softgrasp.reduction.inner import orthonormality
 from softgrasp.reduction.model import SmallModel

@@ -13,18 +13,19 @@ import numpy.typing as npt
 from matplotlib.colors import to_rgb
 from PIL import Image
 
+from softgrasp.fem.columns import Array
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
 
 if TYPE_CHECKING:
     from softgrasp.fem.fields.picture import PictureMesh
 
-Array = npt.NDArray[np.float64]
 
 MOST_FRAMES = 60
 SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them the animation runs slower or faster than the move
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
 MOST_BYTES = 3_000_000
+DPI = 110
 REST = 1.0  # [s] the last frame stays longer
 
 
@@ -52,14 +53,8 @@ def gif_move(
     kept, ticks = _timing(np.asarray(times, dtype=np.float64))
     frames, times = np.asarray(frames, dtype=np.float64)[kept], np.asarray(times, dtype=np.float64)[kept]
     shot = make_shot(picture, frames, times, np.asarray(table, dtype=np.float64), target)
-    images = _render(shot, frames, times)
     durations = [int(10 * n) for n in ticks] + [int(1000 * REST)]
-    for scale in (1.0, 0.8, 0.6, 0.45):
-        data = _encode(images, durations, scale)
-        if len(data) <= MOST_BYTES:
-            break
-    out_gif.write_bytes(data)
-    return out_gif
+    return write_gif(_render(shot, frames, times), durations, out_gif, _palette())
 
 
 def speed_up(times: Array) -> float:
@@ -80,14 +75,14 @@ def speed_up(times: Array) -> float:
 
 def _timing(times: Array) -> tuple[list[int], list[int]]:
     """Frames to show and how long each but the last [1/100 s]; rounding errors do not add up."""
-    some = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
+    chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
     at = np.round(100 * (times - times[0]) / speed_up(times)).astype(int)  # GIF counts in hundredths of a second
-    kept = some[:1]
-    for i in some[1:]:
+    kept = chosen[:1]
+    for i in chosen[1:]:
         if at[i] - at[kept[-1]] >= TICKS:
             kept.append(i)
-    if len(some) > 1 and kept[-1] != some[-1]:
-        kept = [*(kept[:-1] if len(kept) > 1 else kept), some[-1]]
+    if len(chosen) > 1 and kept[-1] != chosen[-1]:
+        kept = [*(kept[:-1] if len(kept) > 1 else kept), chosen[-1]]
     return kept, [max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)]
 
 
@@ -104,34 +99,62 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
         stamp = ax.set_title(f"$t$ = {times[-1]:.{digits}f} s{note}", pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
-        figure.set_dpi(110)
         draw_scene(ax, shot, frames[:1], None, shot.hands[:1])
-        figure.canvas.draw()
-        box = figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
+        box = frame_box(figure)
         for i in range(len(frames)):
             for artist in [*ax.collections, *ax.lines, *ax.texts]:
                 artist.remove()
             draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
             name_layers(ax, shot, frames[i], inside=True)  # beside the body they would change sides
             stamp.set_text(f"$t$ = {times[i]:.{digits}f} s{note}")
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format="png", dpi=110, bbox_inches=box)
-            images.append(Image.open(buffer).convert("RGB"))
+            images.append(frame_image(figure, box))
         plt.close(figure)
     return images
 
 
-def _encode(images: list[Any], durations: list[int], scale: float) -> bytes:
-    """GIF of the pictures with one palette."""
-    size = tuple(round(scale * n) for n in images[0].size)
-    small = images if scale == 1.0 else [image.resize(size, Image.Resampling.LANCZOS) for image in images]
-    palette = _palette()
-    flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in small]
+def frame_box(figure: Any) -> Any:
+    """The part of a figure that every frame shows."""
+    figure.set_dpi(DPI)
+    figure.canvas.draw()
+    return figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
+
+
+def frame_image(figure: Any, box: Any) -> Any:
+    """The figure as it is now, as a picture."""
     buffer = io.BytesIO()
-    flat[0].save(
-        buffer, format="GIF", save_all=True, append_images=flat[1:], duration=durations, loop=0, optimize=False
-    )
-    return buffer.getvalue()
+    figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box, pil_kwargs={"compress_level": 1})
+    return Image.open(buffer).convert("RGB")
+
+
+def write_gif(images: list[Any], durations: list[int], out_gif: Path, palette: Any = None) -> Path:
+    """Write an animation, smaller if it would take more than 3 MB.
+
+    Args:
+        images: frames of one size.
+        durations: of each [ms].
+        out_gif: name of the file.
+        palette: its colours; by default the 256 of the frame in the middle.
+    """
+    palette = palette or palette_of(images[len(images) // 2])
+    for scale in (1.0, 0.8, 0.6, 0.45):
+        size = tuple(round(scale * n) for n in images[0].size)
+        scaled = images if scale == 1.0 else [image.resize(size, Image.Resampling.LANCZOS) for image in images]
+        first, *rest = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in scaled]
+        buffer = io.BytesIO()
+        first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=False)
+        if buffer.tell() <= MOST_BYTES:
+            break
+    out_gif.write_bytes(buffer.getvalue())
+    return out_gif
+
+
+def palette_of(image: Any) -> Any:
+    """The 256 colours of a picture, its paper pure white."""
+    palette = image.quantize(256)
+    colours = np.reshape(palette.getpalette(), (-1, 3))
+    colours[colours.sum(axis=1).argmax()] = 255
+    palette.putpalette(colours.ravel().tolist())
+    return palette
 
 
 def _palette() -> Any:

@@ -19,6 +19,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
+from softgrasp.fem.columns import Array
 from softgrasp.study.pictures.shapes import (
     AZIMUTH,
     chained,
@@ -49,7 +50,6 @@ from softgrasp.study.pictures.style import (
 if TYPE_CHECKING:
     from softgrasp.fem.fields.picture import PictureMesh
 
-Array = npt.NDArray[np.float64]
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
@@ -305,10 +305,10 @@ def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> 
     length = power * max(m for m in (1, 2, 5) if m * power <= length * 1.001)
     ends = seen(length * np.eye(3))
     low = np.minimum(ends.min(axis=0), 0.0)
-    reach = np.maximum(ends.max(axis=0), 0.0) - low
-    y = size[1] - 0.25 - scale * reach[1] if top else 0.4
-    ax = figure.add_axes((0.08 / size[0], y / size[1], *(scale * reach / size)))
-    ax.set(xlim=(low[0], low[0] + reach[0]), ylim=(low[1], low[1] + reach[1]))
+    extent = np.maximum(ends.max(axis=0), 0.0) - low
+    y = size[1] - 0.25 - scale * extent[1] if top else 0.4
+    ax = figure.add_axes((0.08 / size[0], y / size[1], *(scale * extent / size)))
+    ax.set(xlim=(low[0], low[0] + extent[0]), ylim=(low[1], low[1] + extent[1]))
     ax.set_axis_off()
     for name, end in zip("xyz", ends, strict=True):
         ax.annotate("", end, (0.0, 0.0), arrowprops={"arrowstyle": "-", "lw": 0.8, "shrinkA": 0, "shrinkB": 0})

@@ -1,4 +1,4 @@
-"""What a run leaves for the eye: field files for ParaView while it runs, figures and animation afterwards."""
+"""Pictures of a run: field files for ParaView while it runs, figures and animation afterwards."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
 from softgrasp.fem.fields.series import SeriesWriter, owner_file
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.checkpoint import restart_bytes
-from softgrasp.fem.run.simulate import Run, Trajectory, frame_steps
+from softgrasp.fem.run.simulate import Run, frame_steps
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.sealed import AGAIN, read_arrays, write_arrays
 from softgrasp.study.pictures.shapes import pick_instants, way_done
 
@@ -147,7 +147,7 @@ class Frames:
             if state is not None:
                 self.states.append(state.astype(np.float32))
         if self.writer is not None:  # last: when there is no room, the rest goes beside the restart file
-            reserve = restart_bytes(run) if isinstance(run, Run) else 0
+            reserve = run.layout.comm.allreduce(run.restart_state().size) if isinstance(run, Run) else 0
             self.writer.write(t, z, v, q_s, v_s, reserve=reserve if reserve < LARGE_RESTART else 0)
 
     def _ahead(self, run: Run) -> set[int]:
@@ -181,7 +181,7 @@ class Frames:
         files += figure_traces(
             run.times,
             run.outputs,
-            run.output_names,
+            run.columns,
             run.q_s,
             directory / "traces.png",
             rigid=run.outputs_rigid,

@@ -5,7 +5,7 @@ Everything comes in as arrays; nothing here computes a simulation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.lines import Line2D
 
-from softgrasp.fem.model.outputs_named import AXES, TURNS, farthest, turns
+from softgrasp.fem.columns import AXES, Array, Columns, farthest
 from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.shapes import pick_instants
 from softgrasp.study.pictures.style import CYCLE, OUTLINE, SKY, TARGET, WIDTH, length_unit, paper_style, save
@@ -22,7 +22,6 @@ from softgrasp.study.pictures.style import CYCLE, OUTLINE, SKY, TARGET, WIDTH, l
 if TYPE_CHECKING:
     from softgrasp.fem.fields.picture import PictureMesh
 
-Array = npt.NDArray[np.float64]
 Poles = npt.NDArray[np.complex128]
 
 COLOURS = (*CYCLE, "#E69F00", SKY, "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six
@@ -36,7 +35,7 @@ def figure_histories(
     times: Array,
     outputs: Array,
     inputs: Array,
-    names: tuple[str, ...],
+    columns: Columns,
     out_png: Path,
     *,
     target: npt.ArrayLike | None = None,
@@ -51,7 +50,7 @@ def figure_histories(
         times: grid, shape (m + 1,) [s].
         outputs: shape (m + 1, p) [m, rad].
         inputs: constant in each step, shape (m, n_s) [N, N m].
-        names: one per output; those that end in rx, ry, rz are rotations and get axes of their own.
+        columns: one per output; rotations get axes of their own.
         out_png: name of the picture; the PDF gets its stem.
         target: outputs aimed at, shape (p,).
         limits: bounds on the inputs, shape (n_s,); drawn when finite.
@@ -65,7 +64,7 @@ def figure_histories(
     aim = None if target is None else np.asarray(target, dtype=np.float64)
     d = inputs.shape[1] if dimension is None else min(dimension, inputs.shape[1])
     runs = {"": (outputs, inputs), **(others or {})}
-    angles = turns(names)
+    angles = [j for j, column in enumerate(columns) if column.rotation]
     lengths = [j for j in range(outputs.shape[1]) if j not in angles]
     panels = [p for p in (lengths, angles) if p]
     first = len(panels)
@@ -83,7 +82,7 @@ def figure_histories(
             if aim is not None:
                 # the last swings have no later ones to be compared with
                 keep = slice(0, max(2, int(0.97 * len(times))), _thin(len(times)).step)
-                axes[-1].semilogy(times[keep], still_to_come(y, aim, names)[keep], color=OUTLINE, **look)
+                axes[-1].semilogy(times[keep], still_to_come(y, aim, columns)[keep], color=OUTLINE, **look)
         if aim is not None:
             for ax, part in zip(axes, panels, strict=False):
                 for value in dict.fromkeys(aim[part].tolist()):
@@ -103,17 +102,17 @@ def figure_histories(
         for ax in axes:
             ax.set_xlim(0.0, float(times[-1]) if settle is None or ax in whole else min(settle, float(times[-1])))
         axes[-1].set_xlabel("time [s]")
-        labels = [[names[j] for j in part] for part in panels]
+        labels = [[columns[j].formula for j in part] for part in panels]
         _legends(axes, labels, inputs.shape[1], d, list(runs), aim is not None)
         return save(figure, out_png)
 
 
-def still_to_come(outputs: Array, target: Array, names: Sequence[str] = ()) -> Array:
+def still_to_come(outputs: Array, target: Array, columns: Columns = ()) -> Array:
     """Largest distance from each instant on: how well the outputs have settled, without the swings. Shape (m,).
 
-    Args and distance as in :func:`fem.model.outputs_named.farthest`.
+    Args and distance as in :func:`fem.columns.farthest`.
     """
-    distance = np.maximum(farthest(outputs, target, names), FLOOR)
+    distance = np.maximum(farthest(outputs, target, columns), FLOOR)
     return np.asarray(np.maximum.accumulate(distance[::-1])[::-1])
 
 
@@ -151,7 +150,7 @@ def _legends(axes: Any, names: list[list[str]], inputs: int, d: int, runs: list[
         return [Line2D([], [], color=COLOURS[j % len(COLOURS)], label=label) for j, label in enumerate(labels)]
 
     for ax, part in zip(axes, names, strict=False):
-        shown = colours([_pretty(name) for name in part])
+        shown = colours(part)
         if aimed:
             shown.append(Line2D([], [], color=TARGET, lw=1.0, ls=(0, (1, 1.2)), label="target"))
         ax.legend(handles=shown, **place)
@@ -166,13 +165,6 @@ def _legends(axes: Any, names: list[list[str]], inputs: int, d: int, runs: list[
             for i, name in enumerate(runs)
         ]
         axes[-1].legend(handles=entries, **(place if aimed else {**place, "bbox_to_anchor": (1.0, 0.5)}))
-
-
-def _pretty(name: str) -> str:
-    stem, _, axis = name.rpartition("_")
-    if stem and axis in TURNS:
-        return f"{stem}, about ${axis[1]}$"
-    return f"{stem}, ${axis}$" if stem and axis in AXES else name
 
 
 def figure_loop_move(

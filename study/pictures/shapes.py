@@ -62,9 +62,9 @@ def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Arra
     bent /= bent.max() or 1.0
     low, high = _boxes(picture, states)
 
-    def inner(at: float, reach: float) -> list[tuple[float, int]]:
+    def inner(at: float, radius: float) -> list[tuple[float, int]]:
         """Instants whose way is near ``at``, with their merit."""
-        near = np.flatnonzero((np.abs(done - at) <= reach) & (done > 0.02) & (done < 0.98))
+        near = np.flatnonzero((np.abs(done - at) <= radius) & (done > 0.02) & (done < 0.98))
         return [(float(bent[i]) - 3 * abs(float(done[i]) - at), int(i)) for i in near]
 
     pairs = [(a + b, (0, i, j, last)) for a, i in inner(1 / 3, 0.17) for b, j in inner(2 / 3, 0.17) if i < j]

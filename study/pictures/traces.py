@@ -7,19 +7,16 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-import numpy.typing as npt
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.fem.model.outputs import hand_axes
+from softgrasp.fem.columns import AXES, Array, Columns, hand_columns
 from softgrasp.study.pictures.style import COLUMN, CYCLE, HAND, STEPS, length_unit, paper_style, save
-
-Array = npt.NDArray[np.float64]
 
 
 def figure_traces(
     times: Array,
     outputs: Array,
-    names: tuple[str, ...],
+    columns: Columns,
     q_s: Array,
     out_png: Path,
     *,
@@ -33,7 +30,7 @@ def figure_traces(
     Args:
         times: shape (m,) [s].
         outputs: absolute displacements, shape (m, c) [m].
-        names: one per output, ending in _x, _y or _z.
+        columns: one per output; rotations have a panel of their own, of the hand.
         q_s: hand, shape (m, n_s) [m, rad].
         out_png: name of the picture; the PDF gets its stem.
         rigid: share of the outputs that moves with the hand, shape (m, c); by default the hand's translation.
@@ -43,12 +40,11 @@ def figure_traces(
         Names of PNG and PDF.
     """
     d = dimension or min(q_s.shape[1], 3)
-    ends = [name.rsplit("_", 1)[-1] for name in names]
-    axes_of = ["xyz".find(end) if len(end) == 1 else -1 for end in ends]  # rotations have a panel of their own
-    shown = _not_the_hand(outputs, names, axes_of, q_s, d)
+    axes_of = [AXES.index(column.axis) if column.axis in AXES else -1 for column in columns]
+    shown = _not_the_hand(outputs, columns, axes_of, q_s, d)
     moving = q_s[:, [axes_of[i] for i in shown]] if rigid is None else rigid[:, shown]
     relative = outputs[:, shown] - moving
-    bodies = list(dict.fromkeys(names[i].rsplit("_", 1)[0] for i in shown))
+    bodies = list(dict.fromkeys(columns[i].name for i in shown))
     angles = q_s.shape[1] > d
     with paper_style():
         panels = 1 + bool(shown) + angles
@@ -61,9 +57,9 @@ def figure_traces(
             for a in (np.hstack([outputs[:, shown], q_s[:, :d]]), relative)
         ]
         for k, i in enumerate(shown):
-            body = names[i].rsplit("_", 1)[0]
-            look: dict[str, Any] = {"color": CYCLE[axes_of[i]], "ls": ("-", "-.", ":")[bodies.index(body) % 3]}
-            axes[0].plot(times, factors[0][0] * outputs[:, i], label=f"{body}, ${'xyz'[axes_of[i]]}$", **look)
+            style = ("-", "-.", ":")[bodies.index(columns[i].name) % 3]
+            look: dict[str, Any] = {"color": CYCLE[axes_of[i]], "ls": style}
+            axes[0].plot(times, factors[0][0] * outputs[:, i], label=columns[i].formula, **look)
             axes[1].plot(times, factors[1][0] * relative[:, k], **look)
         # The hand last: its thin dashes lie on the lines of the outputs.
         for j in np.flatnonzero(np.abs(q_s[:, :d]).max(axis=0) > 0).tolist():
@@ -88,12 +84,12 @@ def figure_traces(
         return save(figure, out_png)
 
 
-def _not_the_hand(outputs: Array, names: tuple[str, ...], axes_of: list[int], q_s: Array, d: int) -> list[int]:
+def _not_the_hand(outputs: Array, columns: Columns, axes_of: list[int], q_s: Array, d: int) -> list[int]:
     """Displacements to draw: those of outputs that do not repeat a moving hand."""
     groups: dict[str, list[int]] = {}
     for i, axis in enumerate(axes_of):
         if 0 <= axis < d:
-            groups.setdefault(names[i].rsplit("_", 1)[0], []).append(i)
+            groups.setdefault(columns[i].name, []).append(i)
     moves = bool(np.abs(q_s[:, :d]).max(initial=0.0) > 0)
     repeated = [moves and np.array_equal(outputs[:, g], q_s[:, [axes_of[i] for i in g]]) for g in groups.values()]
     return [i for group, same in zip(groups.values(), repeated, strict=True) if not same for i in group]
@@ -102,8 +98,8 @@ def _not_the_hand(outputs: Array, names: tuple[str, ...], axes_of: list[int], q_
 def _angles(ax: Any, times: Array, q_s: Array, d: int) -> None:
     """The angles that the hand turns by; all if it turns by none."""
     turned = np.abs(q_s[:, d:]).max(axis=0) > 0
-    for j, axis in enumerate(hand_axes(q_s.shape[1], d)[d:]):
+    for j, column in enumerate(hand_columns(q_s.shape[1], d)[d:]):
         if turned[j] or not turned.any():
-            ax.plot(times, q_s[:, d + j], color=CYCLE["xyz".index(axis[-1])], label=f"hand, {axis}")
+            ax.plot(times, q_s[:, d + j], color=CYCLE["xyz".index(column.axis[-1])], label=f"hand, {column.axis}")
     ax.set_ylabel("hand angle [rad]")
     ax.legend(loc="best", handlelength=2.0)

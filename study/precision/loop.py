@@ -16,8 +16,8 @@ import numpy as np
 import scipy.linalg
 from mpi4py import MPI
 
+from softgrasp.fem.columns import Columns, farthest
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.model.outputs_named import farthest
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.design.orders import fast_order, orders
 from softgrasp.lqr.loop.actuation import Actuation
@@ -156,11 +156,11 @@ class LoopSweep:
 
         def measure() -> list[LoopReference]:
             design, most, best = self.runs.design, self.counts[0], Feedback()
-            true, loop, names = self.exact(best, most), design.judge.loop, design.problem.names
+            true, loop, columns = self.exact(best, most), design.judge.loop, design.problem.columns
             modes, error = len(loop.plant.omega), 0.0
             if not loop.complete:
                 coarse = exact_outputs(self.runs, ModalLoop(design.problem, modes // 2), self.gain(best), most)
-                error = errors_of(coarse, true, names)[0]
+                error = errors_of(coarse, true, columns)[0]
             run = self._full(LoopSetting(best), most)[0]
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
             return [LoopReference(error, modes, loop.complete, design.judge.optimal, rest)]
@@ -268,9 +268,9 @@ class LoopSweep:
         except (SolverError, ControlError) as failed:
             return replace(lost, reason=str(failed))
         problem, target = self.runs.problem, self.runs.design.target
-        names, y = problem.names, run.outputs - target.y
+        columns, y = problem.columns, run.outputs - target.y
         both = np.hstack([y - (run.q_s - target.state.q_s) @ problem.C_s.T, y])
-        error, displacement = errors_of(both, self.exact(Feedback(), steps), names)
+        error, displacement = errors_of(both, self.exact(Feedback(), steps), columns)
         if not displacement <= GONE:
             return replace(lost, reason="far from the reference")
         per_step, cost = statistics.median(means), float(run.cost[-1])
@@ -278,21 +278,21 @@ class LoopSweep:
         due = reference.optimal - reference.to_come
         return replace(
             lost, seconds=setup + steps * per_step, error=error, ok=stable, per_step=per_step, setup=setup,
-            error_displacement=displacement, error_time=errors_of(both, self.exact(what.gain, steps), names)[0],
+            error_displacement=displacement, error_time=errors_of(both, self.exact(what.gain, steps), columns)[0],
             cost=cost, cost_error=abs(cost - due) / reference.optimal,
         )  # fmt: skip
 
 
-def largest(values: Array, names: Sequence[str]) -> float:
+def largest(values: Array, columns: Columns) -> float:
     """Largest distance of any output at any instant [m]; values (m, p). Not collective."""
-    return float(farthest(values, np.zeros(values.shape[1]), names).max())
+    return float(farthest(values, np.zeros(values.shape[1]), columns).max())
 
 
-def errors_of(values: Array, true: Array, names: Sequence[str]) -> tuple[float, float]:
+def errors_of(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
     """Largest error over the largest value, of each half of the columns (m, 2 p). Not collective."""
     p = true.shape[1] // 2
     halves = (slice(0, p), slice(p, 2 * p))
-    return tuple(largest(values[:, h] - true[:, h], names) / largest(true[:, h], names) for h in halves)  # type: ignore[return-value]
+    return tuple(largest(values[:, h] - true[:, h], columns) / largest(true[:, h], columns) for h in halves)  # type: ignore[return-value]
 
 
 def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -> Array:

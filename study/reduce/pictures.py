@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,13 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from PIL import Image
 
 from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.registry import PAPER_METHODS
 from softgrasp.reduction.replay import FullRun, replay
-from softgrasp.study.pictures.animation import speed_up
+from softgrasp.study.pictures.animation import frame_box, frame_image, speed_up, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
@@ -32,7 +30,6 @@ FRAMES = 30
 INSTANTS = 3  # at most, in the still picture
 ROOM = 0.25  # between two bodies there, over the size of the body
 STRETCH = 0.15  # largest displacement of a drawn mode over the size of the body
-GIF_DPI = 110
 FULL: dict[str, Any] = {"color": ORANGE, "linewidth": 1.1}
 MANY_VERTICES = 200_000  # above, no pictures of the body
 
@@ -251,31 +248,15 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
     images = []
     with paper_style():
         figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1)
-        figure.set_dpi(GIF_DPI)
-        figure.canvas.draw()
-        frame = figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
+        box = frame_box(figure)
         for k in range(len(views.times)):
             for ax, view in zip(axes, views.reduced, strict=True):
                 for artist in [*ax.collections, *ax.lines]:
                     artist.remove()
                 _draw(ax, shot, views, view, k)
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format="png", dpi=GIF_DPI, bbox_inches=frame, pil_kwargs={"compress_level": 1})
-            images.append(Image.open(buffer).convert("RGB"))
+            images.append(frame_image(figure, box))
         plt.close(figure)
-    palette = _palette(images[len(images) // 2])
-    flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     span = float(views.times[-1] - views.times[0]) / speed_up(views.times)
-    wait = max(20, round(100 * span / max(1, len(flat) - 1)) * 10)  # [ms], GIF counts in hundredths of a second
-    durations = [wait] * (len(flat) - 1) + [wait + 1000]
-    flat[0].save(out_gif, format="GIF", save_all=True, append_images=flat[1:], duration=durations, loop=0)
-    return out_gif
-
-
-def _palette(image: Any) -> Any:
-    """The 256 colours of a picture, its paper pure white."""
-    palette = image.quantize(256)
-    colours = np.reshape(palette.getpalette(), (-1, 3))
-    colours[colours.sum(axis=1).argmax()] = 255
-    palette.putpalette(colours.ravel().tolist())
-    return palette
+    wait = max(20, round(100 * span / max(1, len(images) - 1)) * 10)  # [ms], GIF counts in hundredths of a second
+    durations = [wait] * (len(images) - 1) + [wait + 1000]
+    return write_gif(images, durations, out_gif)

@@ -160,7 +160,7 @@ def save_models(out: Path, sweeps: Sequence[Sweep]) -> list[Path]:
 def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
     model = study.full.model
-    whole = simulate_result(model, study.full.trajectory)
+    whole = simulate_result(model, study.full.trajectory).to_json()
     kept = (
         "scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver",
     )  # fmt: skip

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import Trajectory, simulate
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.study.reduce.result import FullTimes, Speed, Sweep, nearest
 
 FULL_REPEATS = 3  # behind the median of the full run

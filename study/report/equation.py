@@ -7,12 +7,11 @@ z = q_e - T q_s against the rigid motion of the hand.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from softgrasp.fem.effects.damping import layered
+from softgrasp.fem.scene.scene import Scene
 
-if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+Rows = tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
 
 
 @dataclass(frozen=True)
@@ -23,11 +22,13 @@ class Equation:
         blocks: rows of the paper's block system in q_s, q_e, as (name, left terms, right terms).
         stepped: the same in z, as it is solved.
         where: definitions of the symbols that occur.
+        feedback: the optimal control of the plant.
     """
 
-    blocks: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
-    stepped: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
+    blocks: Rows
+    stepped: Rows
     where: tuple[str, ...]
+    feedback: Rows = ()
 
 
 def equation(scene: Scene) -> Equation:

@@ -52,7 +52,7 @@ PACKAGES = {"DOLFINx": ("fenics-dolfinx", "dolfinx-solver-real"), "NumPy": ("num
 
 
 def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int, options: str = "") -> str:
-    """How a page about a scene is made again: the command as it is typed. Not collective."""
+    """The command line that writes a page again. Not collective."""
     launch = f"mpiexec -n {ranks} " if ranks > 1 else ""
     sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
     return f"{launch}softgrasp {command} {shlex.quote(str(path))}{sets}{options}"
@@ -69,8 +69,8 @@ def versions() -> list[tuple[str, str]]:
     commit = _commit(PACKAGE.parent / ".git")
     rows = [("softgrasp", package_version() + (f", commit {commit}" if commit else ""))]
     for name, distributions in PACKAGES.items():
-        found = [text for distribution in distributions if (text := _version(distribution))]
-        rows += [(name, found[0])] if found else []
+        installed = [text for distribution in distributions if (text := _version(distribution))]
+        rows += [(name, installed[0])] if installed else []
     rows += [(name, ".".join(map(str, sys.getVersion()))) for name, sys in (("PETSc", PETSc.Sys), ("SLEPc", SLEPc.Sys))]
     library = MPI.Get_library_version().splitlines()[0].split(",")[0]
     rows.append(("MPI", " ".join(library.replace("Version:", " ").split())))

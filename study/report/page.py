@@ -16,82 +16,11 @@ from markupsafe import Markup
 from PIL import Image
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.report.equation import Equation, equation
+from softgrasp.study.report.equation import Equation, Rows, equation
 from softgrasp.study.report.origin import versions
 from softgrasp.study.report.typeset import equation_html
 
-TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>
-*{box-sizing:border-box} html{-webkit-text-size-adjust:100%}
-body{font:16px/1.5 system-ui,sans-serif;max-width:54rem;margin:1.5rem auto;padding:0 1rem;color:#1a1a1a;
-background:#fff;overflow-wrap:break-word}
-h1{font-size:1.5rem;line-height:1.2;margin:0 0 .3rem} h2{font-size:1.15rem;margin:2rem 0 .4rem} p{margin:.4rem 0}
-.wide{overflow-x:auto;margin:.8rem 0;background:linear-gradient(to right,#fff 40%,#fff0) 0/4rem 100% no-repeat local,
-linear-gradient(to left,#fff 40%,#fff0) 100%/4rem 100% no-repeat local,
-linear-gradient(to right,#0003,#0000) 0/.8rem 100% no-repeat,
-linear-gradient(to left,#0003,#0000) 100%/.8rem 100% no-repeat}
-table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.94rem}
-td,th{padding:.25rem 1rem .25rem 0;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
-thead th{border-bottom:1.5px solid #1a1a1a;vertical-align:bottom} td.n,th.n{text-align:right;white-space:nowrap}
-table.wider td,table.wider th{white-space:nowrap}
-table.wider td.t{white-space:normal;min-width:10rem}
-table.pairs{width:100%} table.pairs td{overflow-wrap:anywhere}
-table.pairs td:first-child{width:40%;color:#444;overflow-wrap:normal}
-figure{margin:1rem 0} img{display:block;max-width:100%;height:auto} img.big{min-width:36rem}
-figcaption{color:#444;font-size:.9rem}
-pre{background:#f5f5f5;padding:.7rem;font:.85rem/1.45 ui-monospace,monospace;white-space:pre-wrap;margin:.4rem 0}
-.equation{margin:.4rem 0} .equation i,.term{font-family:Cambria,"STIX Two Text",Georgia,"Times New Roman",serif}
-.equation .head{margin:.7rem 0 .1rem;color:#444;font-size:.94rem}
-.equation .row{margin:.3rem 0 .3rem 6.5rem;text-indent:-6.5rem;font-size:1.1rem;line-height:1.6}
-.equation .name{display:inline-block;width:6.5rem;text-indent:0;color:#444;font-size:.94rem}
-.term{display:inline-block;text-indent:0} .equation .where{margin:.15rem 0 .15rem 1.2rem;text-indent:-1.2rem}
-sub,sup{font-size:.72em;line-height:0}
-@media(max-width:30rem){.equation .row{margin-left:1.2rem;text-indent:-1.2rem} .equation .name{display:block;
-margin-left:-1.2rem}
-table.wider th:first-child,table.wider td:first-child{position:sticky;left:0;background:#fff;white-space:normal;
-min-width:5.5rem;max-width:9rem;box-shadow:inset -1px 0 #ddd;padding-left:0} td,th{padding-right:.7rem}
-table.wider th:nth-child(2),table.wider td:nth-child(2){padding-left:.5rem}}
-@media print{@page{margin:16mm} body{margin:0;max-width:none;padding:0;font-size:10.5pt} .wide{overflow:visible}
-.wide{background:none} h2{break-after:avoid} figure,tr,pre.short,.equation p{break-inside:avoid}
-img{max-height:110mm;width:auto} img.big{min-width:0}
-table.wider td.t{min-width:0}
-table.wider{font-size:8.5pt} table.wider td,table.wider th{white-space:normal}
-table.wider td.n{white-space:nowrap} table.wider td,table.wider th{padding-right:.6rem}
-pre{background:none;border:1px solid #bbb;font-size:8pt} .motion{display:none}}
-</style></head><body>
-<h1>{{ title }}</h1>{% if subtitle %}<p>{{ subtitle }}</p>{% endif %}
-
-{% for section in sections %}<section>{% if section.title %}<h2>{{ section.title }}</h2>{% endif %}
-
-{% for text in section.paragraphs %}<p>{{ text }}</p>
-{% endfor %}
-{% if section.equation %}{{ section.equation }}
-{% elif section.code %}<pre class="short">{{ section.code }}</pre>
-{% endif %}
-{% if section.rows %}<div class="wide"><table class="{{ section.kind }}">
-{% if section.header %}<thead><tr>{% for cell in section.header %}<th{{ section.align[loop.index0] }} scope="col">
-{{- cell }}</th>{% endfor %}</tr></thead>
-{% endif %}
-<tbody>{% for row in section.rows %}<tr>{% for cell in row %}<td{{ section.align[loop.index0] }}>{{ cell }}</td>
-{%- endfor %}</tr>
-{% endfor %}</tbody></table></div>
-{% endif %}
-{% for figure in section.figures %}<figure{% if figure.moving %} class="motion"{% endif %}>
-<div class="wide"><img src="{{ figure.data }}" alt="{{ figure.caption }}" width="{{ figure.width }}"
-{%- if figure.width > 700 and not figure.moving %} class="big"{% endif %}></div>
-<figcaption>{{ figure.caption }}</figcaption></figure>
-{% endfor %}</section>
-{% endfor %}
-{% if scene %}<h2>Scene</h2>
-<p>Every key that has a value, defaults included; saved as a file it is the scene of this page.</p>
-<pre>{{ scene }}</pre>{% endif %}
-
-{% if reproduce %}<h2>Reproduce</h2><pre class="short">{{ reproduce }}</pre>
-<p>{{ how }}</p>{% endif %}
-
-</body></html>
-"""
+TEMPLATE = Path(__file__).with_name("page.html")
 KINDS = {".png": "image/png", ".gif": "image/gif", ".svg": "image/svg+xml", ".jpg": "image/jpeg"}
 PIXELS_PER_INCH = 135  # width of a figure on the screen against its width in print
 EQUATION = "Equation"  # first word of the heading of a section whose code is an equation
@@ -133,11 +62,12 @@ class Section:
 
 def equation_text(rows: Equation) -> str:
     """An equation as lines of text: in blocks, as it is stepped, and what the symbols are."""
-    lines = ["in blocks:", *_lines(rows.blocks), "", "stepped as:", *_lines(rows.stepped), "", "with:"]
-    return "\n".join([*lines, *(f"  {text}" for text in rows.where)])
+    lines = ["in blocks:", *_lines(rows.blocks), "", "stepped as:", *_lines(rows.stepped), ""]
+    lines += ["controlled by:", *_lines(rows.feedback), ""] if rows.feedback else []
+    return "\n".join([*lines, "with:", *(f"  {text}" for text in rows.where)])
 
 
-def _lines(rows: Sequence[tuple[str, Sequence[str], Sequence[str]]]) -> list[str]:
+def _lines(rows: Rows) -> list[str]:
     sides = [[" + ".join(terms).replace("+ -", "-") for terms in (left, right)] for _, left, right in rows]
     wide = max(len(name) for name, _, _ in rows)
     return [f"  {row[0] + ':':<{wide + 1}} {left} = {right}" for row, (left, right) in zip(rows, sides, strict=True)]
@@ -153,10 +83,10 @@ def of_scene(scene: str) -> Section:
 
 
 def outside(page: str) -> list[str]:
-    """Whatever in the marks of a page would load something else: scripts, links, addresses. Not collective."""
+    """Everything in the tags of a page that would load another file: scripts, links, addresses. Not collective."""
     style = "".join(re.findall(r"<style>.*?</style>", page, re.DOTALL))
     marks = re.findall(r"<[^>]*>", re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL))
-    return [found[0] for text in (*marks, style) for found in ADDRESS.finditer(text)]
+    return [address[0] for text in (*marks, style) for address in ADDRESS.finditer(text)]
 
 
 def embed(path: Path) -> str:
@@ -169,8 +99,6 @@ def write_report(
     *,
     title: str,
     subtitle: str = "",
-    figures: Sequence[tuple[Path, str]] = (),
-    tables: Sequence[tuple[str, Sequence[Sequence[Any]]]] = (),
     sections: Sequence[Section] = (),
     scene: str = "",
     reproduce: str = "",
@@ -183,8 +111,6 @@ def write_report(
     Args:
         path: the HTML file.
         title, subtitle: first lines.
-        figures: short for a section of (picture file, caption).
-        tables: short for sections of (title, rows) without header.
         sections: what follows, in this order.
         scene: resolved scene text.
         reproduce: the commands that made this page.
@@ -193,13 +119,14 @@ def write_report(
     Raises:
         ValueError: a row is not as long as its table's header or first row, or the page would load anything.
     """
-    given = [Section("", figures=figures)] if figures else []
-    given += [*(Section(name, rows=rows) for name, rows in tables), *sections]
+    given = list(sections)
     if scene and all(section.title != EQUATION for section in given):
         given.insert(1 if given and not given[0].title else 0, of_scene(scene))
     if reproduce:
         given.append(Section("Versions", rows=versions()))
-    page = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(TEMPLATE)
+    page = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(
+        TEMPLATE.read_text(encoding="utf-8")
+    )
     html = page.render(
         title=title,
         subtitle=subtitle,
@@ -208,8 +135,8 @@ def write_report(
         reproduce=reproduce.strip(),
         how=HOW.format(numbers=numbers),
     )
-    if found := outside(html):
-        raise ValueError(f"the page needs more than itself: {found[0]}")
+    if address := outside(html):
+        raise ValueError(f"the page needs more than itself: {address[0]}")
     path.write_text(html, encoding="utf-8")
     return path
 

@@ -1,1 +1,1 @@
-"""What stands between a terminal and a command."""
+"""From the command line to a command: session, standard streams, other programs, diagnosis."""

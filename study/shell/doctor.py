@@ -1,4 +1,4 @@
-"""Does this installation work: solver stack, MPI launcher, threads, compiler, cache; a cure for each fault.
+"""Checks of the installation: solver stack, MPI launcher, threads, compiler, cache; with a cure for each fault.
 
 Needs neither DOLFINx nor MPI to be imported, so that it can say that they are missing.
 """
@@ -94,17 +94,17 @@ def check_launcher() -> Check:
     if path is None:
         return Check("mpiexec", False, "none", f"Put the mpiexec of {linked} on PATH, or `pip install mpich`.")
     _, text = run_limited([path, "--version"], LAUNCH_LIMIT)
-    found = family(text)
+    launcher = family(text)
     # A launcher we cannot name (srun wrapper, vendor MPI) is judged by the launch alone.
-    if "unknown" in (found, linked) or found == linked:
+    if "unknown" in (launcher, linked) or launcher == linked:
         first = shutil.which("mpiexec")
         if first is not None and not os.path.samefile(first, path):
             other = family(run_limited([first, "--version"], LAUNCH_LIMIT)[1])
             if "unknown" not in (other, linked) and other != linked:
                 cure = f"A bare `mpiexec` starts {first} of {other}, the wrong one: call {path} by its full path."
-                return Check("mpiexec", False, f"{path} ({found}, library {linked})", cure)
-        return Check("mpiexec", True, f"{path} ({found}, library {linked})")
-    cure = f"This mpiexec is {found} but the library is {linked}: use the mpiexec of {linked} by its full path."
+                return Check("mpiexec", False, f"{path} ({launcher}, library {linked})", cure)
+        return Check("mpiexec", True, f"{path} ({launcher}, library {linked})")
+    cure = f"This mpiexec is {launcher} but the library is {linked}: use the mpiexec of {linked} by its full path."
     return Check("mpiexec", False, path, cure)
 
 
@@ -200,18 +200,18 @@ CHECKS: tuple[tuple[str, Callable[[], Check]], ...] = (
 
 
 def checks() -> list[Check]:
-    """Look at everything; a look that fails is a finding, not an error.
+    """Run all checks; one that raises has failed.
 
     Not collective: call on one rank.
     """
-    found = []
+    results = []
     for name, look in CHECKS:
         try:
-            found.append(look())
+            results.append(look())
         except (ImportError, OSError, RuntimeError, AttributeError) as error:
             text = str(error).splitlines() or [type(error).__name__]
-            found.append(Check(name, False, text[0], INSTALL))
-    return found
+            results.append(Check(name, False, text[0], INSTALL))
+    return results
 
 
 def show(console: Console) -> bool:
@@ -219,9 +219,9 @@ def show(console: Console) -> bool:
     table = Table(box=None, pad_edge=False)
     for title in ("", "check", "found", "cure"):
         table.add_column(title, overflow="fold")
-    found = checks()
-    for check in found:
+    results = checks()
+    for check in results:
         mark = "[green]ok[/]" if check.ok else "[red]bad[/]"
         table.add_row(mark, check.name, check.value.replace("[", r"\["), check.cure.replace("[", r"\["))
     console.print(table)
-    return all(check.ok for check in found)
+    return all(check.ok for check in results)

@@ -106,13 +106,16 @@ class Session:
         """Bars with the time left, in a terminal only. Not collective."""
         return progress_bar(self.console, count, quiet=self.quiet)
 
-    def write(self, scene: Scene, result: dict[str, Any], page: Callable[[], Page]) -> list[Path]:
+    def write(
+        self, scene: Scene, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True
+    ) -> list[Path]:
         """Write result.json, scene.toml, tables and report.html on rank 0. Collective.
 
         Args:
             scene: as it was run.
             result: what result.json holds, equal on all ranks; takes ``time.pictures`` and ``time.total`` on rank 0.
             page: draws and composes the rest; called on rank 0 only, so it must not communicate.
+            clock: add the times.
 
         Returns:
             The files, on rank 0.
@@ -125,20 +128,23 @@ class Session:
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
                 drawing = time.perf_counter()
-                made = page()
+                content = page()
                 now = time.perf_counter()
-                result.setdefault("time", {}).update(pictures=now - drawing, total=now - self.begin)
+                if clock:
+                    result.setdefault("time", {}).update(pictures=now - drawing, total=now - self.begin)
                 files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
-                files += [table.write_csv(self.out / name) for name, table in made.tables.items()]
-                files += made.files
+                files += [table.write_csv(self.out / name) for name, table in content.tables.items()]
+                files += content.files
                 files.append(
                     write_report(
                         self.out / "report.html",
-                        title=made.title,
+                        title=content.title,
                         subtitle=scene.description,
-                        sections=made.sections,
+                        sections=content.sections,
                         scene=resolved_toml(scene),
-                        reproduce=command_line(self.command, self.path, self.overrides, self.comm.size, made.options),
+                        reproduce=command_line(
+                            self.command, self.path, self.overrides, self.comm.size, content.options
+                        ),
                     )
                 )
         return files
@@ -173,7 +179,7 @@ def open_model(scene: Scene, console: Console) -> Model:
     return Session("", Path(), (), Path(), console).model(scene)
 
 
-def show_warnings(console: Console, found: Sequence[str]) -> None:
+def show_warnings(console: Console, warnings: Sequence[str]) -> None:
     """Print warnings in yellow. Not collective."""
-    for text in found:
+    for text in warnings:
         console.print(Padding.indent(Text(f"warning: {text}", "yellow"), 0), highlight=False)

@@ -1,4 +1,4 @@
-"""What a shell does to the command: the reader of its output leaves, and Ctrl-C comes while modules load.
+"""Standard streams whose reader may leave, and Ctrl-C while modules load.
 
 Imports nothing but the standard library, so that it can come first.
 """
@@ -12,33 +12,18 @@ import os
 import signal
 import sys
 from types import FrameType
+from typing import Any
 
 
-class Stream(io.TextIOWrapper):
-    """A standard stream; what is written after its reader has gone goes nowhere, and no letter is beyond it."""
+class Unread(io.FileIO):
+    """A standard stream; what is written after its reader has gone goes nowhere."""
 
-    given: io.TextIOWrapper  # kept alive: its end would close the buffer that both use
-
-    def write(self, text: str, /) -> int:
-        """Write, or drop what nobody reads. Not collective."""
+    def write(self, data: Any, /) -> int:
+        """Write, or drop what nobody reads."""
         try:
-            return super().write(text)
+            return super().write(data) or 0
         except BrokenPipeError:
-            return self._leave(len(text))
-
-    def flush(self) -> None:
-        """Flush, or drop what nobody reads. Not collective."""
-        try:
-            super().flush()
-        except BrokenPipeError:
-            self._leave(0)
-
-    def _leave(self, written: int) -> int:
-        """Turn the descriptor to the null device: what is buffered must go somewhere when Python ends."""
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, self.fileno())
-        os.close(null)
-        return written
+            return len(memoryview(data))
 
 
 def write_utf8() -> None:
@@ -56,16 +41,12 @@ def outlive_readers() -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # a PETSc that is initialised already aborts on it
     for name in ("stdout", "stderr"):
         given = getattr(sys, name)
-        if isinstance(given, io.TextIOWrapper) and not isinstance(given, Stream):
-            stream = Stream(
-                given.buffer,
-                encoding=given.encoding,
-                errors="backslashreplace",
-                line_buffering=given.line_buffering,
-                write_through=given.write_through,
-            )
-            stream.given = given
-            setattr(sys, name, stream)
+        if isinstance(given, io.TextIOWrapper):
+            given.flush()
+            raw = Unread(given.fileno(), "w", closefd=False)
+            buffer: Any = raw if isinstance(given.buffer, io.RawIOBase) else io.BufferedWriter(raw)
+            how: dict[str, Any] = {"line_buffering": given.line_buffering, "write_through": given.write_through}
+            setattr(sys, name, io.TextIOWrapper(buffer, given.encoding, "backslashreplace", **how))
 
 
 def quiet_imports() -> None:

@@ -85,7 +85,7 @@ def test_a_strip_that_bends_sags_as_a_beam(comm: MPI.Intracomm) -> None:
     assert sag.largest > 2 * L
     # at the tip nothing but a rotation, whose gradient is skew: sqrt(2) times the slope
     assert sag.gradient.typical == pytest.approx(np.sqrt(2) * rho * g * L**3 / (6 * bending), rel=0.02)  # 5 h of cells
-    assert not sag.gradient.small
+    assert not sag.gradient.linear
     gate = EFFECTS["gravity"].gate(measure(model, np.zeros(0), np.zeros((model.system.layout.n_local, 0))))
     assert gate.number == sag.gradient.typical
     assert rho * g * L / E < 0.1 < gate.number
@@ -106,7 +106,7 @@ def test_a_hanging_bar_stretches_as_it_should(comm: MPI.Intracomm) -> None:
     assert sag.gradient.largest == pytest.approx(steps[0], rel=1e-10)  # as above
     assert sag.gradient.typical == sag.gradient.largest  # a cell is more than one in a hundred
     assert sag.gradient.share == 0.0
-    assert sag.gradient.small
+    assert sag.gradient.linear
 
 
 def test_damping() -> None:

@@ -38,9 +38,7 @@ def test_the_node_that_is_taken_is_named(comm: MPI.Intracomm, point: list[float]
 
 def test_a_result_says_where_its_outputs_are(comm: MPI.Intracomm) -> None:
     model = build(make_scene(time={"steps": 3}), comm=comm)
-    assert simulate_result(model, simulate(model))["output_places"] == {
-        "tip": "node (0, 0), the free one farthest from the hand"
-    }
+    assert simulate_result(model, simulate(model)).places == {"tip": "node (0, 0), the free one farthest from the hand"}
 
 
 TURN = {"effects": {"rotation": True}, "motion": {"target": [0.3, 0.2, 0.1]}}

@@ -20,7 +20,8 @@ from mpi4py import MPI
 from softgrasp.fem.disk import MARGIN, check_room
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError
 from softgrasp.fem.model.build import build
-from softgrasp.fem.run.simulate import RunOptions, Trajectory, simulate
+from softgrasp.fem.run.simulate import RunOptions, simulate
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import read_manifest, write_arrays, write_manifest
 from softgrasp.study.cli import app

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg
 from mpi4py import MPI
 
+from softgrasp.fem.columns import OutputColumn
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.lqr.loop.actuation import Actuation
@@ -85,8 +86,8 @@ def make_problem(model: Model) -> RiccatiProblem:
         for row in o.dofs:
             C_z[row, np.arange(at, at + o.size)] += o.weight
         at += o.size
-    names = tuple(f"y{i}" for i in range(at))
-    return RiccatiProblem(system, C_s, C_z, Q * np.eye(at), R * np.eye(n_s), names)
+    columns = tuple(OutputColumn(f"y{i}") for i in range(at))
+    return RiccatiProblem(system, C_s, C_z, Q * np.eye(at), R * np.eye(n_s), columns)
 
 
 @cache

@@ -21,7 +21,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import PETSc
+from softgrasp.fem.petsc import PETSc, to_scipy
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.file import resolved_toml
@@ -123,10 +123,8 @@ def local_rows(layout: BlockLayout, full: Array) -> Array:
 
 def gather_matrix(layout: BlockLayout, A: PETSc.Mat) -> scipy.sparse.csr_matrix:
     """A distributed tissue matrix in node order, on every rank. Collective."""
-    indptr, columns, values = A.getValuesCSR()
-    part = scipy.sparse.csr_matrix((values, columns, indptr), shape=(len(indptr) - 1, layout.n_e))
     order = dof_order(all_nodes(layout))
-    return scipy.sparse.vstack(layout.comm.allgather(part)).tocsr()[order][:, order]
+    return scipy.sparse.vstack(layout.comm.allgather(to_scipy(A))).tocsr()[order][:, order]
 
 
 def gather_mesh(mesh: Any) -> tuple[Array, NDArray[np.int64]]:

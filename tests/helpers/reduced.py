@@ -13,7 +13,8 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import total
 from softgrasp.fem.run.motion import force_values
-from softgrasp.fem.run.simulate import Trajectory, simulate
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.basis import Basis
 from softgrasp.reduction.model import ReducedModel, SmallModel

@@ -12,6 +12,7 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
+from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
@@ -47,7 +48,7 @@ def make_problem(model: Model) -> RiccatiProblem:
     C_z = np.zeros((system.layout.n_local, 2), order="F")
     for row in tip.dofs:
         C_z[row, [0, 1]] = tip.weight
-    return RiccatiProblem(system, tip.C_s, C_z, Q * np.eye(2), R * np.eye(system.layout.n_s), ("tip_x", "tip_y"))
+    return RiccatiProblem(system, tip.C_s, C_z, Q * np.eye(2), R * np.eye(system.layout.n_s), hand_columns(2, 2, "tip"))
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from softgrasp.fem.fields.strain import magnified
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.forward.cautions import magnified, run_warnings
+from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.hardcases.cases import make
 
 pytestmark = pytest.mark.serial

@@ -12,18 +12,21 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.effects.sag import SMALL_SHARE
-from softgrasp.fem.fields.strain import gradient
+from softgrasp.fem.fields.strain import gradient, slowest
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import factor_bytes
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
-from softgrasp.study.forward.cautions import inexact, run_warnings, slowest
-from softgrasp.study.forward.explain import Explanation, explain, render, run_explain
+from softgrasp.study.forward.cautions import inexact, run_warnings
+from softgrasp.study.forward.explain import Explanation, explain
+from softgrasp.study.forward.explain_page import render, run_explain, sections
 from softgrasp.study.report.equation import equation
+from softgrasp.study.shell.ending import console
 from tests.helpers.models import make_scene
 
 FORCE = {"target": [1.0, 0.0], "drive": "force"}
@@ -246,9 +249,9 @@ def test_factor_estimate(comm: MPI.Intracomm, cells: list[int]) -> None:
 
 
 def text_of(result: Explanation, width: int) -> str:
-    console = Console(file=io.StringIO(), width=width, color_system=None)
-    render(result, console)
-    return console.file.getvalue()  # type: ignore[attr-defined]
+    terminal = Console(file=io.StringIO(), width=width, color_system=None)
+    render(result, sections(result), terminal)
+    return terminal.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_text_and_json(comm: MPI.Intracomm) -> None:
@@ -265,7 +268,6 @@ def test_text_and_json(comm: MPI.Intracomm) -> None:
     assert data["effects"]["gravity"]["gate"]["matters"] is True
 
 
-def test_only_rank_zero_writes(comm: MPI.Intracomm) -> None:
-    file = io.StringIO()
-    run_explain(scene_of(), comm, Console(file=file, width=80))
-    assert bool(file.getvalue()) == (comm.rank == 0)
+def test_only_rank_zero_writes(comm: MPI.Intracomm, capsys: pytest.CaptureFixture[str]) -> None:
+    run_explain(shipped_scenes()["paper_forward"], None, ["tissue.cells=[3,6]"], console())
+    assert ("n_e =" in capsys.readouterr().out) == (comm.rank == 0)

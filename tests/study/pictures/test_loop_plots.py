@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from softgrasp.fem.model.outputs_named import farthest
+from softgrasp.fem.columns import OutputColumn, farthest, hand_columns
 from softgrasp.study.pictures import loop as loop_plots
 from softgrasp.study.pictures.loop import figure_decay, figure_histories, still_to_come
 from softgrasp.study.pictures.shapes import move_steps
@@ -40,7 +40,7 @@ U = np.stack([np.exp(-TIMES[:-1]), -3.0 * np.exp(-TIMES[:-1])], axis=1)
 
 def test_histories_show_the_numbers(tmp_path: Path, drawn: list[Any]) -> None:
     files = figure_histories(
-        TIMES, Y, U, ("tip_x", "tip_y"), tmp_path / "h.png", target=[2.0, 1.0], limits=2.0, settle=10.0,
+        TIMES, Y, U, hand_columns(2, 2, "tip"), tmp_path / "h.png", target=[2.0, 1.0], limits=2.0, settle=10.0,
         others={"N = 8": (Y, U)},
     )  # fmt: skip
     assert [f.suffix for f in files] == [".png", ".pdf"]
@@ -61,7 +61,15 @@ def test_histories_show_the_numbers(tmp_path: Path, drawn: list[Any]) -> None:
 
 def test_torques_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None:
     limits = [2.0, np.inf, 0.5]
-    figure_histories(TIMES, Y, np.hstack([U, U[:, :1]]), ("a", "b"), tmp_path / "t.png", dimension=2, limits=limits)
+    figure_histories(
+        TIMES,
+        Y,
+        np.hstack([U, U[:, :1]]),
+        (OutputColumn("a"), OutputColumn("b")),
+        tmp_path / "t.png",
+        dimension=2,
+        limits=limits,
+    )
     _, force, torque = drawn[0].axes
     assert {line.get_ydata()[0] for line in force.lines[2:]} == {-2.0, 2.0}
     assert {line.get_ydata()[0] for line in torque.lines[1:]} == {-0.5, 0.5}
@@ -72,7 +80,7 @@ def test_torques_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None
 def test_long_runs_are_thinned(tmp_path: Path, drawn: list[Any]) -> None:
     t = np.linspace(0, 300, 300_001)
     y = np.sin(t)[:, None]
-    figure_histories(t, y, y[:-1], ("y",), tmp_path / "long.png", target=[0.0])
+    figure_histories(t, y, y[:-1], (OutputColumn("y"),), tmp_path / "long.png", target=[0.0])
     assert len(drawn[0].axes[0].lines[0].get_xdata()) <= 2 * loop_plots.MANY_POINTS
 
 
@@ -111,7 +119,7 @@ def test_decay_of_few_poles(tmp_path: Path, poles: np.ndarray) -> None:
 
 def test_rotations_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> None:
     """Radians are not drawn as metres, and no two outputs of one panel share a colour."""
-    names = (*(f"tip_{a}" for a in "xyz"), *(f"hand_{a}" for a in "xyz"), *(f"hand_r{a}" for a in "xyz"))
+    names = (*hand_columns(3, 3, "tip"), *hand_columns(6, 3))
     y = np.outer(1 - np.exp(-TIMES), np.arange(1.0, 10.0))
     figure_histories(TIMES, y, U, names, tmp_path / "r.png", target=np.arange(1.0, 10.0))
     top, turn, force, _ = drawn[0].axes
@@ -123,7 +131,16 @@ def test_rotations_get_axes_of_their_own(tmp_path: Path, drawn: list[Any]) -> No
 
 
 def test_distance_is_that_of_the_farthest_output() -> None:
-    y, names = np.array([[3.0, 4.0, 6.0, 0.0, 9.0]]), ("tip_x", "tip_y", "hand_x", "hand_y", "hand_rz")
+    y, names = (
+        np.array([[3.0, 4.0, 6.0, 0.0, 9.0]]),
+        (
+            OutputColumn("tip", "x"),
+            OutputColumn("tip", "y"),
+            OutputColumn("hand", "x"),
+            OutputColumn("hand", "y"),
+            OutputColumn("hand", "rz"),
+        ),
+    )
     assert farthest(y, np.zeros(5), names).tolist() == [6.0]
     assert farthest(y[:, 4:], np.zeros(1), names[4:]).tolist() == [9.0]  # nothing but a rotation
-    assert farthest(y[:, :2], np.zeros(2), ("a", "b")).tolist() == [5.0]
+    assert farthest(y[:, :2], np.zeros(2), (OutputColumn("a"), OutputColumn("b"))).tolist() == [5.0]

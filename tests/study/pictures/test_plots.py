@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageChops
 
+from softgrasp.fem.columns import OutputColumn
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.animation import gif_move, speed_up
 from softgrasp.study.pictures.body import figure_move
@@ -116,16 +117,20 @@ def test_traces_draw_hand_and_output(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 50)
     q = np.stack([t, t**2, 0.1 * t], axis=1)
     y = q[:, :2] + 0.01 * np.sin(9 * t)[:, None]
-    names = ("tip_x", "tip_y")
+    names = (OutputColumn("tip", "x"), OutputColumn("tip", "y"))
     png, pdf = figure_traces(t, y, names, q[:, :2], tmp_path / "a.png")
     turned, _ = figure_traces(t, y, names, q, tmp_path / "b.png", rigid=q[:, :2], dimension=2)
     assert len(colours(png)) > 30
     assert pdf.stat().st_size > 1000
     assert Image.open(turned).height > Image.open(png).height  # a panel for the angle
     both = np.hstack([y, q[:, :2]])  # the hand as an output too: drawn once, so the picture is the same
-    again, _ = figure_traces(t, both, (*names, "hand_x", "hand_y"), q[:, :2], tmp_path / "c.png")
+    again, _ = figure_traces(
+        t, both, (*names, OutputColumn("hand", "x"), OutputColumn("hand", "y")), q[:, :2], tmp_path / "c.png"
+    )
     assert ImageChops.difference(Image.open(again).convert("RGB"), Image.open(png).convert("RGB")).getbbox() is None
-    alone, _ = figure_traces(t, q[:, :2], ("hand_x", "hand_y"), q[:, :2], tmp_path / "d.png")
+    alone, _ = figure_traces(
+        t, q[:, :2], (OutputColumn("hand", "x"), OutputColumn("hand", "y")), q[:, :2], tmp_path / "d.png"
+    )
     assert Image.open(alone).height < Image.open(png).height  # nothing moves relative to the hand
 
 
@@ -256,13 +261,13 @@ class Page(HTMLParser):
 
 def test_report_is_one_balanced_page(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 9)
-    png, _ = figure_traces(t, t[:, None], ("tip_x",), t[:, None] * [1.0, 0.0], tmp_path / "a.png")
+    png, _ = figure_traces(t, t[:, None], (OutputColumn("tip", "x"),), t[:, None] * [1.0, 0.0], tmp_path / "a.png")
     table = Section(
         "Errors", "First.\n\nSecond <b>.", header=("N", "error", "ok"), rows=[(4, 1.25e-7, True), (6, None, False)]
     )
     path = write_report(
-        tmp_path / "r.html", title="A & B", subtitle="s", tables=[("Short", [("a", 1)])], figures=[(png, "caption")],
-        sections=[table], scene=SCENE, reproduce="softgrasp reduce x.toml",
+        tmp_path / "r.html", title="A & B", subtitle="s", scene=SCENE, reproduce="softgrasp reduce x.toml",
+        sections=[Section("", figures=[(png, "caption")]), Section("Short", rows=[("a", 1)]), table],
     )  # fmt: skip
     page = Page(path.read_text())
     assert not page.open
