@@ -16,7 +16,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import gain_error, reduce_riccati
 from softgrasp.study.control.result import TITLES, report_dict
-from softgrasp.study.control.sweep import timed
+from softgrasp.study.control.sweep import with_time
 from softgrasp.study.precision.fit import Slope, power_law
 from softgrasp.study.precision.points import Row, WorkPoint, number
 from softgrasp.study.precision.riccati import CLOSE, SECOND, ControlRuns
@@ -82,7 +82,7 @@ def _order(runs: ControlRuns, family: BasisFamily, N: int) -> Row:
 
     Keys: those of :func:`study.control.sweep.report_dict`, seconds, time_lift.
     """
-    report = timed(runs.problem, runs.design.judge.report(family.at(N)))
+    report = with_time(runs.problem, runs.design.judge.report(family.at(N)))
     row = report_dict(report) | {"seconds": None, "time_lift": 0.0}
     if report.reason:
         return row
