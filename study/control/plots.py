@@ -12,11 +12,12 @@ from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.orders import BasisGains, fast_order
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned, a_priori
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.pictures.loop import Array, Poles, figure_decay, figure_histories, figure_loop_move
+from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories, figure_loop_move
 from softgrasp.study.pictures.style import (
     BLUE,
     COLUMN,
