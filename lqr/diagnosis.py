@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -62,14 +63,17 @@ class Diagnosis:
         """Whether a Riccati solver should be started."""
         return all(f.kind != "error" for f in self.findings)
 
-    def require(self) -> None:
+    def require(self, but: Collection[str] = ()) -> None:
         """Go on only when solvable. Not collective.
+
+        Args:
+            but: topics whose errors do not matter.
 
         Raises:
             ControlError: with the first error's sentence.
         """
         for finding in self.findings:
-            if finding.kind == "error":
+            if finding.kind == "error" and finding.topic not in but:
                 raise ControlError(finding.sentence)
 
 

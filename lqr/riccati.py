@@ -107,6 +107,9 @@ def solve(
         progress: observer of the iteration.
         checkpoint: folder for restart files.
 
+    Returns:
+        Factor Z, ``rank`` columns of the size of the state, gain K = -R^{-1} B'XE, true residual, method and reason.
+
     Raises:
         ControlError: weights or data are refused, or some mode cannot be stabilised.
         SolverError: not converged, or the true residual misses the tolerance.

@@ -15,7 +15,6 @@ from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
@@ -84,9 +83,7 @@ def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
     plant = problem(model)
     diagnosis = diagnose(plant)
     modal = model.scene.control is not None and model.scene.control.method == "modal"
-    for finding in diagnosis.findings:
-        if finding.kind == "error" and not (modal and finding.topic == "damping"):
-            raise ControlError(finding.sentence)
+    diagnosis.require(but=("damping",) if modal else ())
     return plant, diagnosis, modal
 
 

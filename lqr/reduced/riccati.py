@@ -99,7 +99,13 @@ def full_gain(problem: RiccatiProblem, basis: RiccatiBasis, P_N: Array) -> Gain:
 
 
 def reduce_riccati(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedRiccati:
-    """Scale to energy, project, solve the reduced equation on rank 0, and expand its gain. Collective.
+    """A_N'P_N E_N + E_N'P_N A_N - E_N'P_N B_N R^{-1} B_N'P_N E_N + C_N'Q C_N = 0 and its gain [SBRH21]. Collective.
+
+    The basis is scaled to energy first, and the equation is solved on rank 0.
+
+    Args:
+        problem: the plant of full order.
+        basis: costates W and states U of N columns.
 
     Raises:
         ControlError: the reduced equation has no stabilising solution.

@@ -48,6 +48,7 @@ QUANTITIES = (
 TOP = 1.0  # errors above 100 % are not drawn
 LOWEST = 1e-12  # smaller excess cost is rounding
 SHOWN_MODES = 20
+CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.2, "color": UNSTABLE}
 
 
 def drawn(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
@@ -70,17 +71,14 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, Pa
         figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 3.1), layout="constrained", sharex=True)
         for ax, (key, label) in zip(axes, QUANTITIES, strict=True):
             for j, s in enumerate(ran):
-                colour, dashes, marker = LOOKS.get(s.name, (HAND, ":", "x"))
-                look: dict[str, Any] = {"color": colour, "marker": marker, "ms": 3.4, "mfc": "none", "mew": 0.9}
-                ax.plot(*drawn(s, key), ls=dashes, lw=1.1, **look)
+                ax.plot(*drawn(s, key), **_look(s))
                 N, values = unstable(s, key)
                 bad |= bool(N)
-                ax.plot(N, values, ls="", marker="x", ms=6.0, mew=1.2, color=UNSTABLE, zorder=4)
+                ax.plot(N, values, zorder=4, **CROSS)
                 edge = [n + 0.6 * (j - 2) for n, v in zip(N, values, strict=True) if np.isnan(v)]  # methods may meet
-                if edge:
-                    place = {"transform": ax.get_xaxis_transform(), "clip_on": False, "ls": "", "in_layout": False}
+                place = {"transform": ax.get_xaxis_transform(), "clip_on": False, "in_layout": False}
+                for look in (_look(s) | {"ls": ""}, CROSS) if edge else ():
                     ax.plot(edge, [1.0] * len(edge), **place, **look)
-                    ax.plot(edge, [1.0] * len(edge), marker="x", ms=6.0, mew=1.2, color=UNSTABLE, **place)
             ax.set_yscale("log")
             ax.set_ylim(top=2.5 * TOP)
             ax.yaxis.set_major_locator(LogLocator(numticks=12))
@@ -94,38 +92,14 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, Pa
         return save(figure, out_png)
 
 
+def _look(basis: BasisGains) -> dict[str, Any]:
+    colour, dashes, marker = LOOKS[basis.name]
+    return {"color": colour, "ls": dashes, "marker": marker, "ms": 3.4, "mfc": "none", "mew": 0.9, "lw": 1.1}
+
+
 def _entries(ran: Sequence[BasisGains], bad: bool) -> list[Line2D]:
-    entries = []
-    for s in ran:
-        colour, dashes, marker = LOOKS.get(s.name, (HAND, ":", "x"))
-        entries.append(
-            Line2D(
-                [],
-                [],
-                color=colour,
-                ls=dashes,
-                marker=marker,
-                ms=3.4,
-                mfc="none",
-                mew=0.9,
-                lw=1.1,
-                label=TITLES[s.name],
-            )
-        )
-    if bad:
-        entries.append(
-            Line2D(
-                [],
-                [],
-                ls="",
-                marker="x",
-                ms=6.0,
-                mew=1.2,
-                color=UNSTABLE,
-                label="unstable loop; on the edge: error > 1",
-            )
-        )
-    return entries
+    entries = [Line2D([], [], label=TITLES[s.name], **_look(s)) for s in ran]
+    return [*entries, Line2D([], [], label="unstable loop; on the edge: error > 1", **CROSS)] if bad else entries
 
 
 def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, Path]:

@@ -70,7 +70,7 @@ def run_control(
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         notes = [Note("table", sentence)] if sentence else []
-        study, frames = control_model(model, out, watch, bar, notes, pictures, restart)
+        study, frames = control_model(session, model, watch, bar, notes, restart)
     fields = frames.close()
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
@@ -111,23 +111,16 @@ def restart_folder(model: Model, out: Path) -> Path | None:
 
 
 def control_model(
-    model: Model,
-    out: Path,
-    watch: Stopwatch,
-    bar: Progress,
-    notes: list[Note],
-    pictures: bool,
-    restart: Path | None = None,
+    session: Session, model: Model, watch: Stopwatch, bar: Progress, notes: list[Note], restart: Path | None = None
 ) -> tuple[ControlStudy, Frames]:
     """Solve, reduce, re-tune and close the loop. Collective.
 
     Args:
+        session: where field files go, and whether frames are kept.
         model: the scene, with a control table.
-        out: where field files go.
         watch: takes the seconds of the stages.
         bar: shows what is done.
         notes: what is to be said in the report; more is added to the result.
-        pictures: keep frames.
         restart: folder for the solver's restart files.
 
     Raises:
@@ -160,7 +153,7 @@ def control_model(
         notes.append(Note("sampling", f"the loop from tick to tick is not certified: {sampled.reason}"))
     duration = plan(feedback, own_end)
     notes += [Note("end", duration.note)] if duration.note else []
-    frames = Frames(model, out, pictures)
+    frames = Frames(model, session.out, session.pictures)
     with watch.stage("loop"):
         loops = run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
     return ControlStudy(feedback, bases, retuned, controller, tick, loops, tuple(notes)), frames

@@ -29,10 +29,10 @@ BOX_STATES = 30_000  # above, nine more full solutions would take minutes
 def sweep(design: Design, orders: Sequence[int], notify: Notify | None = None) -> tuple[BasisGains, ...]:
     """All bases over their orders, see :func:`lqr.design.orders.reduce_gains`, with times. Collective."""
     bases = reduce_gains(design, orders, notify)
-    return tuple(replace(b, reports=tuple(timed(design.problem, r) for r in b.reports)) for b in bases)
+    return tuple(replace(b, reports=tuple(with_time(design.problem, r) for r in b.reports)) for b in bases)
 
 
-def timed(problem: RiccatiProblem, report: GainReport) -> GainReport:
+def with_time(problem: RiccatiProblem, report: GainReport) -> GainReport:
     """With the seconds of one solution of its reduced equation. Collective."""
     matrices = report.matrices
     if matrices is None:

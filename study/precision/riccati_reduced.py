@@ -15,7 +15,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import ReducedRiccati, gain_error, reduce_riccati
 from softgrasp.study.control.result import TITLES, report_dict
-from softgrasp.study.control.sweep import timed as timed_report
+from softgrasp.study.control.sweep import with_time
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import ReducedRiccatiPoint
 from softgrasp.study.precision.result import Question, ReducedReference
@@ -61,7 +61,7 @@ def _family(runs: ControlRuns, name: str) -> list[ReducedRiccatiPoint]:
 
 def _order(runs: ControlRuns, family: BasisFamily, N: int, time_basis: float, before: float) -> ReducedRiccatiPoint:
     """One reduced equation: cost of its gain, median seconds to solve it, and those to project and lift. Collective."""
-    report = timed_report(runs.problem, runs.design.judge.report(family.at(N)))
+    report = with_time(runs.problem, runs.design.judge.report(family.at(N)))
     seconds, lift = float("inf"), 0.0
     if not report.reason:
         solutions: list[ReducedRiccati] = []
