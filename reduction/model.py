@@ -68,14 +68,17 @@ class Outputs:
 
 @dataclass(frozen=True)
 class SmallModel:
-    """E x' = A x + B u + f at one parameter; everything that a run needs, nothing of full order.
+    """E x' = A x + B u + f, q_s = S_q x, v_s = S_v x, y = C_z x + C_s q_s at one parameter, of dimension N.
+
+    Everything that a run needs, nothing of full order. The state x has no unit of its own: with fixed solid modes its
+    first 2 n_s entries are q_s [m, rad] and v_s [m/s, rad/s].
 
     Attributes:
         name: of the basis.
-        operators: E, A, B, readouts of the hand and energies.
+        operators: E, A (N, N), B (N, n_s), readouts of the hand and energies.
         f: load of gravity, (N,).
-        outputs: y = C_z x + C_s q_s.
-        M_hand: hand mass matrix, (n_s, n_s).
+        outputs: C_z (p, N) and C_s (p, n_s) [m].
+        M_hand: hand mass matrix, (n_s, n_s) [kg, kg m^2].
         fixed_solid: the first 2 n_s coordinates are q_s and v_s.
         two_way: the hand feels the tissue.
         structured: without damping the model conserves its energy by construction.
@@ -175,7 +178,10 @@ class SmallModel:
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """Small matrices in lambda, mu, rho of every layer and in gravity: a new parameter costs no full-order work.
+    """E x' = A x + B u + F g for all lambda, mu, rho of every layer: a new parameter costs no full-order work.
+
+    The matrices are sums over the layers, A = A_0 + sum_l lambda_l A_lambda,l + mu_l A_mu,l and so on, which
+    :meth:`at` assembles; a run needs the :class:`SmallModel` that it returns.
 
     Attributes:
         name: of the basis.

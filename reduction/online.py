@@ -53,7 +53,9 @@ def run(
     x0: Array | None = None,
     allow_unstable: bool = False,
 ) -> ReducedTrajectory:
-    """Run for given forces, or a prescribed hand. Online; not collective.
+    """Midpoint steps E (x_1 - x_0) / dt = A (x_0 + x_1) / 2 + B u + f of a small model. Online; not collective.
+
+    They equal the full model's steps [HLW06], so that structure and errors carry over; many are taken in one product.
 
     Args:
         model: small model, or a propagator made beforehand.
@@ -129,7 +131,9 @@ def trajectory(step: Propagator, w: Array, hand: tuple[Array, Array] | None) -> 
 
 
 class Stepper:
-    """One step a call, for a control loop: u goes in, the outputs come out; nothing is allocated but the result.
+    """One midpoint step a call, for a control loop: u (n_s,) [N, N m] goes in, y (p,) [m] comes out.
+
+    One product with a prefactored matrix of (N + p) x (N + n_s + 1) a step; nothing is allocated.
 
     Args:
         model: small model, or a propagator made beforehand.

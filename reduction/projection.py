@@ -47,7 +47,10 @@ def project(
     outputs: Sequence[OutputLike] = (),
     scene_hash: str = "",
 ) -> ReducedModel:
-    """Reduced model of a basis: (q, v) Galerkin, or canonical when the basis is in (q, p). Collective.
+    """Reduced model E x' = A x + B u + F g, y = C_z x + C_s q_s of a basis V of shape (2n, N). Collective.
+
+    A basis in (q, v) gives the paper's Galerkin model with W = V [SBRH21] (`reduction.galerkin`), one in (q, p) a
+    canonical model that is Hamiltonian, or dissipative with damping [AH19] (`reduction.canonical`).
 
     Costs a product with every component for each basis vector; a canonical model also one factorisation of M_ee and a
     solve for each vector with a momentum.

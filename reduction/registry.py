@@ -132,12 +132,16 @@ def make_basis(
     inner: InnerName | None = None,
     engine: EngineName = "tsqr",
 ) -> Basis:
-    """Build one basis. Collective.
+    """V of shape (2n, N) from snapshots X: POD minimises |X - V V^+ X|_F, PSD does under V' J V = J. Collective.
+
+    Sources: the six of :data:`PAPER_METHODS` [SBRH21]; complex SVD and cotangent lift [PM16]; SVD-like pairs [BBH19];
+    inner products [AH19]; Craig-Bampton [CB68], which needs no snapshots.
 
     Args:
         name: key of :data:`METHODS`.
-        states: system and snapshots.
-        size: N of the whole basis, or a rule; None keeps 99.9 % of the energy, as the paper does.
+        states: system and snapshots: z and v_z (2 n_local, m) [m, m/s] with the hand (n_s, m) of every run.
+        size: N of the whole basis, the hand's columns included, or a rule; None keeps 99.9 % of the energy, as the
+            paper does.
         inner: inner product; None takes that of the method: Euclidean for the paper's six and all in (q, v), energy for
             canonical bases beyond them, where it is ten times better. SVD-like pairs depend on it little.
         engine: engine of the tall factorisation.

@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.reduction.engines import EPS
+from softgrasp.reduction.states import BasisError
 
 # eigenvalues of X'JX carry an absolute error eps * |X|^2: a stage takes those that keep about ten digits
 STAGE = 1e-6
@@ -162,8 +163,17 @@ class _Pool:
 
 
 def symplectic_repair(B: Array) -> Array:
-    """C = (J^-1 B)^(-1/2) with C' B C = J for a skew B near J: S C is symplectic when S' J S = B. Not collective."""
-    return np.linalg.inv(np.real(scipy.linalg.sqrtm(-poisson(B))))
+    """C = (J^-1 B)^(-1/2) with C' B C = J for a skew B near J: S C is symplectic when S' J S = B. Not collective.
+
+    Raises:
+        BasisError: B is singular, far from J.
+    """
+    try:
+        return np.linalg.inv(np.real(scipy.linalg.sqrtm(-poisson(B))))
+    except np.linalg.LinAlgError as error:
+        raise BasisError(
+            "SVD-like pairs of these snapshots are linearly dependent to rounding; take a smaller N or another basis"
+        ) from error
 
 
 def _symplectic(S: Array) -> Array:

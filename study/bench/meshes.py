@@ -94,12 +94,12 @@ def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
     model = build(scene, comm=comm)
     run = simulate(model)
     steps = scene.time.steps
-    swept = sweep(scene.reduction.methods[0], full_run(model, run), scene.reduction)
-    if not swept.points:
-        refused = [f"N = {N}: {reason}" for N, reason in swept.refused.items()]
+    result = sweep(scene.reduction.methods[0], full_run(model, run), scene.reduction)
+    if not result.points:
+        refused = [f"N = {N}: {reason}" for N, reason in result.refused.items()]
         reason = next(iter(refused), f"reduction.N = {scene.reduction.N} fits no basis of this method")
         raise SoftgraspError(f"{scene.reduction.methods[0]}: {reason}")
-    point: Point = swept.points[0]
+    point: Point = result.points[0]
     return MeshRow(
         cells=scene.tissue.cells[0] if scene.tissue.cells else 0,
         n_e=model.system.layout.n_e,

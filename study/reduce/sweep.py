@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 
 import numpy as np
 from mpi4py import MPI
@@ -100,10 +101,7 @@ def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = 
         N=model.N,
         N_tissue=model.N - (2 * layout.n_s if model.fixed_solid else 0),
         split=model.split,
-        error_deformation=errors.error_deformation,
-        error=errors.error,
-        error_canonical=errors.error_canonical,
-        error_energy=errors.error_energy,
+        **asdict(errors),
         projection_error_deformation=comparison.floor("deformation", model, small),
         projection_error=comparison.floor("velocities", model, small),
         time_offline=float(layout.comm.allreduce(sum(model.seconds.values()), MPI.MAX)),

@@ -16,6 +16,7 @@ from softgrasp.reduction.inner import INNERS, InnerName, orthonormality, symplec
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.registry import METHODS, PAPER_METHODS, make_bases, make_basis
 from softgrasp.reduction.states import BasisError, states_of
+from softgrasp.reduction.svd_like import symplectic_repair
 from softgrasp.reduction.truncation import Truncation
 from tests.helpers.models import close, gather_rows
 from tests.helpers.snapshots import (
@@ -231,3 +232,8 @@ def test_solving_columns_undoes_the_matrix() -> None:
     X = c.snapshots.Z[: system.layout.n_local, 5:8]
     Y = gather_rows(system.layout, solve_columns(system.K_ee, system.layout, X))
     assert close(c.K @ Y, gather_rows(system.layout, X)) < 1e-11  # condition below 1e4
+
+
+def test_singular_pairs_are_refused_in_one_sentence() -> None:
+    with pytest.raises(BasisError, match="take a smaller N or another basis"):
+        symplectic_repair(np.zeros((4, 4)))
