@@ -58,7 +58,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 
 
 def at(points: list[dict[str, Any]], N: int) -> dict[str, Any]:
-    """The point whose N is nearest to the one wanted. Not collective."""
+    """The point whose N is nearest to a given one, the smaller of two."""
     return min(points, key=lambda p: (abs(p["N"] - N), p["N"]))
 
 
@@ -77,8 +77,8 @@ def forward_rows(forward: dict[str, Any], reduced: dict[str, Any]) -> list[Row]:
     points, speed = reduced["methods"], {row["method"]: row for row in reduced["speed"]}
     psd, about = at(points["psd"], N_FORWARD), reduced["about"]
     full = forward["time"]["factor"] + forward["time"]["steps"]
-    ours = [name for name in OF_PAPER if points.get(name)]
-    online = [p["time_online"] for name in ours for p in points[name]]
+    paper = [name for name in OF_PAPER if points.get(name)]
+    online = [p["time_online"] for name in paper for p in points[name]]
     return [
         ("states 2n", "1916", str(forward["states"]), "the same mesh, contact zone and elements"),
         ("full run, 600 steps", "16.22 s", number(full, " s"), "factored once, compiled kernels, another machine"),
@@ -108,9 +108,9 @@ def forward_rows(forward: dict[str, Any], reduced: dict[str, Any]) -> list[Row]:
             f"{number(psd['error_deformation'])} in the deformation",
             "hand mass and motion are not in the paper; in (q, p) the rigid motion hides the deformation",
         ),
-        ("N for 99.9 % of the energy", "used, not told", _energies(ours, about), "of the snapshots of each method"),
-        _best(points, about, ours),
-        _structure(points, ours),
+        ("N for 99.9 % of the energy", "used, not told", _energies(paper, about), "of the snapshots of each method"),
+        _best(points, about, paper),
+        _structure(points, paper),
         _flat(points["psd"]),
         (
             "stable at every N tried",
@@ -207,7 +207,7 @@ def control_rows(control: dict[str, Any]) -> list[Row]:
                 "0.053 s" if name == "pod" else "0.051 to 0.057 s" if name in (*FREE, *FIXED) else "not in the paper",
                 f"{number(p['time_are'], ' s')}; error of P {number(p['error_P'])}, of K {number(p['error_K'])}, "
                 + ("stable" if p["stable"] else "not stable"),
-                "a direct solver for the small equation; damping and hand mass are ours",
+                "a direct solver for the small equation; damping and hand mass are chosen here",
             )
         )
     return [*rows, _small(reduced)]

@@ -63,7 +63,7 @@ def reference_text(question: Question, paper: bool) -> str:
             text = f"Reference: {' and '.join(r.names)}; {apart}. No method is compared with itself."
             return text + (f" The paper: {PAPER_ARE} s, 2n = 880, on its own machine." if paper else "")
         case ReducedReference() as r:
-            text = f"Reference: the gain of {r.method.split(':')[0]} with the residual {r.residual:.1e}"
+            text = f"Reference: the gain by {r.method}, with the residual {r.residual:.1e}"
             if r.error is not None:
                 text += f"; the tightest solution of another method differs by {r.error:.1e}"
             text += f". The optimal cost from the scene's start is {r.optimal:.6g}."
