@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,12 +14,9 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from softgrasp.fem.columns import Array
+from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
 from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
-
-if TYPE_CHECKING:
-    from softgrasp.fem.fields.picture import PictureMesh
-
 
 MOST_FRAMES = 60
 SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them the animation runs slower or faster than the move

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -20,6 +20,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from softgrasp.fem.columns import Array
+from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.shapes import (
     AZIMUTH,
     chained,
@@ -46,10 +47,6 @@ from softgrasp.study.pictures.style import (
     paper_style,
     save,
 )
-
-if TYPE_CHECKING:
-    from softgrasp.fem.fields.picture import PictureMesh
-
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -15,12 +15,10 @@ import numpy.typing as npt
 from matplotlib.lines import Line2D
 
 from softgrasp.fem.columns import AXES, Array, Columns, farthest
+from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.shapes import pick_instants
 from softgrasp.study.pictures.style import CYCLE, OUTLINE, SKY, TARGET, WIDTH, length_unit, paper_style, save
-
-if TYPE_CHECKING:
-    from softgrasp.fem.fields.picture import PictureMesh
 
 Poles = npt.NDArray[np.complex128]
 

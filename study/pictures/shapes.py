@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from contourpy import contour_generator
 from PIL import Image, ImageDraw, ImageFilter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-if TYPE_CHECKING:
-    from softgrasp.fem.fields.picture import PictureMesh
-
-Array = npt.NDArray[np.float64]
-
+from softgrasp.fem.columns import Array
+from softgrasp.fem.fields.picture import PictureMesh
 
 ELEVATION, AZIMUTH = 18.0, -58.0  # view of 3D scenes [degree]
 MARGIN = 0.08  # of a body's smaller side, kept free between two bodies of one picture
