@@ -48,7 +48,7 @@ class BlockLayout:
         return bounding_box(self.comm, self.nodes)
 
     def rounded(self, lengths: Array) -> Array:
-        """Lengths on a decimal grid of about 1e-9 of the body, so that rounding makes no difference. Not collective."""
+        """Lengths on a decimal grid of about 1e-9 of the body, so that rounding makes no difference."""
         return np.asarray(np.round(lengths, 9 - int(np.floor(np.log10(self.extent)))))
 
     def nearest_node(self, point: Array) -> tuple[int, int, Array]:

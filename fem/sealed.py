@@ -34,7 +34,7 @@ class _Hashed(io.RawIOBase):
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> str:
-    """Write arrays and return the SHA-256 of the file, of what was meant to be in it. Not collective.
+    """Write arrays and return the SHA-256 of the file, of what was meant to be in it.
 
     Raises:
         OSError: the file cannot be written in full.
@@ -49,7 +49,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any]) -> str:
 
 
 def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str, Array]:
-    """Read arrays back. Not collective.
+    """Read arrays back.
 
     Args:
         path: the file.
@@ -71,7 +71,7 @@ def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str
 
 
 def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
-    """Put a manifest in place of the old one, with its own SHA-256. Not collective.
+    """Put a manifest in place of the old one, with its own SHA-256.
 
     Raises:
         OSError: it cannot be written; the old one stays.
@@ -85,7 +85,7 @@ def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
 
 
 def read_manifest(path: Path, format: int, advice: str = AGAIN) -> dict[str, Any]:
-    """Read a manifest back. Not collective.
+    """Read a manifest back.
 
     Raises:
         CheckpointError: it is missing, of another format, or not as it was written.
@@ -109,7 +109,7 @@ def read_manifest(path: Path, format: int, advice: str = AGAIN) -> dict[str, Any
 
 
 def remove_others(folder: Path, patterns: Iterable[str], kept: Iterable[str]) -> None:
-    """Remove the files of some patterns that a manifest does not name. Not collective."""
+    """Remove the files of some patterns that a manifest does not name."""
     names = set(kept)
     for pattern in patterns:
         for old in folder.glob(pattern):

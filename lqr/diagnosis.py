@@ -64,7 +64,7 @@ class Diagnosis:
         return all(f.kind != "error" for f in self.findings)
 
     def require(self, but: Collection[str] = ()) -> None:
-        """Go on only when solvable. Not collective.
+        """Go on only when solvable.
 
         Args:
             but: topics whose errors do not matter.

@@ -42,7 +42,7 @@ class Choice:
 
 
 def choose(problem: RiccatiProblem, method: Method = "auto") -> Choice:
-    """The method for a problem. Not collective.
+    """The method for a problem.
 
     Newton-ADI by default; RADI where damping couples the modes; Galerkin where complex factorisations no longer fit.
     Layers with different damping couple the modes of the start to those left out, so K_0 is off by that coupling,
@@ -72,7 +72,7 @@ def choose(problem: RiccatiProblem, method: Method = "auto") -> Choice:
 def make_solver(
     method: Method, tol: float | None = None, progress: Progress | None = None, checkpoint: Path | None = None
 ) -> Solver:
-    """The solver object. Not collective.
+    """The solver object.
 
     Args:
         method: any but auto.

@@ -65,7 +65,7 @@ def mass_solve(system: BlockSystem, *blocks: Array) -> list[Array]:
 
 
 def _rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array, Array]:
-    """S_q, rows of the hand's velocity or momentum, and L_q. Not collective."""
+    """S_q, rows of the hand's velocity or momentum, and L_q."""
     S_q, S_p = basis.V_sq, basis.V_sv
     if basis.fixed_solid:
         n_s = system.layout.n_s
@@ -129,7 +129,7 @@ def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Canonical
 
 
 def hand_velocity(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Array:
-    """S_v with v_s = S_v x, (n_s, N): the hand's own columns, or its momentum over its inertia. Not collective."""
+    """S_v with v_s = S_v x, (n_s, N): the hand's own columns, or its momentum over its inertia."""
     if fixed:
         return parts["S_p"]
     if not (p.two_way and absolute):
@@ -180,7 +180,7 @@ def _terms(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Terms:
 
 
 def canonical_operators(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Operators:
-    """E, A, B, F and the energies at one parameter; online. Not collective.
+    """E, A, B, F and the energies at one parameter; online.
 
     Args:
         parts: from :func:`canonical_parts`.

@@ -130,11 +130,11 @@ class Span:
         return R
 
     def error(self, R: Array, Y: Array) -> float:
-        """|X - V Y|_F / |X|_F for R from :meth:`inside`. Not collective."""
+        """|X - V Y|_F / |X|_F for R from :meth:`inside`."""
         return ratio(self.rest + squares(self.C - R @ Y), self.square)
 
     def floor(self, R: Array) -> float:
-        """min_Y |X - V Y|_F / |X|_F. Not collective.
+        """min_Y |X - V Y|_F / |X|_F.
 
         Nearly dependent columns keep all their digits: no Gram matrix is formed.
         """
@@ -233,7 +233,7 @@ class Comparison:
 
 
 def with_hand(small: SmallModel) -> Array:
-    """[I; S_q; S_v]: the hand that belongs to a reduced state, (N + 2 n_s, N). Not collective."""
+    """[I; S_q; S_v]: the hand that belongs to a reduced state, (N + 2 n_s, N)."""
     return np.vstack([np.eye(small.N), small.operators.S_q, small.operators.S_v])
 
 

@@ -20,7 +20,7 @@ from softgrasp.reduction.operators import Operators, Parameters, Parts
 
 
 def relative_rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array]:
-    """Displacement and second row block of every basis vector relative to the hand, local rows. Not collective."""
+    """Displacement and second row block of every basis vector relative to the hand, local rows."""
     if basis.frame == "relative":
         return basis.V_q, basis.V_p
     return (
@@ -74,7 +74,7 @@ def galerkin_parts(basis: Basis, system: BlockSystem) -> Parts:
 
 
 def galerkin_operators(parts: Parts, p: Parameters) -> Operators:
-    """E, A, B, F and the energies at one parameter; online. Not collective."""
+    """E, A, B, F and the energies at one parameter; online."""
     S_q, S_v, M_hand = parts["S_q"], parts["S_v"], parts["M_hand"]
     G, rigid = p.density(parts["WG"]), p.density(parts["rigid"])
     Z_G = p.density(parts["ZG"])

@@ -100,12 +100,12 @@ class Rows:
         return slice(start + half * n, start + (half + 1) * n)
 
     def fill(self, X: Array, half: int, s: Array, e: Array) -> None:
-        """Copy hand and tissue rows of one half into a stack. Not collective."""
+        """Copy hand and tissue rows of one half into a stack."""
         X[self.hand_rows(half)] = s[: self.top]
         X[self.tissue_rows(half)] = e
 
     def stack(self, *halves: tuple[Array, Array]) -> Array:
-        """Stack (hand, tissue) pairs, Fortran order. Not collective."""
+        """Stack (hand, tissue) pairs, Fortran order."""
         X = np.empty((self.local, halves[0][1].shape[1]), order="F")
         for half, (s, e) in enumerate(halves):
             self.fill(X, half, s, e)

@@ -93,7 +93,7 @@ class Modal:
     pull: Array
 
     def march(self, inputs: Array, start: Array) -> Array:
-        """States w of all steps, (steps + 1, k), for inputs (steps, i) and a start (k,). Not collective."""
+        """States w of all steps, (steps + 1, k), for inputs (steps, i) and a start (k,)."""
         steps, pairs, moved = len(inputs), 2 * len(self.angle), self.pull.shape[1]
         w = np.empty((steps + 1, len(start)))
         turn = turns(self.angle, steps)
@@ -115,17 +115,14 @@ class Modal:
 
 
 def turns(angle: Array, steps: int) -> Array:
-    """e^{i a n} for n = 0 .. steps, (steps + 1, m), of modulus 1 to a few roundings whatever n is. Not collective."""
+    """e^{i a n} for n = 0 .. steps, (steps + 1, m), of modulus 1 to a few roundings whatever n is."""
     coarse = np.exp(1j * np.outer(TURNS * np.arange(steps // TURNS + 1), angle))
     fine = np.exp(1j * np.outer(np.arange(TURNS), angle))
     return np.asarray((coarse[:, None] * fine).reshape(-1, len(angle))[: steps + 1])
 
 
 def modal_of(at: Coordinates, E: Array, A: Array, loads: Array, dt: float) -> Modal | None:
-    """The steps of E x' = A x + loads [u; 1] mode by mode; None where the modes do not move by themselves.
-
-    Not collective.
-    """
+    """The steps of E x' = A x + loads [u; 1] mode by mode; None where the modes do not move by themselves."""
     if at.still is None or at.first:
         return None
     pairs = 2 * len(at.omega)

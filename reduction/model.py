@@ -27,7 +27,7 @@ class UnstableModelError(SoftgraspError):
 
 
 def singular(X: Array) -> bool:
-    """Whether a square matrix is singular to rounding once its rows and columns are balanced. Not collective."""
+    """Whether a square matrix is singular to rounding once its rows and columns are balanced."""
     sizes = np.abs(X)
     rows, columns = (np.sqrt(np.where(m > 0, m, 1.0)) for m in (sizes.max(axis=1), sizes.max(axis=0)))
     values = np.linalg.svd(X / np.outer(rows, columns), compute_uv=False)
@@ -112,7 +112,7 @@ class SmallModel:
 
     @cached_property
     def spectrum(self) -> Spectrum:
-        """Eigenvalues without the exact zeros of the free hand. Not collective.
+        """Eigenvalues without the exact zeros of the free hand.
 
         Raises:
             ModelError: E is singular, as with linearly dependent columns.
@@ -124,7 +124,7 @@ class SmallModel:
         return replace(result, zeros=self.N - len(result.eigenvalues))
 
     def check_independent(self) -> None:
-        """Refuse a singular E, which LAPACK need not notice. Not collective.
+        """Refuse a singular E, which LAPACK need not notice.
 
         Raises:
             ModelError: E is singular to rounding, as with linearly dependent columns.
@@ -258,7 +258,7 @@ class ReducedModel:
         )
 
     def parameters(self, materials: tuple[LayerMaterial, ...]) -> Parameters:
-        """Check materials and bundle them with the effects of the scene. Not collective.
+        """Check materials and bundle them with the effects of the scene.
 
         Raises:
             ModelError: wrong number of layers, an impossible value, densities that are no common multiple of those of
@@ -284,7 +284,7 @@ class ReducedModel:
         return Parameters(materials, self.alpha, self.damped, self.in_space, self.hand_weight, self.two_way, scale)
 
     def reconstruct(self, small: SmallModel, x: Array, v_s: Array | None = None) -> tuple[Array, Array]:
-        """Relative tissue states of reduced states x (N, m): z and v_z, local rows (n_local, m). Not collective.
+        """Relative tissue states of reduced states x (N, m): z and v_z, local rows (n_local, m).
 
         Args:
             small: the parameter that x was computed at.

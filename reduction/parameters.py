@@ -20,7 +20,7 @@ MU_SHARES = (0.4, 10.0)
 
 
 def box_of(model: Model) -> tuple[list[float], list[float]]:
-    """Ranges of lambda and mu of the first layer [Pa]: the scene's, or shares of its own constants. Not collective."""
+    """Ranges of lambda and mu of the first layer [Pa]: the scene's, or shares of its own constants."""
     ranges, first = model.scene.reduction, model.system.materials[0]
     lam, mu = ranges.lambda_range, ranges.mu_range
     return lam or [share * first.lam for share in LAMBDA_SHARES], mu or [share * first.mu for share in MU_SHARES]
@@ -74,7 +74,7 @@ def run_at(model: Model, lam: float, mu: float) -> FullRun:
 
 
 def thinned(snapshots: Snapshots, count: int) -> Snapshots:
-    """About ``count`` of the snapshots, evenly spread, first and last among them. Not collective."""
+    """About ``count`` of the snapshots, evenly spread, first and last among them."""
     m = snapshots.Z.shape[1]
     pick = np.unique(np.linspace(0, m - 1, min(count, m)).round().astype(int))
     return replace(

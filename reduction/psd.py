@@ -52,7 +52,7 @@ class Canonical:
     lift: bool
 
     def vectors(self, C: Array) -> Array:
-        """Q L^-T C, local rows. Not collective."""
+        """Q L^-T C, local rows."""
         return np.asfortranarray(self.factor.Q @ (C if self.inverse is None else self.inverse @ C))
 
     def weigh(self, X: Array) -> Array:

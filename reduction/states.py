@@ -103,7 +103,7 @@ class States:
 
 
 def states_of(system: BlockSystem, snapshots: Snapshots | None = None) -> States:
-    """States of one run, or of none. Not collective."""
+    """States of one run, or of none."""
     return States(system, () if snapshots is None else ((system, snapshots),))
 
 

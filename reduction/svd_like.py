@@ -21,13 +21,13 @@ DROP = 0.1  # directions without partner are taken together down to this share o
 
 
 def poisson(Y: Array) -> Array:
-    """J Y for rows (q; p), J = [0 I; -I 0]. Not collective."""
+    """J Y for rows (q; p), J = [0 I; -I 0]."""
     q, p = np.split(Y, 2)
     return np.vstack([p, -q])
 
 
 def form(X: Array, Y: Array) -> Array:
-    """X' J Y. Not collective."""
+    """X' J Y."""
     return X.T @ poisson(Y)
 
 
@@ -163,7 +163,7 @@ class _Pool:
 
 
 def symplectic_repair(B: Array) -> Array:
-    """C = (J^-1 B)^(-1/2) with C' B C = J for a skew B near J: S C is symplectic when S' J S = B. Not collective.
+    """C = (J^-1 B)^(-1/2) with C' B C = J for a skew B near J: S C is symplectic when S' J S = B.
 
     Raises:
         BasisError: B is singular, far from J.
@@ -189,7 +189,7 @@ def _symplectic(S: Array) -> Array:
 
 
 def balanced(S: Array, T: Array) -> tuple[Array, Array]:
-    """Rotate every pair (s, t) so that |s| = |t|; s'Jt and the span stay. Not collective.
+    """Rotate every pair (s, t) so that |s| = |t|; s'Jt and the span stay.
 
     s cos + t sin and -s sin + t cos have equal norms when tan(2 phi) = (|s|^2 - |t|^2) / (-2 s't).
     """

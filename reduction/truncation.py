@@ -23,7 +23,7 @@ class Columns:
     e_p: Array
 
     def first(self, k: int) -> Columns:
-        """The leading k columns. Not collective."""
+        """The leading k columns."""
         return Columns(self.s_q[:, :k], self.s_p[:, :k], self.e_q[:, :k], self.e_p[:, :k])
 
 
@@ -82,7 +82,7 @@ class Truncation:
 
 
 def needed(sigma: Array, total: float, share: float) -> int | None:
-    """Smallest k whose dropped tail is at most ``share`` of the total; None if sigma ends before. Not collective."""
+    """Smallest k whose dropped tail is at most ``share`` of the total; None if sigma ends before."""
     if total <= 0:
         return 0
     # from the small end: total minus a running sum would lose the tail to rounding
@@ -98,7 +98,7 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
     """Share N - hand columns equally among the parts, the first ones taking one more where it does not divide.
 
     What a part cannot carry goes to the others. Displacement and velocity need equally many vectors, whatever their
-    singular values say: a displacement without its velocity cannot move. Not collective.
+    singular values say: a displacement without its velocity cannot move.
 
     Args:
         parts: families of units.
@@ -134,7 +134,7 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
 
 
 def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, name: str) -> tuple[int, ...]:
-    """Units of every part by the rule; parts are equal, so that each keeps at least its share. Not collective.
+    """Units of every part by the rule; parts are equal, so that each keeps at least its share.
 
     Raises:
         BasisError: N does not fit, or the rule asks for more than the rank.

@@ -227,7 +227,7 @@ def _small(reduced: dict[str, Any]) -> Row:
 
 
 def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
-    """paper.html and paper.json from the results of the three commands. Not collective.
+    """paper.html and paper.json from the results of the three commands.
 
     Raises:
         OSError: a file cannot be written.

@@ -99,7 +99,7 @@ def reduced(model: Model) -> Small:
 def difference(small: Small, other: Small, finer: Array, coarse: Array) -> tuple[float, Array]:
     """Largest difference of two runs over the largest deformation [1], and the difference (steps + 1, p).
 
-    Outputs that are the hand's count only where there are no others. Not collective.
+    Outputs that are the hand's count only where there are no others.
     """
     tissue = np.abs(small.C).max(axis=1) + np.abs(other.C).max(axis=1) > 0
     if not tissue.any():
@@ -117,7 +117,7 @@ def next_order(model: Model) -> Model:
 
 
 def comparison(scene: Scene, tolerance: float) -> Scene:
-    """The scene on a graded mesh of quadratic elements or better. Not collective."""
+    """The scene on a graded mesh of quadratic elements or better."""
     tissue = scene.tissue
     refine = Refine(tolerance=tolerance, most=MOST_COMPARED[scene.dimension or 3])
     return _with(scene, tissue.model_copy(update={"order": max(2, tissue.order), "refine": refine}))

@@ -63,7 +63,7 @@ class Small:
 
 
 def output_columns(outputs: tuple[Output, ...], n_local: int) -> Array:
-    """C' of all outputs, local rows (n_local, p). Not collective."""
+    """C' of all outputs, local rows (n_local, p)."""
     columns = []
     for output in outputs:
         for c in range(output.size):
@@ -149,7 +149,7 @@ class SmallRun:
 
 
 def run_small(small: Small, steps: int | None = None) -> SmallRun:
-    """Run the scene's motion or force with the midpoint rule, as the full model does. Not collective.
+    """Run the scene's motion or force with the midpoint rule, as the full model does.
 
     Args:
         small: the model.

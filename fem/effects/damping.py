@@ -26,12 +26,12 @@ def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[Lay
 
 
 def ratios(alpha: float, beta: float, omega: Array) -> Array:
-    """Damping ratios zeta_k = (alpha / omega_k + beta omega_k) / 2 of uniform damping. Not collective."""
+    """Damping ratios zeta_k = (alpha / omega_k + beta omega_k) / 2 of uniform damping."""
     return (alpha / omega + beta * omega) / 2
 
 
 def layered(scene: Scene) -> bool:
-    """Whether a layer has a Kelvin-Voigt time of its own. Not collective."""
+    """Whether a layer has a Kelvin-Voigt time of its own."""
     damping = scene.effects.damping
     return damping is not None and any(
         layer.beta is not None and layer.beta != damping.beta for layer in scene.tissue.layers.values()
@@ -46,17 +46,17 @@ class Damping:
     cost = "Uniform: no matrix, S is scaled, a few vector operations a step; layers that differ: D_ee, two products."
 
     def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on. Not collective."""
+        """Whether the scene has it on."""
         return scene.effects.damping is not None
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
-        """D_ee when the layers differ in beta, else none. Not collective."""
+        """D_ee when the layers differ in beta, else none."""
         return ("D_ee",) if layered(scene) else ()
 
     def gate(self, problem: Problem) -> Gate:
         """Damping ratio of the first mode against one that takes 5 % of its amplitude in the run.
 
-        A mode decays as exp(-zeta omega t). Not collective.
+        A mode decays as exp(-zeta omega t).
         """
         scene, symbol = problem.scene, "zeta_1 = (alpha/omega_1 + beta omega_1)/2"
         if layered(scene):

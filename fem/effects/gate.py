@@ -35,7 +35,7 @@ class Gate:
 
     @property
     def comparison(self) -> str:
-        """Number against threshold, and what else decides, as one line. Not collective."""
+        """Number against threshold, and what else decides, as one line."""
         number = "not computed" if math.isnan(self.number) else f"{self.number:.3g}"
         beside = [] if math.isnan(self.threshold) else [f"threshold {self.threshold:.3g}"]
         beside += [self.condition] if self.condition else []
@@ -83,15 +83,15 @@ class Effect(Protocol):
     cost: str
 
     def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on. Not collective."""
+        """Whether the scene has it on."""
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the operators it allocates in this scene; empty when it is off. Not collective."""
+        """Names of the operators it allocates in this scene; empty when it is off."""
 
     def gate(self, problem: Problem) -> Gate:
-        """The dimensionless number that says whether it matters. Not collective."""
+        """The dimensionless number that says whether it matters."""
 
 
 def force_drives(scene: Scene) -> bool:
-    """Whether a force moves the hand: in the run itself, or in the control problem. Not collective."""
+    """Whether a force moves the hand: in the run itself, or in the control problem."""
     return scene.motion.drive == "force" or scene.control is not None

@@ -12,10 +12,7 @@ EARTH = 9.81  # [m/s2], assumed when the scene leaves gravity off
 
 
 def acceleration(scene: Scene, n_s: int) -> Array | None:
-    """Free fall in the hand's degrees of freedom, g = [g_1 .. g_d, 0 ..] (n_s,) [m/s2]; None when off.
-
-    Not collective.
-    """
+    """Free fall in the hand's degrees of freedom, g = [g_1 .. g_d, 0 ..] (n_s,) [m/s2]; None when off."""
     gravity = scene.effects.gravity
     if gravity is None:
         return None
@@ -30,18 +27,15 @@ class Gravity:
     cost = "No operator and no work in a step: n_s numbers shift the hand's acceleration in a product that is there."
 
     def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on. Not collective."""
+        """Whether the scene has it on."""
         return scene.effects.gravity is not None
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
-        """None: n_s numbers. Not collective."""
+        """None: n_s numbers."""
         return ()
 
     def gate(self, problem: Problem) -> Gate:
-        """Gradient of the static displacement under the weight, bending included; `fem.fields.sag` solves for it.
-
-        Not collective.
-        """
+        """Gradient of the static displacement under the weight, bending included; `fem.fields.sag` solves for it."""
         off, sag, length = problem.scene.effects.gravity is None, problem.sag, problem.length
         number, threshold = sag.gradient.typical, 0.01
         bends = f"sag by {sag.largest:.2g} m, {sag.largest / length:.2g} of its length {length:.3g} m"

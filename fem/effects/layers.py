@@ -17,18 +17,15 @@ class Layers:
     cost = "3 tissue matrices a layer, kept so that new materials need no assembly; nothing in a step."
 
     def active(self, scene: Scene) -> bool:
-        """Whether the scene has layers. Not collective."""
+        """Whether the scene has layers."""
         return bool(scene.tissue.layers)
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
-        """The three components of each layer. Not collective."""
+        """The three components of each layer."""
         return tuple(f"{key}[{name}]" for name in scene.tissue.layers for key in ("K_mu", "K_lambda", "M_1"))
 
     def gate(self, problem: Problem) -> Gate:
-        """Contrast max E / min E; layers of one stiffness still matter if another property differs.
-
-        Not collective.
-        """
+        """Contrast max E / min E; layers of one stiffness still matter if another property differs."""
         materials = problem.materials
         young, nu = zip(*(young_poisson(m.lam, m.mu) for m in materials), strict=True)
         rho = [m.rho for m in materials]

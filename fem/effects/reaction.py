@@ -18,15 +18,15 @@ class Reaction:
     )
 
     def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on. Not collective."""
+        """Whether the scene has it on."""
         return scene.effects.reaction
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
-        """Y = S^-1 G, n_s columns, and its small product with G, when a force moves the hand. Not collective."""
+        """Y = S^-1 G, n_s columns, and its small product with G, when a force moves the hand."""
         return ("Y", "G'Y") if self.active(scene) and scene.motion.drive == "force" else ()
 
     def gate(self, problem: Problem) -> Gate:
-        """Tissue mass over hand mass; matters only if a force moves the hand. Not collective."""
+        """Tissue mass over hand mass; matters only if a force moves the hand."""
         scene = problem.scene
         number = problem.tissue_mass / scene.hand.mass
         change = number / (1 + number)

@@ -13,10 +13,7 @@ THRESHOLD = 0.05  # the hand's angular acceleration under a given torque changes
 
 
 def hand_inertia(scene: Scene, d: int) -> Array | None:
-    """Moments of inertia of the hand, one per rotation, (d (d - 1) / 2,) [kg m2]; None if not given.
-
-    Not collective.
-    """
+    """Moments of inertia of the hand, one per rotation, (d (d - 1) / 2,) [kg m2]; None if not given."""
     if scene.hand.inertia is None:
         return None
     given = np.atleast_1d(np.asarray(scene.hand.inertia, dtype=float))
@@ -24,7 +21,7 @@ def hand_inertia(scene: Scene, d: int) -> Array | None:
 
 
 def hand_mass(scene: Scene, d: int) -> Array:
-    """M_hand = blkdiag(m I, inertia), (n_s, n_s) [kg, kg m2]. Not collective."""
+    """M_hand = blkdiag(m I, inertia), (n_s, n_s) [kg, kg m2]."""
     diagonal = np.full(d, scene.hand.mass)
     inertia = hand_inertia(scene, d)
     if scene.effects.rotation and inertia is not None:
@@ -40,17 +37,17 @@ class Rotation:
     cost = "1 column more of R, T and G in 2D, 3 in 3D; a step multiplies with those columns of G too."
 
     def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on. Not collective."""
+        """Whether the scene has it on."""
         return scene.effects.rotation
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
-        """Columns in operators that are there anyway. Not collective."""
+        """Columns in operators that are there anyway."""
         return tuple(f"rotation columns of {name}" for name in "RTG") if self.active(scene) else ()
 
     def gate(self, problem: Problem) -> Gate:
         """Inertia of the rigid tissue about the reference over that of the hand, worst axis.
 
-        A hand of unknown inertia is taken to have the tissue's radius of gyration. Not collective.
+        A hand of unknown inertia is taken to have the tissue's radius of gyration.
         """
         scene, d = problem.scene, problem.dimension
         hand = hand_inertia(scene, d)

@@ -49,10 +49,7 @@ class PictureMesh:
         return int(self.points.shape[1])
 
     def rigid(self, q_s: npt.ArrayLike, points: Array | None = None) -> Array:
-        """Displacement R q_s of points that move with the hand, shape (n, d) [m]; the vertices by default.
-
-        Not collective.
-        """
+        """Displacement R q_s of points that move with the hand, shape (n, d) [m]; the vertices by default."""
         x = self.points if points is None else points
         modes = rigid_modes(x, self.dimension, self.n_s > self.dimension, self.reference)
         return np.asarray(modes @ np.asarray(q_s, dtype=np.float64)).reshape(len(x), self.dimension)

@@ -102,7 +102,7 @@ def locate(space: Discretisation, points: Array) -> tuple[np.ndarray, Array, Arr
 
 
 def _nearest_cells(space: Discretisation, points: Array) -> np.ndarray:
-    """Nearest owned cell of each point (k, 3), -1 on a rank without cells. Not collective."""
+    """Nearest owned cell of each point (k, 3), -1 on a rank without cells."""
     mesh, d = space.mesh.mesh, space.mesh.dimension
     owned = np.arange(mesh.topology.index_map(d).size_local, dtype=np.int32)
     if not len(owned):
@@ -113,7 +113,7 @@ def _nearest_cells(space: Discretisation, points: Array) -> np.ndarray:
 
 
 def _shapes(space: Discretisation, cell: int, point: Array) -> tuple[np.ndarray, Array, Array]:
-    """Global nodes of a cell, their shape functions at its point nearest to (3,), and that point. Not collective."""
+    """Global nodes of a cell, their shape functions at its point nearest to (3,), and that point."""
     mesh, d = space.mesh.mesh, space.mesh.dimension
     corners = mesh.geometry.x[cell_nodes(mesh)[cell]]
     where = (point + dolfinx.geometry.compute_distance_gjk(corners, point[None, :]))[:d]

@@ -54,7 +54,7 @@ class FullField:
 
 
 def owner_file(series: Path) -> Path:
-    """The small file beside a field series that names its run. Not collective."""
+    """The small file beside a field series that names its run."""
     return series.with_suffix(".run")
 
 
@@ -94,7 +94,7 @@ class SeriesWriter:
         self.file: Any = None
 
     def rename(self, name: str, run: str = "") -> None:
-        """Choose another stem of the files, and the run's name, before the first write. Not collective."""
+        """Choose another stem of the files, and the run's name, before the first write."""
         suffixes = (".bp",) if self.format == "vtx" else (".xdmf", ".h5")
         self.files = tuple(self.directory / f"{name}{suffix}" for suffix in suffixes)
         self.run = run
@@ -136,7 +136,7 @@ class SeriesWriter:
         return self.files
 
     def _bytes(self, fields: int) -> int:
-        """About what one instant takes of all ranks, with the mesh if it is the first; on rank 0. Not collective."""
+        """About what one instant takes of all ranks, with the mesh if it is the first; on rank 0."""
         if self.comm.rank > 0:
             return 0
         space = self.written[0].function_space

@@ -39,7 +39,7 @@ def gradient(model: Model, z: Array) -> Gradient:
 
 
 def _top(rows: Array, limit: float) -> Array:
-    """The steepest rows [size, volume], down to the one with which their volume exceeds the limit. Not collective."""
+    """The steepest rows [size, volume], down to the one with which their volume exceeds the limit."""
     ordered = rows[np.argsort(-rows[:, 0], kind="stable")]
     return ordered[: int(np.searchsorted(np.cumsum(ordered[:, 1]), limit, side="right")) + 1]
 

@@ -74,7 +74,7 @@ class Whole:
 
 
 def bisect(whole: Whole, marked: Ints) -> Whole:
-    """Split the marked cells, and others until no node hangs, through their longest edges [PC00]. Not collective.
+    """Split the marked cells, and others until no node hangs, through their longest edges [PC00].
 
     Args:
         whole: the mesh.
@@ -108,7 +108,7 @@ def bisect(whole: Whole, marked: Ints) -> Whole:
 
 
 def bisect_to(whole: Whole, size: Callable[[Floats], Floats], slack: float, most: int) -> Whole:
-    """Bisect until no cell is larger than its size by a factor. Not collective.
+    """Bisect until no cell is larger than its size by a factor.
 
     Args:
         whole: the mesh.

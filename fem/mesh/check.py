@@ -84,7 +84,7 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
 
 
 def counted(number: int, what: str) -> str:
-    """A count with its noun, singular or plural. Not collective."""
+    """A count with its noun, singular or plural."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 

@@ -10,7 +10,7 @@ from softgrasp.fem.mesh.arrays import MeshArrays, Sets
 
 
 def mesh_digest(arrays: MeshArrays) -> str:
-    """SHA-256 of coordinates, cells, tags and sets, 64 hex digits. Not collective."""
+    """SHA-256 of coordinates, cells, tags and sets, 64 hex digits."""
     digest = hashlib.sha256()
     for array in (arrays.points, arrays.cells, arrays.cell_tags, arrays.facets, arrays.facet_tags):
         if array is None:

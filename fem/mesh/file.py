@@ -96,7 +96,7 @@ def read_mesh(
 
 
 def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
-    """Read and check a mesh file. Not collective.
+    """Read and check a mesh file.
 
     Raises:
         MeshError: see `read_mesh`.

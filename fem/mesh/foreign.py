@@ -27,12 +27,12 @@ WAIT = 20  # seconds on the clock for one of the processor: others may use the m
 
 
 def default_limit(path: Path) -> float:
-    """Processor time after which a file counts as damaged, by its size [s]. Not collective."""
+    """Processor time after which a file counts as damaged, by its size [s]."""
     return LEAST + PER_BYTE * path.stat().st_size
 
 
 def read_foreign(path: Path, limit: float | None = None) -> meshio.Mesh:
-    """Read a mesh file of any format of meshio. Not collective.
+    """Read a mesh file of any format of meshio.
 
     Args:
         path: the file.

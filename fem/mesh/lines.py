@@ -39,7 +39,7 @@ class Axis:
 
 
 def box_axes(scene: Scene) -> tuple[Axis, ...]:
-    """What the lines of a structured box must meet. Not collective.
+    """What the lines of a structured box must meet.
 
     Lines meet the box of the contact zone, the boxes of layers and the points of outputs, and the zone ends at its
     sides and at its box.
@@ -76,7 +76,7 @@ def box_axes(scene: Scene) -> tuple[Axis, ...]:
 
 
 def even_cells(axis: Axis, h: float) -> int:
-    """Number of cells no longer than h between the cuts. Not collective."""
+    """Number of cells no longer than h between the cuts."""
     return sum(int(np.ceil((b - a) / h - SAME)) for a, b in pairwise(axis.cuts))
 
 

@@ -53,7 +53,7 @@ class TissueMesh:
 
 
 def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
-    """Local node numbers of the cells, shape (n_cells, d + 1). Not collective."""
+    """Local node numbers of the cells, shape (n_cells, d + 1)."""
     geometry = mesh.geometry
     # DOLFINx 0.10 has no list of dofmaps, 0.11 warns of the single one
     return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)

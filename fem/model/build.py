@@ -102,7 +102,7 @@ class Model:
 
 
 def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:
-    """Material and Kelvin-Voigt time of each layer; cells of no layer carry tissue.material. Not collective."""
+    """Material and Kelvin-Voigt time of each layer; cells of no layer carry tissue.material."""
     damping = scene.effects.damping
     beta = damping.beta if damping is not None else 0.0
     result = []

@@ -99,7 +99,7 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
 
 
 def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
-    """Refuse parts that keep a free motion when those with contact facets are fixed. Not collective.
+    """Refuse parts that keep a free motion when those with contact facets are fixed.
 
     A part that hangs together through facets moves without strain as a rigid body only, u = R q, and a contact
     facet fixes it. The q of the other parts must agree at each shared node, C q = 0; a null vector of C^T C is
@@ -192,8 +192,6 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
     With (x, y, z) measured from the reference, the rotations are (-y, x) in 2D and (0, -z, y), (z, 0, -x),
     (-y, x, 0) in 3D.
 
-    Not collective.
-
     Args:
         points: coordinates, shape (n_nodes, 2 or 3) [m].
         dimension: 2 or 3.
@@ -219,8 +217,6 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
 def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
     """Owned cells with the layer's ``tag``, or with their midpoint in its ``box``; sorted, maybe empty here.
 
-    Not collective.
-
     Raises:
         SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
     """
@@ -243,7 +239,7 @@ def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
 
 
 def cell_midpoints(tissue: TissueMesh) -> Floats:
-    """Midpoints of the owned cells, shape (n_owned, dimension) [m]. Not collective."""
+    """Midpoints of the owned cells, shape (n_owned, dimension) [m]."""
     owned = tissue.mesh.topology.index_map(tissue.dimension).size_local
     cells = np.arange(owned, dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, cells)

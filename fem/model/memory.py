@@ -38,12 +38,12 @@ class Need:
     tables: float
 
     def of(self, share: float, ranks: int) -> float:
-        """What ``ranks`` ranks need that hold this share of the tissue. Not collective."""
+        """What ``ranks`` ranks need that hold this share of the tissue."""
         return share * (self.mesh + self.factor) + ranks * self.tables
 
 
 def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
-    """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection. Not collective.
+    """Estimated memory of the Cholesky factor over all ranks [byte]; nested dissection.
 
     nnz(L) / n = 7.75 log2 n - 44 in 2D and 19.5 n^(1/3) - 85 in 3D, fitted to regular simplex meshes of 1e3 to 4e6
     (2D) and 5e2 to 2e5 (3D) unknowns; 8 byte an entry and 4 an index, of which cholesky has one for d^2 entries.
@@ -56,7 +56,7 @@ def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
 
 
 def simplices(cells: list[int]) -> int:
-    """Triangles or tetrahedra of a structured box. Not collective."""
+    """Triangles or tetrahedra of a structured box."""
     count = 2 if len(cells) == 2 else 6
     for n in cells:
         count *= n
@@ -64,7 +64,7 @@ def simplices(cells: list[int]) -> int:
 
 
 def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: bool) -> Need:
-    """Estimate the memory of a model and, if it will run, of its steps. Not collective.
+    """Estimate the memory of a model and, if it will run, of its steps.
 
     Args:
         scene: the scene.
@@ -91,7 +91,7 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
 
 
 def free_bytes(scene: Scene) -> float:
-    """Memory that a run may take on this node [byte]: ``output.memory``, or what is free. Not collective."""
+    """Memory that a run may take on this node [byte]: ``output.memory``, or what is free."""
     if scene.output.memory != "auto":
         return scene.output.memory * GIB
     free = float(psutil.virtual_memory().available)
@@ -150,7 +150,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
 def _fitting(
     scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int, share: float, ranks: int, free: float
 ) -> str:
-    """What fits, as text: cells along the edges of a box, or of a mesh file in all. Not collective."""
+    """What fits, as text: cells along the edges of a box, or of a mesh file in all."""
     box = scene.tissue.cells
 
     def smaller(factor: float) -> list[int]:
@@ -166,7 +166,7 @@ def _fitting(
 
 
 def _digits(value: float) -> int:
-    """The first two digits of a number, rounded down. Not collective."""
+    """The first two digits of a number, rounded down."""
     whole = int(value)
     step: int = 10 ** max(len(str(whole)) - 2, 0)
     return whole // step * step

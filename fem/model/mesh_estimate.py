@@ -46,5 +46,5 @@ class MeshEstimate:
     seconds: float = 0.0
 
     def corrected(self, outputs: Array) -> Array:
-        """Outputs y_h + delta y (steps + 1, p) [m, rad]. Not collective."""
+        """Outputs y_h + delta y (steps + 1, p) [m, rad]."""
         return np.asarray(outputs + self.delta)

@@ -51,7 +51,7 @@ class Sizes:
 
 
 def aims(refine: Refine, order: int, d: int, tolerance: float) -> Sizes:
-    """A-priori sizes for a tolerance of the deformation. Not collective."""
+    """A-priori sizes for a tolerance of the deformation."""
     p = min(order, 3)
     mu = refine.grading if isinstance(refine.grading, float) else BISECTION[p]
     across = ACROSS[d][p] * (1e-2 / tolerance) ** (1 / (2 * p))
@@ -59,7 +59,7 @@ def aims(refine: Refine, order: int, d: int, tolerance: float) -> Sizes:
 
 
 def by_lines(scene: Scene) -> bool:
-    """Whether the scene's graded mesh is a box with moved lines. Not collective."""
+    """Whether the scene's graded mesh is a box with moved lines."""
     refine, tissue = scene.tissue.refine, scene.tissue
     if refine is None or tissue.size is None or refine.method == "bisect":
         return False
@@ -111,7 +111,7 @@ def _lined(comm: MPI.Intracomm, scene: Scene, refine: Refine, goal: float | None
 
 
 def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
-    """The bisected mesh, on one rank. Not collective."""
+    """The bisected mesh, on one rank."""
     order, aim = scene.tissue.order, goal
     while True:
         whole = _base(scene, refine, aim)
@@ -127,7 +127,7 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
 
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
-    """The mesh to bisect with contact zone and layers marked. Not collective."""
+    """The mesh to bisect with contact zone and layers marked."""
     size = scene.tissue.size
     if size is None:
         tissue = make_mesh(MPI.COMM_SELF, scene)
@@ -141,7 +141,7 @@ def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
 
 
 def marked(tissue: TissueMesh, scene: Scene) -> Whole:
-    """A mesh on one rank with its contact zone, layers and tags as marks. Not collective."""
+    """A mesh on one rank with its contact zone, layers and tags as marks."""
     facets = contact_facets(tissue, scene.contact)
     n = tissue.mesh.topology.index_map(tissue.dimension).size_local
     layers = np.full(n, -1, dtype=np.int32)
@@ -164,7 +164,7 @@ def marked(tissue: TissueMesh, scene: Scene) -> Whole:
 
 
 def _forget(whole: Whole) -> Whole:
-    """The mesh without the contact zone and layers it has inherited: they are selected again. Not collective."""
+    """The mesh without the contact zone and layers it has inherited: they are selected again."""
     return Whole(
         whole.mesh,
         whole.source,
@@ -176,7 +176,7 @@ def _forget(whole: Whole) -> Whole:
 
 
 def ends_of(whole: Whole, scene: Scene) -> Ends:
-    """Singular ends of a marked mesh. Not collective."""
+    """Singular ends of a marked mesh."""
     layers = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
     number = whole.cells["layers"].astype(np.int64)
     nu = np.array([m.nu for m in layers])[number + 1]
@@ -184,7 +184,7 @@ def ends_of(whole: Whole, scene: Scene) -> Ends:
 
 
 def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Whole:
-    """Bisect until the cells have their a-priori sizes. Not collective."""
+    """Bisect until the cells have their a-priori sizes."""
     points, d = whole.points, whole.dimension
     if refine.grading == "off":
         return whole
@@ -203,7 +203,7 @@ def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Who
 
 
 def unknowns(whole: Whole, order: int) -> int:
-    """Displacement unknowns of a mesh, the hand's contact zone included. Not collective."""
+    """Displacement unknowns of a mesh, the hand's contact zone included."""
     cells, d = np.sort(whole.simplices, axis=1), whole.dimension
     count = len(whole.points)
     if order > 1:
@@ -222,7 +222,7 @@ def _outer(cells: npt.NDArray[np.int64]) -> int:
 
 
 def lattice(cells: list[int], order: int) -> int:
-    """Displacement unknowns of a structured box. Not collective."""
+    """Displacement unknowns of a structured box."""
     return len(cells) * int(np.prod([order * n + 1 for n in cells]))
 
 
@@ -255,7 +255,7 @@ def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
 
 
 def _even(scene: Scene) -> TissueMesh:
-    """The scene's mesh without grading, on one rank; a box meets the ends where the graded one does. Not collective."""
+    """The scene's mesh without grading, on one rank; a box meets the ends where the graded one does."""
     if scene.tissue.refine is None or scene.tissue.size is None:
         return make_mesh(MPI.COMM_SELF, scene)
     return box_of_lines(MPI.COMM_SELF, scene, scene.tissue.cells or [], 1.0, min(scene.tissue.size) / 2)

@@ -141,7 +141,7 @@ def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> Resta
 
 
 def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) -> dict[str, Any]:
-    """The manifest's entry if it is of this scene and rank count. Not collective.
+    """The manifest's entry if it is of this scene and rank count.
 
     Raises:
         CheckpointError: it is not; the message names the key.
@@ -166,7 +166,7 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
 
 
 def _numbering(layout: BlockLayout) -> Array:
-    """SHA-256 of this rank's nodes in their order, 32 numbers. Not collective."""
+    """SHA-256 of this rank's nodes in their order, 32 numbers."""
     digest = hashlib.sha256(np.ascontiguousarray(layout.nodes)).digest()
     return np.frombuffer(digest, dtype=np.uint8).astype(np.float64)
 

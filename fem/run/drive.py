@@ -34,7 +34,7 @@ class Drive(Protocol):
         """Leave w and load of step n in ``midpoint``; fill row n + 1 of ``q`` and ``v``. Collective."""
 
     def check(self, begin: int, end: int) -> None:
-        """Look at what moved the hand in these steps; SolverError unless it is finite. Not collective."""
+        """Look at what moved the hand in these steps; SolverError unless it is finite."""
 
 
 class TableDrive:
@@ -60,7 +60,7 @@ class TableDrive:
         midpoint.solve_midpoint(self.c[n])
 
     def check(self, begin: int, end: int) -> None:
-        """Nothing to look at: tables are checked when they are read. Not collective."""
+        """Nothing to look at: tables are checked when they are read."""
 
 
 class ForceDrive:
@@ -99,7 +99,7 @@ class ForceDrive:
         self.solve = self._two_way if system.two_way else self._one_way  # chosen once, not in every step
 
     def _checked(self, force: Force) -> Force:
-        """The force, with a look at the shape of its first value. Not collective."""
+        """The force, with a look at the shape of its first value."""
         n_s = self.system.layout.n_s
 
         def first(n: int, t: float, q: Array, v: Array) -> Array:
@@ -116,7 +116,7 @@ class ForceDrive:
         return np.asarray(self.u[n])
 
     def check(self, begin: int, end: int) -> None:
-        """Look at the forces taken in these steps, once a segment: a step spends nothing on it. Not collective.
+        """Look at the forces taken in these steps, once a segment: a step spends nothing on it.
 
         Raises:
             SolverError: a force is not finite; the message names the first.
@@ -159,7 +159,7 @@ class ForceDrive:
 
 
 def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float) -> Array:
-    """Force u [N, N m] in each step that leads the hand against inertia and tissue, shape (steps, n_s). Not collective.
+    """Force u [N, N m] in each step that leads the hand against inertia and tissue, shape (steps, n_s).
 
         u = M_hand a + M_rigid (a - g + alpha v_mid) + G' (z'' + alpha z'_mid) - weight
 

@@ -128,7 +128,7 @@ class TissueMidpoint:
         self.dissipated = 0.0
 
     def _picker(self) -> Callable[[], object]:
-        """What copies the owned rows of w to x. Not collective."""
+        """What copies the owned rows of w to x."""
         layout, order = self.system.layout, self.held.order
         if order is not None:
             w, x = (array.reshape(-1, order.d) for array in (self.w_array, self.x_array))
@@ -139,7 +139,7 @@ class TissueMidpoint:
         return lambda: None  # x is w
 
     def _couple(self) -> None:
-        """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w. Not collective.
+        """G as a dense matrix of this rank alone, with vectors that share the arrays of r and w.
 
         PETSc adds a product to r, or takes one with w, in one pass and with less overhead than NumPy.
         """
@@ -220,7 +220,7 @@ class TissueMidpoint:
         return np.asarray(self.Y[self.rows])
 
     def accelerate(self, c: Array) -> None:
-        """Turn S^{-1} h in w into S^{-1} (h - G c), and the right-hand side and the load to match. Not collective."""
+        """Turn S^{-1} h in w into S^{-1} (h - G c), and the right-hand side and the load to match."""
         w = self.w.array_w  # not the view: PETSc must see that w changed
         w -= self.Y @ c
         self.c = self.added_array[:] = -c
@@ -240,10 +240,7 @@ class TissueMidpoint:
         self.pending = self.c
 
     def pull(self) -> Array:
-        """G'w over the rows held, (n_s,), until the next call: the load l = G c of the step did the work 2 c'G'w.
-
-        Not collective.
-        """
+        """G'w over the rows held, (n_s,), until the next call: the load l = G c of the step did the work 2 c'G'w."""
         self.coupling.multTranspose(self.w_here, self.moved)
         return self.moved_array
 

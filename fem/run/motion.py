@@ -69,7 +69,7 @@ def read_csv(path: Path, columns: int, end: float) -> tuple[Array, Array]:
 
 
 def motion_table(scene: Scene, n_s: int) -> HandTable:
-    """Positions of the prescribed motion (drive = "motion") on the time grid. Not collective.
+    """Positions of the prescribed motion (drive = "motion") on the time grid.
 
     A CSV table is joined by a cubic spline, at rest at both ends.
 
@@ -99,7 +99,7 @@ def motion_table(scene: Scene, n_s: int) -> HandTable:
 
 
 def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
-    """Force u [N, N m] on the hand at the step midpoints, shape (steps, n_s). Not collective.
+    """Force u [N, N m] on the hand at the step midpoints, shape (steps, n_s).
 
     A CSV table is joined by straight lines.
 
@@ -123,7 +123,7 @@ def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
 
 
 def driven_table(M_hand: Array, force: Array, dt: float, q0: Array, v0: Array) -> HandTable:
-    """Midpoint rule for the free hand M_hand a = u: exact for the given mean forces. Not collective."""
+    """Midpoint rule for the free hand M_hand a = u: exact for the given mean forces."""
     a = np.linalg.solve(M_hand, force.T).T
     v = np.vstack([v0, v0 + dt * np.cumsum(a, axis=0)])
     q = np.vstack([q0, q0 + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])

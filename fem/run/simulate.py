@@ -125,7 +125,7 @@ class Run(Stepped):
         self.drive.solve(n, self.midpoint, self.state)
 
     def record(self, n: int) -> None:
-        """Store this rank's share of the outputs at step n, and what the work of the load needs. Not collective."""
+        """Store this rank's share of the outputs at step n, and what the work of the load needs."""
         self.pulls[n] = self.midpoint.pull()
         z = self.state.array
         for rows, share in self.points:

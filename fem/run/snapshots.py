@@ -41,11 +41,11 @@ class Snapshots:
     Z: Array
 
     def displacement(self, T: Array) -> Array:
-        """Absolute displacement q_e = z + T q_s, local rows (n_local, m). Not collective."""
+        """Absolute displacement q_e = z + T q_s, local rows (n_local, m)."""
         return np.asarray(self.Z[: self.layout.n_local] + T @ self.q_s)
 
     def velocity(self, T: Array) -> Array:
-        """Absolute velocity v_e = v_z + T v_s, local rows (n_local, m). Not collective."""
+        """Absolute velocity v_e = v_z + T v_s, local rows (n_local, m)."""
         return np.asarray(self.Z[self.layout.n_local :] + T @ self.v_s)
 
 
@@ -117,7 +117,7 @@ class MemoryStore(NoStore):
         self.Z[:, : columns.shape[1]] = columns
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
-        """Snapshots with the hand's rows. Not collective."""
+        """Snapshots with the hand's rows."""
         s = self.steps
         return Snapshots(self.system.layout, s, times[s], q[s].T.copy(), v[s].T.copy(), self.Z)
 

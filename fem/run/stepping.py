@@ -57,7 +57,7 @@ class Stepped(ABC):
 
     @abstractmethod
     def record(self, n: int) -> None:
-        """Store this rank's share of the outputs at step n. Not collective."""
+        """Store this rank's share of the outputs at step n."""
 
     def step(self, ts: Any) -> None:
         """One midpoint step, called by TS; the step number, not a summed time, picks the load. Collective."""

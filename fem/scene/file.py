@@ -37,13 +37,13 @@ _EXPECTED = {
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Name and path of the scenes that ship with the project. Not collective."""
+    """Name and path of the scenes that ship with the project."""
     folder = (PACKAGE / "scenes").resolve()
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def find_scene(path: str | Path) -> Path:
-    """The scene that ships under a bare name, else the file of that path. Not collective."""
+    """The scene that ships under a bare name, else the file of that path."""
     file = Path(path)
     return shipped_scenes().get(file.name, file) if len(file.parts) == 1 and not file.exists() else file
 
@@ -94,7 +94,7 @@ def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequ
 
 
 def resolved_toml(scene: Scene) -> str:
-    """TOML text with every default and absolute file names; it loads to the same scene. Not collective."""
+    """TOML text with every default and absolute file names; it loads to the same scene."""
     data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
     for section, key in _FILES:
         if key in data[section]:

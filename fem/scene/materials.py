@@ -24,12 +24,12 @@ class LibraryMaterial:
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
-    """(lambda, mu) [Pa] from Young's modulus [Pa] and Poisson's ratio [1]. Not collective."""
+    """(lambda, mu) [Pa] from Young's modulus [Pa] and Poisson's ratio [1]."""
     return young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
 
 
 def young_poisson(lam: float, mu: float) -> tuple[float, float]:
-    """(E [Pa], nu [1]) from the Lame constants [Pa]. Not collective."""
+    """(E [Pa], nu [1]) from the Lame constants [Pa]."""
     return mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu))
 
 
@@ -61,7 +61,7 @@ LIBRARY: dict[str, LibraryMaterial] = {
 
 
 def lookup(name: str) -> LibraryMaterial:
-    """The library entry of this name. Not collective.
+    """The library entry of this name.
 
     Raises:
         ValueError: the name is unknown; the message suggests the nearest one.

@@ -161,7 +161,7 @@ class Scene(Model):
         return self.motion.duration if self.time.end is None else self.time.end
 
     def path(self, name: str) -> Path:
-        """A file named in the scene, absolute. Not collective."""
+        """A file named in the scene, absolute."""
         return (self._directory / name).resolve()
 
     @model_validator(mode="after")
@@ -211,7 +211,7 @@ def _check_vectors(scene: Scene, d: int) -> None:
 
 
 def check_dimension(scene: Scene, d: int) -> None:
-    """Check every vector of the scene against the dimension d of its mesh. Not collective.
+    """Check every vector of the scene against the dimension d of its mesh.
 
     Raises:
         SceneError: the first vector, side or value that does not fit.
@@ -225,5 +225,5 @@ def check_dimension(scene: Scene, d: int) -> None:
 
 
 def scene_schema() -> dict[str, Any]:
-    """JSON schema of a scene file; `study.shell.schema` adds what only the packages above know. Not collective."""
+    """JSON schema of a scene file; `study.shell.schema` adds what only the packages above know."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)

@@ -25,7 +25,7 @@ _KEY = re.compile(rf"[^$\\\t\n]{{1,{KEY}}}")
 
 
 def read_text(path: Path) -> str:
-    """The text of a UTF-8 file, with or without byte order mark. Not collective.
+    """The text of a UTF-8 file, with or without byte order mark.
 
     Raises:
         OSError: the file cannot be read.
@@ -43,7 +43,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """`tomllib.loads` with a sentence for all that it meets. Not collective.
+    """`tomllib.loads` with a sentence for all that it meets.
 
     Raises:
         tomllib.TOMLDecodeError: the text is no TOML.
@@ -60,7 +60,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def check_values(data: dict[str, Any]) -> None:
-    """Bound the values of a parsed scene: depth, keys, texts and numbers. Not collective.
+    """Bound the values of a parsed scene: depth, keys, texts and numbers.
 
     Infinite numbers and NaN pass: the types of the scene refuse them by key.
 
@@ -100,14 +100,14 @@ def _wrong(value: Any) -> str:
 
 
 def out_of_range(value: float) -> str:
-    """Bounds that a finite number must keep to be computed with; empty if it does. Not collective."""
+    """Bounds that a finite number must keep to be computed with; empty if it does."""
     if value == 0 or not math.isfinite(value) or SMALLEST <= abs(value) <= LARGEST:
         return ""
     return f"numbers that are 0 or of size {SMALLEST:g} to {LARGEST:g}"
 
 
 def read_table(path: Path, columns: int) -> list[list[float]]:
-    """The rows of numbers of a CSV file; a line of names may come first, comments start with #. Not collective.
+    """The rows of numbers of a CSV file; a line of names may come first, comments start with #.
 
     Raises:
         OSError: the file cannot be read.

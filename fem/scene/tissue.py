@@ -44,7 +44,7 @@ Dropped = Annotated[T | None, BeforeValidator(off), OrFalse()]
 
 
 def check_box(box: list[list[float]] | None, key: str) -> None:
-    """ValueError unless the corners of the box fit each other. Not collective."""
+    """ValueError unless the corners of the box fit each other."""
     if box is None:
         return
     lo, hi = box
@@ -91,7 +91,7 @@ class Material(Model):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """What a file may hold: a name of the library, or one of the two pairs of moduli. Not collective."""
+        """What a file may hold: a name of the library, or one of the two pairs of moduli."""
         reference = handler(core)
         schema = handler.resolve_ref_schema(reference)
         lame = dict(schema)
@@ -260,7 +260,7 @@ class Contact(Model):
         return self
 
     def axes(self, dimension: int) -> list[tuple[int, int]]:
-        """(axis, -1 or +1) of each named side; bottom and top are y in 2D and z in 3D. Not collective.
+        """(axis, -1 or +1) of each named side; bottom and top are y in 2D and z in 3D.
 
         Raises:
             ValueError: a side does not exist in this dimension.

@@ -24,7 +24,7 @@ VANISHING_PIVOT = (71, 81)  # PETSC_ERR_MAT_LU_ZRPVT, PETSC_ERR_MAT_CH_ZRPVT
 
 
 def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] = "petsc") -> PETSc.KSP:
-    """Factor P = P' > 0 in the order of its rows, in blocks where that is stable. Not collective.
+    """Factor P = P' > 0 in the order of its rows, in blocks where that is stable.
 
     Args:
         P: the matrix in blocks of d x d (BAIJ), on this rank alone.
@@ -145,6 +145,6 @@ class OrderedFactor:
         self.w_nodes.take(self.places, 0, w.array_w.reshape(-1, d), "clip")
 
     def destroy(self) -> None:
-        """Free the vectors. Not collective."""
+        """Free the vectors."""
         self.r.destroy()
         self.w.destroy()

@@ -54,11 +54,11 @@ class Held:
         return self.enter(rows_on_all(self.layout.comm, local)) if self.whole else local
 
     def enter(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Rows in the order of the layout as they are held. Not collective."""
+        """Rows in the order of the layout as they are held."""
         return x if self.order is None else self.order.enter(x)
 
     def leave(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Rows held in the order of the layout. Not collective."""
+        """Rows held in the order of the layout."""
         return x if self.order is None else self.order.leave(x)
 
     def destroy(self) -> None:
@@ -102,7 +102,7 @@ def held_operators(system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool
 
 
 def _moved(dissection: Dissection, A: PETSc.Mat) -> PETSc.Mat:
-    """A in the order found; consumes A. Not collective."""
+    """A in the order found; consumes A."""
     result = dissection.matrix(A)
     A.destroy()
     return result

@@ -27,19 +27,19 @@ class NodeOrder:
     d: int
 
     def enter(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Rows (n, ...) in this order, a copy. Not collective."""
+        """Rows (n, ...) in this order, a copy."""
         return x[_rows(self.nodes, self.d)]
 
     def leave(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Rows (n, ...) of this order as they were before, a copy. Not collective."""
+        """Rows (n, ...) of this order as they were before, a copy."""
         return x[_rows(self.places, self.d)]
 
     def places_of(self, first: int, last: int) -> NDArray[np.intp]:
-        """Places of the nodes that had the rows from first to before last. Not collective."""
+        """Places of the nodes that had the rows from first to before last."""
         return self.places[first // self.d : last // self.d]
 
     def rows_of(self, first: int, last: int) -> NDArray[np.intp]:
-        """Where the rows from first to before last are now. Not collective."""
+        """Where the rows from first to before last are now."""
         return _rows(self.places_of(first, last), self.d)
 
 
@@ -60,7 +60,7 @@ class Dissection:
     source: NDArray[np.intp]
 
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
-        """A of the same pattern with rows and columns in this order, in blocks of d x d (BAIJ). Not collective.
+        """A of the same pattern with rows and columns in this order, in blocks of d x d (BAIJ).
 
         Raises:
             ValueError: A has another pattern.
@@ -75,7 +75,7 @@ class Dissection:
 
 
 def dissect(A: PETSc.Mat, d: int) -> Dissection:
-    """Nested dissection of the nodes of a matrix on one rank, d rows a node, with symmetric pattern. Not collective."""
+    """Nested dissection of the nodes of a matrix on one rank, d rows a node, with symmetric pattern."""
     blocks = to_scipy(A).tobsr((d, d))
     before = blocks.indptr, blocks.indices
     count = len(blocks.indices)

@@ -35,7 +35,7 @@ DIRECT_ERROR = 1e-6
 
 
 def choose_solver(layout: BlockLayout, requested: str = "auto", few: bool = False) -> tuple[SolverName, str]:
-    """The solver for a size, with the reason in words; ``few`` solves with one factor. Not collective."""
+    """The solver for a size, with the reason in words; ``few`` solves with one factor."""
     n, d = layout.n_e, layout.dimension
     limit = (FEW_LIMIT if few else CHOLESKY_LIMIT)[d]
     if requested != "auto":
@@ -48,7 +48,7 @@ def choose_solver(layout: BlockLayout, requested: str = "auto", few: bool = Fals
 
 
 def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: Reproducible) -> bool:
-    """Whether every rank factors by itself: no message in a solve, and the same bits in every run. Not collective.
+    """Whether every rank factors by itself: no message in a solve, and the same bits in every run.
 
     The distributed factor of MUMPS needs less memory, but adds in the order messages arrive, so that its last bits
     differ from run to run.
@@ -84,7 +84,7 @@ class TissueSolver:
 
     @property
     def remark(self) -> str:
-        """What to add to the reason of the choice: single entries make a slower step. Not collective."""
+        """What to add to the reason of the choice: single entries make a slower step."""
         if self.name != "cholesky" or "sbaij" in self.ksp.getOperators()[0].getType():
             return ""
         by = self.ksp.getPC().getFactorSolverType().upper().replace("PETSC", "PETSc")

@@ -44,7 +44,7 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
     """Solve A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 for the stabilising X, for small n.
 
     Ordered real Schur form of the balanced Hamiltonian matrix [L79], then Newton's method [K68] on the residual. The
-    work is 25 (2n)^3 operations; memory some 20 n^2. Not collective. Inputs are not changed.
+    work is 25 (2n)^3 operations; memory some 20 n^2. Inputs are not changed.
 
     Args:
         A: (n, n).
@@ -89,13 +89,13 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
 
 
 def riccati_residual(A: Array, G: Array, H: Array, X: Array) -> Array:
-    """Return A'X + XA - XGX + H. Not collective."""
+    """Return A'X + XA - XGX + H."""
     product = A.T @ X
     return np.asarray(product + product.T - X @ G @ X + H)
 
 
 def reciprocal_condition(M: Array) -> tuple[Array, Array, float]:
-    """LU factors and pivots of M with an estimate of 1 / (|M|_1 |M^{-1}|_1). Not collective."""
+    """LU factors and pivots of M with an estimate of 1 / (|M|_1 |M^{-1}|_1)."""
     lu, pivots, info = scipy.linalg.lapack.dgetrf(M)
     size = float(np.abs(M).sum(axis=0).max(initial=0.0))
     rcond = 0.0 if info > 0 else float(scipy.linalg.lapack.dgecon(lu, size, norm="1")[0])
@@ -105,7 +105,7 @@ def reciprocal_condition(M: Array) -> tuple[Array, Array, float]:
 def riccati_schur(A: Array, G: Array, H: Array) -> tuple[Array, Complex, int]:
     """Solve A'X + XA - XGX + H = 0 for symmetric G and H; also return the poles of A - GX and the Newton steps.
 
-    H may be indefinite as long as a stabilising solution exists. Not collective.
+    H may be indefinite as long as a stabilising solution exists.
 
     Raises:
         ControlError: an eigenvalue of the Hamiltonian matrix lies on the imaginary axis, or the stable invariant
@@ -149,7 +149,7 @@ def balance(A: Array, G: Array, H: Array) -> tuple[Array, float]:
     """Scales d (powers of 2) and c so that D^{-1}AD, c D^{-1}GD^{-1} and DHD/c have rows of like size.
 
     The Hamiltonian matrix keeps its structure because x is scaled by D and the costate by D^{-1}/c [B01].
-    Not collective.
+
     """
     n = len(A)
     size = np.block([[np.abs(A), np.abs(G)], [np.abs(H), np.abs(A.T)]])
@@ -164,7 +164,7 @@ def balance(A: Array, G: Array, H: Array) -> tuple[Array, float]:
 
 
 def block_eigenvalues(T: Array) -> Complex:
-    """Eigenvalues of a standardised real Schur form, in its order. Not collective."""
+    """Eigenvalues of a standardised real Schur form, in its order."""
     n = len(T)
     real, imag = np.diag(T).copy(), np.zeros(n)
     below = np.diag(T, -1)
@@ -176,7 +176,7 @@ def block_eigenvalues(T: Array) -> Complex:
 
 
 def check_axis(hamiltonian: Array, values: Complex, stable: int) -> None:
-    """No eigenvalue of the Hamiltonian matrix is on the imaginary axis to working precision. Not collective.
+    """No eigenvalue of the Hamiltonian matrix is on the imaginary axis to working precision.
 
     A double eigenvalue on the axis splits by sqrt(eps), so a small real part alone says nothing: what counts is the
     distance min sigma(H - i omega I) to a matrix with an eigenvalue there.
@@ -198,7 +198,7 @@ def check_axis(hamiltonian: Array, values: Complex, stable: int) -> None:
 
 
 def smallest_singular_value(M: Array, shift: complex) -> float:
-    """Estimate sigma_min(M - shift I) by inverse iteration on one LU factorisation. Not collective."""
+    """Estimate sigma_min(M - shift I) by inverse iteration on one LU factorisation."""
     n = len(M)
     shifted = np.asarray(M - shift * np.eye(n), dtype=complex)
     factors, pivots, info = scipy.linalg.lapack.zgetrf(shifted)
@@ -217,7 +217,7 @@ def smallest_singular_value(M: Array, shift: complex) -> float:
 def newton_polish(A: Array, G: Array, H: Array, X: Array) -> tuple[Array, Complex, int]:
     """Newton's method in correction form, (A - GX)'N + N(A - GX) = -Res, X <- X + N, while the residual halves.
 
-    Returns X, the eigenvalues of A - GX and the number of accepted steps. Not collective.
+    Returns X, the eigenvalues of A - GX and the number of accepted steps.
     """
     residual = riccati_residual(A, G, H, X)
     size = float(np.linalg.norm(residual))
@@ -238,7 +238,7 @@ def newton_polish(A: Array, G: Array, H: Array, X: Array) -> tuple[Array, Comple
 
 
 def lyapunov(T: Array, U: Array, W: Array) -> Array:
-    """Solve F'N + N F = -W for F = U T U', T in real Schur form, W symmetric. Not collective."""
+    """Solve F'N + N F = -W for F = U T U', T in real Schur form, W symmetric."""
     (trsyl,) = scipy.linalg.get_lapack_funcs(("trsyl",), (T,))
     N, factor, info = trsyl(T, T, -(U.T @ W @ U), trana="T", tranb="N")
     if info < 0:
@@ -248,7 +248,7 @@ def lyapunov(T: Array, U: Array, W: Array) -> Array:
 
 
 def unreached(A: Array, B: Array) -> list[complex]:
-    """Eigenvalues of A with Re >= 0 to rounding that no input reaches: rank [A - s I, B] < n [H69]. Not collective.
+    """Eigenvalues of A with Re >= 0 to rounding that no input reaches: rank [A - s I, B] < n [H69].
 
     For outputs that do not see call it with A', C'. The :data:`PBH_LIMIT` eigenvalues farthest to the right are
     examined.

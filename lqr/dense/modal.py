@@ -96,7 +96,7 @@ def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
 def assemble_space(
     problem: RiccatiProblem, M: Array, K: Array, D: Array, G: Array, C_z: Array, B_z: Array | None = None
 ) -> StateSpace:
-    """E, A, B, C of x = [q_s, v_s, z, v_z] from dense blocks of the tissue in any basis of z. Not collective.
+    """E, A, B, C of x = [q_s, v_s, z, v_z] from dense blocks of the tissue in any basis of z.
 
     With drag = "space" and two-way coupling the hand row carries alpha M_rigid and alpha G' as well.
     """
@@ -134,7 +134,7 @@ def relative_space(problem: RiccatiProblem) -> StateSpace | None:
 def modal_plant(
     problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, ...]
 ) -> ModalPlant:
-    """The plant restricted to modes. Not collective.
+    """The plant restricted to modes.
 
     Args:
         problem: weights, hand and flags.
@@ -153,7 +153,7 @@ def modal_plant(
 
 
 def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
-    """The plant in all its modes, K_ee phi = omega^2 M_ee phi. Not collective.
+    """The plant in all its modes, K_ee phi = omega^2 M_ee phi.
 
     Raises:
         SolverError: the stiffness is not positive definite: the hand does not hold the body.
@@ -193,7 +193,7 @@ def _check_held(lowest: float, largest: float) -> None:
 
 
 def factor_psd(X: Array) -> Array:
-    """Z with Z Z' = X for X symmetric positive semidefinite to rounding, columns in descending order. Not collective.
+    """Z with Z Z' = X for X symmetric positive semidefinite to rounding, columns in descending order.
 
     Small rows keep their own relative accuracy: X is scaled to unit diagonal first. Lifting multiplies the rows of
     fast modes by omega^2, and rounding relative to the largest entry of X would be seen in the residual. Rows of modes
@@ -211,7 +211,7 @@ def factor_psd(X: Array) -> Array:
 
 
 def dense_residual(problem: RiccatiProblem, space: StateSpace, Z: Array) -> float:
-    """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'. Not collective."""
+    """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'."""
     moved, driven = space.E.T @ Z, space.A.T @ Z
     gain = moved @ (Z.T @ space.B)
     C = square_root(problem.Q) @ space.C

@@ -59,7 +59,7 @@ class ModeRates:
 def closed_loop_rates(
     problem: RiccatiProblem, omega: Array, damping: Array, g: Array, c: Array, largest: float = 0.0
 ) -> ModeRates:
-    """Estimate the closed-loop pole of every mode; good to 3 or 4 digits when modes do not overlap. Not collective.
+    """Estimate the closed-loop pole of every mode; good to 3 or 4 digits when modes do not overlap.
 
     Args:
         problem: weights and hand.
@@ -84,7 +84,7 @@ def closed_loop_rates(
 
 
 def check_poles(rates: ModeRates) -> None:
-    """Every mode decays measurably in the closed loop. Not collective.
+    """Every mode decays measurably in the closed loop.
 
     Raises:
         ControlError: names the modes that do not, the damping that would be enough, and the way out.
@@ -95,7 +95,7 @@ def check_poles(rates: ModeRates) -> None:
 
 
 def lost_sentence(rates: ModeRates) -> str:
-    """The sentence about the modes that feedback cannot stabilise. Not collective."""
+    """The sentence about the modes that feedback cannot stabilise."""
     lost = np.flatnonzero(rates.lost)
     shown = ", ".join(f"{i + 1} (omega = {rates.omega[i]:.4g}/s)" for i in lost[:3])
     more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
@@ -107,5 +107,5 @@ def lost_sentence(rates: ModeRates) -> str:
 
 
 def enough_damping(rates: ModeRates) -> float:
-    """Kelvin-Voigt time beta [s] that gives the first mode the damping ratio :data:`ENOUGH`. Not collective."""
+    """Kelvin-Voigt time beta [s] that gives the first mode the damping ratio :data:`ENOUGH`."""
     return float(2 * ENOUGH / rates.omega.min())

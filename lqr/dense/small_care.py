@@ -33,7 +33,7 @@ class ReducedMatrices:
 
 
 def solve_reduced(matrices: ReducedMatrices) -> Array:
-    """P_N of E'PA + A'PE - E'PB R^{-1} B'PE + C'QC = 0, (N, N). Not collective.
+    """P_N of E'PA + A'PE - E'PB R^{-1} B'PE + C'QC = 0, (N, N).
 
     The Hamiltonian matrix, scaled by one number so that its off-diagonal blocks have like size, is brought to ordered
     real Schur form. When the residual shows that this is not good enough, :func:`lqr.dense.care.care` balances,
@@ -50,7 +50,7 @@ def solve_reduced(matrices: ReducedMatrices) -> Array:
 
 
 def fast_solution(m: ReducedMatrices) -> Array | None:
-    """P_N without balancing, or None when it is not accurate or not stabilising. Not collective."""
+    """P_N without balancing, or None when it is not accurate or not stabilising."""
     n = m.N
     lu, pivots, info = scipy.linalg.lapack.dgetrf(m.E)
     if info:
@@ -98,7 +98,7 @@ def _left(real: float, imag: float) -> bool:
 
 
 def closed_loop(matrices: ReducedMatrices, P_N: Array) -> Array:
-    """Eigenvalues of the reduced closed loop. Not collective."""
+    """Eigenvalues of the reduced closed loop."""
     m = matrices
     K = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
     try:

@@ -19,7 +19,7 @@ from softgrasp.lqr.spectrum.sampled import Sampling
 
 
 def weight(value: float | list[list[float]], size: int, key: str) -> Array:
-    """A number as multiple of the identity, a matrix as it is. Not collective.
+    """A number as multiple of the identity, a matrix as it is.
 
     Raises:
         SceneError: the matrix has the wrong size.
@@ -62,7 +62,7 @@ def problem(model: Model) -> RiccatiProblem:
 
 
 def scene_target(model: Model) -> Array:
-    """Where the closed loop takes the hand: motion.target, or the end of the table. Not collective.
+    """Where the closed loop takes the hand: motion.target, or the end of the table.
 
     Raises:
         SceneError: the scene names no target, or it is the start.
@@ -79,7 +79,7 @@ def scene_target(model: Model) -> Array:
 
 
 def actuation(model: Model) -> Actuation:
-    """How the feedback of the scene reaches the hand; checked against the time step. Not collective.
+    """How the feedback of the scene reaches the hand; checked against the time step.
 
     Raises:
         ControlError: rate, delay or limit do not fit.
@@ -102,7 +102,7 @@ def actuation(model: Model) -> Actuation:
 
 
 def sampling(model: Model) -> Sampling:
-    """The instants of the scene's loop. Not collective.
+    """The instants of the scene's loop.
 
     Raises:
         ControlError: the tick is no multiple of the time step.

@@ -27,7 +27,7 @@ class Actuation:
     limits: float | tuple[float, ...] | None = None
 
     def bound(self, inputs: int) -> Array | None:
-        """Limits as an array (inputs,), or None. Not collective.
+        """Limits as an array (inputs,), or None.
 
         Raises:
             ControlError: a limit is not positive, or their number does not fit.
@@ -40,7 +40,7 @@ class Actuation:
         return np.broadcast_to(given, (inputs,)).copy()
 
     def ticks(self, dt: float) -> int:
-        """Steps of length dt in one tick; 0 for continuous feedback. Not collective.
+        """Steps of length dt in one tick; 0 for continuous feedback.
 
         Raises:
             ControlError: the tick is no multiple of dt, the rate is not positive, or a delay has no rate.
@@ -89,7 +89,7 @@ class ImplicitInput:
         self.inverse = np.linalg.inv(self.one - H)
 
     def solve(self, u_0: Array) -> Array:
-        """The input of the step, (inputs,). Not collective.
+        """The input of the step, (inputs,).
 
         Raises:
             SolverError: the set of saturated inputs does not settle.

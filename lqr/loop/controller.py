@@ -105,7 +105,7 @@ class Controller:
         return int(self.plant.B.shape[1])
 
     def reset(self, tissue: Array | None = None) -> None:
-        """Forget the past; the tissue starts at [eta, eta'] or, by default, hangs still. Not collective."""
+        """Forget the past; the tissue starts at [eta, eta'] or, by default, hangs still."""
         n_s = self.n_s
         still = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else np.array(tissue, dtype=float)
         self._x = np.zeros(self.plant.N)
@@ -113,13 +113,13 @@ class Controller:
         self._fresh = True
 
     def command(self, x: Array) -> Array:
-        """The load for a known reduced state x (N,). Not collective."""
+        """The load for a known reduced state x (N,)."""
         u = self.K @ x
         u += self._offset
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
     def step(self, q_s: Array, v_s: Array) -> Array:
-        """One tick: take the measured hand, carry the tissue on, return the load [N, N m]. Not collective."""
+        """One tick: take the measured hand, carry the tissue on, return the load [N, N m]."""
         n_s, x = self.n_s, self._x
         step, accelerated, dragged, constant = self.model
         if not self._fresh:
@@ -139,7 +139,7 @@ class Controller:
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
-        """The same gain with another target of the hand. Not collective.
+        """The same gain with another target of the hand.
 
         Raises:
             ControlError: the plant has no state of rest there.
@@ -169,7 +169,7 @@ class Controller:
 
     @classmethod
     def load(cls, path: Path, scene_hash: str | None = None, layout_hash: str | None = None) -> Controller:
-        """Read a file of :meth:`save`. Not collective.
+        """Read a file of :meth:`save`.
 
         Args:
             path: the file.
@@ -264,7 +264,7 @@ def _dofs(order: np.ndarray, d: int) -> np.ndarray:
 
 
 def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Path:
-    """Write arrays and their description; a torn file never replaces a good one. Not collective.
+    """Write arrays and their description; a torn file never replaces a good one.
 
     Raises:
         ControlError: the folder cannot be written.
@@ -282,7 +282,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
 
 
 def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Read a file of :func:`write_npz` and check what it was made for. Not collective.
+    """Read a file of :func:`write_npz` and check what it was made for.
 
     Raises:
         ControlError: the file is missing or damaged, or a hash differs.

@@ -20,7 +20,7 @@ def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: floa
 
     because the midpoint rule keeps quadratic balances [HLW06]; so J(T) + V(x(T)) = V(x(0)) up to the residual of X.
     Input that is sampled and held costs more: by the integral of |u - K x|^2 weighted with R, second order in the
-    length of the tick. Not collective.
+    length of the tick.
 
     Args:
         outputs: y - y_bar at the grid points [m], (steps + 1, p).

@@ -163,13 +163,13 @@ class HeldDrive:
 
 
 def finish(plant: PlantStep, drive: Drive, n: int, u: Array, a: Array) -> None:
-    """Turn S^{-1} h into w for the acceleration a, set load and right-hand side, move the hand. Not collective."""
+    """Turn S^{-1} h into w for the acceleration a, set load and right-hand side, move the hand."""
     plant.midpoint.accelerate(plant.kappa * a + plant.alpha * drive.v[n] - plant.g)
     move(drive, n, u, a, plant.dt)
 
 
 def move(drive: Drive, n: int, u: Array, a: Array, dt: float) -> None:
-    """Midpoint rule of the hand. Not collective."""
+    """Midpoint rule of the hand."""
     drive.u[n] = u
     drive.v[n + 1] = drive.v[n] + dt * a
     drive.q[n + 1] = drive.q[n] + dt * (drive.v[n] + drive.v[n + 1]) / 2

@@ -30,7 +30,7 @@ class Exported:
 
 
 def state_names(plant: SmallPlant) -> list[str]:
-    """q_1.., v_1.., eta_1.., rate_1.. of a plant whose hand comes first; x_1.. of any other. Not collective."""
+    """q_1.., v_1.., eta_1.., rate_1.. of a plant whose hand comes first; x_1.. of any other."""
     n_s, N = plant.B.shape[1], plant.N
     k = (N - 2 * n_s) // 2
     one = np.eye(N)
@@ -41,7 +41,7 @@ def state_names(plant: SmallPlant) -> list[str]:
 
 
 def to_python_control(plant: SmallPlant, K: Array) -> Exported:
-    """The plant as ``control.StateSpace`` with named inputs, states and outputs. Not collective.
+    """The plant as ``control.StateSpace`` with named inputs, states and outputs.
 
     Raises:
         ControlError: python-control is not installed, or K does not fit.
@@ -69,7 +69,7 @@ def to_python_control(plant: SmallPlant, K: Array) -> Exported:
 
 
 def to_pymor(plant: SmallPlant, K: Array) -> Exported:
-    """The plant as ``pymor.models.iosys.LTIModel`` E x' = A x + B u. Not collective.
+    """The plant as ``pymor.models.iosys.LTIModel`` E x' = A x + B u.
 
     For programs of one rank: save the controller and load it there.
 
@@ -93,7 +93,7 @@ def to_pymor(plant: SmallPlant, K: Array) -> Exported:
 
 
 def output_names(plant: SmallPlant) -> list[str]:
-    """Names of the outputs, y_1.. where the plant has none. Not collective."""
+    """Names of the outputs, y_1.. where the plant has none."""
     return list(plant.names) if len(plant.names) == len(plant.C) else [f"y_{i + 1}" for i in range(len(plant.C))]
 
 

@@ -216,7 +216,7 @@ class LoopRun(Stepped):
         self.drive.solve(n, self.state)
 
     def record(self, n: int) -> None:
-        """Keep the entries of z that this rank gives to the outputs. Not collective."""
+        """Keep the entries of z that this rank gives to the outputs."""
         if len(self.rows):
             self.seen[n] = self.state.array[self.rows]
 
@@ -283,7 +283,7 @@ class LoopRun(Stepped):
         return np.asarray(rigid + total(self.problem.layout.comm, self.seen[part] @ self.C_rows.T))
 
     def _cost(self, outputs: Array, first: int) -> Array:
-        """From the grid point ``first`` on, as far as there are outputs. Not collective."""
+        """From the grid point ``first`` on, as far as there are outputs."""
         u = self.drive.u[first : first + len(outputs) - 1] - self.target.u
         return accumulated_cost(outputs - self.target.y, u, self.problem.Q, self.problem.R, self.dt)
 

@@ -79,7 +79,7 @@ class ReducedLoop:
         actuation: Actuation | None = None,
         start: Array | None = None,
     ) -> ReducedTrajectory:
-        """Run for some steps. Not collective.
+        """Run for some steps.
 
         Args:
             K: gain, (n_s, N).

@@ -45,7 +45,7 @@ class SmallPlant:
         return len(self.E)
 
     def rest_at(self, q_bar: Array) -> tuple[Array, Array]:
-        """x_bar (N,) and u_bar (n_s,) with 0 = A x + B u + f and S_q x = q_bar. Not collective.
+        """x_bar (N,) and u_bar (n_s,) with 0 = A x + B u + f and S_q x = q_bar.
 
         Raises:
             ControlError: the plant has no such state, or more than one.
@@ -78,7 +78,7 @@ class Shapes:
         return np.concatenate([x.q_s, x.v_s, tissue.ravel()])
 
     def expand(self, problem: RiccatiProblem, x: Array) -> PlantState:
-        """The full state of a reduced one. Not collective."""
+        """The full state of a reduced one."""
         n_s, k = problem.layout.n_s, self.V.shape[1]
         q, v, eta, rate = np.split(np.asarray(x), [n_s, 2 * n_s, 2 * n_s + k])
         return PlantState(q, v, self.V @ eta, self.V @ rate)
@@ -89,7 +89,7 @@ class Shapes:
         return np.hstack([gain.K_s, tissue[0], tissue[1]])
 
     def expand_gain(self, problem: RiccatiProblem, K: Array) -> Gain:
-        """The gain on the full state that is u = K [q_s, v_s, W'z, W'v_z]. Not collective."""
+        """The gain on the full state that is u = K [q_s, v_s, W'z, W'v_z]."""
         n_s, k = problem.layout.n_s, self.V.shape[1]
         return Gain(K[:, : 2 * n_s], self.W @ K[:, 2 * n_s : 2 * n_s + k].T, self.W @ K[:, 2 * n_s + k :].T)
 

@@ -130,7 +130,7 @@ class Sweep:
 
 
 def start_sweep(plant: Plant, outputs: Right, gain: Right, tol: float) -> Sweep:
-    """W_0 = [C', K']. Not collective."""
+    """W_0 = [C', K']."""
     state = Right.join([gain, outputs, gain, Right(-gain.hand, -gain.rows)])
     return Sweep(state, Columns(plant, SHARE * tol * plant.scale))
 
@@ -139,7 +139,7 @@ def real_columns(p: complex, q: int) -> tuple[Complex, float]:
     """Coefficients c of the real columns Z = Re(V c) of a shift or its conjugate pair, and g in W <- W + g E'Z_1.
 
     p = a + ib, g = 2 sqrt(-a), d = a/b: Z = [g (Re V + d Im V), g sqrt(d^2 + 1) Im V] [BKS13], Z_1 its first q columns.
-    Not collective.
+
     """
     one = np.eye(q, dtype=complex)
     if p.imag == 0:

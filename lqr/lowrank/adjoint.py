@@ -41,12 +41,12 @@ class Right:
         return Right(self.hand[:, part], self.rows[:, part])
 
     def plus(self, E_V: Right, small: Array) -> Right:
-        """W + E'V small. Not collective."""
+        """W + E'V small."""
         return Right(self.hand + E_V.hand @ small, self.rows + E_V.rows @ small)
 
     @classmethod
     def join(cls, parts: list[Right]) -> Right:
-        """Columns side by side. Not collective."""
+        """Columns side by side."""
         return Right(np.hstack([p.hand for p in parts]), np.hstack([p.rows for p in parts]))
 
 
@@ -74,7 +74,7 @@ class Solution:
         return int(self.mix.shape[1])
 
     def real(self, coefficients: Complex) -> Block:
-        """Re(V c) for a (q, l) matrix c, without V: one real product each for a and b. Not collective."""
+        """Re(V c) for a (q, l) matrix c, without V: one real product each for a and b."""
         n, weight_b = len(self.b), self.mix @ coefficients
         weight_a = weight_b / self.p
         pairs = _pairs(self.b)
@@ -104,7 +104,7 @@ def _total(plant: Plant, X: Array, b: Complex) -> Complex:
 
 
 def _solve_small(A: Complex, B: Complex) -> Complex:
-    """A^{-1} B for a matrix of a few rows; LAPACK itself, because the checks around it take longer. Not collective."""
+    """A^{-1} B for a matrix of a few rows; LAPACK itself, because the checks around it take longer."""
     if A.size == 0:
         return np.zeros(B.shape, dtype=complex)
     _, _, X, info = scipy.linalg.lapack.zgesv(A, B)

@@ -106,7 +106,7 @@ def _leading(G: Array, allowed: float) -> Array:
 
     A Cholesky factorisation with pivots, G = L L', first takes out the range of G, of about half its order; then
     L'L = V s V' of that order and U = L V s^{-1/2}. U'U = I to rounding of G / sqrt(s_i s_j): what that adds to
-    U' G U is rounding of G. Not collective.
+    U' G U is rounding of G.
     """
     k = len(G)
     factor, pivots, rank, info = scipy.linalg.lapack.dpstrf(

@@ -9,7 +9,7 @@ import scipy.sparse.linalg
 
 
 class FactorsAhead:
-    """A few threads of one factor each. Not collective.
+    """A few threads of one factor each.
 
     SciPy frees the memory of a factor in the thread that made it and in no other, so each factor goes back there.
 

@@ -95,7 +95,7 @@ class Level:
 
 
 def _normalising(gram: Array) -> Array:
-    """S with S'gram S = I on the part of gram that is not rounding. Not collective."""
+    """S with S'gram S = I on the part of gram that is not rounding."""
     sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
     keep = sizes > max(NEW**2, ROUNDING * float(sizes.max(initial=0.0)))
     return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
@@ -106,10 +106,7 @@ def _m_norms(plant: Plant, columns: Array) -> Array:
 
 
 def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
-    """X of a level in the basis of the next: V_old = V_new T, T the columns of S^{-1} that the old basis filled.
-
-    Not collective.
-    """
+    """X of a level in the basis of the next: V_old = V_new T, T the columns of S^{-1} that the old basis filled."""
     s, r = 2 * plant.n_s, old.small.order
     T = np.linalg.inv(S)[:, :r]
     W = np.zeros((s + 2 * len(omega), s + 2 * r))
@@ -162,7 +159,7 @@ def gain_change(plant: Plant, new: Level, old: Level) -> float:
 
 
 def frequencies(low: float, high: float, count: int) -> Array:
-    """Points that fill [low, high] on a log scale evenly at every stage (van der Corput). Not collective."""
+    """Points that fill [low, high] on a log scale evenly at every stage (van der Corput)."""
     position = []
     for i in range(count):
         x, share, k = 0.0, 0.5, i + 1

@@ -44,7 +44,7 @@ def best_step(comm: MPI.Intracomm, old: tuple[Block, Array], W: Block, change: B
 
 
 def mixed_residual(old: tuple[Block, Array] | None, W: Block, change: Block, t: float) -> tuple[Block, Array]:
-    """(U, signs) of (1 - t) R_j + t W W' - t^2 dK'dK. Not collective."""
+    """(U, signs) of (1 - t) R_j + t W W' - t^2 dK'dK."""
     parts, signs = (
         [W.times(np.sqrt(t) * np.eye(W.columns)), change.times(t * np.eye(change.columns))],
         [

@@ -150,7 +150,7 @@ def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) 
 
 
 def _few_modes(small: ModalSubspace) -> Array | None:
-    """X of the lowest modes alone, zero for the others; None where all are few. Not collective.
+    """X of the lowest modes alone, zero for the others; None where all are few.
 
     With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
     """
@@ -168,7 +168,7 @@ def _few_modes(small: ModalSubspace) -> Array | None:
 
 
 def _corrected(space: StateSpace, X: Array) -> Array | None:
-    """Newton's method from a stabilising X near the solution; None when it is not. Not collective."""
+    """Newton's method from a stabilising X near the solution; None when it is not."""
     n = len(space.E)
     lu, pivots, info = scipy.linalg.lapack.dgetrf(space.E)
     if info:
@@ -226,7 +226,7 @@ def filtered_gain(plant: Plant, small: ModalSubspace, solution: SmallSolution, M
 
 
 def check_damped(plant: Plant) -> None:
-    """The tissue is damped at all. Not collective.
+    """The tissue is damped at all.
 
     Raises:
         ControlError: it is not.

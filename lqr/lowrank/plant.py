@@ -87,7 +87,7 @@ class Plant:
         return total(self.comm, V.tall[self.n_local :].T @ self.B_z)
 
     def outputs(self) -> Block:
-        """C' as a block (z-row unscaled). Not collective."""
+        """C' as a block (z-row unscaled)."""
         hand = np.vstack([self.C_s.T, np.zeros_like(self.C_s.T)])
         return Block(hand, np.vstack([self.C_z, np.zeros_like(self.C_z)]))
 

@@ -44,7 +44,7 @@ class Iteration:
 
 
 def fingerprint(plant: Plant) -> str:
-    """Digest of the problem that this rank sees, to refuse a foreign restart file. Not collective."""
+    """Digest of the problem that this rank sees, to refuse a foreign restart file."""
     digest = hashlib.sha256(repr((plant.comm.size, plant.layout.n_e, plant.two_way, plant.drag_es)).encode())
     for A in (plant.system.M_ee, plant.system.K_ee):
         digest.update(np.ascontiguousarray(A.getValuesCSR()[2]))

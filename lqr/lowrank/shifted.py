@@ -69,7 +69,7 @@ def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
 def factor_bytes(n: int, dimension: int) -> float:
     """What MUMPS asks for to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
 
-    Fitted to n = 6 558 to 103 038 in 2D and n = 7 227 to 52 857 in 3D. Not collective.
+    Fitted to n = 6 558 to 103 038 in 2D and n = 7 227 to 52 857 in 3D.
     """
     return 240 * n * float(np.log2(max(n, 2))) if dimension < 3 else 800 * n ** (4 / 3)
 

@@ -175,7 +175,7 @@ class GatheredTissue:
         return result
 
     def destroy(self) -> None:
-        """Free the factors. Not collective."""
+        """Free the factors."""
         self._forget()
         if self.ahead is not None:
             self.ahead.close()
@@ -185,7 +185,7 @@ _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
 
 
 def _cores() -> int:
-    """Cores that this process may use. Not collective."""
+    """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -32,11 +32,11 @@ class ShiftRange:
     fastest: float
 
     def clip(self, p: complex) -> complex:
-        """Nearest admissible shift in the left half plane, Im >= 0. Not collective."""
+        """Nearest admissible shift in the left half plane, Im >= 0."""
         return complex(self.clip_all(np.array([p], dtype=complex))[0])
 
     def clip_all(self, values: np.ndarray) -> np.ndarray:
-        """Nearest admissible shifts in the left half plane, Im >= 0, (k,). Not collective."""
+        """Nearest admissible shifts in the left half plane, Im >= 0, (k,)."""
         size = np.abs(values)
         usable = np.isfinite(size) & (size > 0)
         values, size = np.where(usable, values, -self.low), np.where(usable, size, self.low)
@@ -136,7 +136,7 @@ def choose_shifts(candidates: np.ndarray, weights: Array, count: int, planned: S
     """Greedy choice: the candidate where most of the residual is left, after the shifts chosen before it.
 
     Like the min-max choice of [P00], with the components of the residual in place of 1: a pole whose residual is
-    already annihilated is not taken again, one that the outputs hardly see is taken late. Not collective.
+    already annihilated is not taken again, one that the outputs hardly see is taken late.
 
     Args:
         candidates: admissible values, Re < 0, Im >= 0.
@@ -178,7 +178,7 @@ class ShiftQueue:
 
     @classmethod
     def start(cls, limits: ShiftRange, poles: Sequence[complex] | np.ndarray) -> ShiftQueue:
-        """The hand's and the lightly damped poles in their order, clipped, doubles removed. Not collective."""
+        """The hand's and the lightly damped poles in their order, clipped, doubles removed."""
         pending: list[complex] = []
         for i, p in enumerate(limits.clip_all(np.asarray(poles, dtype=complex)).tolist()):
             important = i < 4 or -p.real < SHARP * abs(p)
@@ -187,7 +187,7 @@ class ShiftQueue:
         return cls(limits, pending)
 
     def short(self, steps: int) -> bool:
-        """Whether more shifts are due after so many steps. Not collective."""
+        """Whether more shifts are due after so many steps."""
         return not self.pending or (steps > 0 and len(self.pending) <= EARLY)
 
     def refill(self, plant: Plant, recent: Block, W: Block, gain: Right | None) -> None:
@@ -200,5 +200,5 @@ class ShiftQueue:
         self.projections += 1
 
     def next(self) -> tuple[complex, list[complex]]:
-        """The next shift and those after it. Not collective."""
+        """The next shift and those after it."""
         return self.pending.pop(0), self.pending[:]

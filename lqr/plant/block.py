@@ -31,10 +31,10 @@ class Block:
         return Block(self.hand[:, part], self.tall[:, part])
 
     def times(self, small: Array) -> Block:
-        """Block @ small. Not collective."""
+        """Block @ small."""
         return Block(self.hand @ small, self.tall @ small)
 
     @classmethod
     def join(cls, blocks: list[Self]) -> Block:
-        """Columns side by side. Not collective."""
+        """Columns side by side."""
         return Block(np.hstack([b.hand for b in blocks]), np.hstack([b.tall for b in blocks]))

@@ -17,7 +17,7 @@ class ControlError(SoftgraspError):
 
 
 def check_weights(Q: Array, R: Array, outputs: int, inputs: int) -> None:
-    """Q symmetric positive semidefinite of order ``outputs``, R symmetric positive definite. Not collective.
+    """Q symmetric positive semidefinite of order ``outputs``, R symmetric positive definite.
 
     Raises:
         ControlError: a weight has the wrong shape, an entry that is no number, is not symmetric or has a forbidden
@@ -49,7 +49,7 @@ def check_weights(Q: Array, R: Array, outputs: int, inputs: int) -> None:
 
 
 def check_finite(**arrays: Array | None) -> None:
-    """Every array holds finite numbers only. Not collective.
+    """Every array holds finite numbers only.
 
     Args:
         arrays: by the name that a message should use; None is skipped.
@@ -63,7 +63,7 @@ def check_finite(**arrays: Array | None) -> None:
 
 
 def square_root(Q: Array) -> Array:
-    """S of full row rank with S' S = Q for a symmetric positive semidefinite Q. Not collective."""
+    """S of full row rank with S' S = Q for a symmetric positive semidefinite Q."""
     values, vectors = np.linalg.eigh((Q + Q.T) / 2)
     keep = values > len(values) * EPS * max(float(values[-1]), 0.0)
     return np.asarray(np.sqrt(values[keep])[:, None] * vectors[:, keep].T)

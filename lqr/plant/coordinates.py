@@ -30,13 +30,13 @@ def _under(system: BlockSystem, local: Array) -> Array:
 
 
 def states_to_relative(system: BlockSystem, X: Block) -> Block:
-    """S X. Not collective."""
+    """S X."""
     q_s, v_s, q, v = _split(system, X)
     return Block(X.hand, np.concatenate([q - system.T @ q_s, v - system.T @ v_s]))
 
 
 def states_to_absolute(system: BlockSystem, X: Block) -> Block:
-    """S^{-1} X. Not collective."""
+    """S^{-1} X."""
     q_s, v_s, z, v = _split(system, X)
     return Block(X.hand, np.concatenate([z + system.T @ q_s, v + system.T @ v_s]))
 

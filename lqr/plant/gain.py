@@ -54,7 +54,7 @@ class Gain:
 
     @classmethod
     def of_block(cls, K: Block) -> Gain:
-        """The gain whose columns K' are given. Not collective."""
+        """The gain whose columns K' are given."""
         n = len(K.tall) // 2
         return cls(np.ascontiguousarray(K.hand.T), np.asfortranarray(K.tall[:n]), np.asfortranarray(K.tall[n:]))
 

@@ -16,18 +16,18 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 
 def gain_translation(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
-    """Gain u for the whole body displaced by unit translations, (n_s, d) [N/m]. Not collective."""
+    """Gain u for the whole body displaced by unit translations, (n_s, d) [N/m]."""
     return np.asarray(solution.gain.K_s[:, : problem.layout.dimension])
 
 
 def gain_rigid_velocity(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
-    """Gain u for the whole body moving with unit velocities, (n_s, d) [N s/m]. Not collective."""
+    """Gain u for the whole body moving with unit velocities, (n_s, d) [N s/m]."""
     n_s = problem.layout.n_s
     return np.asarray(solution.gain.K_s[:, n_s : n_s + problem.layout.dimension])
 
 
 def optimal_cost(problem: RiccatiProblem, solution: RiccatiSolution, displacement: Array) -> float:
-    """Cost x' E'XE x for the whole body at rest, displaced by hand coordinates from its target. Not collective.
+    """Cost x' E'XE x for the whole body at rest, displaced by hand coordinates from its target.
 
     Args:
         problem: sizes.
@@ -38,14 +38,14 @@ def optimal_cost(problem: RiccatiProblem, solution: RiccatiSolution, displacemen
 
 
 def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float:
-    """||(K x_T)'R(K x_T) - C_s'QC_s|| / ||C_s'QC_s||. Not collective."""
+    """||(K x_T)'R(K x_T) - C_s'QC_s|| / ||C_s'QC_s||."""
     K = solution.gain.K_s[:, : problem.layout.n_s]
     exact = problem.C_s.T @ problem.Q @ problem.C_s
     return float(np.linalg.norm(K.T @ problem.R @ K - exact) / (np.linalg.norm(exact) or 1.0))
 
 
 def velocity_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float | None:
-    """||(K x_T)'R(K v_T) - x_T'E'XE x_T|| / ||x_T'E'XE x_T||. Not collective.
+    """||(K x_T)'R(K v_T) - x_T'E'XE x_T|| / ||x_T'E'XE x_T||.
 
     None when the damping drags against space: the identity does not hold then.
     """

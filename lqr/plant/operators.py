@@ -11,7 +11,7 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 
 
 def modes_couple(system: BlockSystem) -> bool:
-    """Whether the damping couples the modes of the coupled free motion. Not collective."""
+    """Whether the damping couples the modes of the coupled free motion."""
     return system.damping.matrix is not None or (system.two_way and system.damping.alpha > 0)
 
 

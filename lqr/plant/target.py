@@ -37,7 +37,7 @@ class Target:
 
 
 def steady_input(system: BlockSystem) -> Array:
-    """u_bar that holds hand (and, two-way, tissue) against gravity [N, N m], (n_s,). Not collective."""
+    """u_bar that holds hand (and, two-way, tissue) against gravity [N, N m], (n_s,)."""
     u = np.zeros(system.layout.n_s)
     if system.gravity is None:
         return u

@@ -72,7 +72,7 @@ class BasisFamily:
     make: Callable[[int], RiccatiBasis]
 
     def orders(self, sizes: Sequence[int]) -> list[int]:
-        """Those of the orders that exist. Not collective."""
+        """Those of the orders that exist."""
         return [N for N in sizes if self.smallest <= N <= self.largest and (N - self.smallest) % self.step == 0]
 
     def at(self, N: int) -> RiccatiBasis:
@@ -247,7 +247,7 @@ def structured(problem: RiccatiProblem) -> BasisFamily:
 
 
 def modal_basis(problem: RiccatiProblem, name: str, omega: Array, Phi: Array, massed: Array) -> RiccatiBasis:
-    """States [q_s, v_s, Phi/omega, Phi] and costates [q_s, v_s, M Phi omega, Phi] of some modes. Not collective."""
+    """States [q_s, v_s, Phi/omega, Phi] and costates [q_s, v_s, M Phi omega, Phi] of some modes."""
     n_s, n, k = problem.layout.n_s, problem.layout.n_local, len(omega)
     N = 2 * (n_s + k)
     hand = np.hstack([np.eye(2 * n_s), np.zeros((2 * n_s, 2 * k))])
@@ -284,7 +284,7 @@ def energy_scaled(problem: RiccatiProblem, basis: RiccatiBasis) -> RiccatiBasis:
 
 
 def weight_blocks(problem: RiccatiProblem) -> tuple[Array, Array]:
-    """Hand block and coupling column of W = (E + E')/2 in the paper's coordinates, [., v_s] rows. Not collective."""
+    """Hand block and coupling column of W = (E + E')/2 in the paper's coordinates, [., v_s] rows."""
     system = problem.system
     if not system.two_way:
         return system.M_hand, system.M_es / 2

@@ -79,7 +79,7 @@ class Retuner:
         return result
 
     def at(self, materials: Materials) -> ReducedMatrices:
-        """The reduced equation for other Lame constants and viscosities. Not collective.
+        """The reduced equation for other Lame constants and viscosities.
 
         Raises:
             ControlError: the number of layers or a density differs from the reference.
@@ -92,7 +92,7 @@ class Retuner:
         return replace(self.matrices, A=self.A_0 + self._stiffness(materials))
 
     def solve(self, materials: Materials) -> Tuned:
-        """Combine, solve, gain. Not collective.
+        """Combine, solve, gain.
 
         Raises:
             ControlError: the setting is refused, or its reduced equation has no stabilising solution.
@@ -104,7 +104,7 @@ class Retuner:
         return Tuned(P_N, K_N, time.perf_counter() - begin)
 
     def full_gain(self, tuned: Tuned) -> Gain:
-        """K_hat of the full plant: E'W does not depend on the materials. Not collective."""
+        """K_hat of the full plant: E'W does not depend on the materials."""
         return Gain.of_block(self.columns.times(-tuned.P_N @ np.linalg.solve(self.problem.R, self.matrices.B.T).T))
 
 

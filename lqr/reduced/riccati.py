@@ -241,7 +241,7 @@ class GainJudge:
 
 
 def hand_start(problem: RiccatiProblem, displacement: Sequence[float] | Array) -> Block:
-    """Whole body at rest, displaced rigidly by hand coordinates [m, rad], (n_s,), as one column. Not collective."""
+    """Whole body at rest, displaced rigidly by hand coordinates [m, rad], (n_s,), as one column."""
     n_s = problem.layout.n_s
     hand = np.zeros((2 * n_s, 1))
     hand[:n_s, 0] = displacement

@@ -143,7 +143,7 @@ def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, i
 
 
 def _judge(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:
-    """What the eigenvalues nearest to the shift say. Not collective."""
+    """What the eigenvalues nearest to the shift say."""
     distance = np.abs(values - shift)
     order = np.argsort(distance)
     values, distance = values[order], distance[order]

@@ -40,7 +40,7 @@ class Sampling:
 
     @classmethod
     def of(cls, actuation: Actuation, dt: float) -> Sampling:
-        """The instants of an actuation. Not collective.
+        """The instants of an actuation.
 
         Raises:
             ControlError: the tick is no multiple of dt.
@@ -86,7 +86,7 @@ class _Rest:
 
 
 def midpoint_radius(poles: np.ndarray, dt: float) -> float:
-    """Largest |(1 + s dt/2) / (1 - s dt/2)| over closed-loop poles s: the law inside the step. Not collective.
+    """Largest |(1 + s dt/2) / (1 - s dt/2)| over closed-loop poles s: the law inside the step.
 
     Below 1 exactly where every Re s < 0, for every dt.
     """
@@ -96,7 +96,7 @@ def midpoint_radius(poles: np.ndarray, dt: float) -> float:
 
 
 def tick(A: Array, B: Array, law: Sampling) -> tuple[Array, Array]:
-    """A_d = Phi^k, B_d = (I + Phi + ... + Phi^{k-1}) Gamma of k midpoint steps under one input. Not collective.
+    """A_d = Phi^k, B_d = (I + Phi + ... + Phi^{k-1}) Gamma of k midpoint steps under one input.
 
     Phi = (I - dt/2 A)^{-1} (I + dt/2 A), Gamma = dt (I - dt/2 A)^{-1} B.
     """
@@ -240,7 +240,7 @@ def _bounds(n_s: int, k: int) -> tuple[tuple[int, int], ...]:
 
 
 def _judge(parts: _Parts, law: Sampling) -> SampledRadius:
-    """Eigenvalues of the modes kept, and the bound on the rest. Not collective."""
+    """Eigenvalues of the modes kept, and the bound on the rest."""
     A_d, B_d = tick(parts.A, parts.B, law)
     m = B_d.shape[1]
     if law.delay:
@@ -264,7 +264,7 @@ def _judge(parts: _Parts, law: Sampling) -> SampledRadius:
 
 
 def _small_gain(values: np.ndarray, ends: tuple[np.ndarray, np.ndarray], rest: _Rest, law: Sampling) -> float:
-    """Max over |z| = 1 of |(I - L)^{-1}| |D|. Not collective."""
+    """Max over |z| = 1 of |(I - L)^{-1}| |D|."""
     away = np.maximum(np.abs(1 - np.abs(values)), 1e-12)
     angles = np.angle(values)[:, None] + away[:, None] * np.concatenate([-AROUND, AROUND])
     grid = np.concatenate([np.linspace(0.5 / GRID, 1.0, GRID) * np.pi, np.abs(angles.ravel())])
@@ -312,7 +312,7 @@ def _responses(rest: _Rest, law: Sampling) -> tuple[float, float]:
 
 
 def _carried(A: Array, B: Array, hand: Array, K: Controller, law: Sampling) -> SampledRadius:
-    """Plant x, tissue y of the controller, and the command under way. Not collective."""
+    """Plant x, tissue y of the controller, and the command under way."""
     n_s, n = K.n_s, len(A)
     A_d, B_d = tick(A, B, law)
     step, accelerated, dragged, _ = K.model

@@ -17,7 +17,7 @@ MODES = 60
 
 
 def why_no_bound(problem: RiccatiProblem) -> str:
-    """Why :class:`Tail` does not apply; empty when it does. Not collective."""
+    """Why :class:`Tail` does not apply; empty when it does."""
     system, damping = problem.system, problem.system.damping
     if not damping.active:
         return "no damping: modes beyond the radius stay on the axis"
@@ -29,7 +29,7 @@ def why_no_bound(problem: RiccatiProblem) -> str:
 
 
 def least_beta(problem: RiccatiProblem) -> float:
-    """Kelvin-Voigt time of the least damped layer [s]: D_ee >= alpha M_ee + beta K_ee. Not collective."""
+    """Kelvin-Voigt time of the least damped layer [s]: D_ee >= alpha M_ee + beta K_ee."""
     system = problem.system
     if system.damping.matrix is None:
         return system.damping.beta
@@ -94,7 +94,7 @@ class Tail:
         (self.rest_static,) = _norms(problem, static, _moved_mass(problem, static), 1)
 
     def bound(self, r: float, a: float = 0.0) -> float:
-        """The bound at radius r for Re s >= -a, 0 <= a < r; infinite where it says nothing. Not collective."""
+        """The bound at radius r for Re s >= -a, 0 <= a < r; infinite where it says nothing."""
         if not 0 <= a < r or (a > 0 and (self.coupled or self.drag > 0)):
             return np.inf
         hand = self.K_q / r**2 + self.K_v / r
@@ -131,7 +131,7 @@ class Tail:
         return (K_z / r + K_v) * force
 
     def radius(self, limit: float) -> float:
-        """Radius, to a tenth, from where the bound for Re s >= 0 is below ``limit``; inf if none. Not collective."""
+        """Radius, to a tenth, from where the bound for Re s >= 0 is below ``limit``; inf if none."""
         grid = float(self.omega[0]) * 1e-3 * 1.1 ** np.arange(145)  # to 1000 omega_1
         good = [r for r in grid if self.bound(r) < limit]
         return float(min(good, default=np.inf))

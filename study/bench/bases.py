@@ -51,7 +51,7 @@ Row = dict[str, Any]
 
 
 def parse_shapes(text: str) -> list[tuple[int, int]]:
-    """``10000x600`` as pairs of rows and columns. Not collective.
+    """``10000x600`` as pairs of rows and columns.
 
     Raises:
         typer.BadParameter: anything else.
@@ -65,7 +65,7 @@ def parse_shapes(text: str) -> list[tuple[int, int]]:
 
 
 def spectrum_of(m: int) -> Array:
-    """Singular values from 1 to 10^-DECADES. Not collective."""
+    """Singular values from 1 to 10^-DECADES."""
     return 10.0 ** (-DECADES * np.arange(m) / (m - 1))
 
 
@@ -73,7 +73,7 @@ def known_matrix(comm: MPI.Intracomm, n: int, m: int, complex_valued: bool) -> N
     """U diag(sigma) C^H with known sigma: U are cosines, orthonormal on n points, C mixes all columns. F order.
 
     It is made in extended precision and rounded once: a product in double precision alone would change
-    sigma = 1e-10 in its eighth digit. Every rank makes its own rows. Not collective.
+    sigma = 1e-10 in its eighth digit. Every rank makes its own rows.
     """
     start, stop = n * comm.rank // comm.size, n * (comm.rank + 1) // comm.size
     X = np.empty((stop - start, m), dtype=complex if complex_valued else float, order="F")
@@ -98,7 +98,7 @@ def known_matrix(comm: MPI.Intracomm, n: int, m: int, complex_valued: bool) -> N
 
 
 def right_down_to(sigma: Array, true: Array, tolerance: float) -> float:
-    """Smallest sigma / sigma_1 down to which all values are right to a relative tolerance. Not collective."""
+    """Smallest sigma / sigma_1 down to which all values are right to a relative tolerance."""
     k = min(len(sigma), len(true))
     wrong = np.abs(sigma[:k] / true[:k] - 1) > tolerance
     count = int(np.argmax(wrong)) if wrong.any() else k
@@ -173,7 +173,7 @@ HEADER = ("engine", *SHAPE, "s", "/ default", f"right to {RIGHT:g}", f"to {ROUGH
 
 
 def table_of(results: Sequence[Row]) -> Table:
-    """The one table, accuracy against time. Not collective."""
+    """The one table, accuracy against time."""
     cells: list[tuple[Any, ...]] = []
     for row in results:
         size = tuple(row[key] for key in SHAPE)
@@ -187,7 +187,7 @@ def table_of(results: Sequence[Row]) -> Table:
 
 
 def missed(results: Sequence[Row]) -> list[str]:
-    """Sentences for defaults that are not right down to the goal. Not collective."""
+    """Sentences for defaults that are not right down to the goal."""
 
     def last(m: int) -> float:
         """Smallest value of the spectrum that the goal speaks of, with room for rounding."""
@@ -206,7 +206,7 @@ def missed(results: Sequence[Row]) -> list[str]:
 
 
 def csv_table(results: Sequence[Row]) -> Table:
-    """One line an engine, numbers in full. Not collective."""
+    """One line an engine, numbers in full."""
     cells = [
         (name, *(row[key] for key in SHAPE), *(engine[key] for key in ("seconds", "right", "rough", "off")))
         for row in results

@@ -33,7 +33,7 @@ class Goal:
 
 
 def parse_list(text: str, pattern: str, advice: str) -> list[Any]:
-    """The groups of a regular expression for each part of a list with commas. Not collective.
+    """The groups of a regular expression for each part of a list with commas.
 
     Raises:
         typer.BadParameter: a part does not match.
@@ -46,7 +46,7 @@ def parse_list(text: str, pattern: str, advice: str) -> list[Any]:
 
 
 def parse_ranks(text: str) -> list[int]:
-    """``1,2`` as numbers. Not collective.
+    """``1,2`` as numbers.
 
     Raises:
         typer.BadParameter: anything else.
@@ -55,10 +55,7 @@ def parse_ranks(text: str) -> list[int]:
 
 
 def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
-    """Exponent p of cost ~ n^p by least squares on logarithms; None for fewer than two positive points.
-
-    Not collective.
-    """
+    """Exponent p of cost ~ n^p by least squares on logarithms; None for fewer than two positive points."""
     points = [(a, b) for a, b in zip(n, cost, strict=True) if a > 0 and b > 0]
     if len({a for a, _ in points}) < 2:
         return None
@@ -67,14 +64,14 @@ def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Three digits, or all before the point; a dash for None. Not collective."""
+    """Three digits, or all before the point; a dash for None."""
     if value is None:
         return "-"
     return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
 
 
 def open_console(width: int) -> Console:
-    """A terminal wide enough for the table. Not collective.
+    """A terminal wide enough for the table.
 
     Raises:
         typer.BadParameter: the benchmark was started under mpiexec.
@@ -85,19 +82,19 @@ def open_console(width: int) -> Console:
 
 
 def show_goals(console: Console, goals: Sequence[Goal]) -> None:
-    """Print what was to be reached, and whether it is. Not collective."""
+    """Print what was to be reached, and whether it is."""
     for goal in goals:
         verdict = "[green]ok[/green]" if goal.ok else "[red]missed[/red]"
         console.print(f"goal {verdict}: {goal.text} {number(goal.value)} <= {goal.limit:g}")
 
 
 def goal_rows(goals: Sequence[Goal]) -> list[dict[str, Any]]:
-    """Goals as the JSON file has them. Not collective."""
+    """Goals as the JSON file has them."""
     return [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals]
 
 
 def write_bench(out: Path, name: str, content: dict[str, Any], table: Table, markdown: str = "") -> list[Path]:
-    """NAME.json, NAME.csv and NAME.md; returns what was written. Not collective."""
+    """NAME.json, NAME.csv and NAME.md; returns what was written."""
     out.mkdir(parents=True, exist_ok=True)
     files = [write_json(out / f"{name}.json", content), table.write_csv(out / f"{name}.csv")]
     if markdown:
@@ -107,7 +104,7 @@ def write_bench(out: Path, name: str, content: dict[str, Any], table: Table, mar
 
 
 def list_bench(console: Console, files: Sequence[Path], failed: bool) -> None:
-    """Print the files and leave with status 1 where a row failed. Not collective.
+    """Print the files and leave with status 1 where a row failed.
 
     Raises:
         typer.Exit: a row failed.

@@ -58,7 +58,7 @@ Row = dict[str, Any]
 
 
 def parse_sizes(text: str) -> list[tuple[str, int]]:
-    """``2d:1000,3d:50000`` as pairs; a bare number is 2D. Not collective.
+    """``2d:1000,3d:50000`` as pairs; a bare number is 2D.
 
     Raises:
         typer.BadParameter: anything else.
@@ -68,7 +68,7 @@ def parse_sizes(text: str) -> list[tuple[str, int]]:
 
 
 def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
-    """Growth over the 2D sizes for each rank count, memory counted above that of the libraries. Not collective."""
+    """Growth over the 2D sizes for each rank count, memory counted above that of the libraries."""
     result = {}
     good = [row for row in rows if "error" not in row and row["dimension"] == 2 and not row["large"]]
     for ranks in sorted({row["ranks"] for row in good}):
@@ -85,7 +85,7 @@ def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
 
 
 def goals(rows: Sequence[Row]) -> list[Goal]:
-    """All goals that the rows can speak for. Not collective."""
+    """All goals that the rows can speak for."""
     result = []
     for row in rows:
         if "error" in row:
@@ -112,7 +112,7 @@ HEADER = (
 
 
 def table_of(rows: Sequence[Row]) -> Table:
-    """The table of the terminal and the README. Not collective."""
+    """The table of the terminal and the README."""
     cells = []
     for row in rows:
         if "error" in row:
@@ -127,7 +127,7 @@ def table_of(rows: Sequence[Row]) -> Table:
 
 
 def csv_table(rows: Sequence[Row]) -> Table:
-    """One line a row, numbers in full. Not collective."""
+    """One line a row, numbers in full."""
     names = ["problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats"]
     stages = ["mesh", "assembly", "factor"]
     last = ["ratio", "ratio_own", "drift", "residual", "memory_mb", "memory_base_mb", "error"]
@@ -198,7 +198,7 @@ def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
 
 
 def collect(console: Console, sizes: list[tuple[str, int]], ranks: list[int], repeats: int, large: bool) -> list[Row]:
-    """Launch all workers one after the other. Not collective."""
+    """Launch all workers one after the other."""
     rows: list[Row] = []
     jobs: list[tuple[str, int, int, bool]] = [(kind, size, k, False) for kind, size in sizes for k in ranks]
     if large:

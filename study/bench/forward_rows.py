@@ -35,7 +35,7 @@ PEER_SHARE = 3  # SciPy and pyMOR need about so many times longer a step
 
 
 def cells_for(dimension: int, size: int) -> list[int]:
-    """Cells of the 1 x 2 rectangle (1 x 1 x 2 box) whose free nodes come nearest to ``size`` unknowns. Not collective.
+    """Cells of the 1 x 2 rectangle (1 x 1 x 2 box) whose free nodes come nearest to ``size`` unknowns.
 
     Size 1000 in 2D gives 15 x 30, the mesh of the paper.
     """
@@ -160,7 +160,7 @@ def _loops(run: Run, factor: dict[str, float]) -> tuple[dict[str, Any], list[Any
 
 
 def _peers(run: Run, factor: dict[str, float]) -> dict[str, Any]:
-    """SciPy's loop and pyMOR's where it is installed and small enough; notes SciPy's factor time. Not collective."""
+    """SciPy's loop and pyMOR's where it is installed and small enough; notes SciPy's factor time."""
     system = run.model.system
     K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
     begin = time.perf_counter()

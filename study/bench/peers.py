@@ -86,7 +86,7 @@ class PlainCholesky(BareSolve):
 class ScipyLoop:
     """Sparse LU of S and the second-order loop in NumPy, on one rank.
 
-    SuperLU gets its options for a matrix with symmetric pattern, which halve its fill. Not collective.
+    SuperLU gets its options for a matrix with symmetric pattern, which halve its fill.
     """
 
     def __init__(self, K: Any, M: Any, G: Array, dt: float, loads: Array) -> None:
@@ -124,14 +124,14 @@ class ScipyLoop:
 
 
 def has_pymor() -> bool:
-    """Whether pyMOR is installed. Not collective."""
+    """Whether pyMOR is installed."""
     return importlib.util.find_spec("pymor") is not None
 
 
 class PymorLoop:
     """pyMOR's ``ImplicitMidpointTimeStepper`` on the first-order form of size 2 n_e, on one rank.
 
-    [I 0; 0 M] x' + [0 -I; K 0] x = [0; G c(t)] with x = [z; v]; pyMOR keeps its LU factor. Not collective.
+    [I 0; 0 M] x' + [0 -I; K 0] x = [0; G c(t)] with x = [z; v]; pyMOR keeps its LU factor.
     """
 
     def __init__(self, K: Any, M: Any, G: Array, dt: float, loads: Array) -> None:

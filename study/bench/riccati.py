@@ -50,7 +50,7 @@ Row = dict[str, Any]
 
 
 def parse_meshes(text: str) -> list[int]:
-    """``10,20`` as numbers of cells. Not collective.
+    """``10,20`` as numbers of cells.
 
     Raises:
         typer.BadParameter: anything else.
@@ -59,7 +59,7 @@ def parse_meshes(text: str) -> list[int]:
 
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
-    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave. Not collective.
+    """Run one worker under mpiexec; its numbers, or ``error`` with the reason it gave.
 
     The methods that were through when a worker ran out of time or memory keep their numbers.
     """
@@ -90,7 +90,7 @@ class Record:
     peers: list[Row] = field(default_factory=list)
 
     def resume(self) -> None:
-        """Take over the rows of an earlier run with the same damping that have no error. Not collective."""
+        """Take over the rows of an earlier run with the same damping that have no error."""
         if not self.file.is_file():
             return
         old = json.loads(self.file.read_text())
@@ -99,7 +99,7 @@ class Record:
             self.peers = [row for row in old["peers"] if "error" not in row and not row.get("missing")]
 
     def save(self) -> None:
-        """Write the file. Not collective."""
+        """Write the file."""
         self.file.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": "bench_riccati", "beta": self.beta, "rows": self.rows, "peers": self.peers}
         report |= {"exponents": exponents(self.rows), "goals": goal_rows(goals(self.rows))}
@@ -107,7 +107,7 @@ class Record:
 
 
 def flat(rows: Sequence[Row]) -> list[Row]:
-    """One entry for each mesh, rank count and method that ran. Not collective."""
+    """One entry for each mesh, rank count and method that ran."""
     result = []
     for row in rows:
         for name, method in row.get("methods", {}).items():
@@ -117,7 +117,7 @@ def flat(rows: Sequence[Row]) -> list[Row]:
 
 
 def exponents(rows: Sequence[Row]) -> dict[str, float | None]:
-    """Growth of time with the number of states, from nx = 20 on, by method and rank count. Not collective."""
+    """Growth of time with the number of states, from nx = 20 on, by method and rank count."""
     result: dict[str, float | None] = {}
     good = [entry for entry in flat(rows) if "error" not in entry and entry["nx"] >= 20]
     for key in sorted({(entry["method"], entry["ranks"]) for entry in good}):
@@ -127,7 +127,7 @@ def exponents(rows: Sequence[Row]) -> dict[str, float | None]:
 
 
 def goals(rows: Sequence[Row]) -> list[Goal]:
-    """All goals that the rows can speak for. Not collective."""
+    """All goals that the rows can speak for."""
     result = []
     good = [entry for entry in flat(rows) if "error" not in entry]
     for entry in good:
@@ -157,7 +157,7 @@ HEADS += ["true residual", "gain diff.", "MiB"]
 
 
 def cells_of(entry: Row) -> list[str]:
-    """One table line. Not collective."""
+    """One table line."""
     first = [str(entry[name]) for name in ("nx", "states", "ranks", "method")]
     if "error" in entry:
         return [*first, "failed", *[""] * (len(HEADS) - 5)]
@@ -169,7 +169,7 @@ def cells_of(entry: Row) -> list[str]:
 
 
 def peer_line(peer: Row) -> str:
-    """One sentence about a peer. Not collective."""
+    """One sentence about a peer."""
     label = f"{peer['peer']}, nx = {peer['nx']}"
     if peer.get("missing"):
         return f"{label}: not installed"
@@ -184,7 +184,7 @@ def peer_line(peer: Row) -> str:
 
 
 def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
-    """Table, failures, peers, exponents and goals. Not collective."""
+    """Table, failures, peers, exponents and goals."""
     title = "large Riccati equation, paper scene; seconds are medians"
     console.print(Table(tuple(HEADS), [cells_of(entry) for entry in flat(rows)], title).terminal())
     for row in [*rows, *flat(rows)]:
@@ -200,7 +200,7 @@ def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
 
 
 def csv_table(rows: Sequence[Row]) -> Table:
-    """One line a mesh, rank count and method, numbers in full. Not collective."""
+    """One line a mesh, rank count and method, numbers in full."""
     names = ["nx", "states", "ranks", "method", "solves", "newton_steps", "rank", "seconds", "residual"]
     names += ["gain_difference", "memory_mb", "memory_base_mb", "error"]
     cells = [
@@ -211,13 +211,13 @@ def csv_table(rows: Sequence[Row]) -> Table:
 
 
 def markdown(rows: Sequence[Row], peers: Sequence[Row]) -> str:
-    """The table as the README shows it, and a line a peer. Not collective."""
+    """The table as the README shows it, and a line a peer."""
     table = Table(tuple(HEADS), [cells_of(entry) for entry in flat(rows)]).markdown()
     return table + "".join(f"\n- {peer_line(peer)}" for peer in peers) + "\n"
 
 
 def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, Path]:
-    """Time against states for every method on the fewest ranks, peers as single marks, log-log. Not collective."""
+    """Time against states for every method on the fewest ranks, peers as single marks, log-log."""
     import matplotlib.pyplot as plt
 
     from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, paper_style, save
@@ -247,7 +247,7 @@ def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, P
 def collect(
     console: Console, meshes: list[int], ranks: list[int], repeats: int, large: bool, record: Record
 ) -> list[Row]:
-    """Launch all workers one after the other, the largest last. Not collective."""
+    """Launch all workers one after the other, the largest last."""
     every = ["newton_adi", "radi", "galerkin"]
     jobs = [(nx, k, every, repeats) for nx in meshes for k in ranks]
     if large:
@@ -268,7 +268,7 @@ def collect(
 
 
 def collect_peers(console: Console, meshes: list[int], record: Record) -> list[Row]:
-    """The peers on the meshes they can do, one rank. Not collective."""
+    """The peers on the meshes they can do, one rank."""
     known = {(row["peer"], row["nx"]): row for row in record.peers}
     record.peers = []
     for peer, limit in PEER_LIMIT.items():

@@ -130,7 +130,7 @@ def _factor(X: Array) -> Array:
 
 
 def scipy_answer(problem: RiccatiProblem) -> Answer:
-    """SciPy's dense solver on the paper's matrices as they stand. Not collective."""
+    """SciPy's dense solver on the paper's matrices as they stand."""
     E, A, B, C = paper_form(problem)
     begin = time.perf_counter()
     X = scipy.linalg.solve_continuous_are(A.toarray(), B, C.T @ problem.Q @ C, problem.R, e=E.toarray())
@@ -139,7 +139,7 @@ def scipy_answer(problem: RiccatiProblem) -> Answer:
 
 
 def slycot_answer(problem: RiccatiProblem) -> Answer:
-    """SLICOT's SG02AD through slycot on the paper's matrices. Not collective."""
+    """SLICOT's SG02AD through slycot on the paper's matrices."""
     slycot = importlib.import_module("slycot")
 
     E, A, B, C = paper_form(problem)
@@ -154,7 +154,7 @@ def slycot_answer(problem: RiccatiProblem) -> Answer:
 
 
 def pymor_answer(problem: RiccatiProblem) -> Answer:
-    """The low-rank RADI of pyMOR on the paper's sparse matrices. Not collective."""
+    """The low-rank RADI of pyMOR on the paper's sparse matrices."""
     from pymor.core.logger import set_log_levels
     from pymor.operators.numpy import NumpyMatrixOperator
     from pymor.solvers.matrix_equations.equations import RiccatiEquation
@@ -177,7 +177,7 @@ PEERS = {"scipy": scipy_answer, "slycot": slycot_answer, "pymor": pymor_answer}
 
 
 def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
-    """One peer against our Newton-ADI, on one rank. Not collective."""
+    """One peer against our Newton-ADI, on one rank."""
     if importlib.util.find_spec(peer) is None:
         return {"missing": True}
     problem = problem_for(MPI.COMM_WORLD, nx, beta)

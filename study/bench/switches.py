@@ -102,7 +102,7 @@ def compare(
 
 @contextmanager
 def setting_of(module: ModuleType, name: str, value: float) -> Iterator[None]:
-    """Another value of a module's constant inside. Not collective."""
+    """Another value of a module's constant inside."""
     before = getattr(module, name)
     setattr(module, name, value)
     try:
@@ -261,7 +261,7 @@ HEADER = ("switch", "constant", "size", "ranks", "first s", "second s", "second 
 
 
 def table_of(rows: list[Row]) -> Table:
-    """The one table. Not collective."""
+    """The one table."""
     cells = [
         (r.switch, r.limit, r.setting, r.ranks, f"{r.first:.3g}", f"{r.second:.3g}", f"{r.second / r.first:.2f}")
         for r in rows

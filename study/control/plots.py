@@ -52,13 +52,13 @@ CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.2, "color"
 
 
 def drawn(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
-    """Orders and values of the line of a method; nan, which breaks the line, for errors above 100 %. Not collective."""
+    """Orders and values of the line of a method; nan, which breaks the line, for errors above 100 %."""
     values = [getattr(r, key) for r in basis.reports]
     return [r.N for r in basis.reports], [max(v, LOWEST) if v <= TOP else float("nan") for v in values]
 
 
 def unstable(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
-    """Orders and values of gains not known to stabilise; nan for errors above 100 %. Not collective."""
+    """Orders and values of gains not known to stabilise; nan for errors above 100 %."""
     bad = [r for r in basis.reports if not r.stable and not r.reason]
     return [r.N for r in bad], [getattr(r, key) if getattr(r, key) <= TOP else float("nan") for r in bad]
 

@@ -37,7 +37,7 @@ class Shown:
 
 
 def shown(model: Model, run: Trajectory) -> Shown:
-    """Displacements of the outputs of a run. Not collective."""
+    """Displacements of the outputs of a run."""
     d, control = model.system.layout.dimension, model.scene.control
     kinds = [o.kind for o in control.outputs] if control is not None and control.outputs else ["node"]
     widths = [model.system.layout.n_s if kind == "hand" else d for kind in kinds]
@@ -49,7 +49,7 @@ def shown(model: Model, run: Trajectory) -> Shown:
 
 
 def compare(a: Shown, b: Shown) -> Change:
-    """Change between two runs of the same outputs. Not collective."""
+    """Change between two runs of the same outputs."""
 
     def gap(x: Array, y: Array) -> tuple[float, float]:
         scale = max(float(np.linalg.norm(v, axis=2).max()) for v in (x, y))
@@ -61,7 +61,7 @@ def compare(a: Shown, b: Shown) -> Change:
 
 
 def force_of_motion(scene: Scene, model: Model) -> Force:
-    """The force that would carry the bare hand along the prescribed motion, u_n = M_hand a_n. Not collective.
+    """The force that would carry the bare hand along the prescribed motion, u_n = M_hand a_n.
 
     A hand with more freedoms than the scene's gets no load on them, one with fewer none of those it lacks.
 

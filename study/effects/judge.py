@@ -24,7 +24,7 @@ from softgrasp.study.forward.explain import EffectReport, Explanation
 
 
 def judge(change: float, controls: bool, costs: bool, tolerance: float) -> str:
-    """needed, optional or wasted. Not collective.
+    """needed, optional or wasted.
 
     Needed: it changes the outputs by more than the tolerance. Optional: it does not, but it is free, or the control
     problem needs it. Wasted: it costs something and nothing shows it.
@@ -35,13 +35,13 @@ def judge(change: float, controls: bool, costs: bool, tolerance: float) -> str:
 
 
 def quartiles(samples: Array) -> tuple[float, float]:
-    """Lower and upper quartile. Not collective."""
+    """Lower and upper quartile."""
     low, high = np.quantile(samples, [0.25, 0.75])
     return float(low), float(high)
 
 
 def cost_of(with_: Case, without: Case, noise: float) -> Cost:
-    """The differences of two cases; ``noise`` is what a step of one scene differs from itself by. Not collective."""
+    """The differences of two cases; ``noise`` is what a step of one scene differs from itself by."""
 
     def added(stage: str) -> Array:
         return np.asarray(np.array(with_.seconds[stage]) - np.array(without.seconds[stage]))

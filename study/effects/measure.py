@@ -108,7 +108,7 @@ class Stepper:
 
 
 def bare_output(scene: Scene) -> Scene:
-    """The scene without snapshots: their memory and copies belong to no effect. Not collective."""
+    """The scene without snapshots: their memory and copies belong to no effect."""
     return changed(scene, lambda table: table["output"].update(snapshots="none"))
 
 

@@ -30,7 +30,7 @@ def created(comm: MPI.Intracomm) -> dict[str, int]:
 
 
 def read_table(text: str) -> dict[str, int]:
-    """Class and number of creations from the text of PETSc's log. Not collective."""
+    """Class and number of creations from the text of PETSc's log."""
     counts: dict[str, int] = {}
     inside = False
     for line in text.splitlines():
@@ -55,10 +55,10 @@ def counting(comm: MPI.Intracomm) -> Iterator[dict[str, int]]:
 
 
 def difference(more: dict[str, int], less: dict[str, int]) -> dict[str, int]:
-    """What the one has more, or less, of each class than the other. Not collective."""
+    """What the one has more, or less, of each class than the other."""
     return {name: d for name in sorted({*more, *less}) if (d := more.get(name, 0) - less.get(name, 0))}
 
 
 def in_words(objects: dict[str, int]) -> str:
-    """Such as "+1 vector, +2 matrix". Not collective."""
+    """Such as "+1 vector, +2 matrix"."""
     return ", ".join(f"{n:+d} {name.lower()}" for name, n in objects.items()) or "none"

@@ -38,7 +38,7 @@ PROOFS = {
 
 
 def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: Session) -> Page:
-    """Draw the picture and compose the page. Not collective."""
+    """Draw the picture and compose the page."""
     advice = [
         (f"{f.name}: {f.value}" if f.on else f"{f.name}, tried: {f.value}" if f.value else f.name, f.advice)
         for f in study.findings
@@ -78,7 +78,7 @@ def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: 
 
 
 def in_company(study: EffectsStudy) -> str:
-    """What each effect changes beside all that are advised, one sentence. Not collective."""
+    """What each effect changes beside all that are advised, one sentence."""
     parts = [
         f"{f.name} {f.company.change.outputs:.1e}"
         + (f" ({f.company.control:.1e} under a force)" if f.company.control is not None else "")

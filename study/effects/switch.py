@@ -64,7 +64,7 @@ class Switch:
 
 
 def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
-    """A copy of the scene after ``edit`` changed its table in place. Not collective.
+    """A copy of the scene after ``edit`` changed its table in place.
 
     Raises:
         pydantic.ValidationError: the changed table is no scene.
@@ -77,23 +77,23 @@ def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
 
 
 def scales_of(layout: BlockLayout, rigid: tuple[float, tuple[float, ...]], omega: Sequence[float]) -> Scales:
-    """Collect the scales of a model: ``rigid`` is mass and inertia of the tissue. Not collective."""
+    """Collect the scales of a model: ``rigid`` is mass and inertia of the tissue."""
     return Scales(layout.dimension, rigid[0], rigid[1], float(omega[0]) if len(omega) else None)
 
 
 def switches(scene: Scene, scales: Scales) -> tuple[Switch, ...]:
-    """Every effect with the scene in which it is switched the other way. Not collective."""
+    """Every effect with the scene in which it is switched the other way."""
     return tuple(switch(scene, name, scales) for name in EFFECTS)
 
 
 def switch(scene: Scene, name: str, scales: Scales) -> Switch:
-    """One effect with the scene in which it is switched the other way. Not collective."""
+    """One effect with the scene in which it is switched the other way."""
     active = EFFECTS[name].active(scene)
     return _without(scene, name, scales.dimension) if active else _with(scene, name, scales)
 
 
 def neutral(scene: Scene, name: str, d: int) -> Scene | None:
-    """The scene with the effect named but of strength zero; None for effects that know no strength. Not collective."""
+    """The scene with the effect named but of strength zero; None for effects that know no strength."""
     if name == "gravity":
         return changed(scene, lambda t: t["effects"].update(gravity={"g": [0.0] * d}))
     if name == "damping":

@@ -49,7 +49,7 @@ def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | N
 
 
 def keys(result: MeshEstimate | None, run: Trajectory) -> dict[str, Any]:
-    """What result.json holds of it: ``mesh_error`` and ``time_error``. Not collective."""
+    """What result.json holds of it: ``mesh_error`` and ``time_error``."""
     if result is None:
         return {}
     return {
@@ -71,7 +71,7 @@ def keys(result: MeshEstimate | None, run: Trajectory) -> dict[str, Any]:
 
 
 def rows(result: MeshEstimate | None) -> list[tuple[str, str]]:
-    """Lines of the short table. Not collective."""
+    """Lines of the short table."""
     if result is None:
         return []
     better = ""
@@ -85,7 +85,7 @@ def rows(result: MeshEstimate | None) -> list[tuple[str, str]]:
 
 
 def warnings(result: MeshEstimate | None) -> list[str]:
-    """What the estimate warns of. Not collective."""
+    """What the estimate warns of."""
     if result is None:
         return []
     texts = []
@@ -103,12 +103,12 @@ def warnings(result: MeshEstimate | None) -> list[str]:
 
 
 def percent(share: float) -> str:
-    """A share as a percentage of two digits. Not collective."""
+    """A share as a percentage of two digits."""
     return f"{100 * share:.2g} %" if np.isfinite(share) and share < 9.95 else f"{100 * share:.0f} %"
 
 
 def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, Path]:
-    """Outputs against the hand, y and y + delta y, with the band of the bound; PNG and PDF. Not collective."""
+    """Outputs against the hand, y and y + delta y, with the band of the bound; PNG and PDF."""
     import matplotlib.pyplot as plt
 
     from softgrasp.study.pictures.style import COLUMN, CYCLE, length_unit, paper_style, save

@@ -21,13 +21,13 @@ LARGEST = 4_000_000  # fewer where they would be more numbers than this: their p
 
 
 def poisson_ratios(system: BlockSystem) -> dict[str, float]:
-    """Poisson's ratio of each material by the name of its layer [1]. Not collective."""
+    """Poisson's ratio of each material by the name of its layer [1]."""
     names = [blocks.name for blocks in system.layers]
     return {n: young_poisson(m.lam, m.mu)[1] for n, m in zip(names, system.materials, strict=True)}
 
 
 def locking(poisson: dict[str, float], order: int) -> list[str]:
-    """P1 elements in a material that hardly changes its volume. Not collective."""
+    """P1 elements in a material that hardly changes its volume."""
     return [
         f"nu = {_near_half(nu)} of {name} is above {STIFF}: P1 locks, its error grows with lambda / mu = "
         f"{2 * nu / (1 - 2 * nu):.3g}; use tissue.order = 2."
@@ -37,7 +37,7 @@ def locking(poisson: dict[str, float], order: int) -> list[str]:
 
 
 def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
-    """A step too long for a period 2 pi / omega. Not collective.
+    """A step too long for a period 2 pi / omega.
 
     Args:
         omega: angular frequency [1/s].
@@ -52,14 +52,14 @@ def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
 
 
 def turned(angle: float) -> list[str]:
-    """A hand angle [rad] too large for the linearised rotation. Not collective."""
+    """A hand angle [rad] too large for the linearised rotation."""
     if angle <= SMALL_ANGLE:
         return []
     return [f"An angle of {angle:.3g} rad is not small: the linearised rotation stretches by {angle**2 / 2:.1%}."]
 
 
 def inexact(drift: float, residual: float, solver: str, nu: float, rounding: float = 0.0) -> list[str]:
-    """Drift of the energy, residual of a solve or loss to rounding, as the digits they leave. Not collective.
+    """Drift of the energy, residual of a solve or loss to rounding, as the digits they leave.
 
     Args:
         drift: energy that nothing explains, over the largest seen [1]; counts for direct solvers.
@@ -125,7 +125,7 @@ def _near_half(nu: float) -> str:
 
 
 def _instants(run: Trajectory, system: BlockSystem) -> tuple[Array, list[float]]:
-    """Displacements against the hand, local rows (n_local, k) [m], and their times [s]. Not collective."""
+    """Displacements against the hand, local rows (n_local, k) [m], and their times [s]."""
     n = system.layout.n_local
     if run.snapshots is None:
         return run.final[:n, None], [float(run.times[-1])]

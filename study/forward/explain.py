@@ -100,7 +100,7 @@ class Explanation:
     dimension: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dicts, lists and numbers for JSON; what is not known is None. Not collective."""
+        """Plain dicts, lists and numbers for JSON; what is not known is None."""
         result: dict[str, Any] = plain(asdict(self))
         return result
 

@@ -70,7 +70,7 @@ def mesh_report(model: Model) -> MeshReport:
 
 
 def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
-    """The report in sentences. Not collective."""
+    """The report in sentences."""
     place = "points" if dimension == 2 else "edges"
     lines = [f"{e.count} {place} of kind '{e.kind}': u ~ r^{e.alpha:.3g}" for e in report.ends[:6]]
     if len(report.ends) > len(lines):

@@ -99,7 +99,7 @@ def sections(result: Explanation) -> list[Section]:
 
 
 def sag_rows(result: Explanation) -> list[tuple[str, str]]:
-    """Load, sag, gradient and validity of the static solution as label and text. Not collective."""
+    """Load, sag, gradient and validity of the static solution as label and text."""
     sag, assumed = result.sag, "" if result.effects["gravity"].on else " (assumed: gravity is off)"
     steep = sag.gradient
     return [
@@ -112,7 +112,7 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
 
 
 def verdict(effect: EffectReport) -> str:
-    """On or off, and whether that is right. Not collective."""
+    """On or off, and whether that is right."""
     matters = ("matters" if effect.on else "would matter") if effect.gate.matters else ""
     return f"{'on' if effect.on else 'off'}, {matters or ('does not matter' if effect.on else 'not needed')}"
 

@@ -154,7 +154,7 @@ def here(work: Callable[..., float], *arguments: Any) -> Outcome:
 
 
 def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
-    """Run the textbook way; whatever it raises or warns is its outcome. Not collective."""
+    """Run the textbook way; whatever it raises or warns is its outcome."""
     with np.errstate(all="ignore"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
@@ -180,7 +180,7 @@ def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Mod
 
 
 def scaled_condition(A: PETSc.Mat) -> float:
-    """Condition of a symmetric positive definite matrix with its diagonal scaled to one [VDS69]. Not collective.
+    """Condition of a symmetric positive definite matrix with its diagonal scaled to one [VDS69].
 
     Up to the size of the matrix it is the least that any diagonal scaling reaches, and what Cholesky's error depends
     on. For matrices of hundreds of rows.
@@ -192,10 +192,10 @@ def scaled_condition(A: PETSc.Mat) -> float:
 
 
 def qr_rounding(rows: int, columns: int) -> float:
-    """Bound on |Q'Q - I| of Householder's QR without its constant, rows x columns x eps [H02]. Not collective."""
+    """Bound on |Q'Q - I| of Householder's QR without its constant, rows x columns x eps [H02]."""
     return rows * columns * EPS
 
 
 def thin(values: Sequence[float], quick: bool) -> list[float]:
-    """All values, or for the quick half the first, the middle and the last. Not collective."""
+    """All values, or for the quick half the first, the middle and the last."""
     return list(dict.fromkeys([values[0], values[len(values) // 2], values[-1]])) if quick else list(values)

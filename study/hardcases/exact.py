@@ -26,7 +26,7 @@ def exact_gain(problem: RiccatiProblem) -> Array:
 
     A'XE + E'XA - K'RK + C'QC is evaluated in :data:`DIGITS` decimal digits from the matrices as they are in doubles;
     the correction by Newton's method needs a few right digits only and is computed in doubles, in modal coordinates.
-    What starts it does not matter: the limit solves the equation, and its closed loop decays. Not collective.
+    What starts it does not matter: the limit solves the equation, and its closed loop decays.
 
     Args:
         problem: of one rank, some fifty states, R diagonal.
@@ -71,7 +71,7 @@ def exact_gain(problem: RiccatiProblem) -> Array:
 
 
 def worst_part_error(K: Array, exact: Array, n_s: int) -> float:
-    """Largest relative error among the gains for q_s, v_s, z and v_z, each over its own norm. Not collective.
+    """Largest relative error among the gains for q_s, v_s, z and v_z, each over its own norm.
 
     The gain for the hand is up to twelve decades larger; over the norm of all, gains for the tissue could be left
     out and nobody would see it. A block that is zero is measured over the norm of all.

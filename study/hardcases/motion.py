@@ -36,7 +36,7 @@ def free_body() -> tuple[BlockSystem, Array, float, Any, Any]:
 
 
 def let_go(system: BlockSystem, z: Array, dt: float, steps: int) -> tuple[float, float]:
-    """Free vibration from rest; |E_N + lost - E_0| / E_0 and the largest E_n / E_0. Not collective."""
+    """Free vibration from rest; |E_N + lost - E_0| / E_0 and the largest E_n / E_0."""
     midpoint = TissueMidpoint(system, dt, "cholesky")
     state = state_on(np.concatenate([z, np.zeros_like(z)]), system)
     midpoint.start(state)
@@ -61,13 +61,13 @@ def _drift(system: BlockSystem, z: Array, dt: float, steps: int) -> float:
 
 
 def _balance(system: BlockSystem, z: Array, dt: float, steps: int) -> float:
-    """Defect of the balance, or what the energy exceeds the first one by, which is as wrong. Not collective."""
+    """Defect of the balance, or what the energy exceeds the first one by, which is as wrong."""
     defect, highest = let_go(system, z, dt, steps)
     return max(defect, highest - 1)
 
 
 def solve_rounding(system: BlockSystem, dt: float) -> float:
-    """What one solve of a step may change the energy by, relatively: 2 p eps kappa(S). Not collective.
+    """What one solve of a step may change the energy by, relatively: 2 p eps kappa(S).
 
     kappa is the condition with the diagonal scaled to one [VDS69], p the most entries in a row, the constant of a
     factor's backward error [H02]; the energy is quadratic, hence 2.
@@ -79,7 +79,7 @@ def solve_rounding(system: BlockSystem, dt: float) -> float:
 
 
 def drift_bound(system: BlockSystem, ratio: float, dt: float, steps: int) -> tuple[float, str]:
-    """Bound on the relative energy drift and its reason. Not collective."""
+    """Bound on the relative energy drift and its reason."""
     one = solve_rounding(system, dt)
     if ratio < 1:
         return math.sqrt(steps) * one, "the rounding of one solve, 2 p eps cond(S), times sqrt(steps): a random walk"
@@ -161,7 +161,7 @@ RESTARTS = {
 
 
 def differing(a: Trajectory, b: Trajectory) -> int:
-    """Number of doubles whose bits differ between two runs. Not collective."""
+    """Number of doubles whose bits differ between two runs."""
     pairs = [(a.q_s, b.q_s), (a.v_s, b.v_s), (a.outputs, b.outputs), (a.final, b.final)]
     pairs.append((np.array([a.energy_drift]), np.array([b.energy_drift])))
     if a.snapshots is not None and b.snapshots is not None:
@@ -170,7 +170,7 @@ def differing(a: Trajectory, b: Trajectory) -> int:
 
 
 def _interrupted(model: Model, stop: int) -> float:
-    """Doubles that differ between an unbroken run and one that was stopped and resumed. Not collective."""
+    """Doubles that differ between an unbroken run and one that was stopped and resumed."""
     with tempfile.TemporaryDirectory() as name:
         whole, part = Path(name) / "whole", Path(name) / "part"
         unbroken = simulate(model, RunOptions(whole))

@@ -37,7 +37,7 @@ FAULTY = ["-m", "softgrasp.study.hardcases.faulty"]  # then fault and folder
 
 
 def healthy_seconds() -> float:
-    """Seconds of the command on two ranks without a fault: what this machine needs, loaded as it is. Not collective.
+    """Seconds of the command on two ranks without a fault: what this machine needs, loaded as it is.
 
     Raises:
         SoftgraspError: there is no mpiexec, or the run fails.
@@ -53,8 +53,6 @@ def healthy_seconds() -> float:
 def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
     """Run two ranks for at most ``limit`` [s]; status, None when that was not enough, output and seconds.
 
-    Not collective.
-
     Raises:
         SoftgraspError: there is no mpiexec.
     """
@@ -67,7 +65,7 @@ def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
 
 
 def judge(command: list[str], patience: float, healthy: float, sentence: str) -> Outcome:
-    """Time until both ranks have ended over that of a healthy run, or why that is no good end. Not collective."""
+    """Time until both ranks have ended over that of a healthy run, or why that is no good end."""
     status, output, seconds = job(command, patience * healthy)
     if status is None:
         return Outcome(float("inf"), f"hangs, still waiting after {patience:g} times a healthy run")

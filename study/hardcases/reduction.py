@@ -49,10 +49,7 @@ class Moved:
 
 @cache
 def moved(cells: int, every: int = 1, periods: int = 1) -> Moved:
-    """The paper's move in 3 s, driven by force, on a mesh of cells x 2 cells; then rest up to 3 s times periods.
-
-    Not collective.
-    """
+    """The paper's move in 3 s, driven by force, on a mesh of cells x 2 cells; then rest up to 3 s times periods."""
     scene = (f"tissue.cells=[{cells}, {2 * cells}]", "motion.drive='force'", f"output.every={every}")
     model = make("paper_forward", *scene, f"time={{steps={300 * periods}, end={3.0 * periods!r}}}")
     trajectory = simulate(model)
@@ -63,12 +60,12 @@ def moved(cells: int, every: int = 1, periods: int = 1) -> Moved:
 
 
 def stacked(snapshots: Snapshots, T: Array) -> Array:
-    """Columns [q_s; v_s; q_e; v_e] of one rank. Not collective."""
+    """Columns [q_s; v_s; q_e; v_e] of one rank."""
     return np.vstack([snapshots.q_s, snapshots.v_s, snapshots.displacement(T), snapshots.velocity(T)])
 
 
 def gram_basis(X: Array, k: int) -> Array:
-    """The method of snapshots: eigenvectors W of X'X, columns X w / sqrt(lambda). Not collective."""
+    """The method of snapshots: eigenvectors W of X'X, columns X w / sqrt(lambda)."""
     values, W = np.linalg.eigh(X.T @ X)
     return np.asarray(X @ W[:, ::-1][:, :k] / np.sqrt(values[::-1][:k]))
 
@@ -168,7 +165,7 @@ def edge_rows(quick: bool) -> Iterator[HardCase]:
 
 
 def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
-    """Outputs of the midpoint rule on E x' = A x + B u as a textbook has it, unstable or not. Not collective."""
+    """Outputs of the midpoint rule on E x' = A x + B u as a textbook has it, unstable or not."""
     op = rom.operators
     lu = scipy.linalg.lu_factor(op.E - dt / 2 * op.A)
     x = np.zeros(rom.N)
@@ -181,7 +178,7 @@ def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
 
 
 def _tip_error(case: Moved, outputs: Array) -> float:
-    """Largest error of the outputs over the largest deformation seen. Not collective."""
+    """Largest error of the outputs over the largest deformation seen."""
     if not np.isfinite(outputs).all():
         return math.inf
     exact = case.trajectory.outputs

@@ -32,18 +32,18 @@ WEAK = "; with next to no damping a solver may give up, but not return a wrong g
 
 @cache
 def problem_of(*more: str, beta: float = 0.002) -> RiccatiProblem:
-    """The paper's control problem on a mesh small enough for exact gains, 48 states. Not collective."""
+    """The paper's control problem on a mesh small enough for exact gains, 48 states."""
     damping = f"effects={{damping={{kind='kelvin-voigt', beta={beta!r}}}}}" if beta else "effects={}"
     return make_problem(make("paper_lqr", "tissue.cells=[2, 4]", damping, *more))
 
 
 def gain_of(solution: RiccatiSolution) -> Array:
-    """K, (m, states), of a solution of one rank. Not collective."""
+    """K, (m, states), of a solution of one rank."""
     return np.hstack([solution.gain.K_s, solution.gain.K_z.T, solution.gain.K_v.T])
 
 
 def dense(problem: RiccatiProblem) -> Array:
-    """Diagnose and solve densely; the gain. Not collective.
+    """Diagnose and solve densely; the gain.
 
     Raises:
         ControlError, SolverError: there is no gain, or none within the tolerance.
@@ -53,7 +53,7 @@ def dense(problem: RiccatiProblem) -> Array:
 
 
 def low_rank(problem: RiccatiProblem) -> Array:
-    """The same by Newton's method with low-rank ADI. Not collective.
+    """The same by Newton's method with low-rank ADI.
 
     Raises:
         ControlError, SolverError: there is no gain, or none within the tolerance.
@@ -69,7 +69,7 @@ SOLVERS: dict[str, tuple[Callable[[RiccatiProblem], Array], float]] = {
 
 
 def scipy_error(problem: RiccatiProblem, exact: Array | None, pencil: bool = False) -> Outcome:
-    """SciPy's solver, which balances, on x' = E^{-1}A x + E^{-1}B u of the paper; error of its gain. Not collective.
+    """SciPy's solver, which balances, on x' = E^{-1}A x + E^{-1}B u of the paper; error of its gain.
 
     Args:
         problem: the control problem.
@@ -95,7 +95,7 @@ def scipy_error(problem: RiccatiProblem, exact: Array | None, pencil: bool = Fal
 
 
 def both_ways(problem: RiccatiProblem, exact: Array | None) -> Outcome:
-    """SciPy without E and with E; the better number, and in words what the other one is. Not collective."""
+    """SciPy without E and with E; the better number, and in words what the other one is."""
     first, second = textbook(scipy_error, problem, exact), textbook(scipy_error, problem, exact, True)
     if first.value is None or first.text or second.value is None:
         return first if exact is None or first.value is not None else second
@@ -105,7 +105,7 @@ def both_ways(problem: RiccatiProblem, exact: Array | None) -> Outcome:
 def gain_rows(
     name: str, x: float, problem: RiccatiProblem, note: str = "", solvers: Sequence[str] = tuple(SOLVERS)
 ) -> Iterator[HardCase]:
-    """Error of the solvers' gains against the exact one; ``note`` says why it may be refused. Not collective."""
+    """Error of the solvers' gains against the exact one; ``note`` says why it may be refused."""
     exact = exact_gain(problem)
     scipy_ = both_ways(problem, exact)
     for group in solvers:
@@ -152,7 +152,7 @@ def output_rows(quick: bool) -> Iterator[HardCase]:
 
 
 def gain_size(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) -> float:
-    """Size of a gain that ought to have been refused. Not collective."""
+    """Size of a gain that ought to have been refused."""
     return float(np.linalg.norm(solver(problem)))
 
 

@@ -22,7 +22,7 @@ FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for fam
 
 
 def choose(family: str | None) -> list[Family]:
-    """The families to run. Not collective.
+    """The families to run.
 
     Raises:
         SoftgraspError: there is no family of this name.

@@ -27,7 +27,7 @@ COLUMN = ("tissue.size=[1.0, 2.0]", "contact={sides=['top']}", "effects={gravity
 
 
 def static(model: Model) -> Array:
-    """Displacement under gravity with the residual checked, all dofs of one rank. Not collective.
+    """Displacement under gravity with the residual checked, all dofs of one rank.
 
     Raises:
         SolverError: the stiffness is singular or the residual is too large.
@@ -37,13 +37,13 @@ def static(model: Model) -> Array:
 
 
 def unchecked(model: Model) -> Array:
-    """The same by SuperLU, believed as it is. Not collective."""
+    """The same by SuperLU, believed as it is."""
     load = model.system.G @ np.array([0.0, -1.0])
     return np.asarray(scipy.sparse.linalg.spsolve(to_scipy(model.system.K_ee).tocsc(), load))
 
 
 def tip(model: Model, z: Array) -> float:
-    """Last component of the scene's only output. Not collective."""
+    """Last component of the scene's only output."""
     output = make_outputs(model.scene, model.system)[0]
     return float(z[output.dofs[0, -1]])
 
@@ -86,7 +86,7 @@ def stretch_error(y: Array, z: Array, height: float, contrast: float = 1.0) -> f
 
     With lambda = 0 the column of height 2 is in uniaxial stress rho g y, so that u(y) = -int_y^2 rho g s / (2 mu) ds;
     below ``height`` mu is ``contrast`` times larger. The mean over x leaves out that the lower part may turn as a
-    whole, which is no stretch. Not collective.
+    whole, which is no stretch.
     """
     u, mu = z[1::2], 50.0
     bottom, edge = (float(u[np.abs(y - level) < 1e-9].mean()) for level in (0.0, height))

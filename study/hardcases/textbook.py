@@ -26,7 +26,7 @@ def jacobi_cg(K: Any, f: Array) -> tuple[Array, int, bool]:
 
 
 def solve_twice(K: Any, f: Array, error: Callable[[Array], float]) -> Outcome:
-    """Error of SciPy's sparse direct solve; in words that of CG with the diagonal as preconditioner. Not collective."""
+    """Error of SciPy's sparse direct solve; in words that of CG with the diagonal as preconditioner."""
     direct = error(scipy.sparse.linalg.spsolve(K.tocsc(), f))
     z, steps, converged = jacobi_cg(K, f)
     return Outcome(direct, f"Jacobi-CG {error(z):.0e}" + ("" if converged else f", stops after {steps} steps"))
@@ -130,7 +130,7 @@ def staggered_hand(
 
     M_hand a = u - r, r = G' z'' + M_rigid a; the tissue by the midpoint rule under the new a. The force acts in the
     first step only, so that afterwards the momentum of hand and tissue must stay u dt. With ``repeat = 1`` the hand
-    takes the reaction of the last step. Not collective.
+    takes the reaction of the last step.
     """
     s = 2 / dt
     solve = scipy.sparse.linalg.splu((K + s * s * M).tocsc()).solve
@@ -158,7 +158,7 @@ def staggered_hand(
 
 
 def in_turn(*arguments: Any) -> Outcome:
-    """Hand and tissue in turn until they agree, and in words what one turn a step does. Not collective."""
+    """Hand and tissue in turn until they agree, and in words what one turn a step does."""
     agreed, once = staggered_hand(*arguments), staggered_hand(*arguments, repeat=1)
     said = "blows up" if once.value == math.inf else f"{once.value:.0e}"
     return Outcome(agreed.value, f"once: {said}" if math.isfinite(agreed.value or 0.0) else agreed.text)

@@ -87,7 +87,7 @@ class Shot:
 
 
 def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> Shot:
-    """Prepare the views of a move; see `figure_move` for the arguments. Not collective."""
+    """Prepare the views of a move; see `figure_move` for the arguments."""
     hands = hands_at(table, times)
     aim = None
     if target is not None:

@@ -88,8 +88,6 @@ def hands_at(table: Array, times: Array) -> Array:
 def hand_polygons(picture: PictureMesh) -> tuple[list[Array], Array]:
     """Pads on the contact facets of a 2D body and the palm that joins them, where the hand starts.
 
-    Not collective.
-
     Returns:
         Polygons, each (corners, 2) [m], and the point where the arm holds the hand, (2,) [m].
     """

@@ -23,7 +23,7 @@ MORE = 3  # reduced dimensions tried beyond the predicted one
 
 
 def parse_budget(text: str) -> float:
-    """Seconds of a time such as ``1ms``, ``500us`` or ``0.01s``. Not collective.
+    """Seconds of a time such as ``1ms``, ``500us`` or ``0.01s``.
 
     Raises:
         SceneError: anything else.
@@ -39,7 +39,7 @@ def parse_budget(text: str) -> float:
 
 
 def parse_tolerance(text: str | float) -> float:
-    """A relative tolerance such as ``1e-3``. Not collective.
+    """A relative tolerance such as ``1e-3``.
 
     Raises:
         SceneError: it is no number between 0 and 1.
@@ -54,7 +54,7 @@ def parse_tolerance(text: str | float) -> float:
 
 
 def seconds_text(value: float | None) -> str:
-    """A time with a fitting unit. Not collective."""
+    """A time with a fitting unit."""
     if value is None:
         return "-"
     for unit, factor in (("s", 1.0), ("ms", 1e-3)):

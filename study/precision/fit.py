@@ -81,7 +81,7 @@ def power_law(x: Sequence[float], y: Sequence[float]) -> float | None:
 
 
 def interpolate(x: float, xs: Sequence[float], ys: Sequence[float], power: float | None = None) -> float:
-    """y(x), linear between logarithms; outside by the end's slope, or by ``power`` when it is given. Not collective."""
+    """y(x), linear between logarithms; outside by the end's slope, or by ``power`` when it is given."""
     order = np.argsort(xs)
     a, b = np.log(np.array(xs, dtype=float)[order]), np.log(np.maximum(np.array(ys, dtype=float)[order], 1e-300))
     at = float(np.log(x))

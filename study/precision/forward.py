@@ -43,12 +43,12 @@ class Prediction:
 
 
 def step_counts(steps: int, least: int = LEAST_STEPS) -> list[int]:
-    """Numbers of steps to try, most first. Not collective."""
+    """Numbers of steps to try, most first."""
     return sorted({max(least, round(steps * share)) for share in SHARES}, reverse=True)
 
 
 def forward_settings(scene: Scene, d: int) -> list[Setting]:
-    """Settings of the diagram, the most steps of each mesh first; then solvers at the scene's own. Not collective."""
+    """Settings of the diagram, the most steps of each mesh first; then solvers at the scene's own."""
     own = scene_setting(scene)
     groups: list[Group] = [(own.cells, own.order)]
     groups += [(cells, order) for order in (1, 2) for cells in (halved_meshes(scene, MESHES) or (None,))]
@@ -170,7 +170,7 @@ class Predictor:
         return interpolate(steps, list(self.time), list(self.time.values()), -2.0) if self.time else 0.0
 
     def predict(self, setting: Setting) -> Prediction:
-        """Error and times of a setting. Not collective."""
+        """Error and times of a setting."""
         cells, order = setting.cells, setting.order
         error = self.space_error((cells, order)) + self.time_error(setting.steps)
         known = self.space.get((cells, order))

@@ -89,7 +89,7 @@ class LoopSetting:
 
 
 def step_counts(shares: Sequence[float], steps: int, n_e: int = 1, most: float = np.inf) -> list[int]:
-    """Whole multiples and parts of the scene's steps that nest, most first. Not collective.
+    """Whole multiples and parts of the scene's steps that nest, most first.
 
     Args:
         shares: multiples and parts, most first.
@@ -284,12 +284,12 @@ class LoopSweep:
 
 
 def largest(values: Array, columns: Columns) -> float:
-    """Largest distance of any output at any instant [m]; values (m, p). Not collective."""
+    """Largest distance of any output at any instant [m]; values (m, p)."""
     return float(farthest(values, np.zeros(values.shape[1]), columns).max())
 
 
 def errors_of(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
-    """Largest error over the largest value, of each half of the columns (m, 2 p). Not collective."""
+    """Largest error over the largest value, of each half of the columns (m, 2 p)."""
     p = true.shape[1] // 2
     halves = (slice(0, p), slice(p, 2 * p))
     return tuple(largest(values[:, h] - true[:, h], columns) / largest(true[:, h], columns) for h in halves)  # type: ignore[return-value]

@@ -30,7 +30,7 @@ def edges(scene: Scene) -> list[list[float]]:
 
 
 def fits(cells: int, shares: list[float]) -> bool:
-    """Whether all coordinates lie on lines of a uniform mesh. Not collective."""
+    """Whether all coordinates lie on lines of a uniform mesh."""
     return all(abs(cells * s - round(cells * s)) < 1e-6 for s in shares)
 
 
@@ -44,7 +44,7 @@ def fitted(target: float, shares: list[float]) -> int | None:
 def smallest_mesh(scene: Scene) -> tuple[int, ...]:
     """The fewest cells in about the scene's shape whose lines meet the ends of contact zone and layers.
 
-    Where no mesh meets them all, a quarter of the scene's cells along an edge. Not collective.
+    Where no mesh meets them all, a quarter of the scene's cells along an edge.
     """
     cells, lines = scene.tissue.cells or [], edges(scene)
     for part in range(PARTS, 0, -1):
@@ -59,7 +59,7 @@ def smallest_mesh(scene: Scene) -> tuple[int, ...]:
 def nested_meshes(scene: Scene) -> tuple[tuple[int, ...], ...]:
     """Multiples of the smallest mesh up to what the work allows, coarse to fine; empty on a mesh file.
 
-    The scene's own number of cells plays no part in how fine they get. Not collective.
+    The scene's own number of cells plays no part in how fine they get.
     """
     if scene.tissue.cells is None:
         return ()
@@ -74,14 +74,14 @@ def nested_meshes(scene: Scene) -> tuple[tuple[int, ...], ...]:
 
 
 def halved_meshes(scene: Scene, most: int) -> tuple[tuple[int, ...], ...]:
-    """Of these meshes, the finest ones that double the cells from one to the next. Not collective."""
+    """Of these meshes, the finest ones that double the cells from one to the next."""
     meshes = nested_meshes(scene)
     doubled = [c for c in meshes if (c[0] // meshes[0][0]).bit_count() == 1]
     return tuple(doubled[-most:])
 
 
 def few_steps(scene: Scene) -> int:
-    """Steps of the runs on the finest meshes. Not collective."""
+    """Steps of the runs on the finest meshes."""
     n = scene.time.steps
     return n // 2 if n >= 2 * max(FEW_STEPS, least_steps(scene)) else n
 
@@ -89,7 +89,7 @@ def few_steps(scene: Scene) -> int:
 def corner_exponent(poisson: float) -> float:
     """Exponent alpha of u ~ r^alpha where a held side meets a free one at a right angle, plane strain.
 
-    sin(alpha pi / 2)^2 = ((kappa + 1)^2 - 4 alpha^2) / (4 kappa), kappa = 3 - 4 nu [Williams 1952]. Not collective.
+    sin(alpha pi / 2)^2 = ((kappa + 1)^2 - 4 alpha^2) / (4 kappa), kappa = 3 - 4 nu [Williams 1952].
     """
     kappa = 3 - 4 * poisson
 
@@ -119,7 +119,7 @@ def singular_order(scene: Scene) -> float:
 
 
 def observed_order(sizes: list[float], changes: list[float]) -> float | None:
-    """Order p of values a + c h^p at three sizes h, coarse to fine, from their two changes. Not collective.
+    """Order p of values a + c h^p at three sizes h, coarse to fine, from their two changes.
 
     None without one between 0.05 and 6.
     """
@@ -134,6 +134,6 @@ def observed_order(sizes: list[float], changes: list[float]) -> float | None:
 
 
 def limit_weights(sizes: list[float], orders: list[float]) -> np.ndarray:
-    """Weights w of values a + sum_i c_i h^p_i at as many sizes as terms, a = sum w v. Not collective."""
+    """Weights w of values a + sum_i c_i h^p_i at as many sizes as terms, a = sum w v."""
     terms = np.array([[1.0, *((h / sizes[-1]) ** p for p in orders)] for h in sizes])
     return np.asarray(np.linalg.inv(terms)[0])

@@ -112,7 +112,7 @@ class ProbedRun(Run):
         self.stamps[n] = time.perf_counter() - begin - (self.checking - checked)
 
     def record(self, n: int) -> None:
-        """This rank's share of the places, and what the work of the load needs. Not collective."""
+        """This rank's share of the places, and what the work of the load needs."""
         self.pulls[n] = self.midpoint.pull()
         if self.probe is not None and len(self.probe.dofs):
             self.local_outputs[n] = self.probe.weights @ self.state.array[self.probe.dofs]

@@ -142,7 +142,7 @@ def _timed_model(model: ReducedModel, point: Point, against: FullRun, probe: Pro
 
 
 def _steps(model: ReducedModel, against: FullRun) -> Array:
-    """Seconds of single steps, called one by one as a control loop would. Not collective."""
+    """Seconds of single steps, called one by one as a control loop would."""
     step = Stepper(prepared(propagator(model.at(), against.dt), None, False))
     force, stamps = against.force, np.empty(CALLS)
     for k in range(CALLS):

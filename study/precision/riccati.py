@@ -53,7 +53,7 @@ class GainReference:
     error: float
 
     def judge_of(self, method: str) -> RiccatiSolution:
-        """The solution that a method is compared with: of another method, where there is one. Not collective."""
+        """The solution that a method is compared with: of another method, where there is one."""
         others = [s for name, s in self.solutions.items() if name != method]
         return (others or list(self.solutions.values()))[0]
 

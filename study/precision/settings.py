@@ -59,24 +59,24 @@ class Setting:
         return self.cells, self.order
 
     def unknowns(self, d: int) -> int:
-        """About how many tissue unknowns a structured mesh has. Not collective."""
+        """About how many tissue unknowns a structured mesh has."""
         return 0 if self.cells is None else d * int(np.prod([self.order * n + 1 for n in self.cells]))
 
 
 def scene_setting(scene: Scene) -> Setting:
-    """The scene's own setting. Not collective."""
+    """The scene's own setting."""
     cells = None if scene.tissue.cells is None else tuple(scene.tissue.cells)
     return Setting(cells, scene.tissue.order, scene.time.steps, scene.time.solver, scene.time.rtol)
 
 
 def own_setting(scene: Scene) -> Setting:
-    """The scene's mesh, order and steps, as the forward diagram names them. Not collective."""
+    """The scene's mesh, order and steps, as the forward diagram names them."""
     own = scene_setting(scene)
     return Setting(own.cells, own.order, own.steps)
 
 
 def least_steps(scene: Scene) -> int:
-    """Fewest steps of a run: a prescribed move needs two over its duration. Not collective."""
+    """Fewest steps of a run: a prescribed move needs two over its duration."""
     motion = scene.motion
     if motion.drive == "motion" and motion.profile == "quintic":
         return max(LEAST_STEPS, ceil(2 * scene.time_end / motion.duration))
@@ -84,7 +84,7 @@ def least_steps(scene: Scene) -> int:
 
 
 def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: Sequence[float] | None = None) -> Scene:
-    """The scene under another setting. Not collective.
+    """The scene under another setting.
 
     Args:
         scene: the scene.

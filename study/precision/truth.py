@@ -46,7 +46,7 @@ STILL = 1e-12  # of the displacement: an output that moves less against the hand
 
 
 def space_limit(sizes: list[float], values: list[Array], expected: float, d: int) -> Limit:
-    """Limit of values on two meshes or more with cells of size h, coarse to fine. Not collective."""
+    """Limit of values on two meshes or more with cells of size h, coarse to fine."""
     two = sum(w * v for w, v in zip(limit_weights(sizes[-2:], [expected]), values[-2:], strict=True))
     shown = None
     if len(values) >= 3:
@@ -86,7 +86,7 @@ class Plan:
 
 
 def make_plan(scene: Scene) -> Plan:
-    """Settings behind the reference of a scene. Not collective."""
+    """Settings behind the reference of a scene."""
     few, meshes = few_steps(scene), nested_meshes(scene)
     if len(meshes) < 2:  # nothing to refine: P1 beside P2 tells what there is to know
         cells = meshes[0] if meshes else None
@@ -127,7 +127,7 @@ def make_truth(scene: Scene, runs: FullRuns) -> Truth:
 
 
 def combine(scene: Scene, plan: Plan, series: dict[Setting, Series], limit: Limit) -> Truth:
-    """y* and its error estimate from the runs. Not collective.
+    """y* and its error estimate from the runs.
 
     Raises:
         SceneError: the outputs move with the hand.

@@ -18,7 +18,7 @@ MEASURES = (
 
 
 def leader(sweeps: Sequence[Sweep], N: int, key: str, stable: bool = True) -> tuple[Sweep, Point] | None:
-    """Method with the least value at exactly N, among stable models or all; None without any. Not collective."""
+    """Method with the least value at exactly N, among stable models or all; None without any."""
     models = [
         (getattr(p, key), k, s, p)
         for k, s in enumerate(sweeps)
@@ -29,27 +29,24 @@ def leader(sweeps: Sequence[Sweep], N: int, key: str, stable: bool = True) -> tu
 
 
 def sizes_of(sweeps: Sequence[Sweep]) -> list[int]:
-    """All N of any method, ascending. Not collective."""
+    """All N of any method, ascending."""
     return sorted({p.N for s in sweeps for p in s.points})
 
 
 def compared_size(sweeps: Sequence[Sweep]) -> int | None:
-    """The N nearest to the one compared, the smaller of two. Not collective."""
+    """The N nearest to the one compared, the smaller of two."""
     return min(sizes_of(sweeps), key=lambda N: (abs(N - COMPARED), N), default=None)
 
 
 def leaders(sweeps: Sequence[Sweep], key: str) -> list[tuple[Sweep, list[Point]]]:
-    """Best stable methods in the order of N, with their points in a row. Not collective."""
+    """Best stable methods in the order of N, with their points in a row."""
     best = [b for N in sizes_of(sweeps) if (b := leader(sweeps, N, key)) is not None]
     groups = [list(group) for _, group in groupby(best, key=lambda b: b[0].method.key)]
     return [(group[0][0], [p for _, p in group]) for group in groups]
 
 
 def findings(sweeps: Sequence[Sweep]) -> tuple[str, ...]:
-    """Who is best at which N in which measure, what structure buys, and whether the paper's ranking holds.
-
-    Not collective.
-    """
+    """Who is best at which N in which measure, what structure buys, and whether the paper's ranking holds."""
     shown = [s for s in sweeps if s.points]
     return (*_best(shown), *_stability(shown), *_structure(shown), *_paper(shown)) if shown else ()
 

@@ -41,7 +41,7 @@ from softgrasp.study.shell.session import Page, Session, list_files
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
-    """Methods of the scene. Not collective.
+    """Methods of the scene.
 
     Raises:
         SceneError: the scene keeps no snapshots that a basis could be built from.

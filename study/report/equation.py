@@ -32,7 +32,7 @@ class Equation:
 
 
 def equation(scene: Scene) -> Equation:
-    """The equation of a scene with exactly its terms. Not collective."""
+    """The equation of a scene with exactly its terms."""
     effects = scene.effects
     free = scene.motion.drive == "force"
     damped, heavy, two_way = effects.damping is not None, effects.gravity is not None, effects.reaction

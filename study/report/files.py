@@ -13,7 +13,7 @@ from softgrasp.fem.scene.scene import Scene
 
 
 def plain(value: Any) -> Any:
-    """A value that JSON can hold: what is not finite becomes None. Not collective."""
+    """A value that JSON can hold: what is not finite becomes None."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

@@ -33,12 +33,12 @@ def peak_memory_mb(comm: MPI.Intracomm) -> float:
 
 
 def machine() -> str:
-    """Processor, system and Python, as results name them. Not collective."""
+    """Processor, system and Python, as results name them."""
     return f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}"
 
 
 def origin(scene: Scene, ranks: int) -> dict[str, Any]:
-    """Where the numbers of a result come from: the first keys of its ``result.json``. Not collective."""
+    """Where the numbers of a result come from: the first keys of its ``result.json``."""
     return {
         "scene": scene.name,
         "scene_hash": scene_hash(scene),
@@ -52,20 +52,20 @@ PACKAGES = {"DOLFINx": ("fenics-dolfinx", "dolfinx-solver-real"), "NumPy": ("num
 
 
 def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int, options: str = "") -> str:
-    """The command line that writes a page again. Not collective."""
+    """The command line that writes a page again."""
     launch = f"mpiexec -n {ranks} " if ranks > 1 else ""
     sets = "".join(f" --set {shlex.quote(o)}" for o in overrides)
     return f"{launch}softgrasp {command} {shlex.quote(str(path))}{sets}{options}"
 
 
 def made_with(result: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Rows on where the numbers of a result come from, see :func:`study.report.origin.origin`. Not collective."""
+    """Rows on where the numbers of a result come from, see :func:`study.report.origin.origin`."""
     names = {"version": "softgrasp", "machine": "machine", "ranks": "ranks", "scene_hash": "scene hash"}
     return [(name, result[key]) for key, name in names.items()]
 
 
 def versions() -> list[tuple[str, str]]:
-    """Versions of this program and of what its numbers come from. Not collective."""
+    """Versions of this program and of what its numbers come from."""
     commit = _commit(PACKAGE.parent / ".git")
     rows = [("softgrasp", package_version() + (f", commit {commit}" if commit else ""))]
     for name, distributions in PACKAGES.items():

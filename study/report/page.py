@@ -74,7 +74,7 @@ def _lines(rows: Rows) -> list[str]:
 
 
 def of_scene(scene: str) -> Section:
-    """The section with the equation of a resolved scene. Not collective.
+    """The section with the equation of a resolved scene.
 
     Raises:
         pydantic.ValidationError: the text is no scene.
@@ -83,7 +83,7 @@ def of_scene(scene: str) -> Section:
 
 
 def outside(page: str) -> list[str]:
-    """Everything in the tags of a page that would load another file: scripts, links, addresses. Not collective."""
+    """Everything in the tags of a page that would load another file: scripts, links, addresses."""
     style = "".join(re.findall(r"<style>.*?</style>", page, re.DOTALL))
     marks = re.findall(r"<[^>]*>", re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL))
     return [address[0] for text in (*marks, style) for address in ADDRESS.finditer(text)]

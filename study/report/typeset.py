@@ -38,14 +38,14 @@ def symbol(match: re.Match[str]) -> str:
 
 
 def formula(text: str) -> Markup:
-    """A formula, or prose with formulas in it, as HTML. Not collective."""
+    """A formula, or prose with formulas in it, as HTML."""
     safe = str(escape(text)).replace("&#39;", "'")
     marked = re.sub(r"\bint ", "∫ ", SYMBOL.sub(symbol, safe).replace("&lt;", "⟨").replace("&gt;", "⟩"))
     return Markup(re.sub(r"(?<=[\s(\[])-(?=[\s\w<(])|^-", "−", marked))
 
 
 def terms(text: str) -> list[Markup]:
-    """The formula in pieces between which a line may break: each begins with its operator. Not collective."""
+    """The formula in pieces between which a line may break: each begins with its operator."""
     pieces, depth = [""], 0
     for word in text.split(" "):
         if depth == 0 and word in BREAKS and pieces[-1]:
@@ -57,7 +57,7 @@ def terms(text: str) -> list[Markup]:
 
 
 def equation_html(text: str) -> Markup:
-    """The lines of `study.report.page.equation_text` as HTML. Not collective.
+    """The lines of `study.report.page.equation_text` as HTML.
 
     A line that ends in a colon heads what follows; ``name: formula`` has its formula beside the name; other lines are
     prose with formulas.

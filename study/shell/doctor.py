@@ -50,20 +50,20 @@ class Check:
 
 
 def check_python() -> Check:
-    """Python 3.12 or newer. Not collective."""
+    """Python 3.12 or newer."""
     ok = sys.version_info >= (3, 12)
     return Check("Python", ok, sys.version.split()[0], "" if ok else "Use Python 3.12 or newer.")
 
 
 def check_dolfinx() -> Check:
-    """DOLFINx 0.11; 0.10 differs in nothing that is called here. Not collective."""
+    """DOLFINx 0.11; 0.10 differs in nothing that is called here."""
     version = str(importlib.import_module("dolfinx").__version__)
     ok = version.startswith(("0.10.", "0.11."))
     return Check("DOLFINx", ok, version, "" if ok else "softgrasp needs DOLFINx 0.11 or 0.10; install one of them.")
 
 
 def check_petsc() -> Check:
-    """PETSc with real double scalars. Not collective."""
+    """PETSc with real double scalars."""
     importlib.import_module("softgrasp.fem._stack")  # MPI before petsc4py
     petsc = importlib.import_module("petsc4py.PETSc")
     np = importlib.import_module("numpy")
@@ -75,20 +75,20 @@ def check_petsc() -> Check:
 
 
 def check_slepc() -> Check:
-    """SLEPc. Not collective."""
+    """SLEPc."""
     importlib.import_module("softgrasp.fem._stack")
     version = importlib.import_module("slepc4py.SLEPc").Sys.getVersion()
     return Check("SLEPc", True, ".".join(str(part) for part in version))
 
 
 def family(text: str) -> str:
-    """Name the MPI family that a version text belongs to, or "unknown". Not collective."""
+    """Name the MPI family that a version text belongs to, or "unknown"."""
     low = text.lower()
     return next((name for name, words in MPI_FAMILIES.items() if any(word in low for word in words)), "unknown")
 
 
 def check_launcher() -> Check:
-    """The mpiexec in use belongs to the MPI library of mpi4py. Not collective."""
+    """The mpiexec in use belongs to the MPI library of mpi4py."""
     linked = family(importlib.import_module("mpi4py.MPI").Get_library_version())
     path = find_mpiexec()
     if path is None:
@@ -109,7 +109,7 @@ def check_launcher() -> Check:
 
 
 def check_launch() -> Check:
-    """Two ranks really find each other. Not collective."""
+    """Two ranks really find each other."""
     name = "two ranks"
     if any(variable in os.environ for variable in IN_MPI_JOB):
         return Check(name, True, "Not tried: this is already an MPI job, run doctor without mpiexec to try it.")
@@ -130,7 +130,7 @@ def check_launch() -> Check:
 
 
 def check_threads() -> Check:
-    """One BLAS thread a rank. Not collective."""
+    """One BLAS thread a rank."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     value = ", ".join(f"{name}={os.environ.get(name, 'unset')}" for name in names)
     ok = all(os.environ.get(name) == "1" for name in names)
@@ -139,7 +139,7 @@ def check_threads() -> Check:
 
 
 def check_compiler() -> Check:
-    """A C compiler with the headers of this Python, as the JIT of forms needs it. Not collective."""
+    """A C compiler with the headers of this Python, as the JIT of forms needs it."""
     words = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
     path = shutil.which(words[0])
     if path is None:
@@ -156,7 +156,7 @@ def check_compiler() -> Check:
 
 
 def check_cache() -> Check:
-    """The folder of compiled forms can be written. Not collective."""
+    """The folder of compiled forms can be written."""
     importlib.import_module("softgrasp.fem._stack")
     folder = Path(importlib.import_module("dolfinx.jit").get_options()["cache_dir"])
     try:
@@ -169,7 +169,7 @@ def check_cache() -> Check:
 
 
 def check_adios2() -> Check:
-    """ADIOS2 inside DOLFINx, for VTX series. Not collective."""
+    """ADIOS2 inside DOLFINx, for VTX series."""
     importlib.import_module("softgrasp.fem._stack")
     ok = hasattr(importlib.import_module("dolfinx.io"), "VTXWriter")
     cure = "" if ok else "Use a DOLFINx built with ADIOS2, or ask for XDMF output."
@@ -177,7 +177,7 @@ def check_adios2() -> Check:
 
 
 def check_memory() -> Check:
-    """Memory that is free now, enough for the paper's scenes. Not collective."""
+    """Memory that is free now, enough for the paper's scenes."""
     memory = psutil.virtual_memory()
     value = f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
     ok = memory.available > 2**30

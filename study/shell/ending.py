@@ -18,7 +18,7 @@ RANK = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")  # set by launchers, kn
 
 
 def rank() -> int:
-    """Rank of this process, without loading MPI. Not collective."""
+    """Rank of this process, without loading MPI."""
     if "mpi4py.MPI" in sys.modules:
         from mpi4py import MPI
 
@@ -27,12 +27,12 @@ def rank() -> int:
 
 
 def console() -> Console:
-    """A console that writes on rank 0 only. Not collective."""
+    """A console that writes on rank 0 only."""
     return Console(quiet=rank() != 0, highlight=False)
 
 
 def end_all() -> None:
-    """End the other ranks, which may wait for this one. Not collective."""
+    """End the other ranks, which may wait for this one."""
     sys.stderr.flush()
     if "mpi4py.MPI" not in sys.modules:
         return
@@ -44,7 +44,7 @@ def end_all() -> None:
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Refuse what DOLFINx, which looks at all arguments, and Python could not read as text. Not collective.
+    """Refuse what DOLFINx, which looks at all arguments, and Python could not read as text.
 
     Raises:
         SceneError: a word is no text.

@@ -19,8 +19,6 @@ from softgrasp.study.shell.processes import child_environment, find_mpiexec
 def launch_worker(name: str, spec: dict[str, Any], ranks: int, limit: float = 3600.0) -> dict[str, Any]:
     """Run ``python -m softgrasp.study.bench worker NAME SPEC`` on some ranks; its numbers, or ``error``.
 
-    Not collective.
-
     Args:
         name: of the benchmark.
         spec: arguments of the function that measures a row, fit for JSON.

@@ -15,22 +15,19 @@ IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
 
 
 def find_mpiexec() -> str | None:
-    """The launcher beside this Python, else the first on PATH. Not collective."""
+    """The launcher beside this Python, else the first on PATH."""
     beside = Path(sys.executable).parent / "mpiexec"
     return str(beside) if os.access(beside, os.X_OK) else shutil.which("mpiexec")
 
 
 def child_environment() -> dict[str, str]:
-    """Environment in which another Python finds this very package. Not collective."""
+    """Environment in which another Python finds this very package."""
     path = os.pathsep.join(p for p in (str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")) if p)
     return os.environ | {"PYTHONPATH": path}
 
 
 def run_limited(command: list[str], limit: float, environment: dict[str, str] | None = None) -> tuple[int | None, str]:
-    """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough.
-
-    Not collective.
-    """
+    """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough."""
     with subprocess.Popen(
         command,
         stdout=subprocess.PIPE,

@@ -9,7 +9,7 @@ from softgrasp.fem.scene.scene import scene_schema
 
 
 def full_schema() -> dict[str, Any]:
-    """JSON schema of a scene file, draft 2020-12. Not collective."""
+    """JSON schema of a scene file, draft 2020-12."""
     schema = scene_schema()
     schema["$defs"]["Reduction"]["properties"]["methods"]["items"]["enum"] = list(BASES)
     return schema

@@ -103,7 +103,7 @@ class Session:
         return model
 
     def progress(self, count: ProgressColumn) -> Progress:
-        """Bars with the time left, in a terminal only. Not collective."""
+        """Bars with the time left, in a terminal only."""
         return progress_bar(self.console, count, quiet=self.quiet)
 
     def write(
@@ -151,7 +151,7 @@ class Session:
 
 
 def progress_bar(console: Console, count: ProgressColumn, *, quiet: bool = False) -> Progress:
-    """Bars with the time left, in a terminal only. Not collective.
+    """Bars with the time left, in a terminal only.
 
     Args:
         console: where they go; a rank that prints nothing has none.
@@ -163,7 +163,7 @@ def progress_bar(console: Console, count: ProgressColumn, *, quiet: bool = False
 
 
 def list_files(console: Console, files: Sequence[Path]) -> None:
-    """Print what was written, one a line. Not collective."""
+    """Print what was written, one a line."""
     console.print("files:")
     for file in files:
         console.print(f"  {file}", soft_wrap=True, markup=False)
@@ -180,6 +180,6 @@ def open_model(scene: Scene, console: Console) -> Model:
 
 
 def show_warnings(console: Console, warnings: Sequence[str]) -> None:
-    """Print warnings in yellow. Not collective."""
+    """Print warnings in yellow."""
     for text in warnings:
         console.print(Padding.indent(Text(f"warning: {text}", "yellow"), 0), highlight=False)

@@ -27,7 +27,7 @@ class Unread(io.FileIO):
 
 
 def write_utf8() -> None:
-    """Let files be read and written as UTF-8 in any locale, as scenes and JSON are. Not collective."""
+    """Let files be read and written as UTF-8 in any locale, as scenes and JSON are."""
     if locale.getencoding().lower() != "utf-8":
         with contextlib.suppress(locale.Error):  # no such locale here: names beyond ASCII then end in a sentence
             locale.setlocale(locale.LC_CTYPE, "C.UTF-8")
@@ -52,7 +52,7 @@ def outlive_readers() -> None:
 def quiet_imports() -> None:
     """Let Ctrl-C end the program at once while modules load, where KeyboardInterrupt would tear compiled ones apart.
 
-    Not collective. Leaves any handler but Python's own alone.
+    Leaves any handler but Python's own alone.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         with contextlib.suppress(ValueError):  # not the main thread

@@ -29,7 +29,7 @@ def repeated(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int, seconds
 
 
 def warm(count: int) -> int:
-    """Steps before the timed ones: the method before left the caches full of its own factor. Not collective."""
+    """Steps before the timed ones: the method before left the caches full of its own factor."""
     return max(1, count // 20)
 
 
@@ -48,7 +48,7 @@ def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict
 
 
 def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:
-    """Median of each list. Not collective."""
+    """Median of each list."""
     return {name: float(statistics.median(values)) for name, values in samples.items()}
 
 
