@@ -114,6 +114,11 @@ def solve(
         ControlError: weights or data are refused, or some mode cannot be stabilised.
         SolverError: not converged, or the true residual misses the tolerance.
         ResourceError: dense was asked for at a size that would not fit, or the factor of a shift does not fit.
+
+    >>> import softgrasp as sg
+    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
+    >>> sg.solve(problem).residual < 1e-8
+    True
     """
     choice = choose(problem, method)
     if method == "auto" and choice.method == "dense" and problem.layout.states > DenseRiccati().limit:

@@ -115,6 +115,12 @@ def load(path: str | Path, layout: BlockLayout | None = None, scene_hash: str | 
 
     Raises:
         ModelError: the file is missing, damaged, of another scene or of another mesh.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
+    >>> sg.save(sg.reduce(model, sg.simulate(model), "psd", N=8), "small.h5")
+    >>> sg.load("small.h5").at().stable
+    True
     """
     path = Path(path)
     if layout is None:

@@ -65,23 +65,17 @@ def pytest_configure(config: pytest.Config) -> None:
         reporter._tw._file = open(os.devnull, "w")  # noqa: SIM115  (lives as long as the process)
 
 
-# Thousands of small collective calls: minutes on more ranks than cores. Three ranks run their tests of ranks alone.
-CHATTY = {
-    "test_fem_effects", "test_fem_effect_gates", "test_lqr_large", "test_lqr_parts", "test_lqr_reduced",
-    "test_lqr_second_order", "test_lqr_spectrum", "test_lqr_tail", "test_reduction_model", "test_reduction_online",
-    "test_reduction_pymor", "test_reduction_snapshots", "test_study_bench", "test_study_cli",
-    "test_study_control", "test_study_effects", "test_study_explain", "test_study_hardcases", "test_study_loop_plots",
-    "test_study_plots", "test_study_reduce", "test_study_reduce_tables", "test_study_report", "test_study_simulate",
-    "test_study_work", "test_study_work_control", "test_study_work_tolerance",
-}  # fmt: skip
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Most ranks of a test: 1 where marked serial, 3 where marked ranks, n where ranks(n); else 2, and 1 in study."""
     for item in items:
-        if OWN.size > 1 and item.get_closest_marker("serial"):
-            item.add_marker(pytest.mark.skip(reason="runs on one rank only"))
-        elif OWN.size > 2 and item.path.stem in CHATTY and "rank" not in item.name.partition("[")[0]:
-            item.add_marker(pytest.mark.skip(reason="runs on one and two ranks"))
+        mark = item.get_closest_marker("ranks")
+        most = 1 if "study" in item.path.relative_to(item.config.rootpath).parts else 2
+        if mark is not None:
+            most = mark.args[0] if mark.args else 3
+        if item.get_closest_marker("serial"):
+            most = 1
+        if OWN.size > most:
+            item.add_marker(pytest.mark.skip(reason=f"runs on at most {most} rank(s)"))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

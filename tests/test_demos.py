@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.ranks
+
 ROOT = Path(__file__).parents[1]
 DEMOS = sorted((ROOT / "demos").glob("demo_*.py"))
 

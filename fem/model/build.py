@@ -63,6 +63,11 @@ class Model:
         inventory: compiled forms and allocated operators.
         watch: seconds of mesh and assembly.
         accuracy: estimate of the error of the mesh, where the scene has a tolerance.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]"])
+    >>> model.states == 2 * (model.system.layout.n_s + model.system.layout.n_e)
+    True
     """
 
     scene: Scene
@@ -143,6 +148,10 @@ def build(
         SceneError, MeshError: with one sentence that names the key or the file.
         ResourceError: the memory of a node cannot hold it; estimated before anything is allocated, for a mesh file
             when its cells are known.
+
+    >>> import softgrasp as sg
+    >>> sg.build("paper_forward").states
+    1916
     """
     if isinstance(scene, str | Path):
         scene = load_scene_collective(comm, scene, overrides)

@@ -321,6 +321,11 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
         ResourceError: the snapshots do not fit.
         CheckpointError: resume was asked for and no fitting restart file is there.
         Interrupted: Ctrl-C or ``until``; the message names the restart file.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
+    >>> sg.simulate(model).energy_drift < 1e-12
+    True
     """
     options = options or RunOptions()
     run = Run(model, options, force)

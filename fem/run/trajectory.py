@@ -28,6 +28,12 @@ class Trajectory:
         steps_timed: steps taken since the run was started or resumed.
         force: mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with
             two-way coupling what a prescribed motion takes; None when one-way coupling leaves it unknown.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
+    >>> run = sg.simulate(model)
+    >>> run.outputs.shape
+    (61, 2)
     """
 
     times: Array

@@ -37,7 +37,12 @@ _EXPECTED = {
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Name and path of the scenes that ship with the project."""
+    """Name and path of the scenes that ship with the project.
+
+    >>> import softgrasp as sg
+    >>> "paper_forward" in sg.shipped_scenes()
+    True
+    """
     folder = (PACKAGE / "scenes").resolve()
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
@@ -58,6 +63,10 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
 
     Raises:
         SceneError: the file is missing, no TOML, or a key is unknown, missing, ill-typed or meaningless.
+
+    >>> import softgrasp as sg
+    >>> sg.load_scene("paper_lqr", ["control.R=2"]).control.R
+    2.0
     """
     file = find_scene(path)
     data = _read(file)

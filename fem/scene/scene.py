@@ -128,7 +128,12 @@ class Output(Model):
 
 
 class Scene(Model):
-    """A whole scene; relative file names count from `directory`."""
+    """A whole scene; relative file names count from `directory`.
+
+    >>> import softgrasp as sg
+    >>> sg.load_scene("paper_forward").tissue.cells
+    [15, 30]
+    """
 
     name: Label = Field(min_length=1, description="short name [no unit]")
     description: str = Field("", description="what the scene shows [no unit]")

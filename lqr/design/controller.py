@@ -52,6 +52,11 @@ def make_controller(design: Design, order: int | None = None) -> Controller:
 
     Raises:
         ControlError: no such order, or no gain that is certified to stabilise the plant.
+
+    >>> import softgrasp as sg
+    >>> controller = sg.make_controller(sg.design(sg.build("paper_lqr", ["tissue.cells=[2, 4]"])), order=8)
+    >>> controller.K.shape
+    (2, 8)
     """
     sizes = [order] if order is not None else orders(design)[0]
     (basis,) = reduce_gains(design, sizes, names=(A_PRIORI,))

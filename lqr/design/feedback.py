@@ -103,6 +103,10 @@ def design(
         ControlError: no gain exists, in one sentence.
         SolverError: not converged, or a gain that does not stabilise the full plant at the scene's own step, rate and
             delay.
+
+    >>> import softgrasp as sg
+    >>> sg.design(sg.build("paper_lqr", ["tissue.cells=[2, 4]"])).quality.stable
+    True
     """
 
     def stage(name: str) -> Any:

@@ -44,6 +44,11 @@ def problem(model: Model) -> RiccatiProblem:
 
     Raises:
         SceneError: an output lies outside the body, or Q or R has the wrong size.
+
+    >>> import softgrasp as sg
+    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
+    >>> problem.names
+    ('tip_x', 'tip_y')
     """
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)

@@ -67,6 +67,11 @@ class Controller:
 
     Raises:
         ControlError: a shape is wrong, the plant does not begin with the hand, or the period is not positive.
+
+    >>> import softgrasp as sg
+    >>> controller = sg.make_controller(sg.design(sg.build("paper_lqr", ["tissue.cells=[2, 4]"])), order=8)
+    >>> controller.step([0.0, 0.0], [0.0, 0.0]).shape
+    (2,)
     """
 
     K: Array

@@ -109,6 +109,12 @@ class ClosedLoop:
     Raises:
         ControlError: dt is not a positive number.
         SolverError: the factorisation fails.
+
+    >>> import softgrasp as sg
+    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
+    >>> move = sg.ClosedLoop(problem, dt=0.5).run(sg.solve(problem).gain, target=[5.0, 3.0], steps=600)
+    >>> bool(abs(move.q_s[-1] - [5, 3]).max() < 0.01)
+    True
     """
 
     def __init__(

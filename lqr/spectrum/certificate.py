@@ -72,6 +72,11 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
     Raises:
         ControlError: the plant has no hand.
         SolverError: no eigenvalue converges.
+
+    >>> import softgrasp as sg
+    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
+    >>> sg.abscissa(problem, sg.solve(problem).gain).value < 0
+    True
     """
     return certified_abscissa(problem, gain.block)
 

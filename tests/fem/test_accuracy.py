@@ -25,6 +25,8 @@ from softgrasp.fem.solve.modes import lowest_modes
 from tests.fem.test_refined import fingerprint, l_scene
 from tests.helpers.models import CUBE, LAYERS, _k_lambda, _k_mu, _mass, held_by_paper, make_scene
 
+pytestmark = pytest.mark.ranks
+
 TIP = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]}}
 DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
 WEIGHT = {"effects": {"gravity": {"g": [0.0, -9.81]}}, "time": {"start": "equilibrium"}}

@@ -27,6 +27,8 @@ from tests.helpers.models import (
     same_everywhere,
 )  # fmt: skip
 
+pytestmark = pytest.mark.ranks
+
 SCENES: dict[str, tuple[list[dict[str, Any]], Any]] = {
     "2d-p1": ([], held_by_paper),
     "2d-p2": ([{"tissue": {"order": 2}}], held_by_paper),

@@ -22,6 +22,8 @@ from softgrasp.fem.solve.order import dissect
 from softgrasp.fem.solve.solvers import FEW_LIMIT, choose_solver, make_solver
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 
+pytestmark = pytest.mark.ranks
+
 UNEQUAL: dict[str, Any] = {"tissue": {"material": {"lambda": 90.0, "mu": 20.0, "rho": 1.0}}}
 SCENES = {"2d": [UNEQUAL], "3d": [UNEQUAL, CUBE], "p2": [UNEQUAL, {"tissue": {"order": 2}}]}
 # a block 1e6 times as stiff as the one it hangs from, lambda = 0

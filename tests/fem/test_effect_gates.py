@@ -306,6 +306,7 @@ def test_modes_on_a_3d_box(comm: MPI.Intracomm) -> None:
     np.testing.assert_allclose(omega**2, squares[:6], rtol=1e-9)  # eigh loses eps |K| / omega_1^2, about 1e-12
 
 
+@pytest.mark.ranks
 def test_modes_are_the_same_on_one_rank(comm: MPI.Intracomm) -> None:
     """Signs too: compare at the node that lies lowest on the left."""
 

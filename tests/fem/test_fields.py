@@ -20,6 +20,8 @@ from softgrasp.fem.fields.series import FullField, SeriesWriter
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.scene import Scene
 
+pytestmark = pytest.mark.ranks
+
 EXACT = 1e-14  # coordinates of order 1 times rounding
 
 

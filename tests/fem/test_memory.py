@@ -16,6 +16,8 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import check_memory, free_bytes, need, simplices
 from tests.helpers.models import CUBE, make_scene
 
+pytestmark = pytest.mark.ranks
+
 GIB = 2.0**30
 
 

@@ -21,6 +21,8 @@ from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.scene.tissue import Contact
 
+pytestmark = pytest.mark.ranks
+
 COMM = MPI.COMM_WORLD
 PILLOW = Path(__file__).parents[2] / "demos" / "scenes" / "meshes" / "pillow_small.msh"
 WIDE = 1e-12  # sums of a few hundred positive terms of order one: round-off is below 1e-13

@@ -27,6 +27,8 @@ from softgrasp.fem.scene.tissue import Contact, Layer
 from tests.fem.test_mesh import COMM, WIDE, area, grid, volume, zone
 from tests.helpers.models import gather_matrix, node_order
 
+pytestmark = pytest.mark.ranks
+
 Blocks = list[tuple[str, np.ndarray]]
 
 

@@ -39,6 +39,8 @@ from tests.helpers.models import (
     wave,
 )
 
+pytestmark = pytest.mark.ranks
+
 Array = NDArray[np.float64]
 # 60 solves with a matrix of condition 1e4, each good to 1e-12: the two runs may part by 1e-10
 SAME_RUN = 1e-10

@@ -14,6 +14,8 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.forward.result import simulate_result
 from tests.helpers.models import CUBE, gather_rows, make_scene
 
+pytestmark = pytest.mark.ranks
+
 
 def outputs(*entries: dict[str, Any]) -> dict[str, Any]:
     return {"control": {"outputs": list(entries)}}

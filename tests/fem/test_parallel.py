@@ -28,6 +28,8 @@ from tests.helpers.models import (
     wave,
 )
 
+pytestmark = pytest.mark.ranks
+
 # relative; both runs carry the rounding of 60 solves with a matrix of condition 1e4
 SAME = 1e-10
 OUTPUTS = {

@@ -13,6 +13,8 @@ from softgrasp.fem.fields.probe import locate, make_probe
 from softgrasp.fem.model.build import Model, build
 from tests.helpers.models import Array, make_scene
 
+pytestmark = pytest.mark.ranks
+
 
 def model_of(comm: MPI.Intracomm, order: int, cells: tuple[int, ...] = (3, 7)) -> Model:
     tissue: dict[str, Any] = {"cells": list(cells), "order": order}

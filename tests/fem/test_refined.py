@@ -28,6 +28,8 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from tests.helpers.models import CUBE, LAYERS, gather_mesh, make_scene
 
+pytestmark = pytest.mark.ranks
+
 ROUND = 1e-12  # sums of some hundred terms of order one
 ROUGH = {"tolerance": 0.05}
 

@@ -30,6 +30,8 @@ from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.riccati import Refusal
 from tests.helpers.models import make_scene
 
+pytestmark = pytest.mark.ranks
+
 HDF5 = {"snapshots": "hdf5"}
 
 

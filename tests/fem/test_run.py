@@ -24,6 +24,8 @@ from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.solve.solvers import TissueSolver
 
+pytestmark = pytest.mark.ranks
+
 SCENES = Path(__file__).parents[2] / "demos" / "scenes"
 
 

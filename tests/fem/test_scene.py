@@ -19,6 +19,8 @@ from softgrasp.fem.scene import materials
 from softgrasp.fem.scene.file import load_scene, load_scene_collective, resolved_toml, shipped_scenes
 from softgrasp.fem.scene.scene import check_dimension, scene_schema
 
+pytestmark = pytest.mark.ranks
+
 SCENES = shipped_scenes()
 PAPER = SCENES["paper_forward"]
 PILLOW = SCENES["pillow_3d"]

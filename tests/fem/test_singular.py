@@ -10,6 +10,8 @@ import pytest
 from softgrasp.fem.mesh.grading import STEEPEST, SizeField, graded_line
 from softgrasp.fem.mesh.singular import Ends, exponent, singular_ends
 
+pytestmark = pytest.mark.ranks
+
 
 def grid(counts: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Points and Kuhn simplices of a box of unit cells, made without DOLFINx."""

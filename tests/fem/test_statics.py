@@ -26,6 +26,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import LayerMaterial, tissue_matrices
 from tests.helpers.models import dof_order, gather_matrix, gather_rows, local_rows, make_scene
 
+pytestmark = pytest.mark.ranks
+
 Array = NDArray[np.float64]
 SIDES = {2: ["left", "right", "bottom", "top"], 3: ["x-", "x+", "y-", "y+", "z-", "z+"]}
 

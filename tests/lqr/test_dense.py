@@ -41,6 +41,8 @@ from tests.helpers.models import (
     reference,
 )
 
+pytestmark = pytest.mark.ranks
+
 EPS = np.finfo(float).eps
 Example = tuple[Array, Array, Array, Array, Array, Array]  # A, B, C, Q, R, X
 

@@ -20,6 +20,8 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.models import close, gather_matrix, gather_rows, make_scene, same_everywhere
 
+pytestmark = pytest.mark.ranks
+
 SMALL = {"tissue": {"cells": [3, 6]}}
 
 

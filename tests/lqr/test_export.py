@@ -29,6 +29,8 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import hand_target, rest
 from tests.helpers.models import close, gather_rows, make_scene, same_everywhere
 
+pytestmark = pytest.mark.ranks
+
 Array = np.ndarray
 Q, R = 30.0, 0.5
 EFFECTS: dict[str, Any] = {

@@ -103,6 +103,7 @@ def test_inputs_stay_bitwise_the_same() -> None:
         assert np.array_equal(A.getValuesCSR()[2], old)
 
 
+@pytest.mark.ranks
 def test_same_result_on_every_rank_count() -> None:
     """A rank by itself solves the same scene; the parallel gain is the same."""
     problem = problem_of("one_way")

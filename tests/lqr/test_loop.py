@@ -22,6 +22,8 @@ from softgrasp.lqr.plant.target import hand_target, output_target, rest
 from tests.helpers.loop import CASES, Setup, aim, enumerate_input, plain_loop, setup
 from tests.helpers.models import close, gather_rows, gather_states, local_rows, same_everywhere
 
+pytestmark = pytest.mark.ranks
+
 Array = np.ndarray
 STEPS, END = 40, 4.0
 

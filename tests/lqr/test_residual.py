@@ -15,6 +15,8 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import LAYERS, make_scene
 
+pytestmark = pytest.mark.ranks
+
 CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}], "Q": 7.0, "R": [[2.0, 0.5], [0.5, 1.0]]}}
 KELVIN = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.003}}}
 DRAG = {"effects": {"damping": {"kind": "rayleigh", "alpha": 0.3, "beta": 0.003, "drag": "space"}}}

@@ -32,6 +32,8 @@ from tests.helpers.snapshots import (
     snapshot_rows,
 )
 
+pytestmark = pytest.mark.ranks
+
 # --- structure of all bases
 
 

@@ -21,6 +21,8 @@ from softgrasp.study.bench.bases import known_matrix, parse_shapes, right_down_t
 from softgrasp.study.shell.processes import IN_MPI_JOB
 from tests.helpers.models import Array, close, same_everywhere
 
+pytestmark = pytest.mark.ranks
+
 EPS = np.finfo(float).eps
 ACCURATE: tuple[EngineName, ...] = ("tsqr", "svd")
 

@@ -27,6 +27,8 @@ from tests.helpers.reduced import (
     whole_basis,
 )
 
+pytestmark = pytest.mark.ranks
+
 DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
 norm = np.linalg.norm
 

@@ -22,6 +22,8 @@ from softgrasp.reduction.states import states_of
 from tests.helpers.models import Array, close, make_scene
 from tests.helpers.reduced import DAMPED, KINDS, TINY, model_of, reduced, small_of, step_of, symplectic_basis, wiggle
 
+pytestmark = pytest.mark.ranks
+
 FALL = {"effects": {"gravity": {"g": [1.0, -9.0]}}}
 CANONICAL = [kind for kind in KINDS if kind[0] == "qp"]
 

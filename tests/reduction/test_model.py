@@ -237,6 +237,7 @@ def test_materials_that_cannot_be_are_refused(comm: MPI.Intracomm) -> None:
 # --- structure and stability
 
 
+@pytest.mark.ranks
 def test_all_ranks_hold_the_same_bits(comm: MPI.Intracomm) -> None:
     model = model_of(comm, DAMPED)
     for kind in KINDS:

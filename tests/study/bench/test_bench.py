@@ -168,6 +168,7 @@ def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypat
     assert (tmp_path / "bench.png").stat().st_size > 0
 
 
+@pytest.mark.ranks
 @pytest.mark.serial
 def test_driver_gets_numbers_from_two_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in IN_MPI_JOB:

@@ -64,6 +64,7 @@ def result(out: Path) -> dict[str, Any]:
     return ran(out, "newton-adi")[0]
 
 
+@pytest.mark.ranks(2)
 def test_result_holds_what_design_names(result: dict[str, Any], out: Path) -> None:
     assert result.keys() >= KEYS
     assert result["time"]["are"] > 0
@@ -80,6 +81,7 @@ def test_result_holds_what_design_names(result: dict[str, Any], out: Path) -> No
         assert all(p.keys() >= POINT for p in points)
 
 
+@pytest.mark.ranks(2)
 def test_gains_and_cost_agree_with_the_exact_identities(result: dict[str, Any]) -> None:
     """K_T'K_T = Q = I for every mesh, and the cost of a rigid displacement d is d'K_T'K_V d."""
     K_T, K_V = np.array(result["gain_translation"]), np.array(result["gain_rigid_velocity"])
@@ -89,6 +91,7 @@ def test_gains_and_cost_agree_with_the_exact_identities(result: dict[str, Any]) 
     assert result["closed_loop_abscissa"] < 0
 
 
+@pytest.mark.ranks(2)
 def test_the_loop_costs_what_the_riccati_equation_says(result: dict[str, Any]) -> None:
     loop = result["loop"]
     assert loop["cost"] + loop["cost_to_come"] == pytest.approx(result["optimal_cost"], rel=1e-9)  # midpoint: exact
@@ -105,6 +108,7 @@ class _StopError(Exception):
     pass
 
 
+@pytest.mark.ranks(2)
 def test_an_interrupted_run_goes_on(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, result: dict[str, Any]
 ) -> None:
@@ -220,6 +224,7 @@ def test_no_damping_is_diagnosed_and_modal_feedback_offered(tmp_path: Path) -> N
     assert found["loop"]["distance_final"] < 0.1  # the body arrives; its swings are not damped by anything
 
 
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -249,6 +254,7 @@ def quietly(out: Path, *overrides: str) -> dict[str, Any]:
     return run_control(SCENES / "paper_lqr.toml", out, list(overrides), console, quiet=True, pictures=False)
 
 
+@pytest.mark.ranks(2)
 def test_an_unstable_sampled_loop_writes_nothing_and_names_a_rate(tmp_path: Path) -> None:
     """Stable as a continuous law, lost at 5 Hz and one tick late; just above the rate of the sentence it settles."""
     out = common(tmp_path) / "out"

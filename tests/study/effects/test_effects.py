@@ -241,6 +241,7 @@ def test_an_effect_may_need_two_partners_and_a_force() -> None:
 # --- numbers against independent ones
 
 
+@pytest.mark.ranks(2)
 def test_change_is_what_two_runs_differ_by(comm: MPI.Intracomm) -> None:
     _, by = found(comm, CONTROL, effects={"gravity": {"g": [0.0, -3.0]}})
     with_, without = (
@@ -281,6 +282,7 @@ def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None
     assert compare(shown(plain, a), shown(turning, b)).absolute == pytest.approx(node, rel=1e-12)  # the same sums
 
 
+@pytest.mark.ranks(2)
 def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:
     """A run taken back to its start gives the state of a fresh one."""
     model = build(make_scene(effects=ALL_ON, motion={"drive": "force"}), comm=comm)
@@ -422,6 +424,7 @@ def test_switched_off_leaves_a_valid_scene(comm: MPI.Intracomm) -> None:
 # --- files
 
 
+@pytest.mark.ranks(2)
 def test_command_writes_every_file(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     scene = make_scene(QUICK, CONTROL, tissue={"layers": LAYERS}, effects={"damping": ALL_ON["damping"]})
     file, out = write_scene(comm, mpi_tmp_path, scene), mpi_tmp_path / "out"

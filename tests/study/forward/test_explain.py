@@ -268,6 +268,7 @@ def test_text_and_json(comm: MPI.Intracomm) -> None:
     assert data["effects"]["gravity"]["gate"]["matters"] is True
 
 
+@pytest.mark.ranks
 def test_only_rank_zero_writes(comm: MPI.Intracomm, capsys: pytest.CaptureFixture[str]) -> None:
     run_explain(shipped_scenes()["paper_forward"], None, ["tissue.cells=[3,6]"], console())
     assert ("n_e =" in capsys.readouterr().out) == (comm.rank == 0)

@@ -15,6 +15,7 @@ from tests.helpers.rank_worker import numbers
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.ranks
 @pytest.mark.serial
 def test_four_ranks_of_which_one_owns_no_tissue_give_what_one_gives(tmp_path: Path) -> None:
     mpiexec = find_mpiexec()

@@ -39,6 +39,7 @@ def times(file: Path) -> list[float]:
     return sorted({float(t) for t in re.findall(r'Time Value="(.*?)"', file.read_text())})
 
 
+@pytest.mark.ranks(2)
 def test_three_legs_show_what_the_whole_run_shows(
     comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,6 +85,7 @@ def test_frames_that_nobody_kept_are_told(comm: MPI.Intracomm, mpi_tmp_path: Pat
         run(mpi_tmp_path, resume=True)
 
 
+@pytest.mark.ranks(2)
 def test_the_force_that_the_motion_takes_is_written(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     turned = ("effects.rotation=true", "hand.inertia=3.0", "motion.target=[5.0,3.0,0.1]")
     said = run(mpi_tmp_path, *turned, pictures=False)

@@ -355,6 +355,7 @@ def test_every_question_has_slopes(result: dict[str, Any]) -> None:
 # --- parts
 
 
+@pytest.mark.ranks(2)
 def test_places_are_the_nodes_of_the_plain_run_where_there_are_any(comm: MPI.Intracomm) -> None:
     setting, scene = Setting((4, 8), 2, 24), make_scene(SMALL)
     model = build(variant(scene, setting), comm=comm)

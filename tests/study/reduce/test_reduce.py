@@ -166,12 +166,14 @@ def dense_error(against: FullRun, name: str, N: int) -> tuple[float, float]:
     return point.projection_error, float(np.linalg.norm(exact - Q @ (Q.T @ exact)) / norm)
 
 
+@pytest.mark.ranks(2)
 @pytest.mark.parametrize("name", [*PAPER_METHODS, *FURTHER])
 def test_error_and_floor_are_those_of_dense_matrices(coarse: FullRun, name: str) -> None:
     floor, dense = dense_error(coarse, name, 10)
     assert floor == pytest.approx(dense, rel=1e-6)  # one pass of projection in the dense one
 
 
+@pytest.mark.ranks(2)
 def test_floors_lie_below(small: FullRun) -> None:
     for name in ("pod_fixed", "psd_fixed", "psd_fixed_relative", "craig_bampton"):
         for p in sweep(name, small, wanted(small, [8, 14, 22])).points:
@@ -204,6 +206,7 @@ def test_many_vectors_repeat_the_full_run(changes: list[dict[str, Any]], name: s
 # --- ranks
 
 
+@pytest.mark.ranks
 def test_every_rank_count_gives_the_same(small: FullRun) -> None:
     alone = made(load_scene(PAPER, SMALL), MPI.COMM_SELF)
     for name in ("pod_fixed", "psd", "psd_svd_like_fixed", "craig_bampton"):
@@ -271,6 +274,7 @@ KEYS = {
 }  # fmt: skip
 
 
+@pytest.mark.ranks(2)
 def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: FullRun) -> None:
     names = ["global_pod", "psd_fixed", "craig_bampton"]
     result, text = reduced(mpi_tmp_path, f"reduction.methods={names}", "reduction.N=[4,14,20]")

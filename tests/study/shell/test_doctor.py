@@ -34,6 +34,7 @@ def test_this_environment_passes_every_look_but_memory() -> None:
             assert check.cure == ""
 
 
+@pytest.mark.ranks
 @pytest.mark.serial
 @pytest.mark.usefixtures("alone")
 def test_two_ranks_are_really_launched() -> None:
