@@ -7,7 +7,7 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint bench paper pictures clean
+.PHONY: help env demo test check lint bench paper pictures clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -19,7 +19,7 @@ $(STAMP): pyproject.toml tools/make-env
 	@touch $@
 
 demo: $(STAMP) ## run the paper's forward scene into out/
-	@$(BIN)/softgrasp simulate demos/scenes/paper_forward.toml --out out
+	@$(BIN)/softgrasp simulate paper_forward --out out
 
 lint: $(STAMP) ## ruff, mypy and the import contracts
 	$(BIN)/ruff check
@@ -27,8 +27,11 @@ lint: $(STAMP) ## ruff, mypy and the import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+check: lint ## what to run before a commit: lint, types of what changed, the tests of the project itself
+	$(BIN)/python -m pytest -q tests/test_project.py
+
 test: lint ## lint, then the tests on 1, 2 and 3 ranks
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 	$(BIN)/mpiexec -n 2 $(BIN)/python -m pytest -q
 	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q
 
@@ -40,15 +43,16 @@ paper: $(STAMP) ## every figure and table of the paper, and a page that compares
 
 pictures: demo ## make the README's pictures again
 	cp out/move.png docs/paper_forward.png
-	$(BIN)/softgrasp reduce demos/scenes/paper_forward.toml --out out/reduce
+	$(BIN)/softgrasp reduce paper_forward --out out/reduce
 	cp out/reduce/errors.png docs/reduce_errors.png
-	$(BIN)/softgrasp control demos/scenes/paper_lqr.toml --out out/control
+	$(BIN)/softgrasp control paper_lqr --out out/control
 	cp out/control/errors.png docs/control_errors.png
-	$(BIN)/softgrasp study demos/scenes/paper_forward.toml --tolerance 1e-2 --out out/study
+	$(BIN)/softgrasp study paper_forward --tolerance 1e-2 --out out/study
 	cp out/study/work_forward.png docs/study_forward.png
-	$(BIN)/softgrasp effects demos/scenes/franka_muscle.toml --out out/effects
+	$(BIN)/softgrasp effects franka_muscle --out out/effects
 	cp out/effects/effects.png docs/effects.png
+	$(BIN)/python tools/draw_rooms.py docs/rooms.png
 
 clean: ## remove .venv, out and caches
 	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache
-	find fem reduction lqr study tests demos -name __pycache__ -type d -prune -exec rm -rf {} +
+	find fem reduction lqr study softgrasp tests demos -name __pycache__ -type d -prune -exec rm -rf {} +
