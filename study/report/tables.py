@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,11 +89,7 @@ def pairs(rows: Sequence[Sequence[str]]) -> rich.table.Table:
 
 
 def number(cell: Any) -> bool:
-    """A number, the text of one, or an empty cell."""
+    """A number, the text of one with its unit, or an empty cell."""
     if cell is None or cell in ("", "-") or (isinstance(cell, NUMBERS) and not isinstance(cell, bool)):
         return True
-    try:
-        float(str(cell).split(" ")[0].rstrip("%"))
-    except ValueError:
-        return False
-    return True
+    return re.fullmatch(r"[<~]? ?[-+]?[\d.]+(e[-+]?\d+)?( ?%| [a-zA-Zµ/]{1,4})?( ?!)?", str(cell)) is not None
