@@ -119,5 +119,5 @@ def _legend(ax: Any, entries: list[Any]) -> None:
     below = -0.52 / (ax.get_position().height * ax.figure.get_figheight())
     ax.legend(
         handles=entries, loc="upper left", bbox_to_anchor=(-0.1, below),
-        ncols=len(entries), handlelength=1.2, columnspacing=1.2, borderaxespad=0.0,
+        ncols=len(entries) if len(entries) < 4 else 2, handlelength=1.2, columnspacing=1.2, borderaxespad=0.0,
     )  # fmt: skip

@@ -68,7 +68,7 @@ def test_all_methods_end_in_the_same_state(comm: MPI.Intracomm) -> None:
     idle = Run(model, RunOptions())
     assert isinstance(idle.drive, TableDrive)
     loads = idle.drive.c
-    K, M = to_scipy(system.K_ee)(system.M_ee)
+    K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
     # relative; 60 steps of rounding leave about 1e-13, a load one step off would leave 1e-2
     near = {"rtol": 0, "atol": 1e-9 * np.abs(run.final).max()}
     plain = PlainCholesky(midpoint_matrix(system, bench_worker.DT))
