@@ -54,7 +54,9 @@ def render(result: Explanation, parts: Sequence[Section], console: Console) -> N
                 line(e.gate.comparison, 4)
                 line(e.gate.sentence, 4)
         elif part.header:
-            console.print(Padding.indent(Table(tuple(part.header), part.rows).terminal(wrap=range(9)), 2))
+            console.print(
+                Padding.indent(Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header))), 2)
+            )
         for text in (*part.text.split("\n\n"), *part.code.splitlines()):
             if text:
                 line(text.strip(), 2 + len(text) - len(text.lstrip()))
