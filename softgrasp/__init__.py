@@ -86,6 +86,8 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(f"softgrasp.{_FACE[name]}"), name)
         globals()[name] = value
         return value
+    if name in ("fem", "reduction", "lqr", "study"):
+        return import_module(f"softgrasp.{name}")
     if name == "__version__":
         return package_version()
     raise AttributeError(f"module 'softgrasp' has no attribute {name!r}; it has {', '.join(__all__)}")

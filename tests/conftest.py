@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import softgrasp.fem  # noqa: F401  (threads and MPI, before numpy and petsc4py)
+from softgrasp.fem import _stack as _stack  # threads and MPI, before numpy and petsc4py
 
 # isort: split
 import gc

@@ -120,7 +120,7 @@ def _read(file: Path) -> dict[str, Any]:
         return parse_toml(read_text(file))
     except FileNotFoundError:
         near = difflib.get_close_matches(file.stem, shipped_scenes(), n=1)
-        hint = f"; did you mean demos/scenes/{near[0]}.toml?" if near else "; give the path of a TOML scene file"
+        hint = f"; did you mean {near[0]}?" if near else "; give the path of a TOML scene file"
         raise SceneError(f"{file}: there is no such scene file{hint}") from None
     except OSError as error:
         raise SceneError(f"{file}: the scene file cannot be read ({error.strerror})") from None

@@ -104,7 +104,7 @@ def warnings(result: MeshEstimate | None) -> list[str]:
 
 def percent(share: float) -> str:
     """A share as a percentage of two digits."""
-    return f"{100 * share:.2g} %" if np.isfinite(share) and share < 9.95 else f"{100 * share:.0f} %"
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
 def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, Path]:

@@ -20,6 +20,7 @@ from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
 
 EFFECTS = ("effect", "verdict", "gate", "number", "matters from", "what it says")
+COSTS = ("effect", "adds", "allocates", "cost")
 
 
 def run_explain(path: Path, out: Path | None, overrides: Sequence[str], console: Console) -> Explanation:
@@ -53,6 +54,10 @@ def render(result: Explanation, parts: Sequence[Section], console: Console) -> N
                 line(f"{name}: {verdict(e)}")
                 line(e.gate.comparison, 4)
                 line(e.gate.sentence, 4)
+        elif part.header == COSTS:
+            for name, adds, operators, cost in part.rows:
+                line(f"{name} adds {adds}; allocates {operators}.")
+                line(cost, 4)
         elif part.header:
             console.print(
                 Padding.indent(Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header))), 2)
@@ -95,7 +100,7 @@ def sections(result: Explanation) -> list[Section]:
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
         Section("Mesh", text="\n\n".join(mesh_lines(result.mesh, result.dimension))),
         Section("Effects", header=EFFECTS, rows=effects),
-        *([Section("What is on", header=("effect", "adds", "allocates", "cost"), rows=costs)] if costs else []),
+        *([Section("What is on", header=COSTS, rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
     ]
 

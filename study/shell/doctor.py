@@ -57,6 +57,7 @@ def check_python() -> Check:
 
 def check_dolfinx() -> Check:
     """DOLFINx 0.11; 0.10 differs in nothing that is called here."""
+    importlib.import_module("softgrasp.fem._stack")  # MPI before DOLFINx
     version = str(importlib.import_module("dolfinx").__version__)
     ok = version.startswith(("0.10.", "0.11."))
     return Check("DOLFINx", ok, version, "" if ok else "softgrasp needs DOLFINx 0.11 or 0.10; install one of them.")
