@@ -21,6 +21,7 @@ CHEAP = 1.0  # [s]; what costs less is done unasked
 BASE = {2: 0.3, 3: 0.9}
 BASE_FILE = {2: 0.3, 3: 3.5}
 PER_UNKNOWN = {2: 1.5e-5, 3: 4e-5}
+PER_STEP = 3e-5  # of the small models that are run
 
 
 def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | None, list[str]]:
@@ -38,7 +39,8 @@ def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | N
         return model.accuracy, []
     d, n_e = model.system.layout.dimension, model.system.layout.n_e
     base = BASE if model.scene.tissue.size is not None else BASE_FILE
-    if not certify and base[d] + PER_UNKNOWN[d] * n_e > max(CHEAP, seconds):
+    cost = base[d] + PER_UNKNOWN[d] * n_e + PER_STEP * model.scene.time.steps
+    if not certify and cost > max(CHEAP, seconds):
         return None, []
     try:
         return estimate(model), []

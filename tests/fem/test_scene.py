@@ -345,7 +345,7 @@ def test_hash_sees_the_arrays_of_a_mesh_wherever_they_lie(tmp_path: Path, suffix
 
 
 def test_bad_files(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"no such scene file; did you mean demos/scenes/paper_lqr.toml"):
+    with pytest.raises(SceneError, match=r"no such scene file; did you mean paper_lqr"):
         load_scene(tmp_path / "paper_lqr.tml")
     with pytest.raises(SceneError, match="cannot be read"):
         load_scene(tmp_path)
