@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import Control, ControlOutput, Loop, Reduction, Study
-from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, Model, NonNegative, Positive, Tissue
+from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -23,7 +23,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-class Hand(Model):
+class Hand(Section):
     """The rigid hand."""
 
     mass: Positive = Field(20.0, description="mass [kg], > 0")
@@ -34,14 +34,14 @@ class Hand(Model):
     reference: list[float] | None = Field(None, description="reference point of the hand [m]; default: contact centre")
 
 
-class Gravity(Model):
+class Gravity(Section):
     """Body force rho g on the tissue."""
 
     g: list[float] = Field(description="acceleration of gravity, one entry per axis [m/s2]")
     hand_weight: bool = Field(False, description="whether the hand weighs too [no unit]")
 
 
-class Damping(Model):
+class Damping(Section):
     """C = beta K (Kelvin-Voigt) or C = alpha M + beta K (Rayleigh)."""
 
     kind: Literal["kelvin-voigt", "rayleigh"] = Field(description="damping law [no unit]")
@@ -58,7 +58,7 @@ class Damping(Model):
         return self
 
 
-class Effects(Model):
+class Effects(Section):
     """Everything is off unless named."""
 
     gravity: Dropped[Gravity] = Field(None, description="gravity {g [m/s2], hand_weight}; off unless given")
@@ -67,7 +67,7 @@ class Effects(Model):
     rotation: bool = Field(False, description="the hand also turns, by small angles [no unit]")
 
 
-class Motion(Model):
+class Motion(Section):
     """What the hand does."""
 
     target: Dropped[list[float]] = Field(
@@ -95,7 +95,7 @@ class Motion(Model):
         return self
 
 
-class Time(Model):
+class Time(Section):
     """Time grid and linear solver."""
 
     steps: Annotated[int, Field(ge=1)] = Field(description="number of equal time steps [1], >= 1")
@@ -112,7 +112,7 @@ class Time(Model):
     )
 
 
-class Output(Model):
+class Output(Section):
     """What is kept of a run."""
 
     snapshots: Literal["memory", "hdf5", "none"] = Field("memory", description="where snapshots go [no unit]")
@@ -129,7 +129,7 @@ class Output(Model):
     )
 
 
-class Scene(Model):
+class Scene(Section):
     """A whole scene; relative file names count from `directory`.
 
     >>> import softgrasp as sg
