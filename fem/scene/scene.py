@@ -117,7 +117,9 @@ class Output(Model):
 
     snapshots: Literal["memory", "hdf5", "none"] = Field("memory", description="where snapshots go [no unit]")
     every: Annotated[int, Field(ge=1)] = Field(1, description="a snapshot every so many steps [1]")
-    fields: Literal["auto", "vtx", "xdmf", "none"] = Field("auto", description="field file format [no unit]")
+    fields: Literal["vtu", "none"] = Field(
+        "vtu", description="field files, a list fields.pvd of VTK's .vtu files, or none [no unit]"
+    )
     frames: Annotated[int, Field(ge=1)] = Field(60, description="frames in field files and animations [1]")
     checkpoint_every: Annotated[int, Field(ge=0)] = Field(
         0, description="steps between restart files [1]; 0: only on interrupt"

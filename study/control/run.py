@@ -40,6 +40,7 @@ def run_control(
     *,
     quiet: bool = False,
     pictures: bool = True,
+    empty: bool = False,
 ) -> dict[str, Any]:
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
@@ -53,6 +54,7 @@ def run_control(
         console: where the tables go.
         quiet: no progress bars.
         pictures: draw figures and the animation.
+        empty: remove what an earlier run has left in the folder.
 
     Returns:
         What result.json holds.
@@ -60,7 +62,7 @@ def run_control(
     Raises:
         SoftgraspError: with one sentence.
     """
-    session = Session("control", path, overrides, out, console, quiet, pictures)
+    session = Session("control", path, overrides, out, console, quiet, pictures, empty)
     model, sentence = with_control(session.model(session.scene()))
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
