@@ -73,7 +73,7 @@ class TissueMidpoint:
         dt: step [s].
         solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
-        reproducible: see :func:`fem.solve.solvers.factor_on_every_rank`.
+        reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Attributes:
         held: operators on the rows held.

@@ -60,7 +60,7 @@ class Body:
         return self.law.start(self.gradient(z))
 
     def step(self, start: Start, w: PETSc.Vec, f: PETSc.Vec) -> Array:
-        """Force f [N] of the discrete gradient from z to z + 2 w, NaN where J_1 forbids it; and J_1, (Q,). Collective."""
+        """Force f [N] of the discrete gradient from z to z + 2 w, NaN where J_1 forbids it; J_1, (Q,). Collective."""
         P, J = self.law.step(start, self.gradient(w), self.lam, self.mu)
         self._collect(P if P is not None else self.H, f)  # all ranks take part in the product
         return J
