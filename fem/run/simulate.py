@@ -73,8 +73,6 @@ class Run(Stepped):
 
     def __init__(self, model: Model, options: RunOptions, force: Force | None = None) -> None:
         scene, system = model.scene, model.system
-        if system.points is not None:
-            raise SceneError("effects.finite_strain cannot be simulated yet; set it to false")
         self.model = model
         self.end = scene.time_end
         dt, solver = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
