@@ -260,6 +260,20 @@ def sweep(
 
 
 @app.command()
+def view(
+    folder: Annotated[Path, typer.Argument(help="output folder of simulate or control")],
+    field: Annotated[str, typer.Option(help="colour: von_mises, displacement, velocity, stress, strain, layer")] = (
+        "von_mises"
+    ),
+    save: Annotated[Path | None, typer.Option(help="write a PNG instead of opening a window")] = None,
+) -> None:
+    """Show the move of a run with PyVista: a window with a time slider, or a picture."""
+    from softgrasp.study.pictures.view import view as show
+
+    show(folder, field, save)
+
+
+@app.command()
 def reduce(
     scene: SceneFile,
     out: Out = None,
