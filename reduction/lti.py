@@ -43,7 +43,9 @@ class LTI:
     def at(self, s: Sequence[complex] | np.ndarray) -> np.ndarray:
         """Transfer function C (s E - A)^{-1} B at points s [1/s], (len(s), p, n_s)."""
         points = np.asarray(s, dtype=complex).reshape(-1, 1, 1)
-        return np.asarray(self.C @ np.linalg.solve(points * self.E - self.A, np.broadcast_to(self.B, (len(points), *self.B.shape))))
+        return np.asarray(
+            self.C @ np.linalg.solve(points * self.E - self.A, np.broadcast_to(self.B, (len(points), *self.B.shape)))
+        )
 
     def under(self, K: Array) -> LTI:
         """The closed loop u = K x + r with the extra load r as input. python-control's own functions take -K.
@@ -68,7 +70,9 @@ class LTI:
             raise ReductionError("python-control is not installed; `pip install control` brings it") from error
         A, B = np.split(np.linalg.solve(self.E, np.hstack([self.A, self.B])), [len(self.A)], axis=1)
         # python-control may drop states that it thinks uncontrollable, and its names hold no dots
-        names = {key: [name.replace(".", "_") for name in getattr(self, key)] for key in ("states", "inputs", "outputs")}
+        names = {
+            key: [name.replace(".", "_") for name in getattr(self, key)] for key in ("states", "inputs", "outputs")
+        }
         D = np.zeros((len(self.C), B.shape[1]))
         return control.ss(A, B, self.C, D, remove_useless_states=False, **names)
 
@@ -79,7 +83,9 @@ class LTI:
             ReductionError: pyMOR is not installed, or the program runs on several ranks.
         """
         if MPI.COMM_WORLD.size > 1:  # importing pyMOR would put all ranks but the first into an event loop of its own
-            raise ReductionError(f"to_pymor runs on one rank, not on {MPI.COMM_WORLD.size}; save the model and load it there")
+            raise ReductionError(
+                f"to_pymor runs on one rank, not on {MPI.COMM_WORLD.size}; save the model and load it there"
+            )
         try:
             from pymor.models.iosys import LTIModel
         except ImportError as error:
@@ -102,5 +108,9 @@ def make_lti(E: Array, A: Array, B: Array, C: Array, labels: Sequence[str], hand
     inputs = tuple(f"{'torque' if c.rotation else 'force'}_{c.axis} [{c.load_unit}]" for c in hand)
     states = tuple(f"x_{i + 1}" for i in range(N))
     if hand_first:
-        states = tuple(f"q_{c.axis} [{c.unit}]" for c in hand) + tuple(f"v_{c.axis} [{c.unit}/s]" for c in hand) + states[2 * n_s :]
+        states = (
+            tuple(f"q_{c.axis} [{c.unit}]" for c in hand)
+            + tuple(f"v_{c.axis} [{c.unit}/s]" for c in hand)
+            + states[2 * n_s :]
+        )
     return LTI(E, A, B, C, states, inputs, outputs)

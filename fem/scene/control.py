@@ -99,7 +99,8 @@ class Loop(Section):
     )
     limit_torque: Positive | list[Positive] | None = Field(
         None,
-        description="largest torque on a turning hand about each axis [N m], one number or one per axis; none by default",
+        description="largest torque on a turning hand about each axis [N m], one number or one per axis; none by "
+        "default",
     )
     delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
 

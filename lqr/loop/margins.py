@@ -5,8 +5,8 @@ The plant between two ticks of length h with a held load is x_{k+1} = A_d x_k + 
     L(z) = -K (z I - A_d)^{-1} B_d z^{-delay},  z = exp(i w h),  S = (I + L)^{-1}.
 
 With all inputs but the i-th closed the loop seen there is l_i = 1 / S_ii - 1; its gain may grow or shrink by the gain
-margins and its phase lag by the phase margin before the loop loses stability. The smallest singular value of I + L bounds
-what all inputs bear at once: every gain in [1/(1+a), 1/(1-a)], every phase within 2 arcsin(a/2).
+margins and its phase lag by the phase margin before the loop loses stability. The smallest singular value a of I + L
+bounds what all inputs bear at once: every gain in [1/(1+a), 1/(1-a)], every phase within 2 arcsin(a/2).
 """
 
 from __future__ import annotations
@@ -111,13 +111,14 @@ def _grid(poles: np.ndarray, highest: float) -> Array:
 def _axis(name: str, omega: Array, loop: np.ndarray) -> AxisMargins:
     """Margins from the crossings of |l| = 1 and of arg l = -180 degrees, interpolated in log w."""
     gain, phase, log_w = np.log(np.abs(loop)), np.unwrap(np.angle(-loop)), np.log(omega)  # phase 0: l is negative
-    up, down = np.inf, 0.0
+    # at the highest frequency, z = -1, the loop is real: a crossing if it is negative
+    factors = [1 / abs(loop[-1])] if loop[-1].real < 0 else []
     turns = np.floor((phase + np.pi) / (2 * np.pi))  # of the nearest multiple of 360 degrees
     rest = phase - 2 * np.pi * turns
     for i in np.flatnonzero((rest[:-1] * rest[1:] <= 0) & (np.abs(np.diff(rest)) < np.pi)):
         share = rest[i] / (rest[i] - rest[i + 1]) if rest[i] != rest[i + 1] else 0.0
-        factor = np.exp(-(gain[i] + share * (gain[i + 1] - gain[i])))
-        up, down = (min(up, factor), down) if factor > 1 else (up, max(down, factor))
+        factors.append(float(np.exp(-(gain[i] + share * (gain[i + 1] - gain[i])))))
+    up, down = min([f for f in factors if f > 1], default=np.inf), max([f for f in factors if f < 1], default=0.0)
     best, crossover, delay = np.nan, np.nan, np.inf
     for i in np.flatnonzero(gain[:-1] * gain[1:] < 0):
         share = gain[i] / (gain[i] - gain[i + 1])
@@ -127,4 +128,4 @@ def _axis(name: str, omega: Array, loop: np.ndarray) -> AxisMargins:
         delay = min(delay, lag / w)
         if not margin >= best:
             best, crossover = margin, w
-    return AxisMargins(name, float(up), float(down), best, crossover, float(delay))
+    return AxisMargins(name, up, down, best, crossover, float(delay))
