@@ -6,6 +6,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import MultipleLocator
 
 from softgrasp.lqr.loop.margins import LoopMargins
 from softgrasp.study.pictures.style import CYCLE, OUTLINE, WIDTH, paper_style, save
@@ -32,6 +33,7 @@ def figure_bode(margins: LoopMargins, out_png: Path) -> tuple[Path, ...]:
                 phase.plot([axis.crossover] * 2, [-180, at], "o-", color=colour, ms=3, lw=0.8)
         gain.axhline(1.0, color=OUTLINE, lw=0.7)
         phase.axhline(-180.0, color=OUTLINE, lw=0.7)
+        phase.yaxis.set_major_locator(MultipleLocator(45))
         gain.set_ylabel("gain of the loop [1]")
         phase.set(xlabel="frequency [rad/s]", ylabel="phase [deg]")
         gain.legend()
