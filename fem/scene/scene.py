@@ -58,6 +58,17 @@ class Damping(Section):
         return self
 
 
+class FiniteStrain(Section):
+    """A hyperelastic law instead of linear elasticity."""
+
+    law: Literal["neo-hooke", "neo-hooke-quadratic", "stvk"] = Field(
+        "neo-hooke",
+        description="energy of the material [no unit]: neo-Hooke with (ln J)^2 or (J - 1)^2 for the volume, or "
+        "St. Venant-Kirchhoff, which is refused where it folds",
+    )
+    tol: Annotated[float, Field(ge=1e-13, le=1e-3)] = Field(1e-9, description="relative tolerance of each step [1]")
+
+
 class Effects(Section):
     """Everything is off unless named."""
 
@@ -65,6 +76,9 @@ class Effects(Section):
     damping: Dropped[Damping] = Field(None, description="damping {kind, beta [s], alpha [1/s], drag}; off unless given")
     reaction: bool = Field(False, description="the tissue pushes back on the hand [no unit]")
     rotation: bool = Field(False, description="the hand also turns, by small angles [no unit]")
+    finite_strain: Dropped[FiniteStrain] = Field(
+        None, description="large deformation, finite strain {law, tol [1]}; off unless given"
+    )
 
 
 class Motion(Section):
@@ -176,6 +190,11 @@ class Scene(Section):
         effects = self.effects
         if effects.rotation and self.hand.inertia is None:
             raise ValueError("hand.inertia is missing; effects.rotation needs it")
+        if effects.rotation and effects.finite_strain is not None:
+            raise ValueError(
+                "effects.finite_strain cannot go with effects.rotation, whose linearised turns would stretch the "
+                "tissue; set one of them to false"
+            )
         if self.time.start == "equilibrium" and effects.gravity is None:
             raise ValueError("time.start is 'equilibrium' but effects.gravity is off; use 'rest' or give gravity")
         if self.contact.facet_tag is not None and self.tissue.mesh is None:
