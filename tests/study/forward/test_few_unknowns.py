@@ -41,7 +41,7 @@ COMMANDS = {
 # what the machine, the clock and the number of ranks say, and polishing steps, which rounding decides
 OWN = {
     "ranks", "time", "memory_peak_mb", "solver", "command_line", "machine", "versions", "date", "seconds", "time_are",
-    "slowest", "noise", "base", "cost", "newton_steps",
+    "slowest", "noise", "base", "cost", "newton_steps", "time_tick", "builds",
 }  # fmt: skip
 
 
