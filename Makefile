@@ -18,8 +18,8 @@ $(STAMP): pyproject.toml tools/make-env
 	@sh tools/make-env .venv
 	@touch $@
 
-demo: $(STAMP) ## run the paper's forward scene into out/
-	@$(BIN)/softgrasp simulate paper_forward --out out
+demo: $(STAMP) ## run the paper's forward scene into out/paper_forward-simulate
+	@$(BIN)/softgrasp simulate paper_forward
 
 lint: $(STAMP) ## ruff, mypy and the import contracts
 	$(BIN)/ruff check
@@ -42,15 +42,15 @@ paper: $(STAMP) ## every figure and table of the paper, and a page that compares
 	$(BIN)/python -m softgrasp.study.paper --out out/paper
 
 pictures: demo ## make the README's pictures again
-	cp out/move.png docs/paper_forward.png
-	$(BIN)/softgrasp reduce paper_forward --out out/reduce
-	cp out/reduce/errors.png docs/reduce_errors.png
-	$(BIN)/softgrasp control paper_lqr --out out/control
-	cp out/control/errors.png docs/control_errors.png
-	$(BIN)/softgrasp study paper_forward --tolerance 1e-2 --out out/study
-	cp out/study/work_forward.png docs/study_forward.png
-	$(BIN)/softgrasp effects franka_muscle --out out/effects
-	cp out/effects/effects.png docs/effects.png
+	cp out/paper_forward-simulate/move.png docs/paper_forward.png
+	$(BIN)/softgrasp reduce paper_forward
+	cp out/paper_forward-reduce/errors.png docs/reduce_errors.png
+	$(BIN)/softgrasp control paper_lqr
+	cp out/paper_lqr-control/errors.png docs/control_errors.png
+	$(BIN)/softgrasp study paper_forward --tolerance 1e-2
+	cp out/paper_forward-study/work_forward.png docs/study_forward.png
+	$(BIN)/softgrasp effects franka_muscle
+	cp out/franka_muscle-effects/effects.png docs/effects.png
 	$(BIN)/python tools/draw_rooms.py docs/rooms.png
 
 clean: ## remove .venv, out and caches

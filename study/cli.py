@@ -16,16 +16,18 @@ import typer
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.shell.ending import console, rank, run_command
+from softgrasp.study.shell.folder import default_folder
 
+LIST_WIDTH = 200  # [letters]
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
-    help="Simulate a rigid robot hand that holds soft tissue. Start with: softgrasp simulate SCENE --out out",
+    help="Simulate a rigid robot hand that holds soft tissue. Start with: softgrasp simulate SCENE",
 )
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", help="override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"),
+    typer.Option("--set", "-s", help="override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"),
 ]
 
 
@@ -39,10 +41,35 @@ def _folder(out: Path | None) -> Path | None:
     return out
 
 
-Out = Annotated[Path, typer.Option(help="folder for result.json, tables, pictures and report.html", callback=_folder)]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        "-o",
+        help="folder for result.json, tables, pictures and report.html; out/SCENE-COMMAND if it is not given",
+        callback=_folder,
+    ),
+]
+Empty = Annotated[
+    bool, typer.Option("--empty", help="first remove the results that an earlier run has left in the folder")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
 NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")]
-SceneFile = Annotated[Path, typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship")]
+
+
+def _scenes(start: str) -> list[str]:
+    """Scenes that ship and TOML files and folders below, for the shell's completion."""
+    from softgrasp.fem.scene.file import shipped_scenes
+
+    below = Path(start if start.endswith("/") else f"{start}x").parent
+    near = [f"{p}/" if p.is_dir() else str(p) for p in below.glob("*") if p.is_dir() or p.suffix == ".toml"]
+    return [name for name in (*shipped_scenes(), *near) if name.startswith(start)]
+
+
+SceneFile = Annotated[
+    Path,
+    typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship", autocompletion=_scenes),
+]
 
 
 def _show_version(show: bool) -> None:
@@ -90,6 +117,56 @@ def scenes() -> None:
 
 
 @app.command()
+def materials() -> None:
+    """List the materials that a scene can name, with the sources of their numbers."""
+    from softgrasp.study.runs.start import materials_table
+
+    console().print(materials_table().terminal(wrap=[4], width=console().width))
+
+
+@app.command()
+def new(
+    file: Annotated[Path, typer.Argument(help="scene file to write, e.g. my.toml")],
+    solid: Annotated[bool, typer.Option("--3d", help="a block in 3D instead of a strip in 2D")] = False,
+    mesh: Annotated[Path | None, typer.Option(help="mesh file of the body, in any format of meshio")] = None,
+) -> None:
+    """Write a scene to begin with, and the schema of its keys for editors."""
+    from softgrasp.study.runs.start import new_scene
+    from softgrasp.study.shell.session import list_files
+
+    if rank() == 0:
+        list_files(console(), new_scene(file, solid=solid, mesh=mesh))
+        console().print(f"next: softgrasp explain {file}; softgrasp simulate {file}", soft_wrap=True)
+
+
+@app.command("list")
+def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs lie below")] = Path("out")) -> None:
+    """List the runs below a folder, the newest last."""
+    from softgrasp.study.runs.listing import runs_below
+
+    if rank() == 0:
+        wide = console()
+        wide.width = max(wide.width, LIST_WIDTH)  # a narrower terminal breaks the lines, but loses nothing
+        wide.print(runs_below(folder).terminal())
+
+
+@app.command()
+def compare(
+    a: Annotated[Path, typer.Argument(help="folder of a run")],
+    b: Annotated[Path, typer.Argument(help="folder of another run")],
+    out: Out = None,
+    no_pictures: NoPictures = False,
+    empty: Empty = False,
+) -> None:
+    """Show in which keys, numbers and trajectories two runs differ."""
+    from softgrasp.study.runs.listing import run_compare
+
+    if rank() == 0:
+        folder = out or default_folder("compare", Path(f"{a.name}-{b.name}"))
+        run_compare(a, b, folder, console(), pictures=not no_pictures, empty=empty)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
     from softgrasp.study.shell.schema import full_schema
@@ -102,20 +179,22 @@ def schema() -> None:
 def explain(
     scene: SceneFile,
     out: Annotated[
-        Path | None, typer.Option(help="also write result.json and report.html into this folder", callback=_folder)
+        Path | None,
+        typer.Option("--out", "-o", help="also write result.json and report.html into this folder", callback=_folder),
     ] = None,
     set_: Overrides = None,
+    empty: Empty = False,
 ) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
     from softgrasp.study.forward.explain_page import run_explain
 
-    run_explain(scene, out, set_ or [], console())
+    run_explain(scene, out, set_ or [], console(), empty=empty)
 
 
 @app.command()
 def simulate(
     scene: SceneFile,
-    out: Out = Path("out"),
+    out: Out = None,
     set_: Overrides = None,
     quiet: Quiet = False,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
@@ -124,13 +203,14 @@ def simulate(
     certify: Annotated[
         bool, typer.Option("--certify", help="estimate the error of mesh and time step, whatever it costs")
     ] = False,
+    empty: Empty = False,
 ) -> None:
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
     from softgrasp.study.forward.run import run_simulate
 
     run_simulate(
         scene,
-        out,
+        out or default_folder("simulate", scene),
         set_ or [],
         console(),
         quiet=quiet,
@@ -138,41 +218,97 @@ def simulate(
         until=until,
         pictures=not no_pictures,
         certify=certify,
+        empty=empty,
     )
+
+
+@app.command()
+def sweep(
+    scene: SceneFile,
+    axes: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="KEY=FIRST:LAST:COUNT...",
+            help="values of a key: 100:500:9, 1e2:1e4:5:log or 20,50,500; one or two keys",
+        ),
+    ],
+    out: Out = None,
+    set_: Overrides = None,
+    reduced: Annotated[
+        int | None, typer.Option(help="run a reduced model with this many columns instead of the full one", min=1)
+    ] = None,
+    ranks_each: Annotated[int, typer.Option(help="ranks of one point under `mpiexec -n N`", min=1)] = 1,
+    quiet: Quiet = False,
+    no_pictures: NoPictures = False,
+    empty: Empty = False,
+) -> None:
+    """Simulate a scene at many values of its keys; resumes; `mpiexec -n N` runs N points at a time."""
+    from softgrasp.study.runs.run import run_sweep
+
+    run_sweep(
+        scene,
+        axes,
+        out or default_folder("sweep", scene),
+        set_ or [],
+        console(),
+        reduced=reduced,
+        each=ranks_each,
+        quiet=quiet,
+        pictures=not no_pictures,
+        empty=empty,
+    )
+
+
+@app.command()
+def view(
+    folder: Annotated[Path, typer.Argument(help="output folder of simulate or control")],
+    field: Annotated[str, typer.Option(help="colour: von_mises, displacement, velocity, stress, strain, layer")] = (
+        "von_mises"
+    ),
+    save: Annotated[Path | None, typer.Option(help="write a PNG instead of opening a window")] = None,
+) -> None:
+    """Show the move of a run with PyVista: a window with a time slider, or a picture."""
+    from softgrasp.study.pictures.view import view as show
+
+    show(folder, field, save)
 
 
 @app.command()
 def reduce(
     scene: SceneFile,
-    out: Out = Path("out"),
+    out: Out = None,
     set_: Overrides = None,
     quiet: Quiet = False,
     no_pictures: NoPictures = False,
+    empty: Empty = False,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
     from softgrasp.study.reduce.run import run_reduce
 
-    run_reduce(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures)
+    out = out or default_folder("reduce", scene)
+    run_reduce(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty)
 
 
 @app.command()
 def control(
     scene: SceneFile,
-    out: Out = Path("out"),
+    out: Out = None,
     set_: Overrides = None,
     quiet: Quiet = False,
     no_pictures: NoPictures = False,
+    empty: Empty = False,
 ) -> None:
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
     from softgrasp.study.control.run import run_control
 
-    run_control(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures)
+    out = out or default_folder("control", scene)
+    run_control(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty)
 
 
 @app.command()
 def study(
     scene: SceneFile,
-    out: Out = Path("out"),
+    out: Out = None,
     set_: Overrides = None,
     tolerance: Annotated[
         str | None,
@@ -188,6 +324,7 @@ def study(
         ),
     ] = None,
     quiet: Quiet = False,
+    empty: Empty = False,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
     from softgrasp.study.precision.answer import parse_budget, parse_tolerance
@@ -195,28 +332,42 @@ def study(
 
     limit = None if budget is None else parse_budget(budget)
     accuracy = None if tolerance is None else parse_tolerance(tolerance)
-    run_study(scene, out, set_ or [], console(), tolerance=accuracy, budget=limit, questions=question, quiet=quiet)
+    run_study(
+        scene,
+        out or default_folder("study", scene),
+        set_ or [],
+        console(),
+        tolerance=accuracy,
+        budget=limit,
+        questions=question,
+        quiet=quiet,
+        empty=empty,
+    )
 
 
 @app.command()
-def effects(scene: SceneFile, out: Out = Path("out"), set_: Overrides = None, quiet: Quiet = False) -> None:
+def effects(
+    scene: SceneFile, out: Out = None, set_: Overrides = None, quiet: Quiet = False, empty: Empty = False
+) -> None:
     """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""
     from softgrasp.study.effects.run import run_effects
 
-    run_effects(scene, out, set_ or [], console(), quiet=quiet)
+    run_effects(scene, out or default_folder("effects", scene), set_ or [], console(), quiet=quiet, empty=empty)
 
 
 @app.command()
 def hardcases(
-    out: Out = Path("out"),
+    out: Out = None,
     quick: Annotated[bool, typer.Option("--quick", help="the quick half only")] = False,
     family: Annotated[str | None, typer.Option(help="one family of cases only")] = None,
     quiet: Quiet = False,
+    empty: Empty = False,
 ) -> None:
     """Run the suite of hard cases: stay stable, or refuse with a reason."""
     from softgrasp.study.hardcases.run import run_hardcases
 
-    result = run_hardcases(out, console(), quick=quick, family=family, quiet=quiet)
+    folder = out or default_folder("hardcases")
+    result = run_hardcases(folder, console(), quick=quick, family=family, quiet=quiet, empty=empty)
     raise typer.Exit(0 if result["ok"] else 1)
 
 

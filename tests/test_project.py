@@ -125,7 +125,7 @@ def test_wheel_runs_a_scene_beside_modules_of_the_same_names(wheel: Path, tmp_pa
         command, cwd=here, env=os.environ | {"PYTHONPATH": str(site)}, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads((here / "out" / "result.json").read_text())["steps"] == 4
+    assert json.loads((here / "out" / "paper_forward-simulate" / "result.json").read_text())["steps"] == 4
 
 
 LIGHT = """

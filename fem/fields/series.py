@@ -1,21 +1,23 @@
-"""From the tissue unknowns back to fields on the whole body, and series of them for ParaView."""
+"""From the tissue unknowns back to fields on the whole body, and series of them for ParaView and PyVista."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import dolfinx
 import dolfinx.fem
-import dolfinx.io
+import dolfinx.la
+import dolfinx.plot
 import numpy as np
 
 from softgrasp.fem.disk import check_room
-from softgrasp.fem.errors import ResourceError, agree
+from softgrasp.fem.errors import agree
+from softgrasp.fem.fields.stress import CellStress
+from softgrasp.fem.fields.vtu import Collection, Field, Grid, write_vtu
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 
-FORMATS = ("auto", "vtx", "xdmf")
+KINDS = {(2, 1): 5, (2, 2): 22, (2, 3): 69, (3, 1): 10, (3, 2): 24, (3, 3): 71}  # (d, order): VTK's kind of cell
 
 
 class FullField:
@@ -29,13 +31,12 @@ class FullField:
 
     Args:
         model: the model.
-        name: name of the function in field files.
     """
 
-    def __init__(self, model: Model, name: str = "displacement") -> None:
+    def __init__(self, model: Model) -> None:
         space = model.space
         d = space.layout.dimension
-        self.u = dolfinx.fem.Function(space.V, name=name)
+        self.u = dolfinx.fem.Function(space.V)
         self.T, self.R = model.system.T, space.R
         self.free = (space.free[:, None] * d + np.arange(d)).ravel()
 
@@ -53,51 +54,53 @@ class FullField:
         return self.u
 
 
-def owner_file(series: Path) -> Path:
-    """The small file beside a field series that names its run."""
-    return series.with_suffix(".run")
-
-
 class SeriesWriter:
-    """Displacement, and velocity if given, against time in files that ParaView opens.
+    """Fields against time in ``NAME.pvd``, with a file an instant in the folder ``NAME``.
 
-    VTX keeps the order of the elements, XDMF holds vertex values only.
+    Each holds at the nodes ``displacement`` [m], ``velocity`` [m/s] and ``held`` (1 where the hand holds the tissue);
+    in the cells ``strain`` [1], ``stress`` and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's
+    displacement. Cells keep the order of the elements.
 
     Args:
         model: the model.
         directory: made if missing.
-        format: "vtx" (``fields.bp``), "xdmf" (``fields.xdmf`` and ``fields.h5``) or "auto", the first of these that
-            DOLFINx can write here.
         name: stem of the files.
 
     Collective.
 
     Raises:
-        ResourceError: the format is unknown, or VTX is asked for and DOLFINx has no ADIOS2.
         OSError: the directory cannot be made.
     """
 
-    def __init__(self, model: Model, directory: Path, format: str = "auto", name: str = "fields") -> None:
-        if format not in FORMATS:
-            raise ResourceError(f"output.fields = {format!r} is not one of {', '.join(FORMATS)}")
-        if format == "vtx" and not dolfinx.has_adios2:
-            raise ResourceError("output.fields = 'vtx' needs a DOLFINx with ADIOS2; take 'xdmf' or 'auto'")
-        self.format = ("vtx" if dolfinx.has_adios2 else "xdmf") if format == "auto" else format
-        self.comm, self.directory = model.space.layout.comm, directory
+    def __init__(self, model: Model, directory: Path, name: str = "fields") -> None:
+        space, d = model.space, model.space.layout.dimension
+        self.comm, self.directory, self.d = space.layout.comm, directory, d
         with agree(self.comm):
             if self.comm.rank == 0:
                 directory.mkdir(parents=True, exist_ok=True)
         self.rename(name)
-        self.full = (FullField(model), FullField(model, "velocity"))
-        self.written = tuple(f.u if self.format == "vtx" else _at_vertices(f.u) for f in self.full)
-        self.fields = 0  # known at the first write
-        self.file: Any = None
+        self.full, self.stress = FullField(model), CellStress(model)
+        rows, _, points = dolfinx.plot.vtk_mesh(space.V)
+        nodes = space.V.dofmap.list.shape[1]
+        self.used, cells = np.unique(rows.reshape(-1, nodes + 1)[:, 1:], return_inverse=True)  # no node of a ghost cell
+        self.grid = Grid(
+            points[self.used], cells.reshape(-1, nodes).astype(np.int32), KINDS[d, space.V.ufl_element().degree]
+        )
+        held = dolfinx.la.vector(space.V.dofmap.index_map, dtype=np.float64)
+        held.array[:] = 0.0
+        held.array[space.contact] = 1.0
+        held.scatter_forward()
+        self.held = Field("held", "", held.array[self.used].astype(np.uint8))
+        self.layer = Field("layer", "", self.stress.layer)
+        self.written = 0
+
+    def close(self) -> tuple[Path, ...]:
+        """The list of the files written; none if there is none."""
+        return (self.file,) if self.written else ()
 
     def rename(self, name: str, run: str = "") -> None:
         """Choose another stem of the files, and the run's name, before the first write."""
-        suffixes = (".bp",) if self.format == "vtx" else (".xdmf", ".h5")
-        self.files = tuple(self.directory / f"{name}{suffix}" for suffix in suffixes)
-        self.run = run
+        self.file, self.folder, self.run = self.directory / f"{name}.pvd", self.directory / name, run
 
     def write(self, t: float, z: Array, v: Array, q_s: Array, v_s: Array | None = None, *, reserve: int = 0) -> None:
         """Append one instant. Collective.
@@ -106,64 +109,40 @@ class SeriesWriter:
             t: time [s], larger than the one before.
             z, v: relative displacement [m] and velocity [m/s] on the owned free dofs, shape (n_local,).
             q_s: hand, shape (n_s,) [m, rad].
-            v_s: its velocity, shape (n_s,) [m/s, rad/s]; without it in the first call no velocity is written.
+            v_s: its velocity, shape (n_s,) [m/s, rad/s]; without it no velocity is written.
             reserve: bytes that must stay free on the disk.
 
         Raises:
             ResourceError: the disk is full, or soon will be; what was written before is whole.
+            OSError: the files cannot be written.
         """
-        fields = self.fields or (1 if v_s is None else 2)
-        check_room(self.comm, self.files, self._bytes(fields), reserve)
-        if self.file is None:
-            self._open(fields)
-        states = ((z, q_s), (v, v_s))
-        for full, written, (tissue, hand) in zip(self.full[: self.fields], self.written, states, strict=False):
-            full.fill(tissue, np.zeros(self.full[0].R.shape[1]) if hand is None else hand)
-            if written is not full.u:
-                written.interpolate(full.u)
-        if self.format == "vtx":
-            self.file.write(t)
-            return
-        for written in self.written[: self.fields]:
-            self.file.write_function(written, t)
-
-    def close(self) -> tuple[Path, ...]:
-        """Finish the files and return their names; none if nothing was written. Collective."""
-        if self.file is None:
-            return ()
-        self.file.close()
-        self.file = None
-        return self.files
-
-    def _bytes(self, fields: int) -> int:
-        """About what one instant takes of all ranks, with the mesh if it is the first; on rank 0."""
-        if self.comm.rank > 0:
-            return 0
-        space = self.written[0].function_space
-        topology = space.mesh.topology
-        nodes, cells = space.dofmap.index_map.size_global, topology.index_map(topology.dim).size_global
-        mesh = 24 * nodes + 8 * cells * (space.dofmap.list.shape[1] + 1) if self.file is None else 0
-        return int(1.5 * mesh + 36 * fields * nodes)  # three numbers a node, half as much for what goes with them
-
-    def _open(self, fields: int) -> None:
-        self.fields = fields
+        points, cells = self._fields(z, v, q_s, v_s)
+        whole = [Field("TimeValue", "s", np.array([t])), Field("hand", "m", np.asarray(q_s, dtype=np.float64))]
+        fields = [*points, *cells, *(field for part in self.grid.fields().values() for field in part)]
+        needed = self.comm.reduce(sum(field.values.nbytes for field in fields)) or 0  # one file, so rank 0 asks for all
+        with agree(self.comm):
+            if self.comm.rank == 0 and self.written == 0:
+                self.folder.mkdir(exist_ok=True)
+                self.list = Collection(self.file, self.run)
+        path = self.folder / f"{self.written:06}.vtu"
+        check_room(self.comm, [path], needed, reserve)
+        write_vtu(self.comm, path, self.grid, points, cells, whole)
         with agree(self.comm):
             if self.comm.rank == 0:
-                owner_file(self.files[0]).write_text(self.run)
-        written = list(self.written[:fields])
-        if self.format == "vtx":
-            policy = dolfinx.io.VTXMeshPolicy.reuse  # the mesh does not change: write it once
-            self.file = dolfinx.io.VTXWriter(self.comm, self.files[0], written, mesh_policy=policy)
-        else:
-            self.file = dolfinx.io.XDMFFile(self.comm, self.files[0], "w")
-            self.file.write_mesh(written[0].function_space.mesh)
+                self.list.add(t, path)
+        self.written += 1
 
+    def _fields(self, z: Array, v: Array, q_s: Array, v_s: Array | None) -> tuple[list[Field], list[Field]]:
+        u = self.full.fill(z, q_s).x.array.reshape(-1, self.d)
+        strain, stress, mises = (values.astype(np.float32) for values in self.stress(u))
+        cells = [Field("strain", "1", strain), Field("stress", "Pa", stress), Field("von_mises", "Pa", mises)]
+        points = [Field("displacement", "m", self._points(u))]
+        if v_s is not None:
+            points.append(Field("velocity", "m/s", self._points(self.full.fill(v, v_s).x.array.reshape(-1, self.d))))
+        return [*points, self.held], [*cells, self.layer]
 
-def _at_vertices(u: Any) -> Any:
-    """The function itself if it is P1, else an empty P1 function of its name."""
-    V = u.function_space
-    if V.ufl_element().degree == 1:
-        return u
-    mesh = V.mesh
-    V1 = dolfinx.fem.functionspace(mesh, ("Lagrange", 1, (mesh.geometry.dim,)))
-    return dolfinx.fem.Function(V1, name=u.name)
+    def _points(self, values: Array) -> Array:
+        """Rows of the points of the grid, with three components."""
+        rows = np.zeros((len(self.used), 3))
+        rows[:, : self.d] = values[self.used]
+        return rows

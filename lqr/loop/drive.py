@@ -145,21 +145,43 @@ class HeldDrive:
 
     def solve(self, n: int, state: TissueState) -> None:
         """One step. Collective."""
-        plant, midpoint = self.plant, self.plant.midpoint
-        system = plant.system
+        plant = self.plant
         if n % self.every == 0:
             new = self.command(n, state)
             self.held, self.waiting = (self.waiting, new) if self.delay else (new, new)
-        u, c_0 = self.held, plant.alpha * self.v[n] - plant.g
-        if not system.two_way:
-            a = plant.inverse @ (u + plant.weight)
-            midpoint.solve_midpoint(-(plant.kappa * a + c_0))
-            move(self, n, u, a, plant.dt)
-            return
-        x = midpoint.respond()
-        relative = plant.theta * x - plant.s * state.array[system.layout.n_local :]
-        pull = total(plant.comm, system.G.T @ relative) - plant.theta * (plant.GY @ c_0)
-        finish(plant, self, n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
+        push(plant, self, n, self.held, state)
+
+
+class OpenDrive:
+    """Input that is given for every step.
+
+    Args:
+        plant: from :class:`PlantStep`.
+        inputs: u of each step [N, N m], (steps, n_s).
+    """
+
+    def __init__(self, plant: PlantStep, inputs: Array) -> None:
+        steps, n_s = inputs.shape
+        self.plant, self.u = plant, inputs
+        self.q, self.v = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s))
+
+    def solve(self, n: int, state: TissueState) -> None:
+        """One step. Collective."""
+        push(self.plant, self, n, self.u[n], state)
+
+
+def push(plant: PlantStep, drive: Drive, n: int, u: Array, state: TissueState) -> None:
+    """One step of hand and tissue under an input that is known before it. Collective."""
+    midpoint, system, c_0 = plant.midpoint, plant.system, plant.alpha * drive.v[n] - plant.g
+    if not system.two_way:
+        a = plant.inverse @ (u + plant.weight)
+        midpoint.solve_midpoint(-(plant.kappa * a + c_0))
+        move(drive, n, u, a, plant.dt)
+        return
+    x = midpoint.respond()
+    relative = plant.theta * x - plant.s * state.array[system.layout.n_local :]
+    pull = total(plant.comm, system.G.T @ relative) - plant.theta * (plant.GY @ c_0)
+    finish(plant, drive, n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
 
 
 def finish(plant: PlantStep, drive: Drive, n: int, u: Array, a: Array) -> None:

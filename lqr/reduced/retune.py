@@ -113,7 +113,8 @@ class BoxPoint:
     """One setting of the box: errors against the full Riccati solution there.
 
     ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop, and from tick to
-    tick where its instants are known.
+    tick where its instants are known; ``cost_excess_at_most`` is proved, see :mod:`lqr.loop.gap`, nan where it was not
+    asked for.
     """
 
     materials: Materials
@@ -124,6 +125,8 @@ class BoxPoint:
     reason: str = ""
     certified: bool = True
     sampled: SampledRadius | None = None
+    gain: Gain | None = None
+    cost_excess_at_most: float = float("nan")
 
     @property
     def stable(self) -> bool:
@@ -146,8 +149,8 @@ def over_box(
         retuner: the reduced components.
         settings: materials of all layers, one tuple per point.
         solve: full solver, the reference.
-        start: start minus target, see :func:`lqr.reduced.riccati.hand_start`.
-        modes: modes of the full closed loop, see :class:`lqr.spectrum.modal_loop.ModalLoop`.
+        start: start minus target, see :func:`softgrasp.lqr.reduced.riccati.hand_start`.
+        modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
         law: instants of the loop; None judges the continuous law alone.
     """
     result = []
@@ -172,6 +175,7 @@ def over_box(
                 tuned.seconds,
                 certified=quality.certified,
                 sampled=quality.sampled,
+                gain=gain,
             )
         )
     return tuple(result)

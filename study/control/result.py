@@ -178,7 +178,10 @@ def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, 
 
 def report_dict(report: GainReport) -> dict[str, Any]:
     """One point of result.json."""
-    keys = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
+    keys = (
+        "N", "error_P", "error_K", "cost_excess", "cost_excess_at_most", "abscissa_full", "time_are", "stable",
+        "certified", "reason",
+    )  # fmt: skip
     return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
 
 
@@ -194,6 +197,7 @@ def _retuned(r: Retuned) -> dict[str, Any]:
             "mu": p.materials[0].mu,
             "error_K": p.error_K,
             "cost_excess": p.cost_excess,
+            "cost_excess_at_most": p.cost_excess_at_most,
             "abscissa_full": p.abscissa_full,
             "sampled_radius": radius_of(p),
             "time": p.seconds,

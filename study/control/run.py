@@ -13,6 +13,7 @@ from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.lqr.design.bounds import bases_with_bounds
 from softgrasp.lqr.design.controller import NoController, certified_controller
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
@@ -39,6 +40,7 @@ def run_control(
     *,
     quiet: bool = False,
     pictures: bool = True,
+    empty: bool = False,
 ) -> dict[str, Any]:
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
@@ -52,6 +54,7 @@ def run_control(
         console: where the tables go.
         quiet: no progress bars.
         pictures: draw figures and the animation.
+        empty: remove what an earlier run has left in the folder.
 
     Returns:
         What result.json holds.
@@ -59,7 +62,7 @@ def run_control(
     Raises:
         SoftgraspError: with one sentence.
     """
-    session = Session("control", path, overrides, out, console, quiet, pictures)
+    session = Session("control", path, overrides, out, console, quiet, pictures, empty)
     model, sentence = with_control(session.model(session.scene(), steps=False))
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
@@ -130,7 +133,7 @@ def control_model(
     feedback = design(model, watch, solver_bar(bar, model), restart)
     bases: tuple[BasisGains, ...] = ()
     retuned: tuple[Retuned, ...] = ()
-    notes = list(notes)
+    notes, duration = list(notes), plan(feedback, own_end)
     if feedback.modal:
         sentence = "control.method = 'modal': no P of the whole plant to compare reduced equations with"
         notes.append(Note("modal", sentence))
@@ -138,8 +141,10 @@ def control_model(
         sizes, few = orders(feedback)
         with watch.stage("reduced"):
             bases = sweep(feedback, sizes, counted(bar, "reduced equations"))
+        with watch.stage("bounds"):
+            bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
         with watch.stage("retune"):
-            retuned, why = retune(feedback, bases, counted(bar, "re-tuning"))
+            retuned, why = retune(feedback, bases, duration, counted(bar, "re-tuning"))
         notes += [Note("orders", few)] if few else []
         notes += [Note("retune", f"no re-tuning: {why}")] if why else []
     controller, tick = None, float("nan")
@@ -151,7 +156,6 @@ def control_model(
     sampled = feedback.quality.sampled
     if sampled is not None and sampled.reason:
         notes.append(Note("sampling", f"the loop from tick to tick is not certified: {sampled.reason}"))
-    duration = plan(feedback, own_end)
     notes += [Note("end", duration.note)] if duration.note else []
     frames = Frames(model, session.out, session.pictures)
     with watch.stage("loop"):

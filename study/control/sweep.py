@@ -9,6 +9,8 @@ from dataclasses import replace
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.small_care import solve_reduced
+from softgrasp.lqr.design.bounds import with_bounds
+from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains, Notify, fast_order, reduce_gains
 from softgrasp.lqr.plant.checks import ControlError
@@ -27,7 +29,7 @@ BOX_STATES = 30_000  # above, nine more full solutions would take minutes
 
 
 def sweep(design: Design, orders: Sequence[int], notify: Notify | None = None) -> tuple[BasisGains, ...]:
-    """All bases over their orders, see :func:`lqr.design.orders.reduce_gains`, with times. Collective."""
+    """All bases over their orders, see :func:`softgrasp.lqr.design.orders.reduce_gains`, with times. Collective."""
     bases = reduce_gains(design, orders, notify)
     return tuple(replace(b, reports=tuple(with_time(design.problem, r) for r in b.reports)) for b in bases)
 
@@ -50,9 +52,12 @@ def with_time(problem: RiccatiProblem, report: GainReport) -> GainReport:
 
 
 def retune(
-    design: Design, bases: Sequence[BasisGains], notify: Notify | None = None
+    design: Design, bases: Sequence[BasisGains], plan: LoopPlan, notify: Notify | None = None
 ) -> tuple[tuple[Retuned, ...], str]:
-    """The a-priori basis and the paper's best at a small order, re-tuned over the box; or why not. Collective."""
+    """The a-priori basis and the paper's best at a small order, re-tuned over the box; or why not. Collective.
+
+    The duality gaps of all gains of one setting come from the same few runs of ``plan``.
+    """
     layout = design.problem.layout
     reason = outside(design.model)
     if not reason and layout.states > BOX_STATES:
@@ -73,17 +78,18 @@ def retune(
             solutions[key] = solve(problem)
         return solutions[key]
 
-    result, done = [], 0
-    for family, N in chosen:
-        tuner = Retuner(design.problem, family.at(N))
-        points: list[BoxPoint] = []
-        for materials in settings:
-            points.append(_at(tuner, materials, full, design))
-            done += 1
-            if notify is not None:
-                notify(done, len(settings) * len(chosen))
-        result.append(Retuned(family.name, N, tuple(points)))
-    return tuple(result), ""
+    tuners = [Retuner(design.problem, family.at(N)) for family, N in chosen]
+    columns = list[list[BoxPoint]]()
+    for materials in settings:
+        points = [_at(tuner, materials, full, design) for tuner in tuners]
+        if materials in solutions:
+            problem = replace(design.problem, system=design.problem.system.with_materials(materials))
+            points = with_bounds(problem, solutions[materials], points, design.error, plan)
+        columns.append([replace(point, gain=None) for point in points])
+        if notify is not None:
+            notify(len(columns), len(settings))
+    rows = zip(*columns, strict=True)
+    return tuple(Retuned(family.name, N, tuple(row)) for (family, N), row in zip(chosen, rows, strict=True)), ""
 
 
 def _at(

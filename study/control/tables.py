@@ -19,11 +19,12 @@ from softgrasp.study.report.tables import Table
 
 Row = tuple[Any, ...]
 SPECTRUM = ("abscissa [1/s]", "radius a tick")
-REDUCED_HEADER = ("basis", "N", "error of P", "error of K", "excess cost", *SPECTRUM, "reduced ARE [ms]", "gain")
-BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", "excess cost", *SPECTRUM, "re-tuned in [ms]", "gain")
+EXCESS = ("excess cost", "at most (proved)")
+REDUCED_HEADER = ("basis", "N", "error of P", "error of K", *EXCESS, *SPECTRUM, "reduced ARE [ms]", "gain")
+BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", *EXCESS, *SPECTRUM, "re-tuned in [ms]", "gain")
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
 BEST_HEADER = (
-    "best stable gain", "N", "error P", "error K", "excess", "abscissa", "ARE, ms", "unstable N",
+    "best stable gain", "N", "error P", "error K", "excess", "at most", "abscissa", "ARE, ms", "unstable N",
 )  # fmt: skip
 
 
@@ -81,10 +82,12 @@ def _matrix(values: Array) -> str:
 
 def _fast(r: Retuned) -> str:
     stable = [p for p in r.points if p.stable]
-    largest = max((p.cost_excess for p in stable), default=float("nan"))
+    largest, proved = (
+        max((getattr(p, key) for p in stable), default=float("nan")) for key in ("cost_excess", "cost_excess_at_most")
+    )
     return (
         f"{TITLES[r.name]}, N = {r.N}: {len(stable)} of {len(r.points)} stable, at most {1e3 * r.slowest:.2g} ms, "
-        f"excess cost up to {largest:.1e}"
+        f"excess cost up to {largest:.1e}, proved at most {proved:.1e}"
     )
 
 
@@ -109,7 +112,7 @@ def reduced_table(bases: Sequence[BasisGains]) -> Table:
         (
             TITLES[b.name],
             r.N,
-            *_cells(r, r.error_P, r.error_K, r.cost_excess),
+            *_cells(r, r.error_P, r.error_K, r.cost_excess, r.cost_excess_at_most),
             None if r.reason else r.abscissa_full,
             None if r.sampled is None else radius_of(r),
             None if r.reason else 1e3 * r.time_are,
@@ -127,9 +130,10 @@ def best_table(bases: Sequence[BasisGains]) -> Table:
     for b in bases:
         r, unstable = b.best(), ", ".join(str(x.N) for x in b.reports if not x.stable)
         if r is None:
-            rows.append((TITLES[b.name], *([""] * 6), unstable or b.refused))
+            rows.append((TITLES[b.name], *([""] * 7), unstable or b.refused))
             continue
-        values = (f"{r.error_P:.1e}", f"{r.error_K:.1e}", f"{r.cost_excess:.1e}", f"{r.abscissa_full:.4g}")
+        excess = (f"{r.cost_excess:.1e}", f"{r.cost_excess_at_most:.1e}")
+        values = (f"{r.error_P:.1e}", f"{r.error_K:.1e}", *excess, f"{r.abscissa_full:.4g}")
         rows.append((TITLES[b.name], r.N, *values, f"{1e3 * r.time_are:.2g}", unstable))
     return Table(BEST_HEADER, rows)
 
@@ -140,7 +144,7 @@ def box_rows(r: Retuned) -> list[Row]:
         (
             p.materials[0].lam,
             p.materials[0].mu,
-            *_cells(p, p.error_K, p.cost_excess, p.abscissa_full, radius_of(p), 1e3 * p.seconds),
+            *_cells(p, p.error_K, p.cost_excess, p.cost_excess_at_most, p.abscissa_full, radius_of(p), 1e3 * p.seconds),
             _mark(p),
         )
         for p in r.points

@@ -113,14 +113,14 @@ def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> N
 
 
 def run_effects(
-    path: Path, out: Path, overrides: list[str], console: Console, *, quiet: bool = False
+    path: Path, out: Path, overrides: list[str], console: Console, *, quiet: bool = False, empty: bool = False
 ) -> dict[str, Any]:
     """Judge the effects of a scene file and write result.json, table, picture and report. Collective.
 
     Raises:
         SoftgraspError: with one sentence.
     """
-    session = Session("effects", path, overrides, out, console, quiet)
+    session = Session("effects", path, overrides, out, console, quiet, empty=empty)
     comm, scene = session.comm, session.scene()
     console.print(f"effects at the tolerance {scene.study.tolerance:g}")
     with session.progress(MofNCompleteColumn()) as bar:

@@ -23,14 +23,16 @@ EFFECTS = ("effect", "verdict", "gate", "number", "matters from", "what it says"
 COSTS = ("effect", "adds", "allocates", "cost")
 
 
-def run_explain(path: Path, out: Path | None, overrides: Sequence[str], console: Console) -> Explanation:
+def run_explain(
+    path: Path, out: Path | None, overrides: Sequence[str], console: Console, *, empty: bool = False
+) -> Explanation:
     """Explain a scene file, and write result.json and report.html if there is a folder for them. Collective.
 
     Raises:
-        SceneError, MeshError, SolverError: as :func:`study.forward.explain.explain`.
+        SceneError, MeshError, SolverError: as :func:`softgrasp.study.forward.explain.explain`.
     """
-    session = Session("explain", path, overrides, out or Path(), console)
-    scene = session.scene()
+    session = Session("explain", path, overrides, out or Path(), console, empty=empty)
+    scene = session.scene(writes=out is not None)
     explanation = explain(scene, session.comm)
     parts = sections(explanation)
     render(explanation, parts, console)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import Interrupted, ResourceError
+from softgrasp.fem.errors import Interrupted, ResourceError, SceneError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.study.forward import accuracy
@@ -43,6 +43,7 @@ def run_simulate(
     until: int | None = None,
     pictures: bool = True,
     certify: bool = False,
+    empty: bool = False,
 ) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective.
 
@@ -52,7 +53,9 @@ def run_simulate(
     Raises:
         SoftgraspError: with one sentence.
     """
-    session = Session("simulate", path, overrides, out, console, quiet, pictures)
+    if resume and empty:
+        raise SceneError("--empty removes what --resume goes on from; give one of them")
+    session = Session("simulate", path, overrides, out, console, quiet, pictures, empty)
     model = session.model(session.scene())
     scene, frames = model.scene, Frames(model, out, pictures)
 

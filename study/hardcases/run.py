@@ -15,6 +15,7 @@ from softgrasp.study.hardcases import carex, motion, numbers, ranks, reduction, 
 from softgrasp.study.hardcases.cases import Family
 from softgrasp.study.hardcases.page import show, write_files
 from softgrasp.study.hardcases.result import FamilyResult, HardCaseResult
+from softgrasp.study.shell.folder import claim
 from softgrasp.study.shell.session import list_files, progress_bar
 
 MODULES: Any = (statics, motion, reduction, carex, riccati, numbers, ranks)
@@ -42,6 +43,7 @@ def run_hardcases(
     family: str | None = None,
     quiet: bool = False,
     pictures: bool = True,
+    empty: bool = False,
 ) -> dict[str, Any]:
     """Run the cases, print one table a family, and write result.json, hardcases.csv, pictures and report.html.
 
@@ -54,6 +56,7 @@ def run_hardcases(
     if MPI.COMM_WORLD.size > 1:
         raise SoftgraspError("hardcases starts the ranks that it needs by itself; run it without mpiexec")
     families = choose(family)
+    claim(out, "hardcases", "", empty=empty)
     out.mkdir(parents=True, exist_ok=True)
     results = []
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:

@@ -9,7 +9,8 @@ import numpy as np
 
 from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
-from softgrasp.fem.fields.series import SeriesWriter, owner_file
+from softgrasp.fem.fields.series import SeriesWriter
+from softgrasp.fem.fields.vtu import note_of
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Run, frame_steps
@@ -19,7 +20,6 @@ from softgrasp.study.pictures.shapes import pick_instants, way_done
 
 MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
 LARGE_RESTART = 2**26  # bytes: no room is kept for a larger restart file, it would stop runs that end well
-SUFFIXES = (".bp", ".xdmf", ".h5")
 SHOWN = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the way, chosen before the run when few instants are kept
 
 
@@ -43,7 +43,7 @@ class Frames:
         self.model, self.directory, self.pictures = model, directory, pictures
         self.writer = None
         if model.scene.output.fields != "none":
-            self.writer = SeriesWriter(model, directory, model.scene.output.fields)
+            self.writer = SeriesWriter(model, directory)
         self.legs, self.foreign = [0], False
         self.saved = 0  # of the frames below, how many lie beside the checkpoint
         self.steps: list[int] = []
@@ -76,17 +76,14 @@ class Frames:
     def _remove_series(self, run: Run) -> None:
         """Field files that this run did not leave on its way here: those of another run in the same folder."""
         own = [_series(leg) for leg in run.legs[:-1]]
-        for path in self.directory.glob("fields*"):
-            stem, number = path.stem, path.stem.removeprefix("fields-from")
-            if path.suffix not in SUFFIXES or not (stem == "fields" or number.isdecimal()):
+        for path in self.directory.glob("fields*.pvd"):
+            if not (path.stem == "fields" or path.stem.removeprefix("fields-from").isdecimal()):
                 continue
-            owner = owner_file(path)
-            if stem in own and owner.is_file() and owner.read_text() == run.name:
+            if path.stem in own and note_of(path) == run.name:
                 continue
-            self.foreign = self.foreign or stem in own
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-            if not any(path.with_suffix(suffix).exists() for suffix in SUFFIXES):
-                owner.unlink(missing_ok=True)
+            self.foreign = self.foreign or path.stem in own
+            shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+            path.unlink()
 
     def _load(self, run: Run) -> None:
         frames = [
@@ -160,8 +157,8 @@ class Frames:
     def close(self) -> list[Path]:
         """Finish the field files; those of all legs. Collective."""
         own = list(self.writer.close()) if self.writer is not None else []
-        names = [f"{_series(leg)}{suffix}" for leg in self.legs[:-1] for suffix in SUFFIXES]
-        return [path for name in names if (path := self.directory / name).exists()] + own
+        earlier = [self.directory / f"{_series(leg)}.pvd" for leg in self.legs[:-1]]
+        return [path for path in earlier if path.exists()] + own
 
     def draw(self, directory: Path, run: Trajectory) -> list[Path]:
         """Figures and animation; rank 0 only."""

@@ -53,16 +53,22 @@ class Predictor:
     def __init__(self, scene: Scene, points: Sequence[ForwardPoint], d: int) -> None:
         self.scene, self.dimension = scene, d
         runs = [p for p in points if p.series != "solver"]
-        self.runs = {p.setting: p for p in runs}
+        self.runs: dict[Setting, ForwardPoint] = {}
         self.space: dict[Group, ForwardPoint] = {}  # the most steps on every mesh
-        for p in sorted(runs, key=lambda p: p.steps):
-            self.space[p.setting.group] = p
+        for p in runs:
+            self.learn(p)
         changing = over_steps(runs)
         # the mesh with the most steps tried tells about time, the most accurate of those
         best = {name: -self.space[line[0].setting.group].error for name, line in changing.items()}
         name = max(changing, key=lambda name: (len(changing[name]), best[name]), default="")
         most = max((p.steps for p in runs if p.series == name), default=1)
         self.time = {p.steps: (p.error_time or 0.0) / (1 - (p.steps / most) ** 2) for p in changing.get(name, ())}
+
+    def learn(self, point: ForwardPoint) -> None:
+        """Take in a measured point."""
+        self.runs[point.setting], group = point, point.setting.group
+        if group not in self.space or self.space[group].steps <= point.steps:
+            self.space[group] = point
 
     def graded(self, order: int) -> dict[float, ForwardPoint]:
         """The graded meshes of an order that were run, by tolerance."""

@@ -48,6 +48,7 @@ def run_study(
     budget: float | None = None,
     questions: Sequence[str] | None = None,
     quiet: bool = False,
+    empty: bool = False,
 ) -> dict[str, Any]:
     """Measure accuracy against time for a scene file and write the results. Collective.
 
@@ -60,13 +61,14 @@ def run_study(
         console: for the tables.
         tolerance: relative error of the deformation to answer for, or None.
         budget: seconds of a step to answer for, or None.
-        questions: arguments of ``--question``, see :class:`study.precision.points.Request`; None for all.
+        questions: arguments of ``--question``, see :class:`softgrasp.study.precision.points.Request`; None for all.
         quiet: no progress bar.
+        empty: remove what an earlier run has left in the folder.
 
     Raises:
         SoftgraspError: with one sentence.
     """
-    session = Session("study", path, overrides, out, console, quiet)
+    session = Session("study", path, overrides, out, console, quiet, empty=empty)
     request = Request(tolerance, budget, tuple(questions or ()))
     scene = session.scene()
     with session.progress(TaskProgressColumn()) as bar:

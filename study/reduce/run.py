@@ -68,13 +68,14 @@ def run_reduce(
     *,
     quiet: bool = False,
     pictures: bool = True,
+    empty: bool = False,
 ) -> dict[str, Any]:
     """Reduce a scene file by all its methods and write the results. Collective.
 
     Raises:
         SoftgraspError: with one sentence.
     """
-    session = Session("reduce", path, overrides, out, console, quiet, pictures)
+    session = Session("reduce", path, overrides, out, console, quiet, pictures, empty)
     scene = session.scene()
     names = check_scene(scene)
     model = session.model(scene)

@@ -169,14 +169,6 @@ def check_cache() -> Check:
     return Check("JIT cache", True, str(folder))
 
 
-def check_adios2() -> Check:
-    """ADIOS2 inside DOLFINx, for VTX series."""
-    importlib.import_module("softgrasp.fem._stack")
-    ok = hasattr(importlib.import_module("dolfinx.io"), "VTXWriter")
-    cure = "" if ok else "Use a DOLFINx built with ADIOS2, or ask for XDMF output."
-    return Check("ADIOS2", ok, "VTX output" if ok else "missing", cure)
-
-
 def check_memory() -> Check:
     """Memory that is free now, enough for the paper's scenes."""
     memory = psutil.virtual_memory()
@@ -195,7 +187,6 @@ CHECKS: tuple[tuple[str, Callable[[], Check]], ...] = (
     ("threads", check_threads),
     ("C compiler", check_compiler),
     ("JIT cache", check_cache),
-    ("ADIOS2", check_adios2),
     ("memory", check_memory),
 )
 

@@ -23,6 +23,7 @@ from softgrasp.study.report.files import write_json, write_scene
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.folder import claim
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Session:
         console: writes on rank 0 only.
         quiet: no progress bars.
         pictures: draw figures.
+        empty: remove what an earlier run has left in the folder.
         begin: clock at the start [s].
     """
 
@@ -66,6 +68,7 @@ class Session:
     console: Console
     quiet: bool = False
     pictures: bool = True
+    empty: bool = False
     begin: float = field(default_factory=time.perf_counter)
 
     @property
@@ -73,13 +76,19 @@ class Session:
         """Ranks that run the command."""
         return MPI.COMM_WORLD
 
-    def scene(self) -> Scene:
-        """Load the scene file and print its name and description. Collective.
+    def scene(self, *, writes: bool = True) -> Scene:
+        """Load the scene file, claim the folder, and print name and description. Collective.
+
+        Args:
+            writes: the command will write into the folder.
 
         Raises:
-            SceneError: the file or a key is wrong.
+            SceneError: the file or a key is wrong, or the folder holds another run.
         """
         scene = load_scene_collective(self.comm, self.path, self.overrides)
+        with agree(self.comm):
+            if writes and self.comm.rank == 0:
+                claim(self.out, self.command, scene.name, path=self.path, empty=self.empty)
         described = f": {escape(scene.description)}" if scene.description else ""
         self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
         return scene
@@ -171,16 +180,6 @@ def list_files(console: Console, files: Sequence[Path]) -> None:
     console.print("files:")
     for file in files:
         console.print(f"  {file}", soft_wrap=True, markup=False)
-
-
-def open_scene(path: Path, overrides: list[str], console: Console) -> Scene:
-    """See :meth:`Session.scene`; for commands that are not one yet. Collective."""
-    return Session("", path, overrides, Path(), console).scene()
-
-
-def open_model(scene: Scene, console: Console) -> Model:
-    """See :meth:`Session.model`; for commands that are not one yet. Collective."""
-    return Session("", Path(), (), Path(), console).model(scene)
 
 
 def show_warnings(console: Console, warnings: Sequence[str]) -> None:

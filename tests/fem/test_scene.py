@@ -278,14 +278,14 @@ def test_set_takes_toml_values_bare_words_indices_and_false() -> None:
         "tissue.cells=[4, 8]",
         "tissue.material=fat",
         "control.outputs.0.name='a b'",
-        "output.fields=vtx",
+        "output.fields=none",
     ]
     scene = load_scene(PAPER, [*overrides, "effects.damping={kind='rayleigh', beta=0, alpha=2}"])
     assert scene.tissue.cells == [4, 8]
     assert scene.tissue.material.name == "fat"
     assert scene.control is not None
     assert scene.control.outputs[0].name == "a b"
-    assert scene.output.fields == "vtx"
+    assert scene.output.fields == "none"
     assert scene.effects.damping is not None
     assert scene.effects.damping.alpha == 2.0
     assert load_scene(FRANKA, ["effects.damping=false"]).effects.damping is None

@@ -1,0 +1,59 @@
+"""Strain and stress of a displacement at the midpoints of the cells, for pictures.
+
+eps = sym grad u,  sigma = 2 mu eps + lambda tr(eps) I,  von Mises sqrt(3/2 s : s) with s = sigma - tr(sigma)/3 I.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgrasp.fem.mesh.tissue_mesh import cell_nodes
+from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.petsc import Array
+
+VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+
+
+class CellStress:
+    """Strain and stress in the owned cells of a model; exact for P1, of the midpoint for P2 and P3.
+
+    In 2D the strain is plane: eps_zz = 0, sigma_zz = lambda tr(eps).
+
+    Attributes:
+        layer: number of the layer of each owned cell, shape (m,).
+    """
+
+    def __init__(self, model: Model) -> None:
+        space, d = model.space, model.space.mesh.dimension
+        mesh = space.mesh.mesh
+        owned = mesh.topology.index_map(d).size_local
+        element = space.V.element.basix_element
+        middle = np.full((1, d), 1 / (d + 1))
+        slopes = element.tabulate(1, middle)[1:, 0, :, 0]  # of the shape functions on the reference cell, (d, k)
+        x = mesh.geometry.x[cell_nodes(mesh)[:owned], :d]
+        self.gradients = np.linalg.solve(x[:, 1:] - x[:, :1], slopes)  # (m, d, k)
+        self.dofs = space.V.dofmap.list[:owned]
+        self.layer = np.zeros(owned, dtype=np.int32)
+        groups = cells_of_layers(space.mesh, model.scene) if model.scene.tissue.layers else {}
+        for i, cells in enumerate(groups.values()):
+            self.layer[cells] = i
+        self.lam, self.mu = (np.array([getattr(m, key) for m in model.system.materials]) for key in ("lam", "mu"))
+
+    def __call__(self, u: Array) -> tuple[Array, Array, Array]:
+        """Strain [1] (m, 6), stress [Pa] (m, 6), both as xx, yy, zz, xy, yz, xz, and von Mises stress [Pa] (m,).
+
+        Args:
+            u: displacement of the local nodes, ghosts included [m], shape (n, d).
+        """
+        d = u.shape[1]
+        eps = np.zeros((len(self.dofs), 3, 3))
+        eps[:, :d, :d] = self.gradients @ u[self.dofs]
+        eps = (eps + eps.transpose(0, 2, 1)) / 2
+        trace = np.trace(eps, axis1=1, axis2=2)[:, None, None]
+        lam, mu = (values[self.layer][:, None, None] for values in (self.lam, self.mu))
+        sigma = 2 * mu * eps + lam * trace * np.eye(3)
+        shear = 2 * mu * (eps - trace / 3 * np.eye(3))
+        mises = np.sqrt(1.5 * np.einsum("cij,cij->c", shear, shear))
+        rows, columns = zip(*VOIGT, strict=True)
+        return eps[:, rows, columns], sigma[:, rows, columns], mises

@@ -1,0 +1,55 @@
+"""Proved bounds on the excess cost of reduced gains, from the duality gaps of their runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from softgrasp.lqr.design.duration import LoopPlan
+from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.orders import BasisGains
+from softgrasp.lqr.loop.gap import duality_gaps
+from softgrasp.lqr.loop.responses import Notify
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.reduced.retune import BoxPoint
+from softgrasp.lqr.reduced.riccati import GainReport
+
+
+def with_bounds[Judged: (GainReport, BoxPoint)](
+    problem: RiccatiProblem,
+    solution: RiccatiSolution,
+    gains: Iterable[Judged],
+    start: Block,
+    plan: LoopPlan,
+    notify: Notify | None = None,
+) -> list[Judged]:
+    """The same with ``cost_excess_at_most`` where the gain is stable, see :mod:`lqr.loop.gap`. Collective.
+
+    Args:
+        problem: the plant.
+        solution: says what is to come after the end of the plan; its error does not matter to the bound.
+        gains: judged before.
+        start: start minus target, one column.
+        plan: step and number of steps.
+        notify: called with the number of steps done and in all.
+    """
+    gains = list(gains)
+    stable = [(i, g.gain) for i, g in enumerate(gains) if g.stable and g.gain is not None]
+    if stable:
+        laws = [gain for _, gain in stable]
+        gaps = duality_gaps(problem, laws, start, plan.dt, plan.steps, solution.factor, notify)
+        for (i, _), gap in zip(stable, gaps, strict=True):
+            gains[i] = replace(gains[i], cost_excess_at_most=gap.cost_excess_at_most)
+    return gains
+
+
+def bases_with_bounds(
+    design: Design, bases: Sequence[BasisGains], plan: LoopPlan, notify: Notify | None = None
+) -> tuple[BasisGains, ...]:
+    """All gains of all bases from the same few runs. Collective."""
+    every = with_bounds(
+        design.problem, design.solution, (r for b in bases for r in b.reports), design.error, plan, notify
+    )
+    rest = iter(every)
+    return tuple(replace(b, reports=tuple(next(rest) for _ in b.reports)) for b in bases)

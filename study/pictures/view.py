@@ -1,0 +1,130 @@
+"""``softgrasp view``: the move of a finished or stopped run, from its field files, with PyVista."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.errors import ResourceError, SceneError
+
+SHOWN = 4  # bodies in a picture, equally spaced in time, first and last included
+PEAK = 99  # percentile of the colours' end: corners are singular, and the few cells there would take all colours
+
+
+class Move:
+    """The field files of all parts of a run, instant by instant.
+
+    Args:
+        folder: of the run.
+        field: colours the body.
+
+    Attributes:
+        times: of the instants [s].
+        title: the field with its unit.
+        range: ends of its colours, from the bodies of a picture; for a vector its length counts.
+
+    Raises:
+        SceneError: the folder has no field files, or they have no such field.
+        ResourceError: PyVista is missing.
+    """
+
+    def __init__(self, folder: Path, field: str) -> None:
+        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")  # VTK tries X11 first
+        try:
+            import pyvista
+        except ImportError as error:
+            raise ResourceError(
+                f"PyVista is not installed; pip install 'softgrasp[view]', or open {folder}/fields.pvd in ParaView"
+            ) from error
+        parts = {int(path.stem.removeprefix("fields-from")): path for path in folder.glob("fields-from*.pvd")}
+        if (folder / "fields.pvd").exists():
+            parts[0] = folder / "fields.pvd"
+        readers = [pyvista.PVDReader(str(parts[step])) for step in sorted(parts)]
+        readers = [reader for reader in readers if reader.time_values]
+        if not readers:
+            raise SceneError(f"{folder} has no field files; name the output folder of simulate or control")
+        ends = [reader.time_values[0] for reader in readers[1:]] + [np.inf]
+        self._instants = [(t, r) for r, end in zip(readers, ends, strict=True) for t in r.time_values if t < end]
+        self.times, self.field = [t for t, _ in self._instants], field
+        first = self._read(0)
+        self.flat = first.bounds.z_max == first.bounds.z_min
+        known = {*first.point_data.keys(), *first.cell_data.keys()}
+        if field not in known:
+            raise SceneError(f"--field {field}: the files hold {', '.join(sorted(known))}")
+        data = first.GetPointData() if field in first.point_data else first.GetCellData()
+        values = data.GetAbstractArray(field)
+        unit = values.GetInformation().Get(values.UNITS_LABEL())
+        self.title = f"{field} [{unit}]" if unit else field
+        self.shown = sorted({round(i) for i in np.linspace(0, len(self.times) - 1, SHOWN)})
+        sizes = np.concatenate([self._value(self._read(i)) for i in self.shown])
+        self.range = float(sizes.min()), float(np.percentile(sizes, PEAK))
+
+    def body(self, i: int) -> Any:
+        """The surface of the deformed body at an instant, with the field as `value`."""
+        grid = self._read(i)
+        (grid.point_data if self.field in grid.point_data else grid.cell_data)["value"] = self._value(grid)
+        return grid.warp_by_vector("displacement").extract_surface(algorithm=None, nonlinear_subdivision=1)
+
+    def label(self, i: int) -> str:
+        """Time and place of the hand."""
+        hand = np.asarray(self._read(i).field_data["hand"])
+        d = 2 if self.flat else 3
+        return f"{self.times[i]:.3g} s\nhand at ({', '.join(f'{x:.3g}' for x in hand[:d])}) m"
+
+    def _read(self, i: int) -> Any:
+        t, reader = self._instants[i]
+        reader.set_active_time_value(t)
+        return reader.read()[0]
+
+    def _value(self, grid: Any) -> np.ndarray:
+        values = np.asarray(grid[self.field], dtype=np.float64)
+        return values if values.ndim == 1 else np.asarray(np.linalg.norm(values, axis=1))
+
+
+def view(folder: Path, field: str, save: Path | None) -> None:
+    """Show the move in a window with a time slider, or save a picture of some instants.
+
+    Args:
+        folder: output folder of a run.
+        field: colours the body.
+        save: a PNG file; None opens a window.
+
+    Raises:
+        SceneError: there is no display, or the picture is no PNG, or as for `Move`.
+        ResourceError: PyVista is missing.
+    """
+    if save is not None and save.suffix != ".png":
+        raise SceneError(f"--save {save}: the picture is a PNG; name a file that ends in .png")
+    move = Move(folder, field)
+    if save is None and "vtkEGL" in os.environ.get("VTK_DEFAULT_OPENGL_WINDOW", ""):
+        raise SceneError("there is no display here for a window; give --save move.png")
+    import pyvista
+
+    look = {"scalars": "value", "clim": move.range, "cmap": "viridis", "ambient": 0.4, "show_edges": True}
+    look |= {
+        "edge_opacity": 0.2,
+        "scalar_bar_args": {"title": move.title, "color": "black", "n_labels": 3, "fmt": "%.3g"},
+    }
+    shown = [0] if save is None else move.shown
+    plotter = pyvista.Plotter(off_screen=save is not None, shape=(1, len(shown)), window_size=(1280, 640), border=False)
+    for column, i in enumerate(shown):
+        plotter.subplot(0, column)
+        body = move.body(i)
+        plotter.add_mesh(body, name="body", show_scalar_bar=column == 0, **look)
+        if move.flat:
+            plotter.view_xy()
+        if save is not None:
+            plotter.add_title(move.label(i), font_size=9, color="black")
+
+    if save is None:
+
+        def show(t: float) -> None:
+            i = int(np.argmin(np.abs(np.array(move.times) - t)))
+            plotter.add_mesh(move.body(i), name="body", reset_camera=False, **look)
+
+        plotter.add_slider_widget(show, (move.times[0], move.times[-1]), value=move.times[0], title="time [s]")
+    plotter.show(screenshot=None if save is None else str(save))

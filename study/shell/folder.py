@@ -1,0 +1,61 @@
+"""The folder of a run: its default name, whose results it holds, and how it is emptied."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from softgrasp.fem.errors import SceneError
+
+
+def default_folder(command: str, scene: Path | None = None) -> Path:
+    """``out/<scene>-<command>``, the scene by the name of its file."""
+    return Path("out") / (command if scene is None else f"{scene.stem}-{command}")
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """The ``result.json`` of a folder; empty where there is none of a command."""
+    try:
+        result = json.loads((folder / "result.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return result if isinstance(result, dict) and "command" in result else {}
+
+
+def claim(out: Path, command: str, scene: str, *, path: Path = Path(), empty: bool = False) -> None:
+    """Refuse a folder that holds the run of another scene or command, or empty it. Not collective: call on one rank.
+
+    Args:
+        out: folder of the results.
+        command: what is about to be run.
+        scene: name of the scene; empty for a command without one.
+        path: the scene file, which must not be removed.
+        empty: remove what a run has left in the folder.
+
+    Raises:
+        SceneError: the folder belongs to another run, or holds more than one run and is to be emptied.
+    """
+    result = read_result(out)
+    if not empty:
+        if result and (result["command"], result.get("scene", "")) != (command, scene):
+            owner = f" on {result['scene']}" if result.get("scene") else ""
+            raise SceneError(
+                f"--out {out}: it holds the results of {result['command']}{owner}; name another folder, or remove "
+                "them with --empty"
+            )
+        return
+    if not out.exists() or not any(out.iterdir()):
+        return
+    if not result:
+        raise SceneError(f"--out {out}: --empty removes the results of a run, but there is no result.json of one")
+    home = out.resolve()
+    keep = [Path.cwd(), path.resolve(), *(p.parent for p in home.rglob("result.json") if p.parent != home)]
+    if inside := next((p for p in keep if p.is_relative_to(home)), None):
+        raise SceneError(f"--out {out}: --empty would also remove {inside}; name another folder")
+    for item in home.iterdir():
+        if item.is_dir() and not item.is_symlink():
+            shutil.rmtree(item)
+        else:
+            item.unlink()

@@ -1,0 +1,79 @@
+"""`softgrasp view` shows what a run left, or says in one sentence why not."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from softgrasp.fem.errors import Interrupted, ResourceError, SceneError
+from softgrasp.fem.scene.file import shipped_scenes
+from softgrasp.study.forward.run import run_simulate
+from softgrasp.study.pictures.view import Move, view
+
+needs_pyvista = pytest.mark.skipif(importlib.util.find_spec("pyvista") is None, reason="no PyVista here")
+
+
+@pytest.fixture(scope="module")
+def two_legs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was stopped and resumed: two field series."""
+    out = tmp_path_factory.mktemp("run")
+    changes = ["tissue.cells=[3,6]", "time.steps=30", "output.frames=6"]
+    call = (shipped_scenes()["paper_forward"], out, changes, Console(quiet=True))
+    with pytest.raises(Interrupted):
+        run_simulate(*call, quiet=True, pictures=False, until=12)
+    run_simulate(*call, quiet=True, pictures=False, resume=True)
+    return out
+
+
+@needs_pyvista
+def test_parts_of_a_run_join_in_time(two_legs: Path) -> None:
+    move = Move(two_legs, "von_mises")
+    assert sorted(path.name for path in two_legs.glob("*.pvd")) == ["fields-from12.pvd", "fields.pvd"]
+    assert move.times == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
+    assert move.title == "von_mises [Pa]"
+    assert move.label(6) == "3 s\nhand at (5, 3) m"
+    end = move.body(6)
+    assert end.center[:2] == pytest.approx([5.5, 4.0], abs=0.1)  # the body's middle and the target
+
+
+@needs_pyvista
+def test_picture_shows_four_bodies(two_legs: Path, tmp_path: Path) -> None:
+    """In a process of its own: without OpenGL the library ends it."""
+    picture = tmp_path / "move.png"
+    words = [sys.executable, "-m", "softgrasp.study.cli", "view", str(two_legs), "--save", str(picture)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=200, check=False)
+    if done.returncode < 0:
+        pytest.skip("no OpenGL here, not even in memory")
+    assert done.returncode == 0, done.stderr
+    pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    coloured = np.ptp(pixels, axis=2)[100:500] > 30  # without titles and colour bar
+    quarters = [part.sum() for part in np.array_split(coloured, 4, axis=1)]
+    assert min(quarters) > 5000  # of 128,000 pixels
+    assert not np.array_equal(pixels[:, :320], pixels[:, 320:640])
+
+
+@needs_pyvista
+def test_refusals(two_legs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(SceneError, match="no display here"):
+        view(two_legs, "von_mises", None)
+    with pytest.raises(SceneError, match=r"ends in \.png"):
+        view(two_legs, "von_mises", Path("move.jpg"))
+    with pytest.raises(SceneError, match="--field heat: the files hold displacement, held, layer"):
+        Move(two_legs, "heat")
+    with pytest.raises(SceneError, match="has no field files"):
+        Move(tmp_path, "von_mises")
+
+
+def test_without_pyvista(two_legs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    with pytest.raises(ResourceError, match=r"pip install 'softgrasp\[view\]', or open .*fields.pvd in ParaView"):
+        view(two_legs, "von_mises", Path("move.png"))
