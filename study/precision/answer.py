@@ -151,7 +151,7 @@ class Answers:
         return min(held, key=lambda choice: choice.point.seconds) if held else None
 
     def _models_on(self, setting: Setting, full: ForwardPoint, tolerance: float) -> list[Choice]:
-        """Reduced models of the two fastest bases on another mesh; N as the scene's own mesh predicts it."""
+        """Reduced models of the fastest basis on another mesh, or the second; N as the scene's own mesh predicts it."""
         room = tolerance - self.truth.error - full.error
         expected: dict[str, ReducedPoint] = {}
         for p in sorted(usable(self.reduced), key=lambda p: p.seconds):
@@ -165,6 +165,8 @@ class Answers:
             self.measured += points
             predicted = full.error + own.error_outputs_full, own.seconds
             choices += [self.choice(p, predicted) for p in points if self.meets(p, tolerance)]
+            if choices:  # on a large mesh a second basis takes longer than its model can save
+                break
         return choices
 
     def _models_on_the_best_mesh(self, budget: float) -> list[ReducedPoint]:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.precision.settings import Refine, Setting
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 
 QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati", "loop")
 CONTROL = ("riccati", "reduced_riccati", "loop")  # of these, the ones about feedback
@@ -81,7 +81,7 @@ class WorkPoint:
         values = {
             f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None or f.default is MISSING
         }
-        return {"question": self.question, **{name: plain(value) for name, value in values.items()}}
+        return {"question": self.question, **{name: to_json(value) for name, value in values.items()}}
 
 
 @dataclass(frozen=True, kw_only=True)

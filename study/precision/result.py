@@ -11,7 +11,7 @@ from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
 from softgrasp.study.precision.series import Series, TimedRun
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 
 ADVICE = {
     "space": "a finer mesh than the time allows here",
@@ -262,7 +262,7 @@ class WorkStudy:
             for name, q in self.questions.items()
             if isinstance(q.reference, RiccatiReference | ReducedReference | LoopReference)
         }
-        result: dict[str, Any] = plain(
+        result: dict[str, Any] = to_json(
             {
                 "repeats": self.scene.study.repeats,
                 "reference": None if self.truth is None else self.truth.to_dict(),
