@@ -79,7 +79,7 @@ def test_what_docstrings_refer_to_exists() -> None:
         inside = (path.parent if path.name == "__init__.py" else path.with_suffix("")).relative_to(INSIDE).parts
         text = path.read_text()
         lost += [name for part in name.split(".")[1 + len(inside) :] if not re.search(rf"\b{part}\b", text)]
-    assert lost == []
+    assert lost == [], "write :mod:`softgrasp.fem.model.build`, with the whole path"
 
 
 @pytest.mark.serial
