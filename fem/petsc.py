@@ -18,8 +18,9 @@ from softgrasp.fem import _stack as _stack
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
+FEW_ROWS = 500  # up to which SciPy's product is the faster one for any storage
 MANY_COLUMNS = 8  # below, setting up a product of matrices costs more than it saves
-BLOCK_ENTRIES = 32_768  # about so many of a block of columns
+BLOCK_ENTRIES = 32_768  # about so many of a block of columns: room that the C library need not ask the system for
 
 
 @contextmanager
@@ -94,39 +95,54 @@ def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
 
 
 def times_columns(A: PETSc.Mat, X: Array) -> Array:
-    """Return the local rows of A X for dense columns, shape (n_local, k), Fortran order. Collective."""
-    fewest = np.diff(A.getOwnershipRanges()).min()  # rows of a rank; PETSc's product crashes on one without any
-    if X.shape[1] >= MANY_COLUMNS and fewest > 0 and A.getType() != PETSc.Mat.Type.PYTHON:
-        return _times_dense(A, X)
+    """A X for local rows of dense columns, (n_local, k), in the storage of the faster way. Collective.
+
+    On one rank X stored by rows goes by SciPy's product, for which the matrix keeps a copy, and X stored by columns by
+    PETSc's in blocks; on more ranks all columns go at once, since every block costs messages. One column, and a rank
+    without rows, on which PETSc's product crashes, go by the product with vectors. CPU ms of SciPy's and PETSc's way
+    at n = 14638 with 10, 30, 120 columns: 0.7, 1.7, 7 and 0.8, 3.6, 12 for X stored by rows; 0.8, 2.4, 13 and 0.7, 2.2,
+    8 for X stored by columns.
+    """
+    (rows, n), k = A.getSizes()[0], X.shape[1]
+    serial, entries = A.comm.size == 1, A.getType() != PETSc.Mat.Type.PYTHON
+    if serial and entries and k > 1 and (rows <= FEW_ROWS or not X.flags.f_contiguous):
+        return np.asarray(_kept_rows(A) @ X)
+    result = np.empty((rows, k), order="F")
+    blocks = entries and k >= MANY_COLUMNS and np.diff(A.getOwnershipRanges()).min() > 0
+    multiply = _by_blocks if blocks else _by_vectors
+    multiply(A, X, result, max(MANY_COLUMNS, BLOCK_ENTRIES // max(n, 1)) if serial else k)
+    return result
+
+
+def _kept_rows(A: PETSc.Mat) -> Any:
+    """A matrix of one rank as SciPy's CSR, kept with it until its entries change."""
+    kept: Any = A.getAttr("rows")
+    if kept is None or kept[0] != A.stateGet():
+        kept = (A.stateGet(), to_scipy(A))
+        A.setAttr("rows", kept)
+    return kept[1]
+
+
+def _by_vectors(A: PETSc.Mat, X: Array, result: Array, _: int) -> None:
+    """A X column by column. Collective."""
     x, y = A.createVecs()
-    result = np.empty((y.getLocalSize(), X.shape[1]), order="F")
     for j in range(X.shape[1]):
         x.array_w[:] = X[:, j]
         A.mult(x, y)
         result[:, j] = y.array_r
     x.destroy()
     y.destroy()
-    return result
 
 
-def _times_dense(A: PETSc.Mat, X: Array) -> Array:
-    """The same by PETSc's product with a dense matrix, which reads A once for several columns. Collective.
-
-    On one rank in blocks that the C library need not ask the system for: half the time of all columns at once (n = 3718
-    and 14638, 30 to 120 columns), and as fast as SciPy's product. On more ranks every block costs messages.
-    """
-    (rows, n), k = A.getSizes()[0], X.shape[1]
-    width = max(MANY_COLUMNS, BLOCK_ENTRIES // max(n, 1)) if A.comm.size == 1 else k
-    result = np.empty((rows, k), order="F")
-    for first in range(0, k, width):
+def _by_blocks(A: PETSc.Mat, X: Array, result: Array, width: int) -> None:
+    """A X by PETSc's product with a dense matrix, which reads A once for several columns. Collective."""
+    for first in range(0, X.shape[1], width):
         part = np.asfortranarray(X[:, first : first + width])
-        sizes = (A.getSizes()[1], (None, part.shape[1]))
-        dense = PETSc.Mat().createDense(sizes, array=part, comm=A.comm)
+        dense = PETSc.Mat().createDense((A.getSizes()[1], (None, part.shape[1])), array=part, comm=A.comm)
         product = A.matMult(dense)
         result[:, first : first + width] = product.getDenseArray(readonly=True)
         product.destroy()
         dense.destroy()
-    return result
 
 
 def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:

@@ -10,11 +10,15 @@ K_ee T + K_es = 0, and the only coupling is the inertia G = M_es + M_ee T:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
+
+if TYPE_CHECKING:  # only scenes with finite strain load it
+    from softgrasp.fem.strain.points import Points
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,7 @@ class BlockSystem:
         gravity: acceleration of free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None.
         hand_weight: gravity acts on the hand's own mass too.
         two_way: the hand feels the tissue.
+        points: where finite strain evaluates its law; None while the effect is off, and K_ee z is the whole force.
     """
 
     layout: BlockLayout
@@ -105,6 +110,7 @@ class BlockSystem:
     gravity: Array | None = None
     hand_weight: bool = False
     two_way: bool = False
+    points: Points | None = None
 
     @property
     def M_es(self) -> Array:

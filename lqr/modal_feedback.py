@@ -24,7 +24,7 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
 
     One-way coupling and a modal filter leave the other modes where they are: with damping they decay by themselves,
     without damping they stay on the imaginary axis, driven but not destabilised. With two-way coupling the hand feels
-    them, so that the whole loop must be checked with :class:`lqr.spectrum.modal_loop.ModalLoop`. Collective.
+    them, so that the whole loop must be checked with :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`. Collective.
 
     Args:
         problem: the plant.

@@ -143,7 +143,7 @@ class SmallModel:
 
     @property
     def stable(self) -> bool:
-        """No eigenvalue right of the axis beyond the tolerance, :data:`reduction.spectrum.GROWTH_TOLERANCE`.
+        """No eigenvalue right of the axis beyond the tolerance, :data:`softgrasp.reduction.spectrum.GROWTH_TOLERANCE`.
 
         The double zero of the free hand (it drifts at constant velocity) does not count.
         """
@@ -193,7 +193,7 @@ class ReducedModel:
         parts: small matrices, the same bits on every rank.
         materials: those of the projection.
         outputs: of the scene.
-        split: columns of every part of the basis, see :class:`reduction.basis.Basis`.
+        split: columns of every part of the basis, see :class:`softgrasp.reduction.basis.Basis`.
         alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
         damped: damping terms were projected.
         hand_weight, two_way: effects of the scene.

@@ -18,7 +18,7 @@ from softgrasp.reduction.model import Lift, Outputs, ReducedModel
 
 
 class OutputLike(Protocol):
-    """What an output needs to be projected; :class:`fem.model.outputs.Output` has it."""
+    """What an output needs to be projected; :class:`softgrasp.fem.model.outputs.Output` has it."""
 
     @property
     def names(self) -> tuple[str, ...]:

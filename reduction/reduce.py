@@ -35,12 +35,13 @@ def reduce(
     (14, (10,), True)
 
     Args:
-        model: scene; the reduced model is affine in its materials, see :meth:`reduction.model.ReducedModel.at`.
+        model: scene; the reduced model is affine in its materials, see
+            :meth:`softgrasp.reduction.model.ReducedModel.at`.
         run: a run of it with the snapshots in memory.
-        method: key of :data:`reduction.registry.METHODS`; "psd_fixed" is the paper's PSD with fixed solid modes
-            [SBRH21].
+        method: key of :data:`softgrasp.reduction.registry.METHODS`; "psd_fixed" is the paper's PSD with fixed solid
+            modes [SBRH21].
         N: columns of V, the hand's included; or a rule; None keeps 99.9 % of the energy, as the paper does.
-        inner, engine: see :func:`reduction.registry.make_basis`.
+        inner, engine: see :func:`softgrasp.reduction.registry.make_basis`.
 
     Raises:
         SceneError: the run kept no snapshots, or the body is at rest in all of them.
@@ -53,7 +54,7 @@ def reduce(
 
 
 def project_scene(basis: Basis, model: Model) -> ReducedModel:
-    """Projection of a scene with its outputs, see :func:`reduction.projection.project`. Collective.
+    """Projection of a scene with its outputs, see :func:`softgrasp.reduction.projection.project`. Collective.
 
     Raises:
         SolverError: the mass matrix cannot be factored.

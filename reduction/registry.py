@@ -29,7 +29,7 @@ class Method:
         paper: what the paper calls it, None for those beyond it.
         preserving: the reduced model keeps the Hamiltonian or the second-order structure.
         build: makes the parts from the snapshots.
-        coordinates, frame, structure: of the basis, see :class:`reduction.basis.Basis`.
+        coordinates, frame, structure: of the basis, see :class:`softgrasp.reduction.basis.Basis`.
         fixed: the hand's unit columns are kept apart from the decomposition.
         pairs: units are pairs of columns, so N is even.
         snapshots: whether it needs any.

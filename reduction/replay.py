@@ -182,7 +182,7 @@ def comparison_of(rom: ReducedModel, full: FullRun) -> Comparison:
 
 
 def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[Propagator, dict[str, Any]]:
-    """Propagator, and keywords of :func:`reduction.online.run`, that repeat a full run. Collective.
+    """Propagator, and keywords of :func:`softgrasp.reduction.online.run`, that repeat a full run. Collective.
 
     Args:
         rom: reduced model.

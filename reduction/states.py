@@ -28,7 +28,7 @@ class BasisError(ReductionError):
 
 @dataclass(frozen=True)
 class Blocks:
-    """Snapshot columns in the rows of :class:`reduction.basis.Basis`.
+    """Snapshot columns in the rows of :class:`softgrasp.reduction.basis.Basis`.
 
     Attributes:
         s_q: hand displacement, (n_s, m), on every rank [m, rad].

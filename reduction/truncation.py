@@ -15,7 +15,7 @@ PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
 
 @dataclass(frozen=True)
 class Columns:
-    """Equally many basis columns in the row blocks of :class:`reduction.basis.Basis`."""
+    """Equally many basis columns in the row blocks of :class:`softgrasp.reduction.basis.Basis`."""
 
     s_q: Array
     s_p: Array

@@ -18,6 +18,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
 
+LIST_WIDTH = 200  # [letters]
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
@@ -116,6 +117,56 @@ def scenes() -> None:
 
 
 @app.command()
+def materials() -> None:
+    """List the materials that a scene can name, with the sources of their numbers."""
+    from softgrasp.study.runs.start import materials_table
+
+    console().print(materials_table().terminal(wrap=[4], width=console().width))
+
+
+@app.command()
+def new(
+    file: Annotated[Path, typer.Argument(help="scene file to write, e.g. my.toml")],
+    solid: Annotated[bool, typer.Option("--3d", help="a block in 3D instead of a strip in 2D")] = False,
+    mesh: Annotated[Path | None, typer.Option(help="mesh file of the body, in any format of meshio")] = None,
+) -> None:
+    """Write a scene to begin with, and the schema of its keys for editors."""
+    from softgrasp.study.runs.start import new_scene
+    from softgrasp.study.shell.session import list_files
+
+    if rank() == 0:
+        list_files(console(), new_scene(file, solid=solid, mesh=mesh))
+        console().print(f"next: softgrasp explain {file}; softgrasp simulate {file}", soft_wrap=True)
+
+
+@app.command("list")
+def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs lie below")] = Path("out")) -> None:
+    """List the runs below a folder, the newest last."""
+    from softgrasp.study.runs.listing import runs_below
+
+    if rank() == 0:
+        wide = console()
+        wide.width = max(wide.width, LIST_WIDTH)  # a narrower terminal breaks the lines, but loses nothing
+        wide.print(runs_below(folder).terminal())
+
+
+@app.command()
+def compare(
+    a: Annotated[Path, typer.Argument(help="folder of a run")],
+    b: Annotated[Path, typer.Argument(help="folder of another run")],
+    out: Out = None,
+    no_pictures: NoPictures = False,
+    empty: Empty = False,
+) -> None:
+    """Show in which keys, numbers and trajectories two runs differ."""
+    from softgrasp.study.runs.listing import run_compare
+
+    if rank() == 0:
+        folder = out or default_folder("compare", Path(f"{a.name}-{b.name}"))
+        run_compare(a, b, folder, console(), pictures=not no_pictures, empty=empty)
+
+
+@app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
     from softgrasp.study.shell.schema import full_schema
@@ -172,8 +223,45 @@ def simulate(
 
 
 @app.command()
+def sweep(
+    scene: SceneFile,
+    axes: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="KEY=FIRST:LAST:COUNT...",
+            help="values of a key: 100:500:9, 1e2:1e4:5:log or 20,50,500; one or two keys",
+        ),
+    ],
+    out: Out = None,
+    set_: Overrides = None,
+    reduced: Annotated[
+        int | None, typer.Option(help="run a reduced model with this many columns instead of the full one", min=1)
+    ] = None,
+    ranks_each: Annotated[int, typer.Option(help="ranks of one point under `mpiexec -n N`", min=1)] = 1,
+    quiet: Quiet = False,
+    no_pictures: NoPictures = False,
+    empty: Empty = False,
+) -> None:
+    """Simulate a scene at many values of its keys; resumes; `mpiexec -n N` runs N points at a time."""
+    from softgrasp.study.runs.run import run_sweep
+
+    run_sweep(
+        scene,
+        axes,
+        out or default_folder("sweep", scene),
+        set_ or [],
+        console(),
+        reduced=reduced,
+        each=ranks_each,
+        quiet=quiet,
+        pictures=not no_pictures,
+        empty=empty,
+    )
+
+
+@app.command()
 def view(
-    folder: Annotated[Path, typer.Argument(help="output folder of simulate or control")] = Path("out"),
+    folder: Annotated[Path, typer.Argument(help="output folder of simulate or control")],
     field: Annotated[str, typer.Option(help="colour: von_mises, displacement, velocity, stress, strain, layer")] = (
         "von_mises"
     ),

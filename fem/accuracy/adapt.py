@@ -13,8 +13,8 @@ from softgrasp.fem.accuracy.estimate import estimate, next_order, reduced
 from softgrasp.fem.accuracy.marking import marked_cells
 from softgrasp.fem.accuracy.small import run_small
 from softgrasp.fem.errors import SceneError, agree
-from softgrasp.fem.mesh.bisect import Whole, bisect, distribute
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.mesh.bisect import bisect, distribute
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.mesh_estimate import MeshEstimate
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
@@ -37,7 +37,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
 
     Raises:
         SceneError: the time step leaves more than the tolerance, or the scene cannot be built.
-        MeshError, SolverError: see :func:`fem.model.build.build`.
+        MeshError, SolverError: see :func:`softgrasp.fem.model.build.build`.
     """
     begin = time.perf_counter()
     model, refine = build(scene, comm=comm), scene.tissue.refine

@@ -2,9 +2,9 @@
 
     delta y(t) = y'(t) - y_h(t)
 
-is the difference of two small models (:mod:`fem.accuracy.small`) under the scene's own motion, start, damping and
-coupling: one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh where the
-mesh has no grading of its own. Both share the time step, whose error cancels.
+is the difference of two small models (:mod:`softgrasp.fem.accuracy.small`) under the scene's own motion, start,
+damping and coupling: one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh
+where the mesh has no grading of its own. Both share the time step, whose error cancels.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ the rank of their parent. On rank 0 the mesh is the same for every rank count an
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import basix.ufl
 import dolfinx.io
@@ -22,55 +22,13 @@ from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh.check import FLAT, counted, longest_edges, place_text, signed_volumes
 from softgrasp.fem.mesh.parts import Parts, find_parts
 from softgrasp.fem.mesh.seams import sort_facets
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Ints = npt.NDArray[np.int32]
 
 MOST_LEVELS = 60  # each halves the longest edge at most; 2^-30 of a body is below any useful cell
-
-
-@dataclass(frozen=True)
-class Whole:
-    """A simplex mesh on one rank with what its cells and facets carry.
-
-    Attributes:
-        mesh: on MPI.COMM_SELF.
-        source: its name, for messages.
-        cells: marks by name, one a cell: "tags", "layers".
-        facets: marks by name: "tags", "contact".
-        facet_sets, cell_sets: see :class:`TissueMesh`.
-    """
-
-    mesh: dolfinx.mesh.Mesh
-    source: str
-    cells: dict[str, Ints]
-    facets: dict[str, dolfinx.mesh.MeshTags]
-    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
-    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
-
-    @property
-    def dimension(self) -> int:
-        """2 or 3."""
-        return int(self.mesh.topology.dim)
-
-    @property
-    def points(self) -> Floats:
-        """Coordinates, (n_points, d) [m]."""
-        return np.asarray(self.mesh.geometry.x[:, : self.dimension])
-
-    @property
-    def simplices(self) -> Integers:
-        """Nodes of the cells, (n_cells, d + 1)."""
-        return np.asarray(cell_nodes(self.mesh), dtype=np.int64)
-
-    def facet_nodes(self, name: str) -> Integers:
-        """Nodes of the marked facets, (n, d)."""
-        indices = self.facets[name].indices
-        self.mesh.topology.create_connectivity(self.dimension - 1, self.dimension)
-        nodes = dolfinx.mesh.entities_to_geometry(self.mesh, self.dimension - 1, indices)
-        return np.asarray(nodes, dtype=np.int64)
 
 
 def bisect(whole: Whole, marked: Ints) -> Whole:

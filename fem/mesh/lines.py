@@ -87,7 +87,7 @@ def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: fl
         comm: communicator.
         scene: with a structured box.
         cells: along each side.
-        mu: grading, see :func:`fem.mesh.grading.graded_line`.
+        mu: grading, see :func:`softgrasp.fem.mesh.grading.graded_line`.
         radius: R [m].
     """
     axes, tissue = box_axes(scene), scene.tissue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import dolfinx.mesh
 import numpy as np
@@ -11,8 +10,47 @@ import numpy.typing as npt
 
 from softgrasp.fem.mesh.parts import Parts
 
-if TYPE_CHECKING:
-    from softgrasp.fem.mesh.bisect import Whole
+
+@dataclass(frozen=True)
+class Whole:
+    """A simplex mesh on one rank with what its cells and facets carry.
+
+    Attributes:
+        mesh: on MPI.COMM_SELF.
+        source: its name, for messages.
+        cells: marks by name, one a cell: "tags", "layers".
+        facets: marks by name: "tags", "contact".
+        facet_sets, cell_sets: see :class:`TissueMesh`.
+    """
+
+    mesh: dolfinx.mesh.Mesh
+    source: str
+    cells: dict[str, npt.NDArray[np.int32]]
+    facets: dict[str, dolfinx.mesh.MeshTags]
+    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return int(self.mesh.topology.dim)
+
+    @property
+    def points(self) -> npt.NDArray[np.float64]:
+        """Coordinates, (n_points, d) [m]."""
+        return np.asarray(self.mesh.geometry.x[:, : self.dimension])
+
+    @property
+    def simplices(self) -> npt.NDArray[np.int64]:
+        """Nodes of the cells, (n_cells, d + 1)."""
+        return np.asarray(cell_nodes(self.mesh), dtype=np.int64)
+
+    def facet_nodes(self, name: str) -> npt.NDArray[np.int64]:
+        """Nodes of the marked facets, (n, d)."""
+        indices = self.facets[name].indices
+        self.mesh.topology.create_connectivity(self.dimension - 1, self.dimension)
+        nodes = dolfinx.mesh.entities_to_geometry(self.mesh, self.dimension - 1, indices)
+        return np.asarray(nodes, dtype=np.int64)
 
 
 @dataclass(frozen=True)

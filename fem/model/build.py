@@ -33,6 +33,7 @@ from softgrasp.fem.system import (
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.mesh_estimate import MeshEstimate
+    from softgrasp.fem.strain.points import Points
 
 
 @dataclass
@@ -119,6 +120,16 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
+def _points(space: Discretisation, scene: Scene, inventory: Inventory) -> Points | None:
+    effect = scene.effects.finite_strain
+    if effect is None:
+        return None
+    from softgrasp.fem.model.points import make_points  # only scenes with finite strain pay for it
+
+    inventory.operators.append("B")
+    return make_points(space, scene, effect)
+
+
 def _scene_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
     if scene.tissue.refine is None:
         return make_mesh(comm, scene)
@@ -193,5 +204,6 @@ def build(
             gravity=acceleration(scene, layout.n_s),
             hand_weight=bool(scene.effects.gravity is not None and scene.effects.gravity.hand_weight),
             two_way=scene.effects.reaction,
+            points=_points(space, scene, inventory),
         )
     return Model(scene, space, system, inventory, watch)

@@ -22,7 +22,7 @@ from functools import partial
 
 import numpy as np
 
-from softgrasp.fem.errors import SolverError
+from softgrasp.fem.errors import SceneError, SolverError
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.solve.held import held_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
@@ -73,7 +73,7 @@ class TissueMidpoint:
         dt: step [s].
         solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
-        reproducible: see :func:`fem.solve.solvers.factor_on_every_rank`.
+        reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Attributes:
         held: operators on the rows held.
@@ -93,6 +93,8 @@ class TissueMidpoint:
         rtol: float = 1e-10,
         reproducible: Reproducible = "auto",
     ) -> None:
+        if system.points is not None:
+            raise SceneError("effects.finite_strain cannot be run yet; set it to false")
         self.system, self.dt, self.s = system, dt, 2 / dt
         whole, ordered = factor_on_every_rank(system.layout, solver, reproducible), solver == "cholesky"
         self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered)

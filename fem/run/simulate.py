@@ -308,7 +308,7 @@ def simulate(model: Model, options: RunOptions | None = None, force: Force | Non
         (K + s D + s^2 M) w = h_mid - K z_n + s M v_n,    z_{n+1} = z_n + 2 w,    v_{n+1} = 2 s w - v_n.
 
     Args:
-        model: from :func:`fem.model.build.build`.
+        model: from :func:`softgrasp.fem.model.build.build`.
         options: files, resume and observers.
         force: instead of the scene's motion, called as force(n, t_mid, q_s, v_s) for the force on the hand in step n,
             (n_s,) [N, N m]; q_s and v_s are the hand at the start of the step.

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from softgrasp.fem.scene.tissue import Box, Label, Model, Positive, check_box
+from softgrasp.fem.scene.tissue import Box, Label, Positive, Section, check_box
 
 Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 
@@ -28,10 +28,10 @@ BASES = (
     ),
     "craig_bampton",
 )
-"""Names of :mod:`reduction.registry`, here because scenes are read without what builds bases."""
+"""Names of :mod:`softgrasp.reduction.registry`, here because scenes are read without what builds bases."""
 
 
-class Reduction(Model):
+class Reduction(Section):
     """Which reduced models `softgrasp reduce` builds and compares."""
 
     methods: list[str] = Field(
@@ -78,7 +78,7 @@ class Reduction(Model):
         return self
 
 
-class Study(Model):
+class Study(Section):
     """How `softgrasp study`, `effects` and `hardcases` judge."""
 
     tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
@@ -87,7 +87,7 @@ class Study(Model):
     repeats: Annotated[int, Field(ge=1)] = Field(5, description="repeats behind each median time [1]")
 
 
-class Loop(Model):
+class Loop(Section):
     """How the feedback runs in the closed loop."""
 
     sampling: Literal["midpoint", "held"] = Field(
@@ -101,7 +101,7 @@ class Loop(Model):
     delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
 
 
-class ControlOutput(Model):
+class ControlOutput(Section):
     """One vector-valued output of the control problem."""
 
     kind: Literal["node", "region", "hand"] = Field(description="a node, the mean of a region, or the hand [no unit]")
@@ -140,7 +140,7 @@ def _check_weight(key: str, weight: Weight, definite: bool) -> None:
         raise ValueError(f"{key} is {weight}; it must be {word}")
 
 
-class Control(Model):
+class Control(Section):
     """Quadratic cost: integral of y' Q y + u' R u."""
 
     outputs: Annotated[list[ControlOutput], Field(min_length=1)] = Field(

@@ -218,7 +218,7 @@ def _locate(loc: tuple[int | str, ...], data: Any) -> tuple[list[str], Any]:
 
 
 def _model(annotation: Any) -> type[BaseModel] | None:
-    """The model inside an annotation such as `list[Model]` or `Model | None`."""
+    """The model inside an annotation such as `list[Section]` or `Section | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((model for part in get_args(annotation) if (model := _model(part))), None)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 
 from softgrasp.fem.scene.control import Control, ControlOutput, Loop, Reduction, Study
-from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, Model, NonNegative, Positive, Tissue
+from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
 
 __all__ = [
     "Contact", "Control", "ControlOutput", "Damping", "Effects", "Gravity", "Hand", "Layer", "Loop", "Material",
@@ -23,7 +23,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-class Hand(Model):
+class Hand(Section):
     """The rigid hand."""
 
     mass: Positive = Field(20.0, description="mass [kg], > 0")
@@ -34,14 +34,14 @@ class Hand(Model):
     reference: list[float] | None = Field(None, description="reference point of the hand [m]; default: contact centre")
 
 
-class Gravity(Model):
+class Gravity(Section):
     """Body force rho g on the tissue."""
 
     g: list[float] = Field(description="acceleration of gravity, one entry per axis [m/s2]")
     hand_weight: bool = Field(False, description="whether the hand weighs too [no unit]")
 
 
-class Damping(Model):
+class Damping(Section):
     """C = beta K (Kelvin-Voigt) or C = alpha M + beta K (Rayleigh)."""
 
     kind: Literal["kelvin-voigt", "rayleigh"] = Field(description="damping law [no unit]")
@@ -58,16 +58,30 @@ class Damping(Model):
         return self
 
 
-class Effects(Model):
+class FiniteStrain(Section):
+    """A hyperelastic law instead of linear elasticity."""
+
+    law: Literal["neo-hooke", "neo-hooke-quadratic", "stvk"] = Field(
+        "neo-hooke",
+        description="energy of the material [no unit]: neo-Hooke with (ln J)^2 or (J - 1)^2 for the volume, or "
+        "St. Venant-Kirchhoff, which is refused where it folds",
+    )
+    tol: Annotated[float, Field(ge=1e-13, le=1e-3)] = Field(1e-9, description="relative tolerance of each step [1]")
+
+
+class Effects(Section):
     """Everything is off unless named."""
 
     gravity: Dropped[Gravity] = Field(None, description="gravity {g [m/s2], hand_weight}; off unless given")
     damping: Dropped[Damping] = Field(None, description="damping {kind, beta [s], alpha [1/s], drag}; off unless given")
     reaction: bool = Field(False, description="the tissue pushes back on the hand [no unit]")
     rotation: bool = Field(False, description="the hand also turns, by small angles [no unit]")
+    finite_strain: Dropped[FiniteStrain] = Field(
+        None, description="large deformation, finite strain {law, tol [1]}; off unless given"
+    )
 
 
-class Motion(Model):
+class Motion(Section):
     """What the hand does."""
 
     target: Dropped[list[float]] = Field(
@@ -95,7 +109,7 @@ class Motion(Model):
         return self
 
 
-class Time(Model):
+class Time(Section):
     """Time grid and linear solver."""
 
     steps: Annotated[int, Field(ge=1)] = Field(description="number of equal time steps [1], >= 1")
@@ -112,7 +126,7 @@ class Time(Model):
     )
 
 
-class Output(Model):
+class Output(Section):
     """What is kept of a run."""
 
     snapshots: Literal["memory", "hdf5", "none"] = Field("memory", description="where snapshots go [no unit]")
@@ -129,7 +143,7 @@ class Output(Model):
     )
 
 
-class Scene(Model):
+class Scene(Section):
     """A whole scene; relative file names count from `directory`.
 
     >>> import softgrasp as sg
@@ -176,6 +190,11 @@ class Scene(Model):
         effects = self.effects
         if effects.rotation and self.hand.inertia is None:
             raise ValueError("hand.inertia is missing; effects.rotation needs it")
+        if effects.rotation and effects.finite_strain is not None:
+            raise ValueError(
+                "effects.finite_strain cannot go with effects.rotation, whose linearised turns would stretch the "
+                "tissue; set one of them to false"
+            )
         if self.time.start == "equilibrium" and effects.gravity is None:
             raise ValueError("time.start is 'equilibrium' but effects.gravity is off; use 'rest' or give gravity")
         if self.contact.facet_tag is not None and self.tissue.mesh is None:

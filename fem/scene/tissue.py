@@ -19,7 +19,7 @@ ROUNDING = 1e-9  # static solves on graded meshes lose up to seven of sixteen di
 Side = Literal["x-", "x+", "y-", "y+", "z-", "z+", "left", "right", "bottom", "top", "front", "back"]
 
 
-class Model(BaseModel):
+class Section(BaseModel):
     """Frozen, strict, without unknown keys or non-finite numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -54,7 +54,7 @@ def check_box(box: list[list[float]] | None, key: str) -> None:
         raise ValueError(f"{key} is {box}; its first corner must not exceed its second")
 
 
-class Material(Model):
+class Material(Section):
     """Isotropic linear elastic material, resolved to Lame constants and density."""
 
     name: Label | None = Field(None, description="name in the material library, or a label [no unit]")
@@ -129,7 +129,7 @@ class Material(Model):
         return materials.young_poisson(self.lam, self.mu)[1]
 
 
-class Layer(Model):
+class Layer(Section):
     """A part of the tissue with a material of its own."""
 
     tag: int | str | None = Field(
@@ -147,7 +147,7 @@ class Layer(Model):
         return self
 
 
-class Refine(Model):
+class Refine(Section):
     """Cells that shrink towards the singular ends of contact zone, layers and boundary."""
 
     tolerance: Annotated[float, Field(gt=0, lt=1)] | None = Field(
@@ -182,7 +182,7 @@ class Refine(Model):
         return self
 
 
-class Tissue(Model):
+class Tissue(Section):
     """Geometry, material and element order of the tissue."""
 
     size: Dropped[Annotated[list[Positive], Field(min_length=2, max_length=3)]] = Field(
@@ -240,7 +240,7 @@ class Tissue(Model):
         return self
 
 
-class Contact(Model):
+class Contact(Section):
     """Boundary facets that the hand holds: midpoint on one of the sides and in the box, if given."""
 
     sides: list[Side] = Field(

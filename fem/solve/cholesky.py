@@ -2,9 +2,9 @@
 
 PETSc's solves with blocks take less time than those with single entries (``python -m softgrasp.study.bench forward``
 prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc takes such a matrix in the order in
-which it comes, so the rows are put in order first (:mod:`fem.solve.order`); and it multiplies by inverses of the blocks
-on the diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured, and a factor
-of single entries is made where blocks would lose digits.
+which it comes, so the rows are put in order first (:mod:`softgrasp.fem.solve.order`); and it multiplies by inverses of
+the blocks on the diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured,
+and a factor of single entries is made where blocks would lose digits.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class TissueSolver:
         S: the matrix.
         tolerance: relative residual that :meth:`check` accepts.
         factor: what solves without a detour through ``ksp``: with cholesky the factor that every rank has whole, in an
-            order of its own (:mod:`fem.solve.cholesky`); with mumps that of one rank; else None.
+            order of its own (:mod:`softgrasp.fem.solve.cholesky`); with mumps that of one rank; else None.
     """
 
     name: SolverName

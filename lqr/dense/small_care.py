@@ -36,8 +36,8 @@ def solve_reduced(matrices: ReducedMatrices) -> Array:
     """P_N of E'PA + A'PE - E'PB R^{-1} B'PE + C'QC = 0, (N, N).
 
     The Hamiltonian matrix, scaled by one number so that its off-diagonal blocks have like size, is brought to ordered
-    real Schur form. When the residual shows that this is not good enough, :func:`lqr.dense.care.care` balances,
-    polishes and explains.
+    real Schur form. When the residual shows that this is not good enough, :func:`softgrasp.lqr.dense.care.care`
+    balances, polishes and explains.
 
     Raises:
         ControlError: there is no stabilising solution.

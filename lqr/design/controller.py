@@ -48,7 +48,7 @@ def make_controller(design: Design, order: int | None = None) -> Controller:
     Args:
         design: the optimal feedback of a scene.
         order: N of the reduced Riccati equation, the 2 n_s states of the hand included; None tries those of the scene
-            up to :func:`lqr.design.orders.fast_order`.
+            up to :func:`softgrasp.lqr.design.orders.fast_order`.
 
     Raises:
         ControlError: no such order, or no gain that is certified to stabilise the plant.
@@ -74,7 +74,7 @@ def certified_controller(design: Design, basis: BasisGains | None, order: int | 
     Args:
         design: the optimal feedback.
         basis: the a-priori gains; None where there are none.
-        order: take this one; None takes the least cost up to :func:`lqr.design.orders.fast_order`.
+        order: take this one; None takes the least cost up to :func:`softgrasp.lqr.design.orders.fast_order`.
 
     Raises:
         NoController: no gain is certified.

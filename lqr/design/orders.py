@@ -27,7 +27,7 @@ class BasisGains:
     """One basis over its orders.
 
     Attributes:
-        name: key of :data:`lqr.reduced.bases.BASES`.
+        name: key of :data:`softgrasp.lqr.reduced.bases.BASES`.
         family: its bases; None when the basis is refused.
         reports: one an order.
         refused: why there are none.
@@ -72,7 +72,7 @@ def reduce_gains(
         design: the optimal feedback.
         orders: of the reduced equations; those that a basis has not are left out.
         notify: called with the number of equations done and in all.
-        names: keys of :data:`lqr.reduced.bases.BASES`.
+        names: keys of :data:`softgrasp.lqr.reduced.bases.BASES`.
     """
     families: dict[str, BasisFamily | str] = {}
     for name in names:

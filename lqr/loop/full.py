@@ -104,7 +104,7 @@ class ClosedLoop:
         dt: time step [s].
         solver: cholesky, mumps, cg or auto.
         rtol: tolerance of cg.
-        reproducible: see :func:`fem.solve.solvers.factor_on_every_rank`.
+        reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 
     Raises:
         ControlError: dt is not a positive number.
@@ -153,7 +153,7 @@ class ClosedLoop:
         Args:
             gain: u = u_bar + K (x - x_bar).
             target: where the loop goes, or the displacement of the hand there, see
-                :func:`lqr.plant.target.hand_target`.
+                :func:`softgrasp.lqr.plant.target.hand_target`.
             steps: number of steps.
             actuation: sampling, delay, limits; default none of them.
             start: x(0); default at rest with the hand at 0, in equilibrium under gravity.

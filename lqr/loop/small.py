@@ -16,7 +16,7 @@ from softgrasp.lqr.plant.checks import ControlError
 
 
 @dataclass(frozen=True)
-class ReducedTrajectory:
+class ReducedLoopTrajectory:
     """What a reduced run returns.
 
     Attributes:
@@ -78,7 +78,7 @@ class ReducedLoop:
         weights: tuple[Array, Array],
         actuation: Actuation | None = None,
         start: Array | None = None,
-    ) -> ReducedTrajectory:
+    ) -> ReducedLoopTrajectory:
         """Run for some steps.
 
         Args:
@@ -120,7 +120,7 @@ class ReducedLoop:
         outputs = states @ plant.C.T
         saturated = 0.0 if bound is None else float((np.abs(inputs) >= bound).any(axis=1).mean())
         cost = accumulated_cost(outputs - plant.C @ x_bar, inputs - u_bar, *weights, self.dt)
-        return ReducedTrajectory(
+        return ReducedLoopTrajectory(
             times=np.asarray(self.dt * np.arange(steps + 1), dtype=np.float64),
             states=states,
             q_s=states @ plant.S_q.T,

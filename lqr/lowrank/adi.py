@@ -66,7 +66,7 @@ class Columns:
         return Block(self.hand[:, : self.count], self.tall[:, : self.count])
 
     def recent(self) -> Block:
-        """Columns of the last :data:`lqr.lowrank.shifts.WINDOW` blocks (views)."""
+        """Columns of the last :data:`softgrasp.lqr.lowrank.shifts.WINDOW` blocks (views)."""
         first = self.count - min(sum(self.widths[-WINDOW:]), self.count)
         return Block(self.hand[:, first : self.count], self.tall[:, first : self.count])
 

@@ -184,7 +184,7 @@ class StructuredGalerkin:
         max_iterations: bound on the number of spaces.
         modes: number of modes.
         per_step: responses added at a time.
-        tissue: gathered, distributed or auto, see :mod:`lqr.lowrank.shifted`.
+        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
         progress: called on every rank after each space with the history entry.
     """
 

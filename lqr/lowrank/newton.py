@@ -41,7 +41,7 @@ class NewtonADI:
         max_iterations: bound on the Newton steps.
         max_solves: bound on the solves of one sweep.
         modes: modes of the start; 0 starts from the hand alone, None chooses.
-        tissue: gathered, distributed or auto, see :mod:`lqr.lowrank.shifted`.
+        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
         progress: called on every rank after each solve with the history entry.
         checkpoint: folder for restart files, one a rank; an existing one is resumed.
         checkpoint_every: solves between two restart files.

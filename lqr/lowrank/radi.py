@@ -113,7 +113,7 @@ class RADI:
     Attributes:
         tol: bound on the true relative residual, 2-norm, hand-relative coordinates.
         max_iterations: bound on the solves.
-        tissue: gathered, distributed or auto, see :mod:`lqr.lowrank.shifted`.
+        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
         progress: called on every rank after each solve with the history entry.
     """
 

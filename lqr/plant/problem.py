@@ -26,7 +26,7 @@ class RiccatiProblem:
         D_es = alpha G, [D_ss = alpha M_rigid] when the damping acts in space, else 0.
 
     A second-order system without a hand, M_ee z'' + D_ee z' + K_ee z = B_z u, is the case n_s = 0, B = [0; B_z]; see
-    :func:`lqr.plant.second_order.second_order`.
+    :func:`softgrasp.lqr.plant.second_order.second_order`.
 
     Attributes:
         system: the operators; never a dense n x n array.

@@ -338,7 +338,7 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
     Args:
         name: key of :data:`BASES`.
         problem: the plant.
-        Z: factor of X in hand-relative coordinates, see :class:`lqr.plant.problem.RiccatiSolution`.
+        Z: factor of X in hand-relative coordinates, see :class:`softgrasp.lqr.plant.problem.RiccatiSolution`.
 
     Raises:
         ControlError: the name is unknown, or the method does not apply.

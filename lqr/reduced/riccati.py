@@ -53,7 +53,7 @@ class GainReport:
         abscissa_full: largest real part of the full closed loop [1/s].
         time_are: seconds of one solution of the reduced equation, for who measures it; else nan.
         reason: why there is no gain; empty when there is one.
-        certified: the sign of the abscissa is certain, see :class:`lqr.spectrum.modal_loop.LoopQuality`.
+        certified: the sign of the abscissa is certain, see :class:`softgrasp.lqr.spectrum.modal_loop.LoopQuality`.
         sampled: the loop from tick to tick, where its instants are known.
         gain: K_hat; None where there is none.
         cost_excess_at_most: proved bound on the excess, see :mod:`lqr.loop.gap`; nan where it was not asked for.
@@ -174,8 +174,8 @@ class GainJudge:
         """Abscissa, excess cost and sampled radius of any gain. Collective.
 
         Small plants take all modes. Large ones take the abscissa from
-        :func:`lqr.spectrum.certificate.certified_abscissa` and the cost from the lowest modes; where the certificate
-        fails, all modes are taken up to :data:`lqr.spectrum.modal_loop.DENSE_LIMIT`.
+        :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa` and the cost from the lowest modes; where
+        the certificate fails, all modes are taken up to :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
 
         Raises:
             SolverError: no eigenvalue converges, and there are too many modes to take all.

@@ -84,10 +84,11 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
 def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
     """Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it. Collective.
 
-    :class:`lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle |s - sigma| <= d
-    with d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely many eigenvalues
-    accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them outside. One solve
-    with sigma^2 M_ee + sigma D_ee + K_ee a step, factored once; the few inputs enter by Sherman-Morrison-Woodbury.
+    :class:`softgrasp.lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle
+    |s - sigma| <= d with d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely
+    many eigenvalues accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them
+    outside. One solve with sigma^2 M_ee + sigma D_ee + K_ee a step, factored once; the few inputs enter by
+    Sherman-Morrison-Woodbury.
 
     The Krylov space starts from a vector without symmetry, and only eigenvalues before the first one that has not
     converged count; the circle passes through a gap between two of them.

@@ -21,7 +21,7 @@ SOME_MODES = 150
 
 @dataclass(frozen=True)
 class SampledRadius:
-    """Spectral radius of a loop from tick to tick, see :mod:`lqr.spectrum.sampled`.
+    """Spectral radius of a loop from tick to tick, see :mod:`softgrasp.lqr.spectrum.sampled`.
 
     Attributes:
         value: largest modulus of an eigenvalue; of the modes kept where not ``exact``.
@@ -49,7 +49,7 @@ class LoopQuality:
         abscissa: largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``.
         cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
         certified: its sign is certain: from the whole spectrum, or from
-            :func:`lqr.spectrum.certificate.certified_abscissa`.
+            :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa`.
         exact: the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth.
         poles: eigenvalues behind it.
         sampled: from tick to tick, where the instants of the loop are known.
@@ -72,7 +72,7 @@ class ModalLoop:
     """xi' = (A + B K) xi, xi = [q_s, v_s, omega eta, eta'], all modes of a small scene or the lowest of a large one.
 
     With all modes the spectrum is that of the full plant. With some, the modes left out are not in it: use
-    :func:`lqr.spectrum.certificate.certified_abscissa` for large scenes.
+    :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa` for large scenes.
 
     Args:
         problem: the plant.

@@ -120,9 +120,10 @@ class SampledLoop:
         max over |z| = 1 of  |(I - L(z))^{-1}| |D(z)| < 1   (Rouche; D is analytic outside, its modes are damped).
 
     |(I - L)^{-1}| is evaluated on a grid that resolves every eigenvalue by its distance from the circle; |D| is
-    bounded mode by mode in the energy norm and summed by Cauchy-Schwarz as in :class:`lqr.spectrum.tail.Tail`. Where
-    this fails, all modes are taken, up to :data:`lqr.spectrum.modal_loop.DENSE_LIMIT`. Rounding, the mesh of the grids
-    and the residual of the modes are not bounded.
+    bounded mode by mode in the energy norm and summed by Cauchy-Schwarz as in
+    :class:`softgrasp.lqr.spectrum.tail.Tail`. Where this fails, all modes are taken, up to
+    :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`. Rounding, the mesh of the grids and the residual of the modes
+    are not bounded.
 
     Args:
         problem: a plant with a hand.

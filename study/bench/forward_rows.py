@@ -257,5 +257,5 @@ def _row(comm: MPI.Intracomm, model: Model, cells: list[int], seconds: dict[str,
 
 
 def measure_row(*, large: bool, **arguments: Any) -> dict[str, Any]:
-    """A row that :mod:`study.bench.forward` launches. Collective."""
+    """A row that :mod:`softgrasp.study.bench.forward` launches. Collective."""
     return (measure_large if large else measure)(MPI.COMM_WORLD, **arguments)

@@ -50,7 +50,7 @@ class MeshRow:
         time_offline: basis and projection.
         time_setup, time_online: of the reduced model.
         N: its dimension.
-        error, error_deformation: see :class:`study.reduce.result.Point`.
+        error, error_deformation: see :class:`softgrasp.study.reduce.result.Point`.
         stable: of the reduced model.
     """
 

@@ -197,5 +197,5 @@ def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
 
 
 def measure_row(**arguments: Any) -> dict[str, Any]:
-    """A row that :mod:`study.bench.riccati` launches. Collective."""
+    """A row that :mod:`softgrasp.study.bench.riccati` launches. Collective."""
     return (measure_peer if "peer" in arguments else measure)(**arguments)

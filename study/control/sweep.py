@@ -29,7 +29,7 @@ BOX_STATES = 30_000  # above, nine more full solutions would take minutes
 
 
 def sweep(design: Design, orders: Sequence[int], notify: Notify | None = None) -> tuple[BasisGains, ...]:
-    """All bases over their orders, see :func:`lqr.design.orders.reduce_gains`, with times. Collective."""
+    """All bases over their orders, see :func:`softgrasp.lqr.design.orders.reduce_gains`, with times. Collective."""
     bases = reduce_gains(design, orders, notify)
     return tuple(replace(b, reports=tuple(with_time(design.problem, r) for r in b.reports)) for b in bases)
 

@@ -29,7 +29,7 @@ def run_explain(
     """Explain a scene file, and write result.json and report.html if there is a folder for them. Collective.
 
     Raises:
-        SceneError, MeshError, SolverError: as :func:`study.forward.explain.explain`.
+        SceneError, MeshError, SolverError: as :func:`softgrasp.study.forward.explain.explain`.
     """
     session = Session("explain", path, overrides, out or Path(), console, empty=empty)
     scene = session.scene(writes=out is not None)

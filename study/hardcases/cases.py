@@ -174,7 +174,7 @@ def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Mod
     """Build a shipped scene with overrides of the form `section.key=value`. Collective.
 
     Raises:
-        SceneError, MeshError: as :func:`fem.model.build.build`.
+        SceneError, MeshError: as :func:`softgrasp.fem.model.build.build`.
     """
     return build(load_scene(shipped_scenes()[name], overrides), comm=comm)
 

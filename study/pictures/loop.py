@@ -108,7 +108,7 @@ def figure_histories(
 def still_to_come(outputs: Array, target: Array, columns: Columns = ()) -> Array:
     """Largest distance from each instant on: how well the outputs have settled, without the swings. Shape (m,).
 
-    Args and distance as in :func:`fem.columns.farthest`.
+    Args and distance as in :func:`softgrasp.fem.columns.farthest`.
     """
     distance = np.maximum(farthest(outputs, target, columns), FLOOR)
     return np.asarray(np.maximum.accumulate(distance[::-1])[::-1])
@@ -175,7 +175,7 @@ def figure_loop_move(
 ) -> tuple[Path, Path]:
     """The body at a few instants of the move to the target, at equal steps along the path of the hand; PNG and PDF.
 
-    Args and return value as in :func:`study.pictures.body.figure_move`, with as many states as there are.
+    Args and return value as in :func:`softgrasp.study.pictures.body.figure_move`, with as many states as there are.
     """
     chosen = pick_instants(picture, np.asarray(states, dtype=np.float64), times, table)
     return figure_move(picture, np.asarray(states)[chosen], np.asarray(times)[chosen], table, target, out_png)

@@ -12,6 +12,7 @@ from cycler import cycler
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe and Ito
 SKY = "#56B4E9"  # of the same palette
@@ -53,6 +54,16 @@ def colour_map() -> Any:
     """Light for small values, dark for large ones, so that the dark hand stands out against the held tissue."""
     colours = mpl.colormaps["viridis_r"]([0.02 + 0.9 * i / 255 for i in range(256)])
     return mpl.colors.ListedColormap(colours, name="softgrasp")
+
+
+def few_ticks(axis: Any) -> None:
+    """Numbers on a logarithmic axis that do not touch: powers of ten, and 2 and 5 between few of them."""
+    low, high = sorted(axis.get_view_interval())
+    few = high / low < 300
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
+    if few and low >= 1e-3 and high < 1e5:
+        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def save(figure: Any, out_png: Path) -> tuple[Path, Path]:

@@ -113,25 +113,27 @@ class Answers:
         """Run a setting that the diagram does not hold."""
         point = to_point(setting, self.runs.run(setting), self.truth)
         self.measured.append(point)
+        self.predictor.learn(point)
         return point
 
     def cheapest(self, tolerance: float) -> tuple[Prediction, ForwardPoint] | None:
-        """The cheapest full run within a tolerance, predicted and then measured; None when nothing meets it."""
-        held: list[tuple[Prediction, ForwardPoint]] = []
-        runs = 0
-        room = tolerance - self.truth.error
-        for prediction in sorted(self.predictor.candidates(), key=lambda p: (p.seconds, p.error)):
-            if held and prediction.seconds > min(point.seconds for _, point in held):
-                break
-            point = prediction.point
-            if point is None and prediction.error <= SAFETY * room and runs < TRIES:
-                if not self.predictor.affordable(prediction):
-                    continue
-                runs += 1
-                point = self.measure(prediction.setting)
-            if point is not None and self.meets(point, tolerance):
-                held.append((prediction, point))
-        return min(held, key=lambda pair: pair[1].seconds) if held else None
+        """The cheapest full run within a tolerance, predicted and then measured; None when nothing meets it.
+
+        Settings are run in the order of their predicted time, and predicted anew after each, until one meets it.
+        """
+        room = SAFETY * (tolerance - self.truth.error)
+        for runs in range(TRIES + 1):
+            predictions = sorted(self.predictor.candidates(), key=lambda p: (p.seconds, p.error))
+            held = [(p, p.point) for p in predictions if p.point is not None and self.meets(p.point, tolerance)]
+            best = min(held, key=lambda pair: pair[1].seconds, default=None)
+            untried = (p for p in predictions if p.point is None and p.error <= room and self.predictor.affordable(p))
+            first = next(untried, None)
+            if first is None or runs == TRIES or (best is not None and best[1].seconds <= first.seconds):
+                return best
+            point = self.measure(first.setting)
+            if self.meets(point, tolerance):
+                return first, point
+        return None
 
     def too_large(self, tolerance: float) -> Prediction | None:
         """The cheapest setting that is predicted to meet a tolerance but too large to be tried."""

@@ -143,27 +143,41 @@ class Predictor:
     def __init__(self, scene: Scene, points: Sequence[ForwardPoint]) -> None:
         self.scene = scene
         runs = [p for p in points if p.series != "solver"]
-        self.runs = {p.setting: p for p in runs}
+        self.runs: dict[Setting, ForwardPoint] = {}
         self.space: dict[Group, ForwardPoint] = {}  # the most steps on every mesh
-        for p in sorted(runs, key=lambda p: p.steps):
-            self.space[p.setting.group] = p
+        for p in runs:
+            self.learn(p)
         changing = over_steps(runs)
         # the mesh with the most steps tried tells about time, the finest of those
         name = max(changing, key=lambda n: (len(changing[n]), n), default="")
         most = max((p.steps for p in runs if p.series == name), default=1)
         self.time = {p.steps: (p.error_time or 0.0) / (1 - (p.steps / most) ** 2) for p in changing.get(name, ())}
 
+    def learn(self, point: ForwardPoint) -> None:
+        """Take in a measured point."""
+        self.runs[point.setting] = point
+        group = point.setting.group
+        if group not in self.space or self.space[group].steps <= point.steps:
+            self.space[group] = point
+
     def space_error(self, group: Group) -> float:
-        """Error of a mesh at its most steps; of others by the slope of their element order."""
-        if group in self.space:
-            return self.space[group].error
+        """Error of a mesh at its most steps; of others by the slope of their element order.
+
+        Where a mesh ran with few steps only, which is an error of time too, the lower of the two.
+        """
+        point = self.space.get(group)
+        if point is not None and point.steps >= self.scene.time.steps:
+            return point.error
         cells, order = group
         known = [(c, p) for (c, o), p in self.space.items() if o == order and c is not None and cells is not None]
         nested = set(nested_meshes(self.scene))
         known = [(c, p) for c, p in known if c in nested] or known
+        fine = [(c, p) for c, p in known if p.steps >= self.scene.time.steps]
+        known = fine if len(fine) > 1 else known
         if not known or cells is None:
-            return float("inf")
-        return interpolate(cells[0], [c[0] for c, _ in known], [p.error for _, p in known])
+            return float("inf") if point is None else point.error
+        error = interpolate(cells[0], [c[0] for c, _ in known], [p.error for _, p in known])
+        return error if point is None else min(error, point.error)
 
     def time_error(self, steps: int) -> float:
         """Error through the time step; order 2 beyond the steps tried."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import statistics
+import time
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from softgrasp.study.precision.settings import Setting, variant
 from softgrasp.study.shell.timing import medians
 
 BURST_SECONDS = 0.05  # of the steps in each repeat after the first, which is the whole run
+LONG_SECONDS = 5.0  # a run that takes longer is its own average, and is not repeated
 BUILD_SECONDS = 2.0  # builds are repeated about this long
 
 
@@ -78,7 +80,10 @@ class FullRuns:
         _, probe, built = self._built(setting, repeats)
         model = self.model(setting)
         gc.collect()
+        begin = time.perf_counter()
         first = run_probed(model, probe)
+        if self.cache.comm.bcast(time.perf_counter() - begin) > LONG_SECONDS:
+            repeats = 1
         burst = int(np.clip(BURST_SECONDS / max(float(first.stamps.mean()), 1e-7), 2, setting.steps))
         runs = [first] + [run_probed(model, probe, burst) for _ in range(repeats - 1)]
         later = [r.stamps[1:] if len(r.stamps) > 1 else r.stamps for r in runs]  # the first step sets up the solver

@@ -23,7 +23,7 @@ from softgrasp.lqr.design.orders import fast_order, orders
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
-from softgrasp.lqr.loop.small import ReducedLoop, ReducedTrajectory
+from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory
 from softgrasp.lqr.loop.small_plant import SmallPlant, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain
@@ -52,7 +52,7 @@ class Feedback:
     """A gain: optimal, or of a reduced equation.
 
     Attributes:
-        basis: key of :data:`lqr.reduced.bases.BASES`; empty for the optimal gain.
+        basis: key of :data:`softgrasp.lqr.reduced.bases.BASES`; empty for the optimal gain.
         N: order of the reduced equation.
     """
 
@@ -225,7 +225,7 @@ class LoopSweep:
         plant, shapes = galerkin(problem, V)
         return plant, shapes.reduce_gain(problem, self.gain(what))
 
-    def _reduced(self, what: LoopSetting, steps: int) -> tuple[ReducedTrajectory, list[float]]:
+    def _reduced(self, what: LoopSetting, steps: int) -> tuple[ReducedLoopTrajectory, list[float]]:
         """Runs of the reduced plant on rank 0."""
         plant, K = self._reduced_plant(what.gain)
         design, problem, n_s = self.runs.design, self.runs.problem, self.layout.n_s
@@ -234,7 +234,7 @@ class LoopSweep:
             start[2 * n_s :] = 0.0
         rest, law = plant.rest_at(design.target.state.q_s), self._law(what.held, steps)
 
-        def run() -> tuple[ReducedTrajectory, list[float]]:
+        def run() -> tuple[ReducedLoopTrajectory, list[float]]:
             loop = ReducedLoop(plant, self.scene.time_end / steps)
             runs = [loop.run(K, rest, steps, (problem.Q, problem.R), law, start) for _ in range(self.runs.repeats)]
             return runs[0], [r.seconds["steps"] / steps for r in runs]
@@ -262,7 +262,7 @@ class LoopSweep:
             reduced_plant=what.reduced,
             per_step=infinite, error_displacement=infinite, error_time=infinite, cost_error=infinite,
         )  # fmt: skip
-        run: LoopTrajectory | ReducedTrajectory
+        run: LoopTrajectory | ReducedLoopTrajectory
         try:
             run, means = self._reduced(what, steps) if what.reduced else self._full(what, steps)
         except (SolverError, ControlError) as failed:

@@ -142,7 +142,7 @@ class ForwardPoint(RunPoint):
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedPoint(RunPoint):
-    """A run of a reduced model; the attributes not named here are those of :class:`study.reduce.sweep.Point`.
+    """A run of a reduced model; the attributes not named here are those of :class:`softgrasp.study.reduce.sweep.Point`.
 
     Attributes:
         error_full, error_full_deformation: of the states against the full run behind the model.

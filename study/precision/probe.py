@@ -1,7 +1,7 @@
 """The outputs of a scene at fixed places of the body, so that runs on different meshes can be compared.
 
 A node output is the displacement of the node nearest to a point, which differs from mesh to mesh. Here the point itself
-counts, see :mod:`fem.fields.probe`.
+counts, see :mod:`softgrasp.fem.fields.probe`.
 """
 
 from __future__ import annotations

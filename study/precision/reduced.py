@@ -33,10 +33,11 @@ from softgrasp.study.precision.series import Series, TimedRun, errors_of
 from softgrasp.study.precision.settings import Setting, own_setting
 from softgrasp.study.reduce.result import Point
 from softgrasp.study.reduce.sweep import bases_of, chosen_methods, measure
-from softgrasp.study.shell.timing import timed
+from softgrasp.study.shell.timing import repeated
 
 CALLS = 2_000  # single steps of a reduced model that are timed
 ENGINE_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
+LONG = 1.0  # seconds of a factorisation that is not repeated
 WIDEST = 2e8  # entries of the snapshots beyond which the slower engines are left out
 
 
@@ -211,11 +212,11 @@ def _factored(comm: MPI.Intracomm, X: Array, engine: EngineName, tolerance: floa
         keep = min(int(np.argmax(tail <= tolerance * np.sqrt(square))) + 1, len(s))
         return np.asarray(f.Q @ u[:, :keep])
 
+    times = repeated(comm, vectors, repeats, LONG)
     U = vectors()
     rest = X - U @ total(comm, U.T @ X)
     error = float(np.sqrt(total(comm, np.array([np.sum(rest * rest)]))[0] / square))
     off = float(np.abs(total(comm, U.T @ U) - np.eye(U.shape[1])).max())
-    seconds = statistics.median(timed(comm, vectors) for _ in range(repeats))
     label = f"{engine}, tolerance {tolerance:g}, {U.shape[1]} vectors"
-    return BasisPoint(engine, label, seconds, error, error <= 1.1 * tolerance, tolerance=tolerance,
+    return BasisPoint(engine, label, statistics.median(times), error, error <= 1.1 * tolerance, tolerance=tolerance,
                       columns=U.shape[1], orthonormality=off)  # fmt: skip

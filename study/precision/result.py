@@ -246,7 +246,7 @@ class WorkStudy:
     Attributes:
         scene: the scene.
         truth: solution that outputs are compared with; None when no question needed it.
-        questions: by name, in the order of :data:`study.precision.points.QUESTIONS`.
+        questions: by name, in the order of :data:`softgrasp.study.precision.points.QUESTIONS`.
         answers: to a tolerance and a budget.
         measured_for_the_answers: points beside those of the questions.
         measured, cached: runs made now and taken from the cache.

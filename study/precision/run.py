@@ -59,7 +59,7 @@ def run_study(
         console: for the tables.
         tolerance: relative error of the deformation to answer for, or None.
         budget: seconds of a step to answer for, or None.
-        questions: arguments of ``--question``, see :class:`study.precision.points.Request`; None for all.
+        questions: arguments of ``--question``, see :class:`softgrasp.study.precision.points.Request`; None for all.
         quiet: no progress bar.
         empty: remove what an earlier run has left in the folder.
 

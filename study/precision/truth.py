@@ -6,8 +6,9 @@
 
 with a middle mesh m, many steps S, few steps s, and meshes M1 < M2 < M3, all P2, M3 the finest that the work allows.
 Space and time are refined apart, since both at once would cost the product. The ends of the contact zone are singular,
-so that every uniform mesh converges with the order p = 2 alpha of :func:`study.precision.meshes.singular_order`,
-whatever the elements: L is the limit of y + a h^p + b h^(p + 1) through the three. The order that the three show has to
+so that every uniform mesh converges with the order p = 2 alpha of
+:func:`softgrasp.study.precision.meshes.singular_order`, whatever
+the elements: L is the limit of y + a h^p + b h^(p + 1) through the three. The order that the three show has to
 agree with p, else L is y(M3, s) itself. The error estimate adds up
 
     space: |L - L'|, L' the limit of y + a h^p through the two finest (|y(M3, s) - L'| where L is not extrapolated)

@@ -59,7 +59,7 @@ def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int,
 
 
 def made_with(result: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Rows on where the numbers of a result come from, see :func:`study.report.origin.origin`."""
+    """Rows on where the numbers of a result come from, see :func:`softgrasp.study.report.origin.origin`."""
     names = {"version": "softgrasp", "machine": "machine", "ranks": "ranks", "scene_hash": "scene hash"}
     return [(name, result[key]) for key, name in names.items()]
 

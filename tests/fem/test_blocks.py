@@ -50,18 +50,25 @@ def test_the_paper_has_these_sizes(comm: MPI.Intracomm, cells: list[int], states
     assert build(scene, comm=comm).system.layout.states == states
 
 
-@pytest.mark.parametrize("columns", [1, 7, 8, 20])
-def test_products_with_columns_equal_scipy(comm: MPI.Intracomm, columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By vectors, in one block, and in three of which the last is narrow."""
+@pytest.mark.parametrize("few_rows", [0, 10**6])
+@pytest.mark.parametrize("storage", ["C", "F"])
+@pytest.mark.parametrize("columns", [1, 2, 7, 8, 20])
+def test_products_with_columns_equal_scipy(
+    comm: MPI.Intracomm, columns: int, storage: Any, few_rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By vectors, in one block, in three of which the last is narrow, and by SciPy; also after the matrix changed."""
     monkeypatch.setattr(petsc, "BLOCK_ENTRIES", 1)
+    monkeypatch.setattr(petsc, "FEW_ROWS", few_rows)
     system = build(make_scene({}), comm=comm).system
     layout, start = system.layout, system.layout.start
     X = np.random.default_rng(1).standard_normal((layout.n_e, columns))
-    rows, indices, values = system.K_ee.getValuesCSR()
-    whole = scipy.sparse.csr_matrix((values, indices, rows), shape=(layout.n_local, layout.n_e)) @ X
-    product = times_columns(system.K_ee, np.asfortranarray(X[start : start + layout.n_local]))
-    assert product.flags.f_contiguous
-    np.testing.assert_allclose(product, whole, rtol=0, atol=EXACT * np.abs(whole).max())
+    local = np.array(X[start : start + layout.n_local], order=storage)
+    for factor in (1.0, 2.0):
+        system.K_ee.scale(factor)
+        rows, indices, values = system.K_ee.getValuesCSR()
+        whole = scipy.sparse.csr_matrix((values, indices, rows), shape=(layout.n_local, layout.n_e)) @ X
+        product = times_columns(system.K_ee, local)
+        np.testing.assert_allclose(product, whole, rtol=0, atol=EXACT * np.abs(whole).max())
 
 
 @pytest.mark.parametrize("name", SCENES)

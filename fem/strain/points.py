@@ -1,0 +1,116 @@
+"""Quadrature points of the tissue: H = grad z as one sparse product, with volume, material and cell of every point.
+
+f(z) = B' (vol P(B z)) and K(z) = B' (vol A(B z)) B, for any element order, dimension and rank count, without DOLFINx.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from softgrasp.fem.petsc import Array, PETSc, rows_on_all, to_scipy, whole_copy
+from softgrasp.fem.strain.laws import LAWS, Law, LawName
+
+if TYPE_CHECKING:
+    from softgrasp.fem.system import LayerMaterial
+
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Points:
+    """The points of this rank's cells.
+
+    Attributes:
+        B: gradient, rows distributed as the points and columns as the tissue; of the rank's d^2 Q rows the row
+            (i d + j) Q + q gives H_ij = dz_i/dX_j in its point q, so that H is an array (d, d, Q).
+        vol: weight of each point [m^d, in 2D times the thickness], (Q,); they sum to the volume of the rank's cells.
+        layer: number of the material of each point, (Q,).
+        cell: global number of the cell of each point, (Q,).
+        d: space dimension.
+        law: name of the material's law.
+        tol: relative tolerance of the equations of a step [1].
+    """
+
+    B: PETSc.Mat
+    vol: Array
+    layer: Ints
+    cell: Ints
+    d: int
+    law: LawName
+    tol: float
+
+    @property
+    def laws(self) -> Law:
+        """The law itself."""
+        return LAWS[self.law]
+
+    def lame(self, materials: tuple[LayerMaterial, ...]) -> tuple[Array, Array]:
+        """Lam and mu of every point [Pa], (Q,) each."""
+        lam, mu = (np.array([getattr(m, key) for m in materials]) for key in ("lam", "mu"))
+        return lam[self.layer], mu[self.layer]
+
+
+def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: tuple[int, int]) -> PETSc.Mat:
+    """The matrix B of :class:`Points` from the gradients of the nodes' shape functions. Collective.
+
+    Args:
+        comm: ranks.
+        gradients: dN_a/dX_j in every point of every cell, (cells, points, nodes, d).
+        nodes: global number of each cell's nodes among the free ones, negative for nodes that follow the hand,
+            (cells, nodes).
+        columns: rows of the tissue on this rank and in all.
+    """
+    cells, each, _, d = gradients.shape
+    Q = cells * each
+    point = np.arange(Q).reshape(cells, each, 1)
+    free = np.broadcast_to(nodes[:, None] >= 0, gradients.shape[:3])
+    rows, cols, values = [], [], []
+    for i in range(d):
+        col = np.broadcast_to(nodes[:, None] * d + i, free.shape)[free]
+        for j in range(d):
+            rows.append(np.broadcast_to(point + (i * d + j) * Q, free.shape)[free])
+            cols.append(col)
+            values.append(gradients[..., j][free])
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
+    B = scipy.sparse.coo_matrix(entries, shape=(d * d * Q, columns[1])).tocsr()  # keeps zeros: the pattern is that of K
+    return _petsc(B, ((d * d * Q, None), columns), d, comm)
+
+
+def whole_points(points: Points, comm: MPI.Intracomm, columns: Ints | None = None) -> Points:
+    """All points on this rank alone, the columns of B in another order. Collective.
+
+    Args:
+        points: distributed.
+        comm: their ranks.
+        columns: number of each column in the layout's order; None keeps it.
+    """
+    every = whole_copy(points.B)
+    B = to_scipy(every)
+    every.destroy()
+    counts, d = comm.allgather(len(points.vol)), points.d
+    firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    # rank by rank the rows stand component by component; on one rank all points of a component stand together
+    rows = [
+        d * d * first + component * count + np.arange(count)
+        for component in range(d * d)
+        for first, count in zip(firsts, counts, strict=True)
+    ]
+    B = B[np.concatenate(rows)]
+    if columns is not None:
+        B = B[:, columns]
+    B.sort_indices()
+    vol, layer, cell = (rows_on_all(comm, part) for part in (points.vol, points.layer, points.cell))
+    return replace(points, B=_petsc(B, B.shape, d, MPI.COMM_SELF), vol=vol, layer=layer, cell=cell)
+
+
+def _petsc(B: scipy.sparse.csr_matrix, size: object, d: int, comm: MPI.Intracomm) -> PETSc.Mat:
+    csr = (B.indptr.astype(PETSc.IntType), B.indices.astype(PETSc.IntType), B.data)
+    result = PETSc.Mat().createAIJ(size, csr=csr, comm=comm)
+    result.setBlockSizes(1, d)
+    return result

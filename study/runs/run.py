@@ -1,0 +1,85 @@
+"""``softgrasp sweep``: a scene at many values of its keys, as table, picture and page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import MofNCompleteColumn
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.study.report.origin import origin
+from softgrasp.study.report.page import Section
+from softgrasp.study.report.tables import Table
+from softgrasp.study.runs.sweep import METHOD, Row, Sweep, parse_axis, run_sweep_points
+from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
+
+COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of
+LAG = "lag: largest distance of an output from where it would be if the tissue moved rigidly with the hand."
+REDUCED = (
+    f"The model is reduced ({METHOD}) at the scene's own material; error: of the deformation against a full run, "
+    "measured at the first and the last point."
+)
+
+
+def sweep_table(rows: list[Row]) -> Table:
+    """One row a point; a reason where it failed."""
+    header = list(dict.fromkeys(key for row in rows for key in row))
+    return Table(tuple(header), [[row.get(key) for key in header] for row in rows])
+
+
+def run_sweep(
+    path: Path,
+    axes: list[str],
+    out: Path,
+    overrides: list[str],
+    console: Console,
+    *,
+    reduced: int | None = None,
+    each: int = 1,
+    quiet: bool = False,
+    pictures: bool = True,
+    empty: bool = False,
+) -> dict[str, Any]:
+    """Run a scene file at all combinations of values and write the results. Collective.
+
+    Points are kept in ``out``; the same command after an interruption goes on from there.
+
+    Raises:
+        SoftgraspError: with one sentence; also when no point could be run.
+    """
+    session = Session("sweep", path, overrides, out, console, quiet, pictures, empty)
+    scene, comm = session.scene(), session.comm
+    sweep = Sweep(path, overrides, tuple(parse_axis(text) for text in axes), reduced)
+    out.mkdir(parents=True, exist_ok=True)
+    with session.progress(MofNCompleteColumn()) as bar:
+        task = bar.add_task("points", total=len(sweep.points()))
+        rows = run_sweep_points(
+            sweep, out, comm, each, lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    failed = [row for row in rows if "reason" in row]
+    if len(failed) == len(rows):
+        raise SceneError(f"no point of the sweep could be run; the first: {failed[0]['reason']}")
+    table = sweep_table(rows)
+    notes = [f"{len(failed)} of {len(rows)} points failed: {failed[0]['reason']}"] if failed else []
+    if (worst := max((row.get("error") or 0.0 for row in rows), default=0.0)) > COARSE:
+        notes.append(f"The reduced model is off by {worst:.0%} at an end of the sweep; take more columns, --reduced.")
+    result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced, "points": rows, "warnings": notes}
+
+    def page() -> Page:
+        from softgrasp.study.runs.plots import figure_sweep  # brings Matplotlib
+
+        files = figure_sweep(sweep.axes, rows, out / "sweep.png") if pictures else ()
+        text = f"{LAG} {REDUCED}" if reduced else LAG
+        parts = [Section("", figures=[(files[0], "Largest lag of every output.")] if files else []),
+                 *([Section("Warnings", text="\n\n".join(notes))] if notes else []),
+                 Section("Points", text, header=table.header, rows=table.rows)]  # fmt: skip
+        options = "".join(f" {text}" for text in axes) + (f" --reduced {reduced}" if reduced else "")
+        return Page(f"{scene.name}: sweep", parts, {"sweep.csv": table}, files, options)
+
+    files = session.write(scene, result, page)
+    console.print(table.terminal(wrap=range(len(table.header)), width=console.width))
+    show_warnings(console, notes)
+    list_files(console, files)
+    return result

@@ -1,0 +1,104 @@
+"""``softgrasp new`` and ``softgrasp materials``: a scene to begin with, and the library with its sources."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.scene.materials import LIBRARY
+from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.schema import full_schema
+
+SCHEMA = "scene.schema.json"
+SCENE = """\
+#:schema ./{schema}
+# `softgrasp explain {file}` says what this scene simulates; `softgrasp schema` lists every key with its unit.
+name = "{name}"
+description = "{description}"
+
+[tissue]
+{tissue}
+material = "muscle" # `softgrasp materials`, or {{ young = 2.0e4, poisson = 0.45, rho = 1060.0 }} in Pa and kg/m3
+
+[contact] # the hand holds the boundary in this box [m]
+{contact}
+
+[hand]
+mass = 0.73 # [kg]
+
+[effects] # what is not named is off and costs nothing: gravity, damping, reaction, rotation
+gravity = {{ g = {g} }} # [m/s2]
+damping = {{ kind = "kelvin-voigt", beta = 0.01 }} # D = beta K, beta [s]
+
+[motion]
+target = {target} # [m]
+duration = 1.0 # [s]
+
+[time]
+steps = 400
+end = 1.5 # [s]
+start = "equilibrium"
+
+[control]
+outputs = [{{ kind = "node", point = {point}, name = "tip" }}] # [m]
+"""
+
+
+def new_scene(file: Path, *, solid: bool = False, mesh: Path | None = None) -> list[Path]:
+    """Write a scene that runs, with the schema beside it for editors. Not collective.
+
+    A mesh file gives the box of the body: the hand takes its upper tenth, the output its lowest node.
+
+    Raises:
+        SceneError, MeshError: the file exists, or the mesh cannot be read; nothing is written.
+    """
+    if file.suffix != ".toml":
+        raise SceneError(f"{file}: a scene is a TOML file; name it {file.with_suffix('.toml').name}")
+    if file.exists():
+        raise SceneError(f"{file}: this file exists; name another one")
+    lower, upper = np.zeros(3 if solid else 2), np.array([0.06, 0.04, 0.12] if solid else [0.06, 0.12])
+    tip = np.where(np.arange(len(upper)) < len(upper) - 1, upper / 2, 0.0)
+    if mesh is None:
+        cells = [6, 4, 12] if solid else [12, 24]
+        tissue = f"size = {_list(upper)} # [m]\ncells = {cells}" + ("" if solid else "\nthickness = 0.04 # [m]")
+        sides = 'sides = ["left", "right"]\n'
+    else:
+        from softgrasp.fem import _stack  # noqa: F401  MPI before DOLFINx
+        from softgrasp.fem.mesh.file import load_arrays
+
+        points = load_arrays(mesh, 1.0, repair=False).points
+        lower, upper, tip = points.min(axis=0), points.max(axis=0), points[points[:, -1].argmin()]
+        tissue = f"mesh = {json.dumps(str(mesh.resolve()))} # scale = 1.0e-3 for a file in millimetres"
+        sides = ""
+    d = len(upper)
+    top = np.append(lower[:-1], upper[-1] - (0.1 if mesh else 0.25) * (upper[-1] - lower[-1]))
+    text = SCENE.format(
+        schema=SCHEMA, file=file.name, name=file.stem, tissue=tissue,
+        description="A strip of muscle in a hand." if mesh is None else f"The body of {mesh.name} in a hand.",
+        contact=f"{sides}box = [{_list(top)}, {_list(upper)}]",
+        g=_list([0.0] * (d - 1) + [-9.81]), target=_list([0.1] + [0.0] * (d - 2) + [0.05]), point=_list(tip),
+    )  # fmt: skip
+    file.parent.mkdir(parents=True, exist_ok=True)
+    schema = file.with_name(SCHEMA)
+    file.write_text(text)
+    try:
+        load_scene(file)
+    except SceneError:
+        file.unlink()
+        raise
+    schema.write_text(json.dumps(full_schema(), indent=1) + "\n")
+    return [file, schema]
+
+
+def _list(values: np.ndarray | list[float]) -> str:
+    return "[" + ", ".join(f"{float(f'{x:.6g}')!r}" for x in values) + "]"
+
+
+def materials_table() -> Table:
+    """The library: name, E, nu, rho, source."""
+    rows = [(name, m.young, m.poisson, m.rho, m.source) for name, m in LIBRARY.items()]
+    return Table(("material", "E [Pa]", "nu", "rho [kg/m3]", "source"), rows)

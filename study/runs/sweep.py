@@ -1,0 +1,211 @@
+"""A scene at many values of its keys, each point on its own ranks; points that a file holds are not run again."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp import package_version
+from softgrasp.fem.errors import Interrupted, SceneError, SoftgraspError
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.run.simulate import RunOptions, simulate
+from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.reduce import reduce
+from softgrasp.reduction.replay import errors, replay
+
+Row = dict[str, Any]
+METHOD = "craig_bampton"  # needs no snapshots of the other values, and is stable at all of them
+FORM = "write KEY=FIRST:LAST:COUNT, KEY=FIRST:LAST:COUNT:log or KEY=A,B,C, as in tissue.material.mu=100:500:9"
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One key and its values."""
+
+    key: str
+    values: tuple[float, ...]
+    log: bool = False
+
+
+def parse_axis(text: str) -> Axis:
+    """``key=first:last:count[:log]`` or ``key=a,b,c``; whole numbers stay whole where all values are.
+
+    Raises:
+        SceneError: with the form that it must have.
+    """
+    key, _, right = text.partition("=")
+    parts, log = right.split(":"), right.endswith(":log")
+    try:
+        if len(parts) == 1:
+            values = [float(word) for word in right.split(",")]
+        else:
+            first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
+            with np.errstate(all="ignore"):
+                values = [float(x) for x in (np.geomspace if log else np.linspace)(first, last, count)]
+        good = bool(key) and len(parts) - log in (1, 3) and bool(np.isfinite(values).all()) and len(values) > 0
+    except (ValueError, IndexError):
+        good = False
+    if not good:
+        raise SceneError(f"'{text}' is no sweep; {FORM}")
+    whole = all(x == int(x) for x in values) and "." not in right and "e" not in right.lower()
+    return Axis(key, tuple(int(x) for x in values) if whole else tuple(values), log)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is asked for.
+
+    Attributes:
+        path: scene file.
+        overrides: arguments of ``--set``.
+        axes: keys with their values; all combinations are run.
+        N: columns of the reduced model that runs instead of the full one; None for the full model.
+    """
+
+    path: Path
+    overrides: Sequence[str]
+    axes: tuple[Axis, ...]
+    N: int | None = None
+
+    def points(self) -> list[dict[str, float]]:
+        """The values of every point, the last key fastest."""
+        keys = [axis.key for axis in self.axes]
+        return [dict(zip(keys, v, strict=True)) for v in itertools.product(*(axis.values for axis in self.axes))]
+
+    def scene(self, values: dict[str, float]) -> Scene:
+        """The scene of a point.
+
+        Raises:
+            SceneError: a key or a value is wrong.
+        """
+        kept = ["output.snapshots=none"] if self.N is None else []
+        return load_scene(self.path, [*self.overrides, *kept, *(f"{key}={value!r}" for key, value in values.items())])
+
+
+def only_material(a: Scene, b: Scene) -> bool:
+    """Whether two scenes differ in ``tissue.material`` alone, so that no new assembly is needed."""
+    left, right = (s.model_dump(mode="json", exclude={"tissue": {"material"}}) for s in (a, b))
+    return left == right and not a.tissue.layers and a.tissue.refine is None
+
+
+class Runner:
+    """Runs points on one group of ranks and keeps what the next may use again: the model, the reduced model."""
+
+    def __init__(self, sweep: Sweep, comm: MPI.Intracomm, out: Path) -> None:
+        self.sweep, self.comm, self.out = sweep, comm, out
+        self.model: Model | None = None
+        self.rom: ReducedModel | None = None
+        self.base: Trajectory | None = None
+
+    def at(self, scene: Scene) -> Model:
+        """Model of a scene, by sums of the matrices that are there where only the material differs. Collective."""
+        if self.model is None or not only_material(self.model.scene, scene):
+            self.model, self.rom = build(scene, comm=self.comm), None
+        m = scene.tissue.material
+        return self.model.with_materials(m.lam, m.mu, m.rho) if only_material(self.model.scene, scene) else self.model
+
+    def row(self, values: dict[str, float], scene: Scene, judged: bool) -> Row:
+        """Largest distance of each output from the rigid motion, final outputs, energy drift, seconds. Collective.
+
+        Raises:
+            SoftgraspError: with one sentence.
+        """
+        N = self.sweep.N
+        if N is None:
+            model = self.at(scene)
+            run = simulate(model, RunOptions(self.out))
+            return {**values, **_outputs(run, run.outputs), "energy_drift": run.energy_drift,
+                    "seconds": run.seconds["steps"]}  # fmt: skip
+        if self.rom is None:
+            first = self.at(self.sweep.scene({}))
+            self.base = simulate(first)
+            self.rom = reduce(first, self.base, METHOD, N)
+        model = self.at(scene)
+        if self.base is None or not only_material(self.sweep.scene({}), scene):
+            raise SceneError(f"--reduced {N}: the reduced model is affine in tissue.material only; sweep its keys")
+        begin = MPI.Wtime()
+        small = replay(self.rom, model, self.base)
+        row = {**values, **_outputs(self.base, small.outputs), "seconds": MPI.Wtime() - begin, "error": None}
+        if judged:
+            row["error"] = float(errors(self.rom, small, model, simulate(model)).error_deformation)
+        return row
+
+
+def _outputs(run: Trajectory, outputs: np.ndarray) -> Row:
+    """Numbers of the outputs, by the labels of their columns."""
+    lag = np.abs(outputs - run.outputs_rigid).max(axis=0)
+    names = [f"{c.label} {{}} [{c.unit}]" for c in run.columns]
+    return {name.format("lag"): float(x) for name, x in zip(names, lag, strict=True)} | {
+        name.format("end"): float(x) for name, x in zip(names, outputs[-1], strict=True)
+    }
+
+
+def run_sweep_points(
+    sweep: Sweep, out: Path, comm: MPI.Intracomm, each: int, progress: Callable[[int, int], None]
+) -> list[Row]:
+    """All points, ``comm.size / each`` at a time; rows in the order of the points, on all ranks. Collective.
+
+    A point that fails has its reason instead of numbers and is tried again by the next call.
+
+    Args:
+        sweep: what is asked for.
+        out: the folder of the points' files, one a group of ranks.
+        comm: all ranks.
+        each: ranks of one point.
+        progress: called on rank 0 with the points done (of its own group, times the groups) and in all.
+
+    Raises:
+        SceneError: a key or a value is wrong; on all ranks, before the first run.
+        Interrupted: as it was asked; the next call goes on.
+    """
+    points = sweep.points()
+    scenes = [sweep.scene(values) for values in points]
+    keys = [f"{scene_hash(scene)}-{sweep.N}-{package_version()}" for scene in scenes]
+    done: dict[str, Row] = comm.bcast(_read(out) if comm.rank == 0 else None)
+    groups = max(1, comm.size // each)
+    number = min(comm.rank // each, groups - 1)
+    group = comm.Split(number, comm.rank)
+    runner, file = Runner(sweep, MPI.Intracomm(group), out / f"stopped-{number}"), out / f"points-{number}.jsonl"
+    missing = [i for i, key in enumerate(keys) if key not in done]
+    own: dict[str, Row] = {}
+    for count, i in enumerate(missing[number::groups], start=1):
+        try:
+            row = runner.row(points[i], scenes[i], judged=i in (0, len(points) - 1))
+        except Interrupted:
+            raise
+        except SoftgraspError as error:
+            own[keys[i]] = {**points[i], "reason": str(error)}
+        else:
+            own[keys[i]] = row
+            if group.rank == 0:
+                with file.open("a") as lines:
+                    lines.write(json.dumps({"key": keys[i], "row": row}) + "\n")
+        progress(min(len(points), len(points) - len(missing) + count * groups), len(points))
+    for rows in comm.allgather(own):
+        done |= rows
+    group.Free()
+    return [done[key] for key in keys]
+
+
+def _read(out: Path) -> dict[str, Row]:
+    """Rows of earlier calls; a line that was cut off is no row."""
+    rows = {}
+    for file in sorted(out.glob("points-*.jsonl")):
+        for line in file.read_text().splitlines():
+            try:
+                entry = json.loads(line)
+            except ValueError:
+                continue
+            rows[entry["key"]] = entry["row"]
+    return rows

@@ -1,0 +1,132 @@
+"""Many runs: sweeps agree with single runs and go on where they stopped, comparisons name what differs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from mpi4py import MPI
+from rich.console import Console
+
+import softgrasp as sg
+from softgrasp.fem.errors import SceneError
+from softgrasp.study.forward.run import run_simulate
+from softgrasp.study.runs import sweep as sweep_module
+from softgrasp.study.runs.listing import compare, run_compare, runs_below
+from softgrasp.study.runs.run import run_sweep
+from softgrasp.study.runs.start import SCHEMA, materials_table, new_scene
+from softgrasp.study.runs.sweep import parse_axis
+from softgrasp.study.shell.schema import full_schema
+
+SMALL = ["tissue.cells=[3,6]", "time.steps=60"]
+SCENE = sg.shipped_scenes()["paper_forward"]
+QUIET = Console(quiet=True)
+
+
+def test_a_sweep_says_its_values_or_its_form() -> None:
+    assert parse_axis("time.steps=100:300:3").values == (100, 200, 300)
+    assert parse_axis("a.b=1e1:1e3:3:log").values == pytest.approx((10, 100, 1000), rel=1e-15)
+    assert parse_axis("a.b=20,0.5").values == (20.0, 0.5)
+    for wrong in ("a.b=1:2", "a.b=1:2:3:4", "a.b=x", "=1,2", "a.b", "a.b=-1:2:3:log"):
+        with pytest.raises(SceneError, match=r"no sweep; write KEY=FIRST:LAST:COUNT"):
+            parse_axis(wrong)
+
+
+@pytest.mark.ranks(2)
+def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    axes = ["tissue.material.mu=20:500:3", "time.steps=60,80"]
+    result = run_sweep(SCENE, axes, mpi_tmp_path, SMALL[:1], QUIET, quiet=True, pictures=False)
+    assert len(result["points"]) == 6
+    for row in result["points"]:
+        mu, steps = row["tissue.material.mu"], row["time.steps"]
+        model = sg.build(
+            "paper_forward", [*SMALL[:1], f"tissue.material.mu={mu}", f"time.steps={steps}"], MPI.COMM_SELF
+        )
+        run = sg.simulate(model)
+        # with_materials adds matrices in another order than assembly: rounding, carried by the steps
+        assert row["tip_x end [m]"] == pytest.approx(run.outputs[-1, 0], rel=1e-9)
+        assert row["tip_x lag [m]"] == pytest.approx(np.abs(run.outputs - run.outputs_rigid)[:, 0].max(), rel=1e-9)
+    monkeypatch.setattr(sweep_module.Runner, "row", lambda *_: pytest.fail("it was there already"))
+    assert (
+        run_sweep(SCENE, axes, mpi_tmp_path, SMALL[:1], QUIET, quiet=True, pictures=False)["points"] == result["points"]
+    )
+
+
+@pytest.mark.serial
+def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path: Path) -> None:
+    axes = ["tissue.material.mu=40,-1,60"]
+    with pytest.raises(SceneError, match="must be > 0"):
+        run_sweep(SCENE, axes, tmp_path, SMALL, QUIET, quiet=True, reduced=20)
+    axes = ["tissue.material.mu=40:60:3"]
+    result = run_sweep(SCENE, axes, tmp_path, SMALL, QUIET, quiet=True, reduced=20)
+    first, middle, last = result["points"]
+    assert middle["error"] is None
+    for row in (first, last):
+        full = sg.simulate(sg.build("paper_forward", [*SMALL, f"tissue.material.mu={row['tissue.material.mu']}"]))
+        assert 0 < row["error"] < 0.05
+        assert row["tip_x end [m]"] == pytest.approx(full.outputs[-1, 0], abs=0.05 * np.abs(full.outputs[:, 0]).max())
+    assert (tmp_path / "sweep.png").stat().st_size > 5000
+    failed = run_sweep(SCENE, ["output.memory=1e3,1e-9"], tmp_path / "b", SMALL, QUIET, quiet=True, pictures=False)
+    assert "reason" not in failed["points"][0]
+    assert "reason" in failed["points"][1]
+
+
+@pytest.mark.serial
+def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
+    for name, mu in (("a", 50.0), ("b", 30.0)):
+        changes = [*SMALL, f"tissue.material.mu={mu}"]
+        run_simulate(SCENE, tmp_path / name, changes, QUIET, quiet=True, pictures=False)
+    assert [Path(row[0]).name for row in runs_below(tmp_path).rows] == ["a", "b"]
+    comparison = compare(tmp_path / "a", tmp_path / "b")
+    assert comparison.keys.rows == [("tissue.material.mu", "50.0", "30.0")]
+    numbers = {row[0]: row[1:] for row in comparison.numbers.rows}
+    results = [json.loads((tmp_path / name / "result.json").read_text()) for name in "ab"]
+    assert numbers["output_final[0]"][:2] == tuple(r["output_final"][0] for r in results)
+    assert "n_e" not in numbers
+    assert not compare(tmp_path / "a", tmp_path / "a").numbers.rows
+    run_compare(tmp_path / "a", tmp_path / "b", tmp_path / "c", QUIET)
+    assert (tmp_path / "c" / "compare.png").stat().st_size > 5000
+    with (tmp_path / "c" / "compare.csv").open(newline="") as file:
+        assert len(list(csv.reader(file))) == 1 + len(numbers)
+    with pytest.raises(SceneError, match=r"no result\.json"):
+        compare(tmp_path, tmp_path / "b")
+    with pytest.raises(SceneError, match="no such folder"):
+        runs_below(tmp_path / "none")
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["2d", "3d", "mesh"])
+def test_a_new_scene_runs_and_fits_its_schema(tmp_path: Path, kind: str) -> None:
+    mesh = SCENE.parent / "meshes" / "pillow_small.msh" if kind == "mesh" else None
+    file, schema = new_scene(tmp_path / "my.toml", solid=kind == "3d", mesh=mesh)
+    assert file.read_text().startswith(f"#:schema ./{SCHEMA}\n")
+    scene = sg.load_scene(file)
+    jsonschema.validate(scene.model_dump(mode="json", by_alias=True, exclude_none=True), json.loads(schema.read_text()))
+    run = sg.simulate(
+        sg.build(
+            file,
+            [
+                "time.steps=40",
+                *([] if mesh else ["tissue.cells=" + "[2,4]" * (kind == "2d") + "[2,2,4]" * (kind == "3d")]),
+            ],
+        )
+    )
+    assert np.isfinite(run.outputs).all()
+    with pytest.raises(SceneError, match="exists"):
+        new_scene(file)
+    with pytest.raises(SceneError, match=r"name it my\.toml"):
+        new_scene(tmp_path / "my.txt")
+
+
+def test_materials_have_sources() -> None:
+    assert all(row[-1] for row in materials_table().rows)
+
+
+def test_the_schema_beside_the_shipped_scenes_is_current() -> None:
+    shipped = json.loads((SCENE.parent / SCHEMA).read_text())
+    assert shipped == full_schema(), f"write it again: softgrasp schema > demos/scenes/{SCHEMA}"
+    assert all(path.read_text().startswith(f"#:schema ./{SCHEMA}\n") for path in sg.shipped_scenes().values())
