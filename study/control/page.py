@@ -12,7 +12,7 @@ from softgrasp.study.control.result import TITLES, ControlStudy
 from softgrasp.study.control.tables import BOX_HEADER, box_rows, loop_table, reduced_table, summary_rows
 from softgrasp.study.pictures.animation import speed_up
 from softgrasp.study.report.equation_control import control_text
-from softgrasp.study.report.origin import made_with, origin
+from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section
 
 CAPTIONS = {
@@ -64,7 +64,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
         own = [] if i else pick("retune.png")
         parts.append(Section("" if i else "Re-tuning", text, header=BOX_HEADER, rows=box_rows(r), figures=own))
     about: list[tuple[str, Any]] = [("n_s", layout.n_s), ("n_e", layout.n_e), ("states", layout.states)]
-    about += made_with(origin(scene, layout.comm.size))
+    about += provenance(origin(scene, layout.comm.size))
     about += [(f"time {k}", f"{v:.3g} s") for k, v in seconds.items()]
     about += [(f"solver {k}", f"{v:.3g} s") for k, v in study.design.solution.seconds.items()]
     return [*parts, Section("Made with", rows=about)]

@@ -27,7 +27,7 @@ from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.plots import drawn, figure_reduced, unstable
 from softgrasp.study.control.result import settled
 from softgrasp.study.control.run import run_control
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene
 
@@ -383,7 +383,7 @@ def test_small_helpers() -> None:
     t = np.arange(5.0)
     assert settled(t, np.array([1.0, 0.5, 0.005, 0.02, 0.001])) == 4.0
     assert settled(t, np.array([1.0, 0.5, 0.005, 0.001, 0.02])) is None
-    assert plain({"a": [np.float64(np.nan), np.inf, 1.0, np.int64(2)], "b": True}) == {
+    assert to_json({"a": [np.float64(np.nan), np.inf, 1.0, np.int64(2)], "b": True}) == {
         "a": [None, None, 1.0, 2],
         "b": True,
     }
