@@ -25,7 +25,7 @@ def with_bounds[Judged: (GainReport, BoxPoint)](
     plan: LoopPlan,
     notify: Notify | None = None,
 ) -> list[Judged]:
-    """The same with ``cost_excess_at_most`` where the gain is stable, see :mod:`lqr.loop.gap`. Collective.
+    """The same with ``cost_excess_at_most`` where the gain is stable, see :mod:`softgrasp.lqr.loop.gap`. Collective.
 
     Args:
         problem: the plant.

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from rich.console import Console
+from softgrasp.lqr.loop.export import to_python_control
 
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
@@ -21,7 +22,6 @@ from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.design.scene import actuation, with_control
 from softgrasp.lqr.loop.controller import Controller, load_gain
-from softgrasp.lqr.loop.export import to_python_control
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.plots import drawn, figure_reduced, unstable
