@@ -31,8 +31,8 @@ from softgrasp.reduction.certified.trainer import (
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
 from softgrasp.study.forward.result import simulate_result
-from softgrasp.study.report.files import plain
-from softgrasp.study.report.origin import made_with, origin, peak_memory_mb
+from softgrasp.study.report.files import to_json
+from softgrasp.study.report.origin import origin, peak_memory_mb, provenance
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -171,7 +171,7 @@ def certify_result(model: Model, certified: CertifiedModel, watch: Stopwatch) ->
         "time": {**watch.seconds, "query": query},
         "memory_peak_mb": peak_memory_mb(comm),
     }
-    return dict(plain(result))
+    return dict(to_json(result))
 
 
 def greedy_table(certified: CertifiedModel) -> Table:
@@ -225,7 +225,7 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
 def sections(model: Model, certified: CertifiedModel, result: dict[str, Any]) -> list[Section]:
     """Parts of the page."""
     scene, comm = model.scene, model.system.layout.comm
-    rows = made_with(origin(scene, comm.size))
+    rows = provenance(origin(scene, comm.size))
     rows += [(f"time {key}", f"{value:.3g} s") for key, value in result["time"].items()]
     return [
         Section("What holds", text="\n\n".join(sentences(certified, result))),

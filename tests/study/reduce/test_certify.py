@@ -29,7 +29,7 @@ def reduced(folder: Path, tolerance: float, *changes: str) -> tuple[dict[str, An
 
 @pytest.mark.serial
 def test_a_certified_model_by_command(tmp_path: Path) -> None:
-    result, text = reduced(tmp_path, 0.2, "reduction.validation=2")
+    _, text = reduced(tmp_path, 0.2, "reduction.validation=2")
     certified = load_certified(tmp_path / "models" / "certified.h5")
     about = json.loads((tmp_path / "result.json").read_text())["certified"]
     assert about["k"] == certified.k
