@@ -145,7 +145,9 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
         key = "tissue.cells" if scene.tissue.cells else "tissue.mesh"
         given = f"{scene.tissue.cells}" if scene.tissue.cells else f"'{scene.tissue.mesh}'"
         fits = _fitting(scene, comm, run, dimension, cells, share, ranks, free)
-        parts = f"mesh and matrices {size_text(share * estimate.mesh)}, factor {size_text(share * estimate.factor)}"
+        parts = f"mesh and matrices {size_text(share * estimate.mesh)}"
+        if estimate.factor:  # conjugate gradients have none
+            parts += f", factor {size_text(share * estimate.factor)}"
     where = f"{ranks} rank{'s' if ranks > 1 else ''} of {comm.size} on one node"
     needs = size_text(estimate.of(share, ranks))
     raise ResourceError(

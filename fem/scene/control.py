@@ -99,9 +99,13 @@ class Loop(Section):
         "midpoint", description="feedback inside the midpoint rule, or sampled and held as on a robot [no unit]"
     )
     rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
-    limit: Positive | None = Field(None, description="largest force on the hand in each direction [N]; none by default")
-    limit_torque: Positive | None = Field(
-        None, description="largest torque on a turning hand about each axis [N m]; none by default"
+    limit: Positive | list[Positive] | None = Field(
+        None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
+    )
+    limit_torque: Positive | list[Positive] | None = Field(
+        None,
+        description="largest torque on a turning hand about each axis [N m], one number or one per axis; none by "
+        "default",
     )
     delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
 

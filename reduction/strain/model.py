@@ -163,7 +163,7 @@ class SmallStrainModel:
             hand: q_s and v_s, (steps + 1, n_s) each.
             a0: start at rest, (k,); None is the undeformed body.
             tol: residual of a step over the largest load seen.
-            engine: see :func:`reduction.strain.stepper.march`.
+            engine: see :func:`softgrasp.reduction.strain.stepper.march`.
 
         Raises:
             ModelError: shapes do not fit, or the hand or the run leaves the training box.

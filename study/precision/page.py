@@ -31,8 +31,8 @@ from softgrasp.study.precision.series import TimedRun
 from softgrasp.study.precision.tables import points_table, question_table, slope_table
 from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation_control import control_text
-from softgrasp.study.report.files import plain
-from softgrasp.study.report.origin import command_line, made_with, origin, peak_memory_mb
+from softgrasp.study.report.files import to_json
+from softgrasp.study.report.origin import command_line, origin, peak_memory_mb, provenance
 from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -63,7 +63,7 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
         "command": "study",
         **origin(study.scene, comm.size),
         **study.to_dict(),
-        "answers": plain(answers),
+        "answers": to_json(answers),
         "memory_peak_mb": peak_memory_mb(comm),
         "time": {"total": comm.allreduce(time.perf_counter() - session.begin, MPI.MAX)},
     }
@@ -215,4 +215,4 @@ def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
     ]
     if paper_of(study.scene) == "forward":
         rows.append(("the paper", f"{PAPER_FULL} s full, {PAPER}, own machine"))
-    return [*rows, *made_with(result), ("time of this study", seconds_text(result["time"]["total"]))]
+    return [*rows, *provenance(result), ("time of this study", seconds_text(result["time"]["total"]))]

@@ -89,8 +89,7 @@ class ReducedRuns:
         section = self.scene.reduction.model_copy(update={"N": list(sizes)})
         key = {
             "method": name, "N": list(sizes), "inner": section.inner, "engine": section.engine,
-            "energy": section.energy,
-            "setting": [self.setting.cells, self.setting.order, self.setting.steps, self.setting.solver],
+            "energy": section.energy, "setting": self.setting.parameters,
         }  # fmt: skip
 
         def sweep() -> list[TimedModel]:
@@ -117,7 +116,8 @@ class ReducedRuns:
         own = ("error", "error_deformation", "times", "values")
         return ReducedPoint(
             name, label, model.time_online, error, model.stable and finite, method=name, cells=setting.cells,
-            order=setting.order, steps=setting.steps, solver=setting.solver, rtol=None, mesh=setting.mesh,
+            order=setting.order, steps=setting.steps, solver=setting.solver, rtol=None, refine=setting.refine,
+            mesh=setting.mesh,
             error_deformation=error, error_displacement=displacement, error_range=self.truth.range_of(error),
             error_full=model.error, error_full_deformation=model.error_deformation,
             error_outputs_full=errors_of(series, full.series)[0] if finite else float("inf"), scratch=scratch,
@@ -183,8 +183,7 @@ def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Que
     points: list[BasisPoint] = []
     for engine in ENGINES:
         runs.guard.next(f"engine {engine}")
-        s = reduced.setting
-        key = {"engine": engine, "setting": [s.cells, s.order, s.steps], "repeats": scene.study.repeats}
+        key = {"engine": engine, "setting": reduced.setting.parameters, "repeats": scene.study.repeats}
 
         def sweep(engine: EngineName = engine) -> list[BasisPoint]:
             X = reduced.full()[0].snapshots.Z

@@ -6,38 +6,18 @@ from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import Any
 
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
 from softgrasp.study.precision.series import Series, TimedRun
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 
 ADVICE = {
-    "space": "finer meshes than the time allows here",
+    "space": "a finer mesh than the time allows here",
     "time": "more steps, time.steps",
     "mixed": "more steps, time.steps, on finer meshes",
 }
-
-
-@dataclass(frozen=True)
-class Limit:
-    """Outputs in the limit of fine meshes.
-
-    Attributes:
-        values: (steps + 1, 2 p) [m].
-        gap: what they may be off, same shape.
-        order: that the meshes show, None without one.
-        expected: order that the singular ends leave; None where there is one mesh only.
-        extrapolated: the values are not those of the finest mesh.
-    """
-
-    values: Array
-    gap: Array
-    order: float | None
-    expected: float | None
-    extrapolated: bool
 
 
 @dataclass(frozen=True)
@@ -47,7 +27,6 @@ class Truth:
     Attributes:
         series: the solution.
         space, time, mixed: parts of the estimate, each (deformation, displacement).
-        limit: in space.
         settings: that were run.
         note: one sentence or more.
     """
@@ -56,7 +35,6 @@ class Truth:
     space: tuple[float, float]
     time: tuple[float, float]
     mixed: tuple[float, float]
-    limit: Limit
     settings: tuple[Setting, ...]
     note: str
 
@@ -83,15 +61,13 @@ class Truth:
     @property
     def need(self) -> str:
         """What would make that part smaller."""
-        part = self.largest_part
-        return "a finer mesh" if part == "space" and self.limit.expected is None else ADVICE[part]
+        return ADVICE[self.largest_part]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "note": self.note, "error": self.error, "error_displacement": self.error_displacement,
-            "space": self.space, "time": self.time, "mixed": self.mixed, "order": self.limit.order,
-            "expected_order": self.limit.expected, "extrapolated": self.limit.extrapolated,
+            "space": self.space, "time": self.time, "mixed": self.mixed,
             "settings": [s.label for s in self.settings],
         }  # fmt: skip
 
@@ -286,7 +262,7 @@ class WorkStudy:
             for name, q in self.questions.items()
             if isinstance(q.reference, RiccatiReference | ReducedReference | LoopReference)
         }
-        result: dict[str, Any] = plain(
+        result: dict[str, Any] = to_json(
             {
                 "repeats": self.scene.study.repeats,
                 "reference": None if self.truth is None else self.truth.to_dict(),

@@ -10,8 +10,10 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import TaskProgressColumn
 
+from softgrasp.fem.accuracy.adapt import build_to_tolerance
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.model.build import build
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.refined import scene_ends
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.plant.checks import ControlError
@@ -19,7 +21,7 @@ from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.reduction.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
 from softgrasp.study.precision.cache import Cache, Guard
-from softgrasp.study.precision.forward import ask_forward, forward_settings
+from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
 from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
@@ -29,7 +31,7 @@ from softgrasp.study.precision.result import Answer, Question, Truth, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_riccati, settings_of
 from softgrasp.study.precision.riccati_reduced import ask_reduced_riccati
 from softgrasp.study.precision.settings import own_setting, variant
-from softgrasp.study.precision.truth import make_plan, make_truth
+from softgrasp.study.precision.truth import LADDER, make_truth
 from softgrasp.study.reduce.sweep import chosen_methods
 from softgrasp.study.shell.session import Session
 
@@ -102,7 +104,7 @@ def study_scene(
     """
     request = request or Request()
     names = request.questions
-    model = build(variant(scene, own_setting(scene)), comm=comm)
+    model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
     guard = Guard(comm, progress)
     store = Cache(cache, comm, scene)
     runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store, guard)
@@ -115,8 +117,8 @@ def study_scene(
     with interruptible(False) as guard.stop:
         guard.count = count_points(scene, control, [name for name in names if not (refused and name in CONTROL)])
         if set(names) - set(CONTROL):
-            truth = make_truth(scene, runs)
-            questions |= forward_questions(scene, runs, truth, names)
+            truth = make_truth(scene, runs, request.tolerance)
+            questions |= forward_questions(model, runs, truth, names)
             answers, measured = answer(scene, runs, truth, questions, request)
         if not refused:
             questions |= control_questions(control, names)
@@ -131,9 +133,11 @@ def study_scene(
     )
 
 
-def forward_questions(scene: Scene, runs: FullRuns, truth: Truth, names: Sequence[str]) -> dict[str, Question]:
+def forward_questions(model: Model, runs: FullRuns, truth: Truth, names: Sequence[str]) -> dict[str, Question]:
     """Full model, reduced models, and bases. Collective."""
-    questions = {"forward": ask_forward(scene, runs, truth)} if "forward" in names else {}
+    questions, scene = {}, runs.scene
+    if "forward" in names:
+        questions["forward"] = ask_forward(runs, truth, scene_ends(runs.cache.comm, model.space.mesh, model.scene))
     asks = {"reduced": ask_reduced, "bases": ask_bases}
     if not set(names) & set(asks):
         return questions
@@ -176,13 +180,14 @@ def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Q
 
 def count_points(scene: Scene, control: ControlRuns, names: Sequence[str]) -> int:
     """About how many points the questions have, for the time left."""
+    d = control.layout.dimension
     counts = {
-        "forward": len(forward_settings(scene, control.layout.dimension)),
+        "forward": sum(map(len, mesh_series(scene, d))) * len(SHARES) + len(solver_settings(scene)),
         "reduced": 1 + len(chosen_methods(scene.reduction)),
         "bases": 1 + len(ENGINES),
         "riccati": 1 + len(settings_of(control)),
         "reduced_riccati": 1 + len(BASES),
         "loop": 1 + CONTROLLERS,
     }
-    truth = len(make_plan(scene).settings) if set(names) - set(CONTROL) else 0
+    truth = len(LADDER) if set(names) - set(CONTROL) else 0
     return truth + sum(counts[name] for name in names) or 1

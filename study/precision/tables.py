@@ -116,10 +116,10 @@ def slope_table(study: WorkStudy) -> Table:
     """Question, series, what against what, power, points."""
     rows = [
         (s.question.replace("_", " "), SERIES_TITLES.get(s.question, {}).get(s.series, s.series), s.against,
-         f"{s.power:+.2f}", s.count)
+         f"{s.power:+.2f}", "" if s.expected is None else f"{s.expected:+.2f}", s.count)
         for s in study.slopes
     ]  # fmt: skip
-    return Table(("question", "series", "of", "power", "points"), rows, "slopes, x^power")
+    return Table(("question", "series", "of", "power", "theory", "points"), rows, "slopes, x^power")
 
 
 def points_table(study: WorkStudy) -> Table:

@@ -34,7 +34,7 @@ from softgrasp.study.reduce.tables import (
     time_table,
 )
 from softgrasp.study.reduce.times import full_times, speed_notes, speed_of
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -188,7 +188,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
         },
         "memory_peak_mb": peak_memory_mb(model.system.layout.comm),
     }
-    return dict(plain(result))
+    return dict(to_json(result))
 
 
 def _about(s: Sweep) -> dict[str, Any]:
