@@ -19,7 +19,7 @@ from softgrasp.study.reduce.strain_measure import measure_strain
 from softgrasp.study.reduce.strain_page import cell_table, error_table, sections, sentences, time_table
 from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy, speed_up
 from softgrasp.study.reduce.times import full_times
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -108,4 +108,4 @@ def strain_result(study: StrainStudy, watch: Stopwatch) -> dict[str, Any]:
         "time": {"full_steps_median": study.times.steps, "full_factor_median": study.times.factor, **watch.seconds},
         "memory_peak_mb": peak_memory_mb(model.system.layout.comm),
     }
-    return dict(plain(result))
+    return dict(to_json(result))
