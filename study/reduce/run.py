@@ -85,6 +85,10 @@ def run_reduce(
         from softgrasp.study.reduce.certify import run_certify  # only certified models pay for it
 
         return run_certify(session, scene)
+    if scene.effects.finite_strain is not None:
+        from softgrasp.study.reduce.strain_run import run_strain  # models of another kind
+
+        return run_strain(session, scene)
     model = session.model(scene)
     watch = Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
