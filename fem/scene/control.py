@@ -55,18 +55,23 @@ class Reduction(Section):
     lambda_range: Range | None = Field(
         None,
         description="range of lambda for tests at other parameters [Pa]; by default 0.6 to 10 times that of the first "
-        "layer",
+        "layer, 0.8 to 2.4 times with effects.finite_strain",
     )
     mu_range: Range | None = Field(
         None,
         description="range of mu for tests at other parameters [Pa]; by default 0.4 to 10 times that of the first "
-        "layer",
+        "layer, 0.8 to 2.4 times with effects.finite_strain",
     )
 
     train: Literal["corners"] | list[Range] = Field(
         "corners",
         description="[lambda, mu] of full runs that train bases beside the scene's own, for the tests at other "
         "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none",
+    )
+    motions: Literal["mirrored"] | list[list[float]] = Field(
+        "mirrored",
+        description="targets [m] of further full runs that train models with effects.finite_strain; mirrored: the "
+        "scene's own with other signs; empty: none",
     )
 
     @model_validator(mode="after")
