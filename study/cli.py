@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.study.query.command import query
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
 
@@ -287,6 +288,9 @@ def reduce(
 
     out = out or default_folder("reduce", scene)
     run_reduce(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty)
+
+
+app.command()(query)
 
 
 @app.command()

@@ -55,18 +55,23 @@ class Reduction(Section):
     lambda_range: Range | None = Field(
         None,
         description="range of lambda for tests at other parameters [Pa]; by default 0.6 to 10 times that of the first "
-        "layer",
+        "layer, 0.8 to 2.4 times with effects.finite_strain",
     )
     mu_range: Range | None = Field(
         None,
         description="range of mu for tests at other parameters [Pa]; by default 0.4 to 10 times that of the first "
-        "layer",
+        "layer, 0.8 to 2.4 times with effects.finite_strain",
     )
 
     train: Literal["corners"] | list[Range] = Field(
         "corners",
         description="[lambda, mu] of full runs that train bases beside the scene's own, for the tests at other "
         "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none",
+    )
+    motions: Literal["mirrored"] | list[list[float]] = Field(
+        "mirrored",
+        description="targets [m] of further full runs that train models with effects.finite_strain; mirrored: the "
+        "scene's own with other signs; empty: none",
     )
 
     @model_validator(mode="after")
@@ -94,9 +99,13 @@ class Loop(Section):
         "midpoint", description="feedback inside the midpoint rule, or sampled and held as on a robot [no unit]"
     )
     rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
-    limit: Positive | None = Field(None, description="largest force on the hand in each direction [N]; none by default")
-    limit_torque: Positive | None = Field(
-        None, description="largest torque on a turning hand about each axis [N m]; none by default"
+    limit: Positive | list[Positive] | None = Field(
+        None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
+    )
+    limit_torque: Positive | list[Positive] | None = Field(
+        None,
+        description="largest torque on a turning hand about each axis [N m], one number or one per axis; none by "
+        "default",
     )
     delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
 

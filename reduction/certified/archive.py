@@ -1,6 +1,6 @@
 """One HDF5 file for a certified model: a reduced model's own file, the triangles, the box, and hashes of all of it.
 
-:func:`reduction.archive.load` reads the reduced model in it too, which then answers without a certificate.
+:func:`softgrasp.reduction.archive.load` reads the reduced model in it too, which then answers without a certificate.
 """
 
 from __future__ import annotations
@@ -90,7 +90,8 @@ def load_certified(path: str | Path, layout: BlockLayout | None = None) -> Certi
 
     Args:
         path: file of :func:`save_certified`.
-        layout: where the lift goes, see :func:`reduction.archive.load`; None leaves it out, which runs do without.
+        layout: where the lift goes, see :func:`softgrasp.reduction.archive.load`; None leaves it out, which runs do
+        without.
 
     Raises:
         ModelError: the file is missing, damaged, without a certificate, or of another mesh.

@@ -69,7 +69,7 @@ def load_strain(path: str | Path, layout: BlockLayout | None = None, scene_hash:
     True
 
     Args:
-        path: file of :func:`reduction.archive.save`.
+        path: file of :func:`softgrasp.reduction.archive.save`.
         layout: where the lift goes, by node coordinates: any rank count; None leaves the lift out (online use).
         scene_hash: refuse a model of another scene.
 

@@ -25,6 +25,8 @@ CAPTIONS = {
     "plant unstable or without certificate; on the upper edge those with an error above 100 %.",
     "retune.png": "Excess cost over the box when the basis stays that of the scene's parameter. Red crosses: no stable "
     "gain.",
+    "bode.png": "The loop at each input, all others closed, on the controller's own plant, sampled and held; marked: "
+    "the crossover and its phase margin.",
     "decay.png": "Decay rates of the lowest modes without feedback and with the gains.",
 }
 
@@ -59,6 +61,13 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     ]
     if study.bases:
         parts += _reduced(study, pick("errors.png"))
+    if study.margins is not None:
+        from softgrasp.study.control.bode import MARGIN_HEADER, margin_rows, margin_text  # brings Matplotlib
+
+        rows, text = margin_rows(study.margins), margin_text(study.margins)
+        parts.append(
+            Section("Margins of the small controller", text, header=MARGIN_HEADER, rows=rows, figures=pick("bode.png"))
+        )
     for i, r in enumerate(study.retuned):
         text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
         own = [] if i else pick("retune.png")
@@ -76,7 +85,7 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
         "Each equation is projected on N basis vectors and solved; its gain is judged on the full plant. The bases "
         "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
         f"The excess cost is J/J* - 1 on the modes kept; the bound beside it is proved for the whole plant by the "
-        f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with the optimal feedback after that."
+        f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with room for what is to come after it."
     )
     table = reduced_table(study.bases)
     parts = [Section(table.title, text, header=table.header, rows=table.rows, figures=figures)]

@@ -78,6 +78,10 @@ def run_reduce(
     session = Session("reduce", path, overrides, out, console, quiet, pictures, empty)
     scene = session.scene()
     names = check_scene(scene)
+    if scene.effects.finite_strain is not None:
+        from softgrasp.study.reduce.strain_run import run_strain  # models of another kind
+
+        return run_strain(session, scene)
     model = session.model(scene)
     watch = Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
