@@ -91,8 +91,7 @@ class Controller:
             value = getattr(self, name)
             if value is not None and (value.shape != shape or (name != "limits" and not np.isfinite(value).all())):
                 raise ControlError(f"{name} of the controller must be finite and of shape {shape}, not {value.shape}")
-        one = np.eye(N)
-        if not (np.array_equal(self.plant.S_q, one[:n_s]) and np.array_equal(self.plant.S_v, one[n_s : 2 * n_s])):
+        if not self.plant.hand_first:
             raise ControlError(
                 "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small_plant.galerkin"
             )

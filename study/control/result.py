@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
+from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.reduced.retune import BoxPoint
@@ -122,6 +124,11 @@ class ControlStudy:
     loops: LoopRuns
     notes: tuple[Note, ...]
 
+    @cached_property
+    def margins(self) -> LoopMargins | None:
+        """Of the loop under the small controller, on the plant that it was made for."""
+        return loop_margins(self.controller.controller, int(self.design.actuation.delay)) if self.controller else None
+
     @property
     def findings(self) -> list[str]:
         """Sentences of the diagnosis."""
@@ -210,11 +217,12 @@ def _retuned(r: Retuned) -> dict[str, Any]:
 
 
 def _controller(study: ControlStudy) -> dict[str, Any] | None:
-    if study.controller is None:
+    if study.controller is None or study.margins is None:
         return None
-    c = study.controller.controller
+    c, margins = study.controller.controller, study.margins
     return {"method": study.controller.method, "N": c.plant.N, "period": c.period, "time_tick": study.tick,
-            "sampled_radius": study.controller.radius.value}  # fmt: skip
+            "sampled_radius": study.controller.radius.value,
+            "margins": {"axes": [asdict(axis) for axis in margins.axes], "distance": margins.distance}}  # fmt: skip
 
 
 def _loop(study: ControlStudy) -> dict[str, Any]:

@@ -52,6 +52,14 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
         c = study.controller.controller
         text = f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms"
         rows.append(("small controller", text))
+    if study.margins is not None:
+        low, high, phase = study.margins.together
+        text = (
+            f"gain x {low:.3g} to {high:.3g}, phase {phase:.3g} deg"
+            if high < 1e3
+            else f"gain x {low:.3g} or more, phase {phase:.3g} deg"
+        )
+        rows.append(("its margins, all inputs at once", text))
     rows += [("re-tuned", _fast(r)) for r in study.retuned]
     stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
     return [*rows, ("time: ARE, reduced, loop", stages)]

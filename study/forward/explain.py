@@ -21,7 +21,7 @@ from softgrasp.study.forward.cautions import coarse, locking, poisson_ratios, tu
 from softgrasp.study.forward.explain_mesh import MeshReport, mesh_report
 from softgrasp.study.forward.result import Sizes, model_sizes, output_places
 from softgrasp.study.report.equation import Equation, equation
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 
 MODES = 6
 
@@ -101,7 +101,7 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None."""
-        result: dict[str, Any] = plain(asdict(self))
+        result: dict[str, Any] = to_json(asdict(self))
         return result
 
 

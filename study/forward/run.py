@@ -19,7 +19,7 @@ from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.equation import equation
-from softgrasp.study.report.origin import made_with, origin
+from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section, equation_text
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
@@ -136,5 +136,5 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
         Section("Equation", code=equation_text(equation(scene))),
         Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
         Section("Size", rows=rows),
-        Section("Made with", rows=made_with(origin(scene, sizes.ranks))),
+        Section("Made with", rows=provenance(origin(scene, sizes.ranks))),
     ]

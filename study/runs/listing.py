@@ -93,8 +93,8 @@ def compare(a: Path, b: Path) -> Comparison:
     ]
     numbers = []
     for name, x in results[0].items():
-        y = results[1].get(name)
-        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in (x, y)):
+        y: Any = results[1].get(name)
+        if type(x) in (int, float) and type(y) in (int, float):
             change = abs(y - x) / max(abs(x), abs(y)) if x != y else 0.0
             if change > ALIKE:
                 numbers.append((name, x, y, y / x - 1 if x else None))
@@ -136,7 +136,7 @@ def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool
         console.print(Table(table.header, table.rows[:SHOWN]).terminal(wrap=(0, 1, 2)) if table.rows else none)
     if len(numbers.rows) > SHOWN:
         console.print(f"{len(numbers.rows) - SHOWN} more numbers are in compare.csv")
-    result = {"command": "compare", "scene": f"{a.name} {b.name}", "a": str(a), "b": str(b)}
+    result: dict[str, Any] = {"command": "compare", "scene": f"{a.name} {b.name}", "a": str(a), "b": str(b)}
     result |= {"keys": [list(row) for row in keys.rows], "numbers": [list(row) for row in numbers.rows]}
     files = [write_json(out / "result.json", result), numbers.write_csv(out / "compare.csv")]
     if pictures and (comparison.traces is not None or numbers.rows):

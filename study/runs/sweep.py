@@ -176,7 +176,7 @@ def run_sweep_points(
     groups = max(1, comm.size // each)
     number = min(comm.rank // each, groups - 1)
     group = comm.Split(number, comm.rank)
-    runner, file = Runner(sweep, group, out / f"stopped-{number}"), out / f"points-{number}.jsonl"
+    runner, file = Runner(sweep, MPI.Intracomm(group), out / f"stopped-{number}"), out / f"points-{number}.jsonl"
     missing = [i for i, key in enumerate(keys) if key not in done]
     own: dict[str, Row] = {}
     for count, i in enumerate(missing[number::groups], start=1):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from rich.console import Console
+from softgrasp.lqr.loop.export import to_python_control
 
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
@@ -21,13 +22,12 @@ from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.design.scene import actuation, with_control
 from softgrasp.lqr.loop.controller import Controller, load_gain
-from softgrasp.lqr.loop.export import to_python_control
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.plots import drawn, figure_reduced, unstable
 from softgrasp.study.control.result import settled
 from softgrasp.study.control.run import run_control
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene
 
@@ -108,14 +108,12 @@ def test_the_loop_costs_what_the_riccati_equation_says(result: dict[str, Any]) -
 def test_every_stable_gain_has_a_proved_bound(result: dict[str, Any]) -> None:
     points = [p for points in result["reduced"].values() for p in points]
     points = [p for p in [*points, *(p for r in result["retune"] for p in r["points"])] if p["stable"]]
-    assert len([p for p in points if p["cost_excess_at_most"] is not None]) > 10
+    assert len(points) > 10
     for p in points:
-        if p["cost_excess_at_most"] is None:  # infinite: the gap is more than the cost itself
-            assert p["cost_excess"] > 0.02
-            continue
         # the excess of the loop without end, from an X with a residual of 1e-10 that the bound does not share
-        assert p["cost_excess_at_most"] >= p["cost_excess"] * (1 - 1e-6) - 1e-12, p
-        assert p["cost_excess_at_most"] <= 100 * p["cost_excess"] + 1e-9, p  # 5 to 30 measured
+        after = 1e-2 if p["cost_excess"] > 1 else 1e-6  # a loop worse than none pays more after the end
+        assert p["cost_excess_at_most"] >= p["cost_excess"] * (1 - after) - 1e-12, p
+        assert p["cost_excess_at_most"] <= 30 * p["cost_excess"] + 2e-12, p  # 24 measured where little is to come
 
 
 class _StopError(Exception):
@@ -385,7 +383,7 @@ def test_small_helpers() -> None:
     t = np.arange(5.0)
     assert settled(t, np.array([1.0, 0.5, 0.005, 0.02, 0.001])) == 4.0
     assert settled(t, np.array([1.0, 0.5, 0.005, 0.001, 0.02])) is None
-    assert plain({"a": [np.float64(np.nan), np.inf, 1.0, np.int64(2)], "b": True}) == {
+    assert to_json({"a": [np.float64(np.nan), np.inf, 1.0, np.int64(2)], "b": True}) == {
         "a": [None, None, 1.0, 2],
         "b": True,
     }

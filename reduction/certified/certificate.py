@@ -1,0 +1,163 @@
+"""What a certified run says about its errors: bounds that are proved, and numbers that are estimates and say so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.online import ReducedTrajectory
+
+Kind = Literal["proof", "estimate"]
+
+
+class ToleranceError(SoftgraspError):
+    """The proved error of a run is above what was asked for.
+
+    Attributes:
+        run: the run with its certificate.
+    """
+
+    def __init__(self, text: str, run: CertifiedRun) -> None:
+        super().__init__(text)
+        self.run = run
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Error of a run at every step.
+
+    Attributes:
+        values: at every step, (steps + 1,) or one column for each component.
+        size: largest value of the reduced solution itself, in the same norm.
+        kind: "proof": not exceeded; "estimate": about so large.
+    """
+
+    values: Array = field(repr=False)
+    size: float
+    kind: Kind
+
+    @property
+    def largest(self) -> Array:
+        """Largest value over the run, of every component."""
+        return np.asarray(self.values.max(axis=0))
+
+    @property
+    def relative(self) -> float:
+        """Largest value over the largest of the true solution, which is at least the reduced one less the proof.
+
+        Infinite when the proof is larger than the reduced solution, 0 when nothing moves.
+        """
+        off = float(np.linalg.norm(self.largest))
+        least = self.size - off if self.kind == "proof" else self.size
+        return 0.0 if off == 0 else off / least if least > 0 else float("inf")
+
+
+@dataclass(frozen=True)
+class MeshNumber:
+    """What the mesh leaves in the deformation of the outputs, estimated offline; no bound.
+
+    Attributes:
+        places: (lambda, mu) of the first layer where it was estimated [Pa].
+        estimates: relative error there [1].
+    """
+
+    places: tuple[tuple[float, float], ...]
+    estimates: tuple[float, ...]
+
+    @property
+    def largest(self) -> float:
+        """Over all places."""
+        return max(self.estimates)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Errors of one reduced run, apart by their sources: reduction, time step, mesh.
+
+    Attributes:
+        energy: of the deformation in the energy norm, |e|^2 = e_z'K e_z + e_v'M e_v [J^(1/2)]; for a hand that a force
+            drives with the tissue pulling back, of deformation and hand, e_v with the hand's velocity.
+        outputs: proof for every output component [m, rad].
+        estimate, outputs_estimate: difference to the run of the larger basis; None without one.
+        effectivity_at_most: of the proof's running maximum, as far as the numbers themselves prove it; infinite if they
+            do not.
+        time_step: estimate of the error of the step, relative, in the energy norm; None where no finer table of the
+            motion was given.
+        time_step_proof: the same with the bounds of both runs added; None if not asked for.
+        mesh: what is known of the mesh's error; None: nothing.
+        inside: the materials lie in the box that the model was trained in.
+        norm: what :attr:`reduction` is about: "energy" or "output".
+        tolerance: asked for; None: none.
+    """
+
+    energy: Bound
+    outputs: Bound
+    estimate: Bound | None = None
+    outputs_estimate: Bound | None = None
+    effectivity_at_most: float = np.inf
+    time_step: float | None = None
+    time_step_proof: float | None = None
+    mesh: MeshNumber | None = None
+    inside: bool = True
+    norm: str = "energy"
+    tolerance: float | None = None
+
+    @property
+    def proved(self) -> bool:
+        """Whether :attr:`reduction` is proved, not estimated."""
+        return self.energy.kind == "proof"
+
+    @property
+    def how(self) -> str:
+        """What :attr:`reduction` is, in a word."""
+        return "proved" if self.proved else "estimated"
+
+    @property
+    def what(self) -> str:
+        """What :attr:`reduction` is relative to, in words."""
+        return "largest energy norm" if self.norm == "energy" else "largest deformation at the outputs"
+
+    @property
+    def reduction(self) -> float:
+        """Relative error of the reduction in the norm asked for."""
+        return (self.outputs if self.norm == "output" else self.energy).relative
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is at most the tolerance."""
+        return self.tolerance is None or self.reduction <= self.tolerance
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What a user should know, in sentences."""
+        result = []
+        if not self.inside:
+            result.append("The materials lie outside the box of the training; the bound holds all the same.")
+        if self.reduction > 1:
+            result.append("The bound is larger than the deformation itself, so it says nothing about this run.")
+        others = {"time step": self.time_step, "mesh": None if self.mesh is None else self.mesh.largest}
+        value, key = max(((value, key) for key, value in others.items() if value is not None), default=(0.0, ""))
+        if value > self.reduction:
+            result.append(f"The {key} leaves the larger error: a finer basis gains nothing.")
+        return tuple(result)
+
+    def sentence(self) -> str:
+        """The three numbers in one line."""
+        step = "not known" if self.time_step is None else f"{self.time_step:.1e} (estimate)"
+        mesh = "not known"
+        if self.mesh is not None:
+            count = len(self.mesh.places)
+            mesh = f"{self.mesh.largest:.1e} (estimated at {count} parameter{'s' * (count > 1)}, no bound)"
+        return f"reduction {self.reduction:.1e} ({self.how}) | time step {step} | mesh {mesh}"
+
+
+@dataclass(frozen=True)
+class CertifiedRun:
+    """A reduced run and what is known of its error."""
+
+    trajectory: ReducedTrajectory
+    certificate: Certificate

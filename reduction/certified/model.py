@@ -1,0 +1,305 @@
+"""A reduced model that answers with a certificate: two nested bases, residual norms, the box that it was trained in.
+
+    |u - u_k| <= |u_k2 - u_k| + bound(k2):
+
+the run of the small basis is the answer, the larger one measures it, and its own static bound proves the rest [HORU19].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.certified import bounds
+from softgrasp.reduction.certified.certificate import Bound, Certificate, CertifiedRun, MeshNumber, ToleranceError
+from softgrasp.reduction.certified.motion import (
+    Drive,
+    Materials,
+    Motion,
+    hand_inertia,
+    known_hand,
+    leading,
+    modal_motions,
+    padded,
+    stepped_motion,
+)
+from softgrasp.reduction.certified.oscillators import SecondOrder
+from softgrasp.reduction.certified.residual import ResidualNorms
+from softgrasp.reduction.model import ModelError, ReducedModel
+
+Certify = Literal["two", "proof", "estimate"]
+TOGETHER = 4_000_000  # entries of the states of a batch that march at once: 32 MB
+
+
+@dataclass(frozen=True)
+class Box:
+    """Ranges of lambda and mu of the first layer [Pa], at its density in the projection; others keep their ratios."""
+
+    lam: tuple[float, float]
+    mu: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class CertifiedModel:
+    """A reduced model with everything that a certified run needs; small arrays, equal on every rank. Not collective.
+
+    Attributes:
+        fine: model of the larger basis k2; its leading k modes make the answer.
+        k: modes of the answer; k2 when there is one basis.
+        norms: residual norms of the larger basis.
+        compliance: sqrt(c' K_r^-1 c) of every output component, (p,).
+        box: where it was trained; None: nowhere.
+        tolerance: relative error above which a run is refused; None: never.
+        certify: "two" bases, the "proof" of one, or the "estimate" of two.
+        norm: in which the tolerance counts, "energy" or "output".
+        mesh: error of the mesh at some parameters.
+        drive: the motion of the scene.
+        training: what the greedy did, for archive and reports.
+    """
+
+    fine: ReducedModel
+    k: int
+    norms: ResidualNorms
+    compliance: Array
+    box: Box | None = None
+    tolerance: float | None = None
+    certify: Certify = "two"
+    norm: str = "energy"
+    mesh: MeshNumber | None = None
+    drive: Drive | None = None
+    training: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        fine, k2, second = self.fine, self.norms.k, self.fine.structure == "second_order"
+        if not (fine.fixed_solid and fine.frame == "relative" and (second or self.norms.shape is not None)):
+            raise ModelError("a certificate needs a basis with fixed solid modes relative to the hand", fine.name)
+        if fine.two_way and not second:
+            raise ModelError("with two-way coupling only a second-order basis has a certificate", fine.name)
+        if not 0 < self.k <= k2 or (self.k < k2 and not second):
+            raise ModelError(f"k = {self.k} of {k2} modes; only second-order bases have leading ones", fine.name)
+        if self.certify != "proof" and self.k == k2:
+            object.__setattr__(self, "certify", "proof")
+
+    @property
+    def k2(self) -> int:
+        """Modes of the larger basis."""
+        return self.norms.k
+
+    def with_sizes(self, k: int, k2: int) -> CertifiedModel:
+        """The same with fewer modes in both bases: leading blocks, no new work."""
+        fine = self.fine if k2 == self.k2 else leading(self.fine, k2)
+        return replace(self, fine=fine, k=k, norms=self.norms.leading(k2))
+
+    @cached_property
+    def coarse(self) -> ReducedModel:
+        """Model of the leading k modes, whose run is the answer."""
+        return self.fine if self.k == self.k2 else leading(self.fine, self.k)
+
+    @cached_property
+    def _blocks(self) -> dict[int, SecondOrder]:
+        return {k: SecondOrder.of(m) for k, m in ((self.k2, self.fine), (self.k, self.coarse))}
+
+    def materials(self, lam: float, mu: float, rho: float | None = None) -> Materials:
+        """Materials with these numbers in the first layer [Pa, kg/m^3]; the others keep their ratios to it."""
+        first = self.fine.materials[0]
+        a, b, c = lam / first.lam, mu / first.mu, 1.0 if rho is None else rho / first.rho
+        return tuple(replace(m, lam=m.lam * a, mu=m.mu * b, rho=m.rho * c) for m in self.fine.materials)
+
+    def inside(self, materials: Materials) -> bool:
+        """Whether these lie in the box: a motion depends on lambda / rho and mu / rho alone, one-way."""
+        if self.box is None:
+            return True
+        first, own = materials[0], self.fine.materials[0]
+        scale = own.rho / first.rho
+        near = all(
+            np.allclose((m.lam, m.mu, m.rho, m.beta), (o.lam, o.mu, o.rho, o.beta), rtol=1e-9, atol=0)
+            for m, o in zip(materials, self.materials(first.lam, first.mu, first.rho), strict=True)
+        )
+        pairs = ((first.lam * scale, self.box.lam), (first.mu * scale, self.box.mu))
+        return near and all(low * (1 - 1e-9) <= value <= high * (1 + 1e-9) for value, (low, high) in pairs)
+
+    def run(
+        self,
+        materials: Materials | None = None,
+        drive: Drive | None = None,
+        *,
+        tolerance: float | None = None,
+        gravity: Array | None = None,
+        allow: bool = False,
+        prove_time_step: bool = False,
+    ) -> CertifiedRun:
+        """A run of the small basis with its certificate. Online; not collective.
+
+        Args:
+            materials: one per layer; None takes those of the projection.
+            drive: what moves the hand; None takes the scene's motion.
+            tolerance: relative; None takes that of the model.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            allow: return a run above the tolerance too.
+            prove_time_step: prove the error of the step as well, by a second certified run at the finer step.
+
+        Raises:
+            ToleranceError: the error is above the tolerance; it carries the run.
+            ModelError: materials or tables do not fit.
+        """
+        (run,) = self.run_batch(
+            [self.fine.materials if materials is None else materials], drive,
+            tolerance=tolerance, gravity=gravity, prove_time_step=prove_time_step,
+        )  # fmt: skip
+        certificate = run.certificate
+        if not (allow or certificate.passed):
+            first = (materials or self.fine.materials)[0]
+            raise ToleranceError(
+                f"the error at lambda = {first.lam:g}, mu = {first.mu:g} Pa is {certificate.how} at most "
+                f"{certificate.reduction:.2g} of the {certificate.what}, above the tolerance "
+                f"{certificate.tolerance:g}; run the full model, or allow it",
+                run,
+            )
+        return run
+
+    def run_batch(
+        self,
+        many: Sequence[Materials],
+        drive: Drive | None = None,
+        *,
+        tolerance: float | None = None,
+        gravity: Array | None = None,
+        prove_time_step: bool = False,
+    ) -> list[CertifiedRun]:
+        """Runs at many parameters under one motion, refused or not: the modes of all march in one product.
+
+        Args and errors as in :meth:`run`, without the refusal.
+        """
+        drive = self.drive if drive is None else drive
+        if drive is None:
+            raise ModelError("give the motion of the hand, or the force on it; the model holds none", self.fine.name)
+        tolerance = self.tolerance if tolerance is None else tolerance
+        g = self.fine.gravity if gravity is None else np.asarray(gravity, dtype=float)
+        g = np.zeros(len(self.fine.parts["M_hand"])) if g is None else g
+        chunk = max(1, TOGETHER // (2 * self.k2 * (drive.steps + 1)))
+        runs = []
+        for at in range(0, len(many), chunk):
+            for materials, answer, certificate in self._certified(many[at : at + chunk], drive, g):
+                if prove_time_step and drive.finer is not None and certificate.time_step is not None:
+                    ((_, _, finer),) = self._certified([materials], replace(drive.finer, finer=None), g)
+                    off = certificate.energy.largest + finer.energy.largest
+                    proof = certificate.time_step + float(off) / certificate.energy.size
+                    certificate = replace(certificate, time_step_proof=proof)
+                certificate = replace(certificate, tolerance=tolerance, mesh=self.mesh, norm=self.norm)
+                runs.append(CertifiedRun(answer.trajectory(drive.dt, self.fine.outputs.names), certificate))
+        return runs
+
+    def _motions(self, k: int, many: Sequence[Materials], drive: Drive, g: Array, residual: bool) -> list[Motion]:
+        model = self.fine if k == self.k2 else self.coarse
+        norms = self.norms if residual else None
+        hand = known_hand(model, drive, g)
+        alike = all(len({m.beta for m in materials}) == 1 for materials in many)
+        if model.structure == "second_order" and hand is not None and alike:
+            return modal_motions(model, self._blocks[k], norms, many, drive, g, hand)
+        return [stepped_motion(model, norms, materials, drive, g) for materials in many]
+
+    def _certified(
+        self, many: Sequence[Materials], drive: Drive, g: Array
+    ) -> list[tuple[Materials, Motion, Certificate]]:
+        """Answer and certificate at every parameter."""
+        two, proved = self.k < self.k2, self.certify != "estimate"
+        answers = self._motions(self.k, many, drive, g, proved and not two)
+        fines = self._motions(self.k2, many, drive, g, proved) if two else answers
+        refined: list[Motion | None] = [None] * len(many)
+        if drive.finer is not None:
+            refined = list(self._motions(self.k, many, drive.finer, g, False))
+        result = []
+        for materials, answer, fine, finer in zip(many, answers, fines, refined, strict=True):
+            certificate = self._certificate(materials, answer, fine, drive)
+            if finer is not None and drive.finer is not None:
+                step = self._time_step(materials, answer, finer, drive, drive.finer)
+                certificate = replace(certificate, time_step=step)
+            result.append((materials, answer, certificate))
+        return result
+
+    def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive) -> Certificate:
+        rigid = answer.q_s @ self.fine.outputs.C_s.T
+        size = answer.size
+        deformation = float(np.linalg.norm(answer.outputs - rigid, axis=1).max(initial=0.0))
+        estimate = wide = None
+        if fine is not answer:
+            estimate = Bound(self._difference(materials, answer, fine, drive), size, "estimate")
+            wide = Bound(np.abs(fine.outputs - answer.outputs), deformation, "estimate")
+        inside = self.inside(materials)
+        if self.certify == "estimate" and estimate is not None and wide is not None:
+            return Certificate(estimate, wide, inside=inside)
+        own = self._bound(fine, materials, drive)
+        reach = self._reach(own, materials, drive)
+        effectivity = np.inf
+        if estimate is not None and estimate.largest > own.max():
+            effectivity = float((estimate.largest + own.max()) / (estimate.largest - own.max()))
+        return Certificate(
+            energy=Bound(own if estimate is None else estimate.values + own, size, "proof"),
+            outputs=Bound(reach if wide is None else wide.values + reach, deformation, "proof"),
+            estimate=estimate,
+            outputs_estimate=wide,
+            effectivity_at_most=effectivity,
+            inside=inside,
+        )
+
+    def _coupled(self, drive: Drive) -> bool:
+        """Whether the hand's own motion has an error."""
+        return self.fine.two_way and drive.hand is None
+
+    def _difference(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive) -> Array:
+        """|u_k2 - u_k|_E at every step, (steps + 1,)."""
+        if fine.modes is not None and answer.modes is not None and fine.w is not None and answer.w is not None:
+            change = fine.modes.inverse[:, : self.k] @ answer.modes.X  # modes of the answer in those of the larger one
+            d = fine.w.copy()
+            d[:, 0] -= (fine.modes.omega[:, None] * change / answer.modes.omega) @ answer.w[:, 0]
+            d[:, 1] -= change @ answer.w[:, 1]
+            return bounds.lengths(d.reshape(-1, d.shape[2]))
+        n_s = answer.q_s.shape[1]
+        d = fine.states(drive.dt) - padded(answer.states(drive.dt), self.fine.N, n_s)
+        return self._energy(self.fine, materials, d, drive)
+
+    def _energy(self, model: ReducedModel, materials: Materials, d: Array, drive: Drive) -> Array:
+        small = model.at(materials)
+        energy = small.total_energy(d) if self._coupled(drive) else small.energy(d)
+        return np.asarray(np.sqrt(np.maximum(2 * energy, 0.0)))
+
+    def _bound(self, motion: Motion, materials: Materials, drive: Drive) -> Array:
+        """Static bound of a run, (steps + 1,)."""
+        r = motion.residual
+        assert r is not None
+        kernel, betas = None, {m.beta for m in materials}
+        if not self._coupled(drive) and len(betas) == 1 and self.fine.damped:
+            low, high = self.norms.frequencies(materials)
+            kernel = bounds.decay(low, high, self.fine.alpha, betas.pop(), drive.dt, drive.steps)
+        drift, gap, start = r.inexact or (None, None, 0.0)
+        return bounds.static_bound(r.static, r.rest, drive.dt, r.first, kernel, drift, gap, start)
+
+    def _reach(self, bound: Array, materials: Materials, drive: Drive) -> Array:
+        """Bound of every output component from one of the energy, (steps + 1, p)."""
+        reach = np.outer(bound, self.norms.static_factor(materials) * self.compliance)
+        if self._coupled(drive):
+            # the hand's velocity error is at most S^(-1/2) |e|, its displacement error the integral of that
+            scale = max(1.0, self.norms.mass_factor(materials))
+            hand = scale * np.linalg.norm(self.fine.outputs.C_s @ hand_inertia(self.fine, self.norms)[1], axis=1)
+            reach += np.outer(drive.dt * np.concatenate([[0.0], np.cumsum((bound[1:] + bound[:-1]) / 2)]), hand)
+        return np.asarray(reach)
+
+    def _time_step(self, materials: Materials, answer: Motion, finer: Motion, drive: Drive, fine_drive: Drive) -> float:
+        """Difference of the same run at a finer step, and what dt -> 0 adds to it by its second order; relative."""
+        many = fine_drive.steps // drive.steps
+        if answer.size <= 0:
+            return 0.0
+        if finer.w is not None and answer.w is not None:
+            d = finer.w[:, :, ::many] - answer.w
+            off = bounds.lengths(d.reshape(-1, d.shape[2]))
+        else:
+            x = finer.states(fine_drive.dt)[::many] - answer.states(drive.dt)
+            if not self._coupled(drive):
+                x[:, : 2 * answer.q_s.shape[1]] = 0.0
+            off = self._energy(self.coarse, materials, x, drive)
+        return float(off.max() / answer.size * many**2 / (many**2 - 1))

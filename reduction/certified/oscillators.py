@@ -1,0 +1,131 @@
+"""Second-order reduced models under a known hand, mode by mode: one small eigenproblem a parameter, then 2 x 2 steps.
+
+With X' M X = 1 and X' K X = omega^2 of the reduced pair, a = X eta and the midpoint rule of
+
+    eta'' + (alpha + beta omega^2) eta' + omega^2 eta = -X'G c,   c = a_s - g [+ alpha v_s]
+
+turns w = (omega eta, eta') by one 2 x 2 matrix a mode. Blocks of steps are products; no step of Python is a time step.
+The same numbers as :func:`softgrasp.reduction.online.run` to rounding, in less time: nothing of size 2 k is factored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.operators import Parameters
+
+STEPS = 24  # of a block: near the root of usual numbers of steps
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Modes of the reduced pair at one parameter.
+
+    Attributes:
+        omega: (k,) [1/s].
+        X: (k, k), X' M X = 1.
+        inverse: X^-1 = X' M.
+        g: X'G, (k, n_s).
+        alpha, beta: damping [1/s, s].
+    """
+
+    omega: Array
+    X: Array
+    inverse: Array
+    g: Array
+    alpha: float
+    beta: float
+
+    @property
+    def rate(self) -> Array:
+        """Damping alpha + beta omega^2 of every mode."""
+        return np.asarray(self.alpha + self.beta * self.omega**2)
+
+
+@dataclass(frozen=True)
+class SecondOrder:
+    """Reduced M, K and G of every layer at unit materials, (L, k, k) and (L, k, n_s); all of a second-order model."""
+
+    K_mu: Array
+    K_lambda: Array
+    M: Array
+    G: Array
+
+    @staticmethod
+    def of(model: ReducedModel) -> SecondOrder:
+        """Blocks of a model with V = blkdiag(I, Phi, Phi)."""
+        hand = 2 * len(model.parts["M_hand"])
+        q, v = slice(hand, (hand + model.N) // 2), slice((hand + model.N) // 2, model.N)
+        K_mu, K_lambda, M = (
+            np.array(model.parts[key][:, v, columns]) for key, columns in (("K_mu", q), ("K_lambda", q), ("M", v))
+        )
+        return SecondOrder(K_mu, K_lambda, M, np.array(model.parts["WG"][:, v]))
+
+    def modes(self, p: Parameters) -> Modes:
+        """Solve K x = omega^2 M x at a parameter.
+
+        Raises:
+            ModelError: the reduced mass is not definite, as with linearly dependent columns.
+        """
+        K, M = p.stiffness(self.K_mu, self.K_lambda), p.density(self.M)
+        try:
+            squares, X = scipy.linalg.eigh(K, M, driver="gvd", check_finite=False)
+        except np.linalg.LinAlgError as error:
+            raise ModelError("the reduced mass is singular; its basis vectors are linearly dependent") from error
+        omega = np.sqrt(np.maximum(squares, 0.0))
+        return Modes(omega, X, X.T @ M, X.T @ p.density(self.G), p.alpha if p.damped else 0.0, p.materials[0].beta)
+
+
+def march(omega: Array, rate: Array, loads: Array, dt: float, start: Array | None = None) -> Array:
+    """Midpoint steps of eta'' + rate eta' + omega^2 eta = f for many modes; w = (omega eta, eta').
+
+    Args:
+        omega, rate: (m,).
+        loads: f at the middles of the steps, (m, steps).
+        dt: step [s].
+        start: w at the start, (m, 2); None is zero.
+
+    Returns:
+        w, (m, 2, steps + 1).
+    """
+    (m, steps), h = loads.shape, dt / 2
+    b = min(STEPS, steps)
+    blocks = -(-steps // b)
+    inverse = np.empty((m, 2, 2))  # (1 - h A)^-1 with A = [0, omega; -omega, -rate]
+    inverse[:, 0, 0], inverse[:, 1, 1] = 1 + h * rate, 1.0
+    inverse[:, 0, 1], inverse[:, 1, 0] = h * omega, -h * omega
+    inverse /= (1 + h * rate + (h * omega) ** 2)[:, None, None]
+    powers = np.empty((m, b + 1, 2, 2))
+    powers[:, 0], powers[:, 1] = np.eye(2), 2 * inverse - np.eye(2)
+    done = 1
+    while done < b:
+        more = min(done, b - done)
+        powers[:, done + 1 : done + 1 + more] = powers[:, done : done + 1] @ powers[:, 1 : 1 + more]
+        done += more
+    impulse = np.zeros((m, b + 1, 2))  # answer to a unit load in one step; the last row stays 0
+    impulse[:, :b] = (powers[:, :b] @ (dt * inverse[:, None, :, 1:]))[..., 0]
+    lag = np.subtract.outer(np.arange(b), np.arange(b))
+    answer = np.empty((m, b, 2, b + 2))  # of a block's states to its loads and its start
+    answer[..., :b] = impulse[:, np.where(lag >= 0, lag, b)].transpose(0, 1, 3, 2)
+    answer[..., b:] = powers[:, 1:]
+    answer = answer.reshape(m, 2 * b, b + 2)
+    inputs = np.zeros((m, b + 2, blocks))
+    padded = np.zeros((m, blocks * b))
+    padded[:, :steps] = loads
+    inputs[:, :b] = padded.reshape(m, blocks, b).transpose(0, 2, 1)
+    ends = answer[:, -2:, :b] @ inputs[:, :b]  # what the loads of each block leave at its end
+    turn, w = powers[:, b], np.zeros((m, 2)) if start is None else start
+    inputs[:, b:, 0] = w
+    for i in range(blocks - 1):
+        w = (turn @ w[:, :, None])[:, :, 0] + ends[:, :, i]
+        inputs[:, b:, i + 1] = w
+    states = np.empty((m, 2, steps + 1))
+    states[:, :, 0] = inputs[:, b:, 0]
+    moved = (answer @ inputs).reshape(m, b, 2, blocks).transpose(0, 2, 3, 1).reshape(m, 2, blocks * b)
+    states[:, :, 1:] = moved[:, :, :steps]
+    return states

@@ -1,0 +1,276 @@
+"""Norms of a reduced run's residual, |r| = |T(theta) c|: triangles of orthonormalised columns instead of Gram matrices.
+
+A run z = Phi a, v_z = Phi b with a' = b leaves in the momentum balance of the full model, at the middle of a step,
+
+    r = sum over the layers of rho (M_1 Phi (b' + alpha b) + G_1 c) + (mu K_mu + lambda K_lambda) Phi (a + beta b),
+    c = a_s - g [+ alpha v_s],
+
+a combination of few columns C = Q T. With Q orthonormal in M_r^-1 (or K_r^-1) its norm is that of T times the
+coefficients. A Gram matrix of C would lose half of the digits [BEOR14].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+from slepc4py import SLEPc
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array, PETSc, times_columns, total
+from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.solve.solvers import choose_solver, make_solver
+from softgrasp.fem.system import BlockSystem, LayerMaterial
+from softgrasp.reduction.galerkin import unit_coupling
+
+DROPPED = 1e-14  # of a column's own length: what is left of it is rounding
+PREFIX = "softgrasp_certified_"
+MARGIN = 1.01  # of the largest frequency, which the iteration meets from below
+
+
+@dataclass(frozen=True)
+class ResidualNorms:
+    """Triangles of the columns [G_1 of every layer; M_1 phi, K_mu phi, K_lambda phi of every layer, mode by mode].
+
+    Attributes:
+        static: in K_r^-1, (rows, L n_s + 3 L k).
+        mass: in M_r^-1, alike.
+        reference: materials of K_r and M_r.
+        n_s: degrees of freedom of the hand.
+        dimension: of space.
+        omega: lowest and (a bound on the) highest frequency at the reference [1/s].
+        shape: triangle of the modes in K_r, and of [modes, those of the velocity] in M_r, for models whose kinematics
+            are not exact; else None.
+    """
+
+    static: Array
+    mass: Array
+    reference: tuple[LayerMaterial, ...]
+    n_s: int
+    dimension: int
+    omega: tuple[float, float]
+    shape: tuple[Array, Array] | None = None
+
+    @property
+    def k(self) -> int:
+        """Number of modes."""
+        layers = len(self.reference)
+        return int(self.static.shape[1] // layers - self.n_s) // 3
+
+    def leading(self, k: int) -> ResidualNorms:
+        """Of the first k modes: leading blocks."""
+        width = len(self.reference) * (self.n_s + 3 * k)
+        return replace(self, static=_leading(self.static, width), mass=_leading(self.mass, width))
+
+    def columns(self, T: Array, materials: tuple[LayerMaterial, ...]) -> tuple[Array, Array, Array, Array]:
+        """A triangle at a parameter: what multiplies c, (rows, n_s), b' + alpha b, a, and b by viscosity, (rows, k)."""
+        layers, n_s, rows = len(materials), self.n_s, len(T)
+        weights = np.zeros((layers, 3, 3))
+        for i, m in enumerate(materials):
+            weights[i, :, 0] = m.rho, 0.0, 0.0
+            weights[i, :, 1] = 0.0, m.mu, m.lam
+            weights[i, :, 2] = 0.0, m.beta * m.mu, m.beta * m.lam
+        G = np.tensordot(T[:, : layers * n_s].reshape(rows, layers, n_s), weights[:, 0, 0], (1, 0))
+        parts = T[:, layers * n_s :].reshape(-1, 3 * layers) @ weights.reshape(3 * layers, 3)
+        M, K, D = np.moveaxis(parts.reshape(rows, -1, 3), 2, 0)
+        return G, M, K, D
+
+    def static_factor(self, materials: tuple[LayerMaterial, ...]) -> float:
+        """Factor c with |r|_{K^-1} <= c |r|_{K_r^-1}: 0 <= K_lambda <= (d / 2) K_mu, since (tr e)^2 <= d e:e."""
+        return float(min(min(pair) for pair in self._ratios(materials)) ** -0.5)
+
+    def stiffness_factor(self, materials: tuple[LayerMaterial, ...]) -> float:
+        """Factor c with |z|_K <= c |z|_{K_r}."""
+        return float(max(max(pair) for pair in self._ratios(materials)) ** 0.5)
+
+    def _ratios(self, materials: tuple[LayerMaterial, ...]) -> list[tuple[float, float]]:
+        half = self.dimension / 2
+        pairs = zip(materials, self.reference, strict=True)
+        return [(m.mu / r.mu, (m.mu + half * m.lam) / (r.mu + half * r.lam)) for m, r in pairs]
+
+    def mass_factor(self, materials: tuple[LayerMaterial, ...]) -> float:
+        """Factor c with |r|_{M^-1} <= c |r|_{M_r^-1}; exact for a common factor of all densities."""
+        return float(max(r.rho / m.rho for m, r in zip(materials, self.reference, strict=True)) ** 0.5)
+
+    def inertia_factor(self, materials: tuple[LayerMaterial, ...]) -> float:
+        """Factor c with |v|_M <= c |v|_{M_r}."""
+        return float(max(m.rho / r.rho for m, r in zip(materials, self.reference, strict=True)) ** 0.5)
+
+    def frequencies(self, materials: tuple[LayerMaterial, ...]) -> tuple[float, float]:
+        """Bounds below and above on all natural frequencies at a parameter [1/s]."""
+        low = self.omega[0] / (self.static_factor(materials) * self.inertia_factor(materials))
+        return low, self.omega[1] * self.stiffness_factor(materials) * self.mass_factor(materials)
+
+
+def _leading(T: Array, width: int) -> Array:
+    columns = T[:, :width]
+    used = np.flatnonzero(columns.any(axis=1))
+    return np.ascontiguousarray(columns[: int(used[-1]) + 1 if len(used) else 1])
+
+
+class Orthonormal:
+    """Columns Q with Q' W^-1 Q = I, grown by and by, and the triangle T of C = Q T. Collective.
+
+    Gram-Schmidt with re-orthogonalisation, one solve a column; Y = W^-1 Q is kept beside Q.
+
+    Args:
+        W: symmetric positive definite; None stands for W^-1 = ``product``.
+        layout: of the system.
+        product: the inner product itself instead of W.
+    """
+
+    def __init__(self, system: BlockSystem, W: PETSc.Mat | None, product: PETSc.Mat | None = None) -> None:
+        self.comm, self.product = system.layout.comm, product
+        self.n = system.layout.n_local
+        if W is not None:
+            name, _ = choose_solver(system.layout, few=True)
+            self.solver = make_solver(W.copy(), name, system.layout, PREFIX, 1e-12, reproducible=False)
+            self.b, self.x = W.createVecs()
+        self.Q, self.Y = np.empty((self.n, 0), order="F"), np.empty((self.n, 0), order="F")
+        self.T: list[Array] = []
+        self.rank = 0
+
+    def riesz(self, X: Array) -> Array:
+        """W^-1 X, local rows. Collective."""
+        if self.product is not None:
+            return times_columns(self.product, X)
+        Y = np.empty(X.shape, order="F")
+        for j in range(X.shape[1]):
+            self.b.array_w[:] = X[:, j]
+            self.solver.solve(self.b, self.x)
+            Y[:, j] = self.x.array_r
+        return Y
+
+    def add(self, C: Array) -> None:
+        """Append columns, local rows (n_local, p). Collective."""
+        X = np.array(C, order="F")
+        room = self.rank + X.shape[1]
+        if room > self.Q.shape[1]:
+            self.Q, self.Y = (
+                np.asfortranarray(np.hstack([A[:, : self.rank], np.empty((self.n, 2 * X.shape[1] + self.rank))]))
+                for A in (self.Q, self.Y)
+            )
+        known = total(self.comm, self.Y[:, : self.rank].T @ X)
+        X -= self.Q[:, : self.rank] @ known
+        for j in range(X.shape[1]):
+            x, t = X[:, j], np.zeros(self.rank)
+            t[: len(known)] = known[:, j]
+            for _ in range(2):
+                h = total(self.comm, self.Y[:, : self.rank].T @ x)
+                x -= self.Q[:, : self.rank] @ h
+                t += h
+            y = self.riesz(x[:, None])[:, 0]
+            length = float(np.sqrt(max(total(self.comm, np.array([x @ y]))[0], 0.0)))
+            if length > DROPPED * np.hypot(np.linalg.norm(t), length):
+                self.Q[:, self.rank], self.Y[:, self.rank] = x / length, y / length
+                self.rank += 1
+                t = np.append(t, length)
+            self.T.append(t)
+
+    def triangle(self) -> Array:
+        """T of all columns so far, (rank, columns), the same bits on every rank. Collective."""
+        T = np.zeros((max(self.rank, 1), len(self.T)))
+        for j, t in enumerate(self.T):
+            T[: len(t), j] = t
+        return np.asarray(self.comm.bcast(T))
+
+    def destroy(self) -> None:
+        """Free what PETSc holds. Collective."""
+        if self.product is None:
+            for used in (self.solver, self.b, self.x):
+                used.destroy()
+
+
+class ResidualSpace:
+    """The columns of the residual of a growing basis, orthonormalised in M_r^-1 and in K_r^-1. Collective.
+
+    Memory: 4 arrays of n_e x (3 L k + L n_s), in the offline stage only.
+
+    Args:
+        system: gives layers and layout; its materials do not matter.
+        reference: materials of the norms.
+
+    Raises:
+        SolverError: a factorisation failed.
+    """
+
+    def __init__(self, system: BlockSystem, reference: tuple[LayerMaterial, ...]) -> None:
+        self.system, self.reference = system.with_materials(reference), reference
+        self.static = Orthonormal(system, self.system.K_ee)
+        self.mass = Orthonormal(system, self.system.M_ee)
+        self._omega: tuple[float, float] | None = None
+        self._add(np.hstack(unit_coupling(system)[0]))
+
+    def _add(self, C: Array) -> None:
+        self.static.add(C)
+        self.mass.add(C)
+
+    def extend(self, Phi: Array) -> None:
+        """Append the columns of new modes, local rows (n_local, p). Collective."""
+        products = [
+            times_columns(A.ee, Phi) for layer in self.system.layers for A in (layer.M_1, layer.K_mu, layer.K_lambda)
+        ]
+        if Phi.shape[1]:
+            # mode by mode, so that leading modes have leading blocks
+            self._add(np.stack(products, axis=2).reshape(len(Phi), -1))
+
+    def norms(self) -> ResidualNorms:
+        """Triangles of all modes so far. Collective."""
+        layout = self.system.layout
+        if self._omega is None:
+            low = float(lowest_modes(self.system, 1)[0][0])
+            self._omega = low, MARGIN * highest_frequency(self.system) if self.system.damping.active else np.inf
+        return ResidualNorms(
+            self.static.triangle(), self.mass.triangle(), self.reference, layout.n_s, layout.dimension, self._omega
+        )
+
+    def compliance(self, C: Array) -> Array:
+        """sqrt(c' K_r^-1 c) of every output column c of the tissue, local rows (n_local, p); (p,). Collective."""
+        squares = total(self.system.layout.comm, (C * self.static.riesz(C)).sum(axis=0))
+        return np.asarray(self.system.layout.comm.bcast(np.sqrt(np.maximum(squares, 0.0))))
+
+    def destroy(self) -> None:
+        """Free the factors. Collective."""
+        self.static.destroy()
+        self.mass.destroy()
+
+
+def highest_frequency(system: BlockSystem) -> float:
+    """Largest omega of K_ee phi = omega^2 M_ee phi [1/s], met from below to 1e-3. Collective.
+
+    Raises:
+        SolverError: the iteration did not converge.
+    """
+    eps = SLEPc.EPS().create(system.layout.comm)
+    eps.setOptionsPrefix(PREFIX)
+    eps.setOperators(system.K_ee, system.M_ee)
+    eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+    eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
+    eps.setDimensions(nev=1, ncv=min(40, system.layout.n_e))
+    eps.setTolerances(1e-3, 500)
+    st = eps.getST()
+    ksp = st.getKSP()
+    ksp.setType("cg")
+    ksp.getPC().setType("jacobi")
+    ksp.setTolerances(rtol=1e-10, max_it=500)
+    try:
+        eps.solve()
+        if eps.getConverged() < 1:
+            raise SolverError("the largest frequency of the tissue did not converge; check material and mesh")
+        value = float(eps.getEigenvalue(0).real) ** 0.5
+    except PETSc.Error as error:
+        raise SolverError(f"the largest frequency of the tissue failed ({error}); check material and mesh") from error
+    finally:
+        eps.destroy()
+    return float(system.layout.comm.allreduce(value, MPI.MAX))
+
+
+def kinematic_triangles(space: ResidualSpace, L_q: Array, L_v: Array) -> tuple[Array, Array]:
+    """Triangles of L_q in K_r and of [L_q, L_v] in M_r, for :attr:`ResidualNorms.shape`. Collective."""
+    triangles = []
+    for product, columns in ((space.system.K_ee, L_q), (space.system.M_ee, np.hstack([L_q, L_v]))):
+        basis = Orthonormal(space.system, None, product)
+        basis.add(columns)
+        triangles.append(basis.triangle())
+    return triangles[0], triangles[1]

@@ -1,0 +1,126 @@
+"""Certified models of a scene: bases in V = blkdiag(I, Phi, Phi), projected with their residuals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.motion import force_values, motion_table
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.certified.model import CertifiedModel
+from softgrasp.reduction.certified.motion import Drive
+from softgrasp.reduction.certified.residual import ResidualSpace, kinematic_triangles
+from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.reduce import project_scene
+
+FINER = 8  # steps for one, of the run that measures the error of the step
+
+
+def second_order_basis(model: Model, Phi: Array, name: str = "certified") -> Basis:
+    """V = blkdiag(I, Phi, Phi) in (q, v) relative to the hand, of modes Phi, local rows (n_local, k)."""
+    layout = model.system.layout
+    zero, hand = np.zeros((layout.n_local, 2 * layout.n_s)), 2 * layout.n_s
+    V_q, V_v = (np.asfortranarray(np.hstack(x)) for x in ([zero, Phi, 0 * Phi], [zero, 0 * Phi, Phi]))
+    one = np.eye(hand, V_q.shape[1])
+    return Basis(
+        name, layout, one[: hand // 2], one[hand // 2 :], V_q, V_v, "qv", "relative", "second_order", True,
+        split=(2 * Phi.shape[1],),
+    )  # fmt: skip
+
+
+def scene_drive(scene: Scene, M_hand: Array, finer: int = FINER) -> Drive:
+    """The scene's motion of the hand, or the force on it, and the same at a step ``finer`` times smaller (1: none).
+
+    Raises:
+        SceneError: a CSV file does not fit.
+    """
+    n_s, steps = len(M_hand), scene.time.steps
+    dt, start = scene.time_end / steps, scene.time.start
+    if scene.motion.drive == "motion":
+        table = motion_table(scene, n_s)
+        drive = Drive(dt, hand=(table.q, table.v), start=start)
+    else:
+        drive = Drive(dt, force=force_values(scene, n_s, M_hand), start=start)
+    if finer <= 1:
+        return drive
+    time = scene.time.model_copy(update={"steps": finer * steps})
+    other = scene.model_copy(update={"time": time})
+    other._directory = scene._directory
+    return replace(drive, finer=scene_drive(other, M_hand, 1))
+
+
+def certified_model(
+    model: Model, Phi: Array, k: int | None = None, space: ResidualSpace | None = None, **about: Any
+) -> CertifiedModel:
+    """A certified model of a scene from modes Phi of its displacement, leading ones first. Collective.
+
+    >>> import softgrasp as sg
+    >>> from softgrasp.reduction.certified.training import certified_model
+    >>> from softgrasp.fem.solve.modes import lowest_modes
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> certified = certified_model(model, lowest_modes(model.system, 24)[1], k=8)
+    >>> certified.run().certificate.proved
+    True
+
+    Args:
+        model: the scene.
+        Phi: local rows (n_local, k2).
+        k: modes of the answer; None takes all, with one basis.
+        space: residuals of these modes; None makes them at the materials of the scene.
+        about: other fields of :class:`softgrasp.reduction.certified.model.CertifiedModel`.
+
+    Raises:
+        SolverError: a factorisation failed.
+    """
+    own = space is None
+    space = space or ResidualSpace(model.system, model.system.materials)
+    try:
+        if own:
+            space.extend(Phi)
+        rom = project_scene(second_order_basis(model, Phi), model)
+        norms, compliance = space.norms(), space.compliance(output_columns(model))
+    finally:
+        if own:
+            space.destroy()
+    about.setdefault("drive", scene_drive(model.scene, model.system.M_hand))
+    return CertifiedModel(rom, k or Phi.shape[1], norms, compliance, **about)
+
+
+def certified_any(model: Model, rom: ReducedModel, **about: Any) -> CertifiedModel:
+    """A certified model from any reduced one with fixed solid modes relative to the hand. Collective.
+
+    Canonical models and those without structure tie velocities to displacements loosely: their bound is larger.
+
+    Raises:
+        ModelError: the model holds no lift, or its basis has no certificate.
+    """
+    columns = slice(2 * model.system.layout.n_s, None)
+    assert rom.lift is not None
+    L_q, L_v = (np.asfortranarray(L[:, columns]) for L in (rom.lift.L_q, rom.lift.L_v))
+    space = ResidualSpace(model.system, rom.materials)
+    try:
+        space.extend(L_q)
+        norms = replace(space.norms(), shape=kinematic_triangles(space, L_q, L_v))
+        compliance = space.compliance(output_columns(model))
+    finally:
+        space.destroy()
+    about.setdefault("drive", scene_drive(model.scene, model.system.M_hand))
+    return CertifiedModel(rom, L_q.shape[1], norms, compliance, **about)
+
+
+def output_columns(model: Model) -> Array:
+    """C' of the tissue for all outputs of the scene, local rows (n_local, p). Collective."""
+    outputs = make_outputs(model.scene, model.system)
+    C = np.zeros((model.system.layout.n_local, sum(o.size for o in outputs)))
+    at = 0
+    for o in outputs:
+        for i in range(o.size):
+            C[o.dofs[:, i], at + i] = o.weight
+        at += o.size
+    return C
