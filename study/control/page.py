@@ -85,7 +85,7 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
         "Each equation is projected on N basis vectors and solved; its gain is judged on the full plant. The bases "
         "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
         f"The excess cost is J/J* - 1 on the modes kept; the bound beside it is proved for the whole plant by the "
-        f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with the optimal feedback after that."
+        f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with room for what is to come after it."
     )
     table = reduced_table(study.bases)
     parts = [Section(table.title, text, header=table.header, rows=table.rows, figures=figures)]

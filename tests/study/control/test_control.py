@@ -108,14 +108,12 @@ def test_the_loop_costs_what_the_riccati_equation_says(result: dict[str, Any]) -
 def test_every_stable_gain_has_a_proved_bound(result: dict[str, Any]) -> None:
     points = [p for points in result["reduced"].values() for p in points]
     points = [p for p in [*points, *(p for r in result["retune"] for p in r["points"])] if p["stable"]]
-    assert len([p for p in points if p["cost_excess_at_most"] is not None]) > 10
+    assert len(points) > 10
     for p in points:
-        if p["cost_excess_at_most"] is None:  # infinite: the gap is more than the cost itself
-            assert p["cost_excess"] > 0.02
-            continue
         # the excess of the loop without end, from an X with a residual of 1e-10 that the bound does not share
-        assert p["cost_excess_at_most"] >= p["cost_excess"] * (1 - 1e-6) - 1e-12, p
-        assert p["cost_excess_at_most"] <= 100 * p["cost_excess"] + 1e-9, p  # 5 to 30 measured
+        after = 1e-2 if p["cost_excess"] > 1 else 1e-6  # a loop worse than none pays more after the end
+        assert p["cost_excess_at_most"] >= p["cost_excess"] * (1 - after) - 1e-12, p
+        assert p["cost_excess_at_most"] <= 30 * p["cost_excess"] + 2e-12, p  # 24 measured where little is to come
 
 
 class _StopError(Exception):
