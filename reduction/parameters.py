@@ -55,7 +55,7 @@ def grid_of(model: Model) -> list[tuple[float, float]]:
 def training_of(model: Model) -> list[tuple[float, float]]:
     """Lamé constants of the runs that train bases beside the scene's own."""
     train = model.scene.reduction.train
-    if train == "corners":
+    if isinstance(train, str):
         lam, mu = box_of(model)
         return [(a, b) for a in lam for b in mu]
     return [(a, b) for a, b in train]
