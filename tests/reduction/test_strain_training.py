@@ -124,8 +124,8 @@ def test_runs_that_trained_nothing(own: FullRun) -> None:
 
 EFFECTS = {
     "second order": ("tissue.order=2", "tissue.cells=[3, 6]"),
-    "weight": ("effects.gravity={vector=[0.0, -1.0]}", 'time.start="equilibrium"'),
-    "damping": ('effects.damping={kind="kelvin-voigt", beta=2e-3, alpha=0.3, drag="space"}',),
+    "weight": ("effects.gravity={g=[0.0, -1.0]}", 'time.start="equilibrium"'),
+    "damping": ('effects.damping={kind="rayleigh", beta=2e-3, alpha=0.3, drag="space"}',),
     "stvk": ('effects.finite_strain.law="stvk"', "motion.target=[1.0, 0.5]"),
     "pushed": ('motion.drive="force"',),
 }
@@ -144,8 +144,12 @@ def test_with_other_effects(effect: str) -> None:
 
 
 @pytest.mark.serial
-def test_a_body_of_layers_in_3d() -> None:
-    model = built("tissue.cells=[2, 2, 4]", "time.steps=60", "effects.finite_strain={}", scene="block_3d")
+@pytest.mark.parametrize("scene", ["block_3d", "layers_2d"])
+def test_scenes_that_ship(scene: str) -> None:
+    """In 3D with gravity, damping and reaction; and of three materials."""
+    smaller = {"block_3d": ("tissue.cells=[2, 2, 4]", "effects.rotation=false", "motion.target=[0.2, 0.1, 0.3]"),
+               "layers_2d": ("tissue.cells=[10, 25]",)}  # fmt: skip
+    model = built(*smaller[scene], "time.steps=60", "effects.finite_strain={}", scene=scene)
     run = simulate(model)
     rom = reduce_strain(model, run, N=18)
     again = replay_strain(rom, model, run)
