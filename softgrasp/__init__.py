@@ -74,8 +74,8 @@ _FACE = {
 """What a user imports -> the module that has it."""
 
 __all__ = [
-    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors", "errors_strain",
-    "load", "load_scene", "load_strain", "make_controller", "problem", "reduce", "reduce_strain", "replay",
+    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors",
+    "errors_strain", "load", "load_scene", "load_strain", "make_controller", "problem", "reduce", "reduce_strain", "replay",
     "replay_strain", "save", "shipped_scenes", "simulate", "solve",
 ]  # fmt: skip
 

@@ -300,9 +300,8 @@ def replay_strain(
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
     >>> run = sg.simulate(model)
     >>> rom = sg.reduce_strain(model, run, N=14)
-    >>> again = sg.replay_strain(rom, model, run)
-    >>> again.energy_drift < 1e-8, sg.errors_strain(rom, again, model, run).z < 0.05
-    (True, True)
+    >>> sg.replay_strain(rom, model, run).energy_drift < 1e-8
+    True
 
     Args:
         rom: which.
@@ -327,6 +326,13 @@ def _replay(small: SmallStrainModel, full: FullRun, engine: str = "") -> StrainR
 
 def errors_strain(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajectory | FullRun) -> StrainErrors:
     """How far a reduced run is from a full one: deformation, its velocity, energy norm. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce_strain(model, run, N=20)
+    >>> sg.errors_strain(rom, sg.replay_strain(rom, model, run), model, run).z < 0.01
+    True
 
     Args and errors as in :func:`replay_strain`, which makes the reduced run; the model must hold its lift.
     """
