@@ -282,12 +282,20 @@ def reduce(
     quiet: Quiet = False,
     no_pictures: NoPictures = False,
     empty: Empty = False,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(help="build one model that proves its error over the scene's box, to this relative error: 1e-2"),
+    ] = None,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
+    from softgrasp.study.precision.answer import parse_tolerance
     from softgrasp.study.reduce.run import run_reduce
 
+    accuracy = None if tolerance is None else parse_tolerance(tolerance)
     out = out or default_folder("reduce", scene)
-    run_reduce(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty)
+    run_reduce(
+        scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty, tolerance=accuracy
+    )
 
 
 app.command()(query)

@@ -105,8 +105,10 @@ def _points(runs: FullRuns, truth: Truth) -> Iterator[ForwardPoint]:
                     yield to_point(fewer, runs.run(fewer), truth, most)
             if few.n_e * few.steps > POINT_WORK[d]:
                 break
+    usual = runs.run(own_setting(scene)).series
     for setting in solver_settings(scene):
-        yield to_point(setting, runs.run(setting), truth)
+        run = runs.run(setting)
+        yield replace(to_point(setting, run, truth), error_solver=errors_of(run.series, usual)[0])
 
 
 def on_meshes(points: Sequence[ForwardPoint]) -> dict[str, list[ForwardPoint]]:

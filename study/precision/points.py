@@ -128,6 +128,7 @@ class ForwardPoint(RunPoint):
         n_e, states: unknowns.
         dt, mesh, assembly, factor, per_step: step of the scheme, and seconds of the stages [s].
         error_time: change of the deformation against the most steps on the same mesh; None for the most steps.
+        error_solver: against the usual solver on the same mesh and steps; None for that.
     """
 
     question: ClassVar[str] = "forward"
@@ -139,6 +140,7 @@ class ForwardPoint(RunPoint):
     factor: float
     per_step: float
     error_time: float | None = None
+    error_solver: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,6 +222,7 @@ class ReducedRiccatiPoint(WorkPoint):
     error_P: float  # noqa: N815
     error_K: float  # noqa: N815
     cost_excess: float
+    cost_excess_at_most: float
     abscissa_full: float
     time_are: float
     stable: bool

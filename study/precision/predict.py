@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from softgrasp.fem.scene.scene import Scene
@@ -15,6 +15,7 @@ from softgrasp.study.precision.settings import Group, Setting, least_steps
 LARGEST = {2: 300_000, 3: 60_000}  # unknowns of a setting that no run of the diagram tried
 GROWTH = 8.0  # and its work over that of the largest point
 SAFETY = 0.9  # of the tolerance that a predicted error may use
+SURE = 0.1  # of an error, at least, is the mesh's
 BETWEEN = 4  # tolerances of graded meshes a decade
 BEYOND = 100.0  # below the smallest one of the diagram
 
@@ -78,25 +79,26 @@ class Predictor:
         """Error through the time step; order 2 beyond the steps tried."""
         return interpolate(steps, list(self.time), list(self.time.values()), -2.0) if self.time else 0.0
 
+    def space_of(self, point: ForwardPoint) -> float:
+        """What the mesh of a point leaves, less its steps; the two may cancel in what was measured."""
+        return max(point.error - self.time_error(point.steps), SURE * point.error)
+
     def space_error(self, setting: Setting) -> float:
         """Error through the mesh."""
         return self.predict(setting).error - self.time_error(setting.steps)
 
     def predict(self, setting: Setting) -> Prediction:
         """Error, unknowns and seconds of a setting on a mesh that was run, or on a graded one."""
-        known = self.space.get(setting.group)
+        known, line = self.space.get(setting.group), self.graded(setting.order)
 
-        def at(name: str) -> float:
+        def at(value: Callable[[ForwardPoint], float]) -> float:
             if known is not None:
-                return float(getattr(known, name))
-            line = self.graded(setting.order)
-            return interpolate(float(setting.refine), list(line), [getattr(p, name) for p in line.values()])
+                return value(known)
+            return interpolate(float(setting.refine), list(line), [value(p) for p in line.values()])
 
-        error = at("error") - (self.time_error(known.steps) if known is not None else 0.0)
-        floor = 0.0 if known is None else 0.1 * known.error  # the two parts may cancel in what was measured
-        seconds = at("mesh") + at("assembly") + at("factor") + setting.steps * at("per_step")
-        whole = max(error, floor) + self.time_error(setting.steps)
-        return Prediction(setting, at("n_e"), whole, seconds, self.runs.get(setting))
+        error = at(self.space_of) + self.time_error(setting.steps)
+        seconds = at(lambda p: p.mesh + p.assembly + p.factor) + setting.steps * at(lambda p: p.per_step)
+        return Prediction(setting, at(lambda p: p.n_e), error, seconds, self.runs.get(setting))
 
     def candidates(self) -> list[Prediction]:
         """Settings of the diagram, other steps on their meshes, and graded meshes of other tolerances."""

@@ -216,6 +216,51 @@ class Answer:
 
 
 @dataclass(frozen=True)
+class Part:
+    """One source of error.
+
+    Attributes:
+        name: of the source.
+        error: that it leaves [1].
+        share: of the sum of all parts [1].
+        wasted: whole digits below a tenth of the largest part, which nobody sees.
+        halved_by: setting that halves it; empty where none that was tried does.
+        cost: time of that setting over the time now [1]; None without one.
+    """
+
+    name: str
+    error: float
+    share: float = 0.0
+    wasted: int = 0
+    halved_by: str = ""
+    cost: float | None = None
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """Where the digits of one setting are lost; the largest part first.
+
+    Attributes:
+        label: the setting in words.
+        parts: sources of error.
+        missing: sources that are no part of it, with the reason.
+    """
+
+    label: str
+    parts: tuple[Part, ...]
+    missing: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """The largest part, and what is computed for nothing."""
+        first = self.parts[0]
+        text = f"Of the error of {self.label}, {first.name} carries {100 * first.share:.0f} %"
+        text += f" and is halved by {first.halved_by}, in {first.cost:.2g} of the time." if first.cost else "."
+        wasted = [f"{p.wasted} of {p.name}" for p in self.parts if p.wasted]
+        return text + (f" Digits that nobody sees: {', '.join(wasted)}." if wasted else "")
+
+
+@dataclass(frozen=True)
 class WorkStudy:
     """All that one study found.
 
@@ -224,6 +269,7 @@ class WorkStudy:
         truth: solution that outputs are compared with; None when no question needed it.
         questions: by name, in the order of :data:`softgrasp.study.precision.points.QUESTIONS`.
         answers: to a tolerance and a budget.
+        error_budgets: of the scene's own setting and of the one that answers; none without the forward question.
         measured_for_the_answers: points beside those of the questions.
         measured, cached: runs made now and taken from the cache.
     """
@@ -232,6 +278,7 @@ class WorkStudy:
     truth: Truth | None
     questions: dict[str, Question]
     answers: tuple[Answer, ...]
+    error_budgets: tuple[ErrorBudget, ...]
     measured_for_the_answers: tuple[WorkPoint, ...]
     measured: int
     cached: int
@@ -270,6 +317,7 @@ class WorkStudy:
                 "points": {name: self.questions[name].rows for name in self.points},
                 "pareto": {name: [p.label for p in pareto(points)] for name, points in self.points.items()},
                 "slopes": [asdict(s) for s in self.slopes],
+                "error_budgets": [asdict(b) for b in self.error_budgets],
                 "skipped": self.skipped,
                 "measured_for_the_answers": [p.to_row() for p in self.measured_for_the_answers],
                 "runs": {"measured": self.measured, "cached": self.cached},

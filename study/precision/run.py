@@ -20,14 +20,16 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.reduction.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
+from softgrasp.study.precision.balance import companion, error_budget
 from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
-from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
+from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RiccatiPoint, RunPoint
+from softgrasp.study.precision.predict import Predictor
 from softgrasp.study.precision.probe import find_places
 from softgrasp.study.precision.reduced import ask_bases, ask_reduced
-from softgrasp.study.precision.result import Answer, Question, Truth, WorkStudy
+from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_riccati, settings_of
 from softgrasp.study.precision.riccati_reduced import ask_reduced_riccati
 from softgrasp.study.precision.settings import own_setting, variant
@@ -122,11 +124,13 @@ def study_scene(
             answers, measured = answer(scene, runs, truth, questions, request)
         if not refused:
             questions |= control_questions(control, names)
+    budgets = error_budgets(scene, runs, questions, answers, measured) if "forward" in questions else ()
     return WorkStudy(
         scene=scene,
         truth=truth,
         questions={name: questions[name] for name in names},
         answers=tuple(answers),
+        error_budgets=budgets,
         measured_for_the_answers=tuple(measured),
         measured=store.misses,
         cached=store.hits,
@@ -163,6 +167,28 @@ def answer(
     by_tolerance = [] if request.tolerance is None else [answers.tolerance(request.tolerance)]
     by_budget = [] if request.budget is None else [answers.budget(request.budget)]
     return by_tolerance + by_budget, answers.measured
+
+
+def error_budgets(
+    scene: Scene,
+    runs: FullRuns,
+    questions: dict[str, Question],
+    answers: Sequence[Answer],
+    measured: Sequence[RunPoint],
+) -> tuple[ErrorBudget, ...]:
+    """Of the scene's own setting, and of the one that answers a tolerance."""
+    points = [*measured, *(p for question in questions.values() for p in question.points)]
+    forward = [p for p in points if isinstance(p, ForwardPoint)]
+    reduced = [p for p in points if isinstance(p, ReducedPoint)]
+    riccati = [p for p in points if isinstance(p, RiccatiPoint)]
+    skipped = {name: question.skipped for name, question in questions.items() if question.skipped}
+    predictor = Predictor(scene, forward, runs.dimension)
+    asked = [a.full.point.setting for a in answers if a.kind == "tolerance" and a.full is not None]
+    result = []
+    for setting in dict.fromkeys([own_setting(scene), *asked]):
+        model = companion(predictor.predict(setting).error, reduced)
+        result.append(error_budget(scene, predictor, setting, forward, model, reduced, riccati, skipped))
+    return tuple(result)
 
 
 def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Question]:

@@ -109,6 +109,14 @@ def test_tolerance_is_reached_and_estimated(comm: MPI.Intracomm, tolerance: floa
     assert run.energy_drift < 1e-12
 
 
+def test_cubic_elements_are_estimated_by_those_of_order_four(comm: MPI.Intracomm) -> None:
+    fine = simulate(build(with_refine(make_scene(TIP), 3, 1e-4), comm=comm))
+    model = build(with_refine(make_scene(TIP), 3, 0.1), comm=comm)
+    true, result = error(deformation(simulate(model)), deformation(fine)), estimate(model)
+    assert 0.4 <= result.estimate / true <= 1.1
+    assert result.bound >= true
+
+
 def test_mesh_file_reaches_its_tolerance(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     steps = {"steps": 150}
     scenes = [l_scene(mpi_tmp_path, comm, order=o, refine={"tolerance": t}) for o, t in ((2, 2e-2), (3, 1e-3))]

@@ -31,12 +31,13 @@ from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import reduced as wp_reduced
 from softgrasp.study.precision import truth as wp_truth
 from softgrasp.study.precision.answer import advice, parse_budget, parse_tolerance
+from softgrasp.study.precision.balance import balanced
 from softgrasp.study.precision.fit import interpolate, pareto, power_law
 from softgrasp.study.precision.forward import step_counts
 from softgrasp.study.precision.meshes import even_meshes, fitted
 from softgrasp.study.precision.points import Request, WorkPoint
 from softgrasp.study.precision.probe import find_places, run_probed
-from softgrasp.study.precision.result import WorkStudy
+from softgrasp.study.precision.result import Part, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
 from softgrasp.study.precision.series import largest
 from softgrasp.study.precision.settings import Setting, least_steps, variant
@@ -199,6 +200,34 @@ def test_advice_names_what_carries_the_largest_share(shares: dict[str, float], w
     text = advice(shares)
     assert words in text
     assert text.startswith(f"Of its error, {max(shares, key=lambda name: shares[name])} carries the largest share")
+
+
+def test_error_budget_names_the_part_that_costs_the_digits(result: dict[str, Any], folder: Path) -> None:
+    own, answered = result["error_budgets"]
+    assert own["label"] == "4 x 8, P1, 64 steps"
+    for budget in (own, answered):
+        parts = {p["name"]: p for p in budget["parts"]}
+        assert set(parts) == {"the mesh", "the time step", "the reduced model", "the linear solver"}
+        assert sum(p["share"] for p in parts.values()) == pytest.approx(1.0)
+        assert 8 <= parts["the linear solver"]["wasted"] <= 14  # Cholesky and MUMPS agree to rounding
+        assert budget["missing"][0][0] == "the Riccati equation"
+        assert budget["missing"][0][1].startswith("no damping")
+    mesh = own["parts"][0]
+    assert (mesh["name"], mesh["wasted"]) == ("the mesh", 0)
+    assert mesh["share"] > 0.8
+    row = next(r for r in result["points"]["forward"] if r["label"] == "4 x 8, P1, 128 steps")
+    assert mesh["error"] == pytest.approx(row["error"], rel=0.02)  # less that of its steps
+    assert mesh["cost"] < 20
+    total = sum(p["error"] for p in answered["parts"] if p["name"] in ("the mesh", "the time step"))
+    assert total <= 1.5 * TOLERANCE  # the two parts may cancel each other by a third
+    assert "Error budget of 4 x 8, P1, 64 steps" in (folder / "report.html").read_text()
+
+
+def test_wasted_digits_are_those_below_a_tenth_of_the_largest_part() -> None:
+    budget = balanced("x", [Part("a", 1e-5), Part("b", 0.03), Part("c", 0.004), Part("d", 0.0)])
+    assert [(p.name, p.wasted) for p in budget.parts] == [("b", 0), ("c", 0), ("a", 2), ("d", 13)]
+    assert budget.parts[0].share == pytest.approx(0.03 / 0.03401)
+    assert budget.sentence == "Of the error of x, b carries 88 %. Digits that nobody sees: 2 of a, 13 of d."
 
 
 def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dict[str, Any]) -> None:
