@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import isclose
 from typing import Any, Literal
 
 import numpy as np
@@ -117,8 +118,9 @@ class CertifiedModel:
         first, own = materials[0], self.fine.materials[0]
         scale = own.rho / first.rho
         near = all(
-            np.allclose((m.lam, m.mu, m.rho, m.beta), (o.lam, o.mu, o.rho, o.beta), rtol=1e-9, atol=0)
+            isclose(x, y)
             for m, o in zip(materials, self.materials(first.lam, first.mu, first.rho), strict=True)
+            for x, y in ((m.lam, o.lam), (m.mu, o.mu), (m.rho, o.rho), (m.beta, o.beta))
         )
         pairs = ((first.lam * scale, self.box.lam), (first.mu * scale, self.box.mu))
         return near and all(low * (1 - 1e-9) <= value <= high * (1 + 1e-9) for value, (low, high) in pairs)
