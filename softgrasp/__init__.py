@@ -75,8 +75,8 @@ _FACE = {
 
 __all__ = [
     "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors",
-    "errors_strain", "load", "load_scene", "load_strain", "make_controller", "problem", "reduce", "reduce_strain", "replay",
-    "replay_strain", "save", "shipped_scenes", "simulate", "solve",
+    "errors_strain", "load", "load_scene", "load_strain", "make_controller", "problem", "reduce", "reduce_strain",
+    "replay", "replay_strain", "save", "shipped_scenes", "simulate", "solve",
 ]  # fmt: skip
 
 
