@@ -64,8 +64,8 @@ def training_of(model: Model) -> list[tuple[float, float]]:
 def mirrored(model: Model) -> list[list[float]]:
     """Targets of the runs that train models at finite strain beside the scene's own."""
     chosen, target = model.scene.reduction.motions, model.scene.motion.target or []
-    if chosen != "mirrored":
-        return [list(each) for each in chosen]
+    if chosen == "own" or not isinstance(chosen, str):
+        return [] if chosen == "own" else [list(each) for each in chosen]
     signs = product(*((1.0, -1.0) if x else (1.0,) for x in target))
     return [[s * x for s, x in zip(each, target, strict=True)] for each in signs][1:]
 

@@ -84,16 +84,14 @@ class Reduction(Section):
     )
     add: Annotated[int, Field(ge=1)] = Field(4, description="modes that each full run of the greedy adds [1]")
     max_N: Annotated[int, Field(ge=1)] = Field(200, description="largest N of the greedy's basis [1]")
-    motions: Literal["own", "unit"] = Field(
-        "own", description="train with the scene's motion, or with every freedom of the hand by itself [no unit]"
-    )
     validation: Annotated[int, Field(ge=0)] = Field(
         0, description="random parameters where full runs test the certified model afterwards [1]"
     )
-    motions: Literal["mirrored"] | list[list[float]] = Field(
-        "mirrored",
-        description="targets [m] of further full runs that train models with effects.finite_strain; mirrored: the "
-        "scene's own with other signs; empty: none",
+    motions: Literal["auto", "own", "unit", "mirrored"] | list[list[float]] = Field(
+        "auto",
+        description="motions that train [no unit]: own, the scene's; unit, every freedom of the hand by itself, for "
+        "certified models; mirrored, the scene's with other signs too, or further targets [m], with "
+        "effects.finite_strain; auto: own, and mirrored with that effect",
     )
 
     @model_validator(mode="after")

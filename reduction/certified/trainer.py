@@ -60,7 +60,7 @@ def motions_of(model: Model) -> list[Model]:
         SceneError: unit motions of a motion that is no quintic one.
     """
     scene, n_s = model.scene, model.system.layout.n_s
-    if scene.reduction.motions == "own":
+    if scene.reduction.motions != "unit":
         return [model]
     target = np.zeros(n_s)
     if scene.motion.target is None or scene.motion.drive == "force":
@@ -213,7 +213,7 @@ def state_of(model: CertifiedModel) -> Greedy:
 
 
 def history(trainer: Trainer, state: Greedy) -> dict[str, Any]:
-    """What a greedy did, as :attr:`reduction.certified.model.CertifiedModel.training` keeps it."""
+    """What a greedy did, as :attr:`softgrasp.reduction.certified.model.CertifiedModel.training` keeps it."""
     return {
         "key": train_key(trainer.model),
         "rounds": [asdict(r) for r in state.rounds],
