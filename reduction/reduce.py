@@ -55,7 +55,7 @@ def reduce(
 
     Raises:
         SceneError: the run kept no snapshots, or the body is at rest in all of them.
-        ReductionError: the scene has finite strain, which :func:`reduction.strain.training.reduce_strain` reduces.
+        ReductionError: finite strain, see :func:`softgrasp.reduction.strain.training.reduce_strain`.
         BasisError: the method is unknown, or it has no basis of N columns.
         SolverError: a factorisation failed.
     """

@@ -306,13 +306,13 @@ def replay_strain(
     Args:
         rom: which.
         model: gives the materials of a trajectory.
-        run: the full run; a :class:`reduction.replay.FullRun` has materials of its own.
+        run: the full run; a :class:`softgrasp.reduction.replay.FullRun` has materials of its own.
         outside: allow what the model was not trained on.
-        engine: see :func:`reduction.strain.stepper.march`.
+        engine: see :func:`softgrasp.reduction.strain.stepper.march`.
 
     Raises:
         ModelError: the run lies outside the training box, or there is no equilibrium to start in.
-        SceneError: see :func:`reduction.replay.full_run`.
+        SceneError: see :func:`softgrasp.reduction.replay.full_run`.
         SolverError: a step did not converge.
     """
     full = run if isinstance(run, FullRun) else full_run(model, run)
