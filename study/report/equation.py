@@ -73,7 +73,8 @@ def _motion(scene: Scene) -> str:
 
 def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
     effects, layers = scene.effects, "sum over layers of " if scene.tissue.layers else ""
-    strain = [] if effects.finite_strain is None else [f"f(z) = dW/dz, W(F) {effects.finite_strain.law}, F = I + grad z"]
+    finite = effects.finite_strain
+    strain = [] if finite is None else [f"f(z) = dW/dz, W(F) {finite.law}, F = I + grad z"]
     result = [
         *strain,
         "q_s: translations" + (" and small angles" if effects.rotation else "") + " of the hand",
