@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from rich.console import Console
-from softgrasp.lqr.loop.export import to_python_control
 
 from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
@@ -193,11 +192,13 @@ def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
     assert controller.plant.N == result["controller"]["N"] == 12
     u = controller.step(np.zeros(2), np.zeros(2))
     assert np.linalg.norm(u) == pytest.approx(np.hypot(5, 3), rel=1e-4)  # |K_T d| = |d|, at the error of this gain
-    exported = to_python_control(controller.plant, controller.K)
-    assert exported.plant.output_labels == result["loop"]["output_names"] == [n.split()[0] for n in table[0][3:5]]
+    exported = controller.plant.lti()
+    labels = [name.split()[0] for name in exported.to_control().output_labels]
+    assert labels == result["loop"]["output_names"] == [n.split()[0] for n in table[0][3:5]]
     small = controller.plant
     poles = np.linalg.eigvals(np.linalg.solve(small.E, small.A + small.B @ controller.K))
-    assert exported.closed_loop.poles().real.max() == pytest.approx(poles.real.max(), rel=1e-9)  # one matrix, twice
+    closed = exported.under(controller.K).to_control()
+    assert closed.poles().real.max() == pytest.approx(poles.real.max(), rel=1e-9)  # one matrix, twice
     assert result["controller"]["sampled_radius"] < 1
     model = build(load_scene(SCENES / "paper_lqr.toml", SMALL), comm=MPI.COMM_WORLD)
     gain, target = load_gain(out / "gain.npz", model.system.layout)
@@ -337,7 +338,8 @@ def test_outputs_that_see_only_the_hand(tmp_path: Path, method: str) -> None:
     assert controller.plant.N == 4
     u = controller.step(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     assert np.allclose(u, [4.0, 3.0 - np.sqrt(40)], rtol=0, atol=1e-9)  # as above
-    assert to_python_control(controller.plant, controller.K).plant.output_labels == ["arm_x", "arm_y"]
+    labels = controller.plant.lti().to_control().output_labels
+    assert [name.split()[0] for name in labels] == ["arm_x", "arm_y"]
 
 
 def test_a_scene_without_control_watches_tip_and_turning_hand() -> None:
