@@ -111,7 +111,7 @@ def test_tolerance_is_reached_and_estimated(comm: MPI.Intracomm, tolerance: floa
 
 def test_cubic_elements_are_estimated_by_those_of_order_four(comm: MPI.Intracomm) -> None:
     fine = simulate(build(with_refine(make_scene(TIP), 3, 1e-4), comm=comm))
-    model = build(with_refine(make_scene(TIP), 3, 0.1), comm=comm)
+    model = build(with_refine(make_scene(TIP), 3, 0.03), comm=comm)
     true, result = error(deformation(simulate(model)), deformation(fine)), estimate(model)
     assert 0.4 <= result.estimate / true <= 1.1
     assert result.bound >= true
