@@ -63,7 +63,7 @@ def unstable(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
     return [r.N for r in bad], [getattr(r, key) if getattr(r, key) <= TOP else float("nan") for r in bad]
 
 
-def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, Path]:
+def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]:
     """Relative error of P, of K, and excess cost against N for all methods; unstable gains marked; PNG and PDF."""
     ran = [s for s in bases if s.reports]
     bad = False
@@ -102,7 +102,7 @@ def _entries(ran: Sequence[BasisGains], bad: bool) -> list[Line2D]:
     return [*entries, Line2D([], [], label="unstable loop; on the edge: error > 1", **CROSS)] if bad else entries
 
 
-def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, Path]:
+def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]:
     """Excess cost of the re-tuned gains over the box of lambda and mu, one panel a basis; PNG and PDF."""
     with paper_style():
         count = len(retuned)

@@ -118,7 +118,7 @@ def figure_move(
     table: Array,
     target: npt.ArrayLike | None,
     out_png: Path,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """The deformed body at a few instants with hand, path and target; PNG and PDF.
 
     Bodies that would hide each other get a panel each.

@@ -41,7 +41,7 @@ def figure_histories(
     others: Mapping[str, tuple[Array, Array]] | None = None,
     settle: float | None = None,
     dimension: int | None = None,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """Outputs, their distance to the target, and inputs against time; PNG and PDF.
 
     Args:
@@ -172,7 +172,7 @@ def figure_loop_move(
     table: Array,
     target: npt.ArrayLike | None,
     out_png: Path,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """The body at a few instants of the move to the target, at equal steps along the path of the hand; PNG and PDF.
 
     Args and return value as in :func:`softgrasp.study.pictures.body.figure_move`, with as many states as there are.
@@ -186,7 +186,7 @@ def figure_decay(
     out_png: Path,
     *,
     noise: float = 0.0,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """Decay rate -Re p of every pole against its frequency |Im p|, one mark a plant or gain; PNG and PDF.
 
     Poles on the real axis stand in a strip at the left; poles that do not decay are drawn as crosses on the lower edge

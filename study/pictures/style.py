@@ -10,6 +10,8 @@ from typing import Any
 import matplotlib as mpl
 from cycler import cycler
 
+from softgrasp.study.pictures import PDF
+
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -22,7 +24,7 @@ OUTLINE = "#555555"
 TARGET = ORANGE
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
 COLUMN, WIDTH = 3.4, 7.0  # [inch], one column and both of a two-column page
-DPI = 300
+DPI = 150
 STEPS = [1, 2, 5, 10]  # between ticks
 
 
@@ -66,13 +68,13 @@ def few_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def save(figure: Any, out_png: Path) -> tuple[Path, Path]:
-    """Write the figure as PNG and, beside it, as PDF; close it and return both names."""
-    out_pdf = out_png.with_suffix(".pdf")
-    figure.savefig(out_png, bbox_inches="tight", pad_inches=0.04)
-    figure.savefig(out_pdf, bbox_inches="tight", pad_inches=0.04)
+def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
+    """Write the figure as PNG and, where :data:`PDF` is set, beside it as PDF; close it and return the names."""
+    files = (out_png, out_png.with_suffix(".pdf")) if PDF.get() else (out_png,)
+    for file in files:
+        figure.savefig(file, bbox_inches="tight", pad_inches=0.04)
     plt.close(figure)
-    return out_png, out_pdf
+    return files
 
 
 def length_unit(largest: float) -> tuple[float, str]:

@@ -18,7 +18,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.registry import PAPER_METHODS
 from softgrasp.reduction.replay import FullRun, replay
-from softgrasp.study.pictures.animation import frame_box, frame_image, speed_up, write_gif
+from softgrasp.study.pictures.animation import Film, speed_up, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
@@ -152,7 +152,7 @@ def _modes(model: Model, s: Sweep, i: int) -> Array | None:
     return None if shapes is None else np.asarray(shapes)
 
 
-def figure_modes(views: Views, out_png: Path) -> tuple[Path, Path]:
+def figure_modes(views: Views, out_png: Path) -> tuple[Path, ...]:
     """First modes of the best methods drawn on the body, scaled to one largest displacement; PNG and PDF."""
     picture = views.picture
     size = float(np.ptp(picture.points, axis=0).max())
@@ -231,7 +231,7 @@ def instants(views: Views) -> list[int]:
     return sorted(chosen)
 
 
-def figure_compare(views: Views, out_png: Path) -> tuple[Path, Path]:
+def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
     """Full outline over reduced bodies at some instants; PNG and PDF."""
     shown = instants(views)
     note = f"; shown: $t$ = {', '.join(f'{views.times[k]:.2g}' for k in shown)} s"
@@ -248,13 +248,12 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
     images = []
     with paper_style():
         figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1)
-        box = frame_box(figure)
+        film = Film(figure, axes)
         for k in range(len(views.times)):
+            film.clear()
             for ax, view in zip(axes, views.reduced, strict=True):
-                for artist in [*ax.collections, *ax.lines]:
-                    artist.remove()
                 _draw(ax, shot, views, view, k)
-            images.append(frame_image(figure, box))
+            images.append(film.frame())
         plt.close(figure)
     span = float(views.times[-1] - views.times[0]) / speed_up(views.times)
     wait = max(20, round(100 * span / max(1, len(images) - 1)) * 10)  # [ms], GIF counts in hundredths of a second

@@ -74,7 +74,7 @@ def further_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
     return ([] if first is None else [first[1]]) + [s for s in sweeps if s.method.key not in PAPER_METHODS and s.points]
 
 
-def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, Path]:
+def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...]:
     """Four errors against N with the floor of the projection and the unstable points; PNG and PDF."""
     look = looks(sweeps)
     with paper_style():
@@ -95,7 +95,7 @@ def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, Path]:
         return save(figure, out_png)
 
 
-def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[Path, Path]:
+def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[Path, ...]:
     """Errors against online time, and against offline plus online time, with the unstable points; PNG and PDF.
 
     Args:
@@ -136,7 +136,7 @@ def _marks(look: tuple[str, str, str]) -> dict[str, Any]:
     return {"ls": "", "marker": marker, "ms": 3.6, "mew": 0.8, "color": colour, "fillstyle": fill}
 
 
-def figure_sigma(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, Path] | None:
+def figure_sigma(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...] | None:
     """Singular values over the first, a line for each part of a decomposition; PNG and PDF, None without any."""
     look = looks(sweeps)
     groups = [
