@@ -257,6 +257,9 @@ def control(
     set_: Overrides = None,
     quiet: Quiet = False,
     no_pictures: NoPictures = False,
+    gain_only: Annotated[
+        bool, typer.Option("--gain-only", help="only the Riccati equation and the controllers: no loop, no pictures")
+    ] = False,
     empty: Empty = False,
     pdf: Pdf = False,
 ) -> None:
@@ -264,7 +267,9 @@ def control(
     from softgrasp.study.control.run import run_control
 
     out = out or default_folder("control", scene)
-    run_control(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty)
+    run_control(
+        scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty, gain_only=gain_only
+    )
 
 
 @app.command()

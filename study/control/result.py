@@ -139,7 +139,18 @@ def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, 
         study: what was found.
         seconds: of the stages.
     """
-    d = study.design
+    return gain_result(study.design, study.controller, study.tick, study.notes, seconds) | {
+        "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
+        "refused": {b.name: b.refused for b in study.bases if b.refused},
+        "retune": [_retuned(r) for r in study.retuned],
+        "loop": _loop(study),
+    }
+
+
+def gain_result(
+    d: Design, controller: CertifiedController | None, tick: float, notes: Sequence[Note], seconds: dict[str, float]
+) -> dict[str, Any]:
+    """The keys of ``result.json`` that need no closed loop. Collective."""
     problem, solution, quality, layout = d.problem, d.solution, d.quality, d.problem.layout
     return {
         "command": "control",
@@ -163,14 +174,10 @@ def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, 
         "sampled_certified": quality.sampled is not None and quality.sampled.certified,
         "sampled_exact": quality.sampled is not None and quality.sampled.exact,
         "stable": quality.stable,
-        "findings": study.findings,
+        "findings": [finding.sentence for finding in d.diagnosis.findings],
         "damping_enough": d.diagnosis.damping_enough,
-        "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
-        "refused": {b.name: b.refused for b in study.bases if b.refused},
-        "retune": [_retuned(r) for r in study.retuned],
-        "controller": _controller(study),
-        "loop": _loop(study),
-        "notes": [note.text for note in study.notes],
+        "controller": _controller(controller, tick),
+        "notes": [note.text for note in notes],
         "time": {**seconds, "solver": dict(solution.seconds)},
         "memory_peak_mb": peak_memory_mb(layout.comm),
     }
@@ -209,12 +216,12 @@ def _retuned(r: Retuned) -> dict[str, Any]:
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}
 
 
-def _controller(study: ControlStudy) -> dict[str, Any] | None:
-    if study.controller is None:
+def _controller(controller: CertifiedController | None, tick: float) -> dict[str, Any] | None:
+    if controller is None:
         return None
-    c = study.controller.controller
-    return {"method": study.controller.method, "N": c.plant.N, "period": c.period, "time_tick": study.tick,
-            "sampled_radius": study.controller.radius.value}  # fmt: skip
+    c = controller.controller
+    return {"method": controller.method, "N": c.plant.N, "period": c.period, "time_tick": tick,
+            "sampled_radius": controller.radius.value}  # fmt: skip
 
 
 def _loop(study: ControlStudy) -> dict[str, Any]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from cycler import cycler
 
 from softgrasp.study.pictures import PDF
@@ -66,6 +67,34 @@ def few_ticks(axis: Any) -> None:
     if few and low >= 1e-3 and high < 1e5:
         axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: float = 7.0) -> None:
+    """Names of curves right of the axes, each beside the end of its own, moved apart where they would touch.
+
+    Args:
+        ax: axes with their final limits and scales.
+        ends: x and y of the last point, name and colour of each curve.
+        size: of the font [pt].
+    """
+    inverse, inch = ax.transAxes.inverted(), ax.get_position().height * ax.figure.get_figheight()
+    gap = 1.25 * size / 72 / inch
+    heights = [float(np.clip(inverse.transform(ax.transData.transform((x, y)))[1], 0, 1)) for x, y, _, _ in ends]
+    order = sorted(range(len(ends)), key=heights.__getitem__)
+    places = list(np.array(heights)[order])
+    for i in range(1, len(places)):
+        places[i] = max(places[i], places[i - 1] + gap)
+    excess = max(0.0, places[-1] - 1.0) if places else 0.0
+    for i in reversed(range(len(places))):  # back below the upper edge
+        places[i] = min(places[i], 1.0 if i == len(places) - 1 else places[i + 1] - gap) if excess else places[i]
+    for place, i in zip(places, order, strict=True):
+        x, y, name, colour = ends[i]
+        ax.annotate(
+            name, (x, y), (1.04, place), xycoords="data", textcoords="axes fraction", va="center", color=colour,
+            fontsize=size, annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "alpha": 0.6, "shrinkA": 1, "shrinkB": 2,
+                "relpos": (0, 0.5)},
+        )  # fmt: skip
 
 
 def save(figure: Any, out_png: Path) -> tuple[Path, ...]:

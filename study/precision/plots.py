@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import Formatter, LogLocator
 
 from softgrasp.reduction.registry import METHODS
@@ -91,8 +92,8 @@ def figure_forward(
             ax.plot([p.seconds for p in line], [p.error for p in line], color=colour, marker=marker, ms=3.2, **THIN)
             if last.cells is not None:
                 ax.annotate(
-                    "x".join(map(str, last.cells)), (last.seconds, last.error), (4, -2), textcoords="offset points",
-                    fontsize=6, color=colour,
+                    "x".join(map(str, last.cells)), (last.seconds, last.error), (7, 3), textcoords="offset points",
+                    fontsize=6, color=colour, zorder=9, path_effects=[withStroke(linewidth=2.0, foreground="white")],
                 )  # fmt: skip
         solvers = [p for p in usable(points) if p.series == "solver"]
         ax.plot([p.seconds for p in solvers], [p.error for p in solvers], ls="", marker="x", ms=4, color=GREEN)
