@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import care
-from softgrasp.lqr.dense.modal import some_modes
+from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
 from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.operators import modal_inputs
@@ -90,7 +90,7 @@ def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
     system, comm = problem.system, problem.layout.comm
     findings = _outputs(problem)
     k = min(modes, system.layout.n_e)
-    omega, Phi, massed = some_modes(problem, k)
+    omega, Phi, massed = modes_of_plant(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
     g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c, largest=_largest_frequency(problem))

@@ -8,7 +8,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import on_root, total
 from softgrasp.lqr.dense.care import care
-from softgrasp.lqr.dense.modal import factor_psd, some_modes
+from softgrasp.lqr.dense.modal import factor_psd, modes_of_plant
 from softgrasp.lqr.dense.poles import closed_loop_rates
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.checks import ControlError, check_weights
@@ -44,7 +44,7 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
     if modes < 0:
         raise ControlError(f"modal_lqr: modes = {modes} must be 0 or more")
     k = min(max(candidates, modes, 1), system.layout.n_e)
-    omega, Phi, massed = some_modes(problem, k)
+    omega, Phi, massed = modes_of_plant(problem, k)
     g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, np.diag(modal_damping(problem, Phi)), g, c)
     good = np.flatnonzero(rates.lost == 0)

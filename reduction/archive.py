@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -17,6 +18,9 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import Lift, ModelError, Outputs, ReducedModel
 
+if TYPE_CHECKING:
+    from softgrasp.reduction.strain.model import StrainModel
+
 FORMAT = "softgrasp reduced model 1"
 ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns
 KEYS = (
@@ -25,7 +29,7 @@ KEYS = (
 )  # fmt: skip
 
 
-def save(model: ReducedModel, path: str | Path) -> None:
+def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
     """Write a reduced model to one HDF5 file, atomically. Collective when the model holds a lift.
 
     The file holds the small matrices in full precision, the outputs, and the lift (2 or 3 arrays of n_e x N) beside the
@@ -47,17 +51,27 @@ def save(model: ReducedModel, path: str | Path) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    path = Path(path)
-    lift = model.lift
+    if not isinstance(model, ReducedModel):
+        from softgrasp.reduction.strain.archive import save_strain  # only scenes with finite strain pay for it
+
+        save_strain(model, path)
+        return
+    write_model(Path(path), model.lift, lambda part: _write_small(model, part))
+
+
+def write_model(path: Path, lift: Lift | None, small: Callable[[Path], None]) -> None:
+    """Write a file by ``small`` on one rank, then the rows of the lift, and rename it. Collective with a lift."""
     comm = None if lift is None else lift.layout.comm
     partial = path.with_name(path.name + ".part")
     if lift is None or comm is None:
-        _write_small(model, partial)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        small(partial)
         partial.replace(path)
         return
     with agree(comm):
         if comm.rank == 0:
-            _write_small(model, partial)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            small(partial)
     for rank in range(comm.size):
         # one file, one writer at a time: the file library here is not a parallel one
         with agree(comm):
@@ -69,7 +83,6 @@ def save(model: ReducedModel, path: str | Path) -> None:
 
 
 def _write_small(model: ReducedModel, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     lift = model.lift
     data: dict[str, Any] = {key: getattr(model, key) for key in KEYS}
     data["materials"] = [asdict(m) for m in model.materials]
@@ -83,10 +96,15 @@ def _write_small(model: ReducedModel, path: Path) -> None:
         if model.gravity is not None:
             file["gravity"] = model.gravity
         if lift is not None:
-            layout, d = lift.layout, lift.layout.dimension
-            file.create_dataset("lift/nodes", (layout.n_e // d, d), dtype="f8")
-            for key, part in _lift_arrays(lift).items():
-                file.create_dataset(f"lift/{key}", (layout.n_e, part.shape[1]), dtype="f8")
+            write_lift_header(file, lift)
+
+
+def write_lift_header(file: h5py.File, lift: Lift) -> None:
+    """Empty rows of a lift and its nodes."""
+    layout, d = lift.layout, lift.layout.dimension
+    file.create_dataset("lift/nodes", (layout.n_e // d, d), dtype="f8")
+    for key, part in _lift_arrays(lift).items():
+        file.create_dataset(f"lift/{key}", (layout.n_e, part.shape[1]), dtype="f8")
 
 
 def _lift_arrays(lift: Lift) -> dict[str, Array]:
@@ -134,12 +152,14 @@ def _read(path: Path, layout: BlockLayout | None, scene_hash: str | None) -> Red
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise ModelError(f"{path} is no reduced model of this version ({FORMAT!r}); reduce the scene again")
+                strain = "at finite strain" in str(file.attrs.get("format"))
+                advice = "softgrasp.load_strain reads it" if strain else "reduce the scene again"
+                raise ModelError(f"{path} is no reduced model of this version ({FORMAT!r}); {advice}")
             data = json.loads(file.attrs["model"])
             parts = {key: value[()] for key, value in file["parts"].items()}
             outputs = Outputs(file["outputs/C_z"][()], file["outputs/C_s"][()], tuple(data.pop("names")))
             gravity = file["gravity"][()] if "gravity" in file else None
-            lift = None if layout is None else _read_lift(file, layout, path)
+            lift = None if layout is None else read_lift(file, layout, path)
     except (OSError, KeyError, ValueError) as error:
         raise ModelError(f"{path} cannot be read as a reduced model ({error}); reduce the scene again") from error
     if scene_hash is not None and data["scene_hash"] != scene_hash:
@@ -157,7 +177,7 @@ def _read(path: Path, layout: BlockLayout | None, scene_hash: str | None) -> Red
     )
 
 
-def _read_lift(file: h5py.File, layout: BlockLayout, path: Path) -> Lift:
+def read_lift(file: h5py.File, layout: BlockLayout, path: Path) -> Lift:
     """Rows of this rank, found by the coordinates of its nodes."""
     if "lift" not in file:
         raise ModelError(f"{path} holds no lift; load it without a layout, or reduce the scene again")

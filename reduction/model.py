@@ -14,6 +14,7 @@ from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
+from softgrasp.reduction.lti import LTI, make_lti
 from softgrasp.reduction.operators import Operators, Parameters, Parts
 from softgrasp.reduction.spectrum import Spectrum, spectrum
 
@@ -157,6 +158,11 @@ class SmallModel:
         """Energy with that of the hand's motion, of states (..., N) [J]; two-way it is the Hamiltonian."""
         return np.asarray(np.einsum("...i,...i->...", x @ self.operators.total, x) / 2)
 
+    def lti(self) -> LTI:
+        """The system from the hand's load u to the scene's outputs; with ``to_control`` and ``to_pymor``."""
+        op, C = self.operators, self.outputs.C_z + self.outputs.C_s @ self.operators.S_q
+        return make_lti(op.E, op.A, op.B, C, self.outputs.names, self.fixed_solid)
+
     def equilibrium(self) -> Array:
         """State at rest under gravity with the hand at the origin, (N,).
 
@@ -256,6 +262,10 @@ class ReducedModel:
             structured=conservative and kept,
             scale=p.scale,
         )
+
+    def lti(self, materials: tuple[LayerMaterial, ...] | None = None) -> LTI:
+        """The linear time-invariant system at some materials, see :meth:`SmallModel.lti`; as for :meth:`at`."""
+        return self.at(materials).lti()
 
     def parameters(self, materials: tuple[LayerMaterial, ...]) -> Parameters:
         """Check materials and bundle them with the effects of the scene.

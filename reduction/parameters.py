@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -17,13 +18,18 @@ from softgrasp.reduction.states import States
 GRID = 3  # test values of each constant, from corner to corner of the box
 LAMBDA_SHARES = (0.6, 10.0)  # of the scene's own constant: the paper's box around its 50, 50
 MU_SHARES = (0.4, 10.0)
+STRAIN_SHARES = (0.8, 2.4)  # of both at finite strain, where a softer body folds and its runs fail
 
 
 def box_of(model: Model) -> tuple[list[float], list[float]]:
     """Ranges of lambda and mu of the first layer [Pa]: the scene's, or shares of its own constants."""
     ranges, first = model.scene.reduction, model.system.materials[0]
-    lam, mu = ranges.lambda_range, ranges.mu_range
-    return lam or [share * first.lam for share in LAMBDA_SHARES], mu or [share * first.mu for share in MU_SHARES]
+    linear = model.system.points is None
+    lam, mu = (LAMBDA_SHARES, MU_SHARES) if linear else (STRAIN_SHARES, STRAIN_SHARES)
+    return (
+        ranges.lambda_range or [share * first.lam for share in lam],
+        ranges.mu_range or [share * first.mu for share in mu],
+    )
 
 
 def outside(model: Model) -> str:
@@ -49,10 +55,25 @@ def grid_of(model: Model) -> list[tuple[float, float]]:
 def training_of(model: Model) -> list[tuple[float, float]]:
     """Lamé constants of the runs that train bases beside the scene's own."""
     train = model.scene.reduction.train
-    if train == "corners":
+    if isinstance(train, str):
         lam, mu = box_of(model)
         return [(a, b) for a in lam for b in mu]
     return [(a, b) for a, b in train]
+
+
+def mirrored(model: Model) -> list[list[float]]:
+    """Targets of the runs that train models at finite strain beside the scene's own."""
+    chosen, target = model.scene.reduction.motions, model.scene.motion.target or []
+    if chosen == "own" or not isinstance(chosen, str):
+        return [] if chosen == "own" else [list(each) for each in chosen]
+    signs = product(*((1.0, -1.0) if x else (1.0,) for x in target))
+    return [[s * x for s, x in zip(each, target, strict=True)] for each in signs][1:]
+
+
+def moved_to(model: Model, target: list[float]) -> Model:
+    """The scene with another target of its hand."""
+    motion = model.scene.motion.model_copy(update={"target": target})
+    return replace(model, scene=model.scene.model_copy(update={"motion": motion}))
 
 
 def materials_at(model: Model, lam: float, mu: float) -> tuple[LayerMaterial, ...]:

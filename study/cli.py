@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.study.query.command import query
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
 from softgrasp.study.shell.options import Empty, NoPictures, Out, Overrides, Pdf, Quiet, SceneFile, check_folder
@@ -242,12 +243,23 @@ def reduce(
     no_pictures: NoPictures = False,
     empty: Empty = False,
     pdf: Pdf = False,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(help="build one model that proves its error over the scene's box, to this relative error: 1e-2"),
+    ] = None,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
+    from softgrasp.study.precision.answer import parse_tolerance
     from softgrasp.study.reduce.run import run_reduce
 
+    accuracy = None if tolerance is None else parse_tolerance(tolerance)
     out = out or default_folder("reduce", scene)
-    run_reduce(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty)
+    run_reduce(
+        scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty, tolerance=accuracy
+    )
+
+
+app.command()(query)
 
 
 @app.command()

@@ -51,6 +51,49 @@ def test_doctor_finds_a_healthy_installation_healthy() -> None:
     assert re.search(r"ok +DOLFINx", done.stdout), done.stdout + done.stderr
 
 
+def module_of(name: str) -> Path | None:
+    """File of the longest part of a dotted name that is a module of the package."""
+    parts = name.split(".")[1:]
+    for k in range(len(parts), 0, -1):
+        path = INSIDE.joinpath(*parts[:k])
+        if path.with_suffix(".py").is_file():
+            return path.with_suffix(".py")
+        if (path / "__init__.py").is_file():
+            return path / "__init__.py"
+    return None
+
+
+@pytest.mark.serial
+def test_what_docstrings_refer_to_exists() -> None:
+    names = {
+        name
+        for path in SOURCES
+        for name in re.findall(r":(?:class|func|mod|data|meth|attr|exc):`~?([A-Za-z_]+\.[\w.]+)`", path.read_text())
+        if name.split(".")[0] in ("softgrasp", *PACKAGES)
+    }
+    assert len(names) > 50
+    lost = [name for name in names if not name.startswith("softgrasp.") or module_of(name) is None]
+    for name in names - set(lost):
+        path = module_of(name)
+        assert path is not None
+        inside = (path.parent if path.name == "__init__.py" else path.with_suffix("")).relative_to(INSIDE).parts
+        text = path.read_text()
+        lost += [name for part in name.split(".")[1 + len(inside) :] if not re.search(rf"\b{part}\b", text)]
+    assert lost == [], "write :mod:`softgrasp.fem.model.build`, with the whole path"
+
+
+@pytest.mark.serial
+def test_tests_of_a_lower_floor_need_no_higher_one() -> None:
+    """As the source: study above lqr above reduction above fem; what a test takes as a tool is in tests/helpers."""
+    wrong = []
+    for below, above in (("fem", "reduction|lqr|study"), ("reduction", "lqr|study"), ("lqr", "study")):
+        pattern = rf"^\s*(?:from|import) softgrasp\.(?:{above})\b"
+        files = sorted((ROOT / "tests" / below).rglob("*.py"))
+        assert files
+        wrong += [str(f.relative_to(ROOT)) for f in files if re.search(pattern, f.read_text(), re.MULTILINE)]
+    assert wrong == []
+
+
 @pytest.mark.serial
 def test_keys_of_references_exist() -> None:
     text = (ROOT / "REFERENCES.md").read_text()

@@ -32,8 +32,15 @@ GUESSED = 0.7  # what a pass aims at, at least: too many cells cost more than an
 LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 
 
-def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
+def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) -> Model:
     """Build a scene on a mesh of its tolerance, with the estimate of what it reached; others as they are. Collective.
+
+    With ``passes = 0`` the mesh is the a-priori one, which nothing estimates here.
+
+    Args:
+        scene: the scene.
+        comm: communicator.
+        steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:
         SceneError: the time step leaves more than the tolerance, or the scene cannot be built.
@@ -41,7 +48,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
     """
     begin = time.perf_counter()
     model, refine = build(scene, comm=comm), scene.tissue.refine
-    if refine is None or refine.tolerance is None:
+    if refine is None or refine.tolerance is None or refine.passes == 0:
         return model
     passes, aim, accepted = 0, refine.tolerance, ACCEPTED
     last: tuple[Array, Array] | None = None
@@ -52,7 +59,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm) -> Model:
         if last is not None:
             accepted = _effectivity(last[1], outputs + result.delta - last[0], result.delta)
         last = outputs, result.delta
-        if passes == 0:
+        if passes == 0 and steps:
             _check_steps(scene, refine.tolerance, result.time_error)
         reached = result.estimate <= accepted * refine.tolerance
         obstacle = "" if reached else f"tissue.refine.passes = {refine.passes} are used up"
@@ -84,6 +91,19 @@ def _effectivity(old: Array, error: Array, new: Array) -> float:
 
 def _final(result: MeshEstimate, refine: Refine, passes: int, obstacle: str) -> MeshEstimate:
     return replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
+
+
+def judged(model: Model) -> MeshEstimate:
+    """The estimate of a model that was built without one, against the tolerance of its scene if it has one. Collective.
+
+    Raises:
+        SolverError, SceneError, MeshError: see :func:`softgrasp.fem.accuracy.estimate.estimate`.
+    """
+    result, refine = estimate(model), model.scene.tissue.refine
+    if refine is None or refine.tolerance is None:
+        return result
+    obstacle = "tissue.refine.passes = 0 allow none" if result.estimate > ACCEPTED * refine.tolerance else ""
+    return _final(result, refine, 0, obstacle)
 
 
 def _check_steps(scene: Scene, tolerance: float, error: float) -> None:

@@ -52,6 +52,21 @@ class Ends:
         return np.sqrt(nearest)
 
 
+def expected_order(ends: Ends, order: int, graded: bool, edges: bool = False) -> float:
+    """Order of the outputs in n_e^(1/d): 2 p on graded meshes, min(2 p, 2 alpha) on even ones.
+
+    Args:
+        ends: singular ends of the body.
+        order: p of the elements.
+        graded: whether cells shrink towards the ends.
+        edges: whether they do so by bisection in 3D, where small cells along an edge are many: at most 3.
+    """
+    full = 2.0 * order
+    if graded:
+        return min(full, 3.0) if edges else full
+    return min(full, 2 * float(ends.alpha.min(initial=full)))
+
+
 def exponent(angle: float, nu: float, held: int) -> float:
     """Real part of the smallest exponent alpha > 0 of u ~ r^alpha at a corner in plane strain [W52].
 

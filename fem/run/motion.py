@@ -45,8 +45,14 @@ def quintic(t: Array, duration: float) -> tuple[Array, Array, Array]:
     return s, ds, dds
 
 
-def read_csv(path: Path, columns: int, end: float) -> tuple[Array, Array]:
+def read_csv(path: Path, columns: int, end: float | None = None, key: str = "motion.csv") -> tuple[Array, Array]:
     """Read times (steps,) and values (steps, columns) of a trajectory.
+
+    Args:
+        path: the file.
+        columns: degrees of freedom of the hand.
+        end: of the run [s]; None takes the file as long as it is, from 0 on.
+        key: who names the file, for the messages.
 
     Raises:
         SceneError: the file is missing, not numeric, not increasing in time or does not cover [0, end].
@@ -54,17 +60,17 @@ def read_csv(path: Path, columns: int, end: float) -> tuple[Array, Array]:
     try:
         table = np.array(read_table(path, columns + 1))
     except OSError as error:
-        raise SceneError(f"motion.csv: {path} cannot be read ({error.strerror}); name an existing CSV file") from error
+        raise SceneError(f"{key}: {path} cannot be read ({error.strerror}); name an existing CSV file") from error
     except ValueError as error:
-        raise SceneError(f"motion.csv: {path} {error} (time, then one per hand degree of freedom)") from error
+        raise SceneError(f"{key}: {path} {error} (time, then one per hand degree of freedom)") from error
     if len(table) < 2:
-        raise SceneError(f"motion.csv: {path} has {len(table)} rows of numbers; it must have at least two")
+        raise SceneError(f"{key}: {path} has {len(table)} rows of numbers; it must have at least two")
     if (np.diff(table[:, 0]) <= 0).any():
-        raise SceneError(f"motion.csv: the times in {path} must increase from row to row")
-    if table[0, 0] > 0 or table[-1, 0] < end * (1 - 1e-12):
-        raise SceneError(
-            f"motion.csv: {path} covers {table[0, 0]:g} to {table[-1, 0]:g} s, the run needs 0 to {end:g} s"
-        )
+        raise SceneError(f"{key}: the times in {path} must increase from row to row")
+    if end is None and table[0, 0] != 0:
+        raise SceneError(f"{key}: the times in {path} must begin at 0, not at {table[0, 0]:g} s")
+    if end is not None and (table[0, 0] > 0 or table[-1, 0] < end * (1 - 1e-12)):
+        raise SceneError(f"{key}: {path} covers {table[0, 0]:g} to {table[-1, 0]:g} s, the run needs 0 to {end:g} s")
     return table[:, 0], table[:, 1:]
 
 
@@ -120,6 +126,23 @@ def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
         times, values = read_csv(scene.directory / (motion.csv or ""), n_s, end)
         return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
     return np.zeros((steps, n_s))
+
+
+def largest_acceleration(scene: Scene, n_s: int, M_hand: Array) -> Array:
+    """The largest acceleration that a motion, or a force on the bare hand, gives the hand [m/s^2, rad/s^2], (n_s,).
+
+    Raises:
+        SceneError: a CSV file does not fit.
+    """
+    if scene.motion.profile == "quintic":
+        target = np.zeros(n_s)
+        target[: len(scene.motion.target or [])] = scene.motion.target or []
+        return np.asarray(10 / np.sqrt(3) / scene.motion.duration**2 * target)
+    if scene.motion.drive == "motion":
+        a = motion_table(scene, n_s).a
+    else:
+        a = np.linalg.solve(M_hand, force_values(scene, n_s, M_hand).T).T
+    return np.asarray(a[int(np.argmax(np.abs(a).max(axis=1)))])
 
 
 def driven_table(M_hand: Array, force: Array, dt: float, q0: Array, v0: Array) -> HandTable:

@@ -55,18 +55,43 @@ class Reduction(Section):
     lambda_range: Range | None = Field(
         None,
         description="range of lambda for tests at other parameters [Pa]; by default 0.6 to 10 times that of the first "
-        "layer",
+        "layer, 0.8 to 2.4 times with effects.finite_strain",
     )
     mu_range: Range | None = Field(
         None,
         description="range of mu for tests at other parameters [Pa]; by default 0.4 to 10 times that of the first "
-        "layer",
+        "layer, 0.8 to 2.4 times with effects.finite_strain",
     )
 
-    train: Literal["corners"] | list[Range] = Field(
+    train: Literal["corners", "greedy"] | list[Range] = Field(
         "corners",
         description="[lambda, mu] of full runs that train bases beside the scene's own, for the tests at other "
-        "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none",
+        "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none; greedy: builds one certified model",
+    )
+    certify: Literal["off", "two", "proof", "estimate"] = Field(
+        "off",
+        description="build one model that knows its error [no unit]: by two bases and a proof, by a proof or an "
+        "estimate alone",
+    )
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
+        1e-2, description="relative error that a certified model is built to, and above which it refuses [1]"
+    )
+    norm: Literal["energy", "output"] = Field(
+        "energy", description="what the tolerance is about [no unit]: energy norm of the deformation, or the outputs"
+    )
+    grid: Annotated[int, Field(ge=1)] = Field(
+        20, description="values of lambda and of mu, logarithmically over their ranges, where the greedy looks [1]"
+    )
+    add: Annotated[int, Field(ge=1)] = Field(4, description="modes that each full run of the greedy adds [1]")
+    max_N: Annotated[int, Field(ge=1)] = Field(200, description="largest N of the greedy's basis [1]")
+    validation: Annotated[int, Field(ge=0)] = Field(
+        0, description="random parameters where full runs test the certified model afterwards [1]"
+    )
+    motions: Literal["auto", "own", "unit", "mirrored"] | list[list[float]] = Field(
+        "auto",
+        description="motions that train [no unit]: own, the scene's; unit, every freedom of the hand by itself, for "
+        "certified models; mirrored, the scene's with other signs too, or further targets [m], with "
+        "effects.finite_strain; auto: own, and mirrored with that effect",
     )
 
     @model_validator(mode="after")
@@ -94,9 +119,13 @@ class Loop(Section):
         "midpoint", description="feedback inside the midpoint rule, or sampled and held as on a robot [no unit]"
     )
     rate: Positive = Field(1000.0, description="sampling rate [Hz], held only")
-    limit: Positive | None = Field(None, description="largest force on the hand in each direction [N]; none by default")
-    limit_torque: Positive | None = Field(
-        None, description="largest torque on a turning hand about each axis [N m]; none by default"
+    limit: Positive | list[Positive] | None = Field(
+        None, description="largest force on the hand in each direction [N], one number or one per axis; none by default"
+    )
+    limit_torque: Positive | list[Positive] | None = Field(
+        None,
+        description="largest torque on a turning hand about each axis [N m], one number or one per axis; none by "
+        "default",
     )
     delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
 

@@ -170,7 +170,9 @@ class Refine(Section):
         description="contact zone of a bisected mesh [no unit]: the parts of the facets held before, or those selected "
         "again by their midpoints; layers alike",
     )
-    passes: Annotated[int, Field(ge=0)] = Field(3, description="refinements after the first estimate, at most [1]")
+    passes: Annotated[int, Field(ge=0)] = Field(
+        3, description="refinements after the first estimate, at most [1]; 0: the a-priori mesh as it is"
+    )
     most: Annotated[int, Field(ge=1)] = Field(200_000, description="tissue unknowns, at most [1]")
 
     @model_validator(mode="after")

@@ -165,7 +165,7 @@ def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
     return modal_plant(problem, np.sqrt(squares), Phi, tissue.M @ Phi, parts)
 
 
-def some_modes(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
+def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
     """The k lowest modes: LAPACK on rank 0 up to :data:`DENSE_MODES` unknowns, else SLEPc. Collective.
 
     Returns:

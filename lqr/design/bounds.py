@@ -11,6 +11,7 @@ from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.gap import duality_gaps
 from softgrasp.lqr.loop.responses import Notify
 from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.retune import BoxPoint
 from softgrasp.lqr.reduced.riccati import GainReport
@@ -24,7 +25,7 @@ def with_bounds[Judged: (GainReport, BoxPoint)](
     plan: LoopPlan,
     notify: Notify | None = None,
 ) -> list[Judged]:
-    """The same with ``cost_excess_at_most`` where the gain is stable, see :mod:`lqr.loop.gap`. Collective.
+    """The same with ``cost_excess_at_most`` where the gain is stable, see :mod:`softgrasp.lqr.loop.gap`. Collective.
 
     Args:
         problem: the plant.
@@ -35,11 +36,11 @@ def with_bounds[Judged: (GainReport, BoxPoint)](
         notify: called with the number of steps done and in all.
     """
     gains = list(gains)
-    stable = [(i, g.gain) for i, g in enumerate(gains) if g.stable and g.gain is not None]
-    if stable:
-        laws = [gain for _, gain in stable]
-        gaps = duality_gaps(problem, laws, start, plan.dt, plan.steps, solution.factor, notify)
-        for (i, _), gap in zip(stable, gaps, strict=True):
+    laws: dict[int, Gain] = {i: g.gain for i, g in enumerate(gains) if g.stable and g.gain is not None}
+    if laws:
+        every = [*laws.values(), solution.gain]  # the last has the best lower bound of the least cost
+        gaps = duality_gaps(problem, every, start, plan.dt, plan.steps, solution.factor, notify)
+        for i, gap in zip(laws, gaps[:-1], strict=True):
             gains[i] = replace(gains[i], cost_excess_at_most=gap.cost_excess_at_most)
     return gains
 

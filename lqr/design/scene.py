@@ -100,10 +100,16 @@ def actuation(model: Model) -> Actuation:
         )
     limits = None
     if loop.limit is not None or loop.limit_torque is not None:
-        limits = (loop.limit or np.inf,) * layout.dimension + (loop.limit_torque or np.inf,) * turns
+        limits = _per_axis("limit", loop.limit, layout.dimension) + _per_axis("limit_torque", loop.limit_torque, turns)
     law = Actuation(loop.rate if loop.sampling == "held" else None, loop.delay, limits)
     law.ticks(scene.time_end / scene.time.steps)
     return law
+
+
+def _per_axis(key: str, limit: float | list[float] | None, axes: int) -> tuple[float, ...]:
+    if isinstance(limit, list) and len(limit) != axes:
+        raise ControlError(f"control.loop.{key} has {len(limit)} numbers; give one, or {axes}, one per axis")
+    return tuple(limit) if isinstance(limit, list) else (limit or np.inf,) * axes
 
 
 def sampling(model: Model) -> Sampling:

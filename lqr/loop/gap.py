@@ -11,10 +11,13 @@ of all inputs, J(u + d) >= J(u) + 2 dt sum_n d_n'r_n + dt sum_n d_n'R d_n, so th
 
 with the adjoint state p of the midpoint rule, (E - dt/2 A)'p_{n-1} = (E + dt/2 A)'p_n + dt/2 C'Q (y_{n-1} + y_n), which
 begins at the end with 2 (E - dt/2 A)'p_{N-1} = dt C'Q y_{N-1} + 2 E'Z Z'E x_N: weak duality of the linear-quadratic
-problem. Nothing is assumed of Z; no constant of stability and no solution of the whole plant's Riccati equation enters.
+problem. Nothing is assumed of Z, and no constant of stability enters. Every run gives such a lower bound of min J, and
+the best of them serves all: beside the optimal run, whose gap is rounding, J(u) - max (J - gap) is the excess of any
+other.
 
 The midpoint rule keeps quadratic balances, so with X exact J(u*) is the optimal cost of the continuous problem without
-end, for every dt. What the bound leaves out is the excess of a feedback that goes on beyond t = N dt.
+end, for every dt. The proof covers the run to t = N dt and the optimal feedback after it; for a loop that goes on with
+its own gain the bound has room for an excess after the end that is as many times what is to come as J(u) is min J.
 
 B'p needs no run of the adjoint: by reciprocity it is the correlation of y with the responses of y to the inputs.
 """
@@ -22,7 +25,7 @@ B'p needs no run of the adjoint: by reciprocity it is the correlation of y with 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +36,8 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
+ROUNDING = 1e-12  # of a cost: sums over the steps with the growing responses of the hand
+
 
 @dataclass(frozen=True)
 class DualityGap:
@@ -41,20 +46,27 @@ class DualityGap:
     Attributes:
         gap: J(u) - min J is at most this; infinite when the run diverges.
         cost: J(u) with what is to come.
+        least: proved lower bound of min J, J - gap of this run or of a better one from the same start.
         to_come: |Z'E x_N|^2, what is to come after the end.
         end: N dt [s].
     """
 
     gap: float
     cost: float
+    least: float
     to_come: float
     end: float
 
     @property
     def cost_excess_at_most(self) -> float:
-        """Bound on J(u) / min J - 1: gap / (J - gap), because min J >= J - gap; infinite when that is not positive."""
-        least = self.cost - self.gap
-        return self.gap / least if least > 0 else np.inf
+        """Bound on J(u) / min J - 1; infinite when the lower bound of min J is not positive.
+
+        The gap, or the distance to the lower bound with room for what is to come, whichever is less.
+        """
+        if not (self.least > 0 and np.isfinite(self.gap)):
+            return float("inf")
+        after = self.to_come * self.cost / self.least
+        return min(self.gap, self.cost - self.least + after + ROUNDING * self.cost) / self.least
 
 
 def duality_gaps(
@@ -93,7 +105,9 @@ def duality_gaps(
     first = p + len(gains) * n_s
     outputs, end = seen.part(slice(p)).at_midpoints(), seen.part(slice(first, None))
     laws = (seen.part(slice(p + i * n_s, p + (i + 1) * n_s)) for i in range(len(gains)))
-    return tuple(run_gap(outputs, end, feedback_inputs(law.at_midpoints()), problem.Q, problem.R) for law in laws)
+    runs = [run_gap(outputs, end, feedback_inputs(law.at_midpoints()), problem.Q, problem.R) for law in laws]
+    least = max((run.least for run in runs if np.isfinite(run.gap)), default=-np.inf)
+    return tuple(replace(run, least=least) for run in runs)
 
 
 def run_gap(outputs: Responses, end: Responses, u: Array, Q: Array, R: Array) -> DualityGap:
@@ -107,7 +121,7 @@ def run_gap(outputs: Responses, end: Responses, u: Array, Q: Array, R: Array) ->
     """
     dt, steps = outputs.dt, len(u)
     if not np.isfinite(u).all():
-        return DualityGap(np.inf, np.inf, np.inf, dt * steps)
+        return DualityGap(np.inf, np.inf, -np.inf, np.inf, dt * steps)
     y = outputs.free + causal(outputs.kernel, u)
     reach = end.kernel[:0:-1]  # of Z'E x_N to the input of every step
     last = end.free[-1] + np.einsum("kij,kj->i", reach, u)
@@ -116,4 +130,4 @@ def run_gap(outputs: Responses, end: Responses, u: Array, Q: Array, R: Array) ->
     gap = dt * float(np.sum(r * np.linalg.solve(R, r.T).T))
     to_come = float(last @ last)
     cost = dt * float(np.sum((y @ Q) * y) + np.sum((u @ R) * u)) + to_come
-    return DualityGap(gap, cost, to_come, dt * steps)
+    return DualityGap(gap, cost, cost - gap, to_come, dt * steps)

@@ -15,6 +15,7 @@ from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.operators import damp
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import steady_input
+from softgrasp.reduction.lti import LTI, make_lti
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,16 @@ class SmallPlant:
     def N(self) -> int:
         """Dimension."""
         return len(self.E)
+
+    @property
+    def hand_first(self) -> bool:
+        """Whether the state begins with q_s and v_s."""
+        n_s, one = len(self.S_q), np.eye(self.N)
+        return np.array_equal(self.S_q, one[:n_s]) and np.array_equal(self.S_v, one[n_s : 2 * n_s])
+
+    def lti(self) -> LTI:
+        """The system for other packages, and for frequency responses; ``lti().under(K)`` is the closed loop."""
+        return make_lti(self.E, self.A, self.B, self.C, self.names, self.hand_first)
 
     def rest_at(self, q_bar: Array) -> tuple[Array, Array]:
         """x_bar (N,) and u_bar (n_s,) with 0 = A x + B u + f and S_q x = q_bar.

@@ -14,7 +14,7 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
-from softgrasp.lqr.dense.modal import some_modes
+from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.dense.poles import closed_loop_rates
 from softgrasp.lqr.lowrank.compress import gram, triangular
 from softgrasp.lqr.plant.block import Block
@@ -229,7 +229,7 @@ def structured(problem: RiccatiProblem) -> BasisFamily:
     """
     system = problem.system
     k = min(STRUCTURED_MODES, system.layout.n_e)
-    omega, Phi, massed = some_modes(problem, k)
+    omega, Phi, massed = modes_of_plant(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
     c = total(system.layout.comm, problem.C_z.T @ Phi)
     g = modal_inputs(problem, Phi)

@@ -113,8 +113,8 @@ class BoxPoint:
     """One setting of the box: errors against the full Riccati solution there.
 
     ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop, and from tick to
-    tick where its instants are known; ``cost_excess_at_most`` is proved, see :mod:`lqr.loop.gap`, nan where it was not
-    asked for.
+    tick where its instants are known; ``cost_excess_at_most`` is proved, see :mod:`softgrasp.lqr.loop.gap`, nan where
+    it was not asked for.
     """
 
     materials: Materials

@@ -56,8 +56,8 @@ class GainReport:
         certified: the sign of the abscissa is certain, see :class:`softgrasp.lqr.spectrum.modal_loop.LoopQuality`.
         sampled: the loop from tick to tick, where its instants are known.
         gain: K_hat; None where there is none.
-        cost_excess_at_most: proved bound on the excess, see :mod:`lqr.loop.gap`; nan where it was not asked for.
-        matrices: of the reduced equation; None where they are not kept.
+        cost_excess_at_most: proved bound on the excess, see :mod:`softgrasp.lqr.loop.gap`; nan where it was not asked
+        for. matrices: of the reduced equation; None where they are not kept.
     """
 
     method: str

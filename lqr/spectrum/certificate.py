@@ -10,7 +10,7 @@ from slepc4py import SLEPc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import PETSc, combine, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
-from softgrasp.lqr.dense.modal import some_modes
+from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.plant.gain import Gain
@@ -135,7 +135,7 @@ def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, i
     Collective.
     """
     k = min(SHOWN, problem.layout.n_e)
-    omega = some_modes(problem, k)[0] if tail is None else tail.omega[:k]
+    omega = modes_of_plant(problem, k)[0] if tail is None else tail.omega[:k]
     beta = problem.system.damping.beta if tail is None else tail.beta
     needed = 0.0 if tail is None else tail.radius(SAFE)
     shown = 1.05 * float(omega[-1])

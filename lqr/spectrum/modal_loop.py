@@ -9,7 +9,7 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
-from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, some_modes
+from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, modes_of_plant
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import damp, modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -154,7 +154,7 @@ def _all(problem: RiccatiProblem) -> tuple[Array, Array, ModalPlant]:
 
 def _lowest(problem: RiccatiProblem, k: int) -> tuple[Array, Array, ModalPlant]:
     comm = problem.layout.comm
-    omega, Phi, massed = some_modes(problem, k)
+    omega, Phi, massed = modes_of_plant(problem, k)
     parts = (
         modal_damping(problem, Phi),
         modal_inputs(problem, Phi),

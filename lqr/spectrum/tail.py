@@ -6,7 +6,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
-from softgrasp.lqr.dense.modal import some_modes
+from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.modal_start import plant_modes
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
@@ -38,7 +38,7 @@ def least_beta(problem: RiccatiProblem) -> float:
 
 def tail_modes(problem: RiccatiProblem, k: int) -> tuple[Array, Array]:
     """The k lowest frequencies and modes, two-way with the hand floating. Collective."""
-    return plant_modes(Plant(problem), k) if problem.system.two_way else some_modes(problem, k)[:2]
+    return plant_modes(Plant(problem), k) if problem.system.two_way else modes_of_plant(problem, k)[:2]
 
 
 class Tail:

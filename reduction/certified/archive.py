@@ -1,6 +1,6 @@
 """One HDF5 file for a certified model: a reduced model's own file, the triangles, the box, and hashes of all of it.
 
-:func:`reduction.archive.load` reads the reduced model in it too, which then answers without a certificate.
+:func:`softgrasp.reduction.archive.load` reads the reduced model in it too, which then answers without a certificate.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _append(model: CertifiedModel, path: Path, key: str) -> None:
     with h5py.File(path, "r+") as file:
         group = file.create_group(GROUP)
         group.attrs["format"] = FORMAT
-        group.attrs["about"] = json.dumps(about)
+        group["about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)  # attributes end at 64 kB
         group["static"], group["mass"], group["compliance"] = norms.static, norms.mass, model.compliance
         for i, T in enumerate(norms.shape or ()):
             group[f"shape/{i}"] = T
@@ -90,7 +90,8 @@ def load_certified(path: str | Path, layout: BlockLayout | None = None) -> Certi
 
     Args:
         path: file of :func:`save_certified`.
-        layout: where the lift goes, see :func:`reduction.archive.load`; None leaves it out, which runs do without.
+        layout: where the lift goes, see :func:`softgrasp.reduction.archive.load`; None leaves it out, which runs do
+        without.
 
     Raises:
         ModelError: the file is missing, damaged, without a certificate, or of another mesh.
@@ -115,7 +116,7 @@ def _read(path: Path, lift: bool) -> dict[str, Any]:
             for name in ("sha256", "sha256_lift") if lift else ("sha256",):
                 if group.attrs[name] != _digest(file, lift=name != "sha256"):
                     raise ModelError(f"{path} is damaged: it is not what was written; reduce the scene again")
-            about = json.loads(group.attrs["about"])
+            about = json.loads(group["about"][()].tobytes())
             drive = None
             for name in ("finer", "drive"):
                 if name in group:
@@ -152,7 +153,7 @@ def _digest(file: h5py.File, lift: bool) -> str:
     """SHA-256 of all numbers of the lift, or of all others with what the file says about them."""
     digest = hashlib.sha256()
     if not lift:
-        digest.update((file.attrs["model"] + file[GROUP].attrs["about"]).encode())
+        digest.update(file.attrs["model"].encode())
         for name in ("drive", "finer"):
             if name in file[GROUP]:
                 digest.update(repr(sorted((k, str(v)) for k, v in file[f"{GROUP}/{name}"].attrs.items())).encode())

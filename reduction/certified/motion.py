@@ -54,7 +54,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Residual:
-    """What the static bound takes of a run, see :func:`reduction.certified.bounds.static_bound`.
+    """What the static bound takes of a run, see :func:`softgrasp.reduction.certified.bounds.static_bound`.
 
     Attributes:
         static: T r in K^-1 at the middles, (w, steps).
@@ -101,7 +101,7 @@ class Motion:
         return np.hstack([consistent(self.q_s, self.v_s, dt), self.v_s, *tissue])
 
     def trajectory(self, dt: float, names: tuple[str, ...]) -> ReducedTrajectory:
-        """As :func:`reduction.online.run` returns it."""
+        """As :func:`softgrasp.reduction.online.run` returns it."""
         x = self.states(dt)
         return ReducedTrajectory(dt * np.arange(float(len(x))), x, self.q_s, self.v_s, self.outputs, names)
 

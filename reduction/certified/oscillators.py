@@ -5,7 +5,7 @@ With X' M X = 1 and X' K X = omega^2 of the reduced pair, a = X eta and the midp
     eta'' + (alpha + beta omega^2) eta' + omega^2 eta = -X'G c,   c = a_s - g [+ alpha v_s]
 
 turns w = (omega eta, eta') by one 2 x 2 matrix a mode. Blocks of steps are products; no step of Python is a time step.
-The same numbers as :func:`reduction.online.run` to rounding, in less time: nothing of size 2 k is factored.
+The same numbers as :func:`softgrasp.reduction.online.run` to rounding, in less time: nothing of size 2 k is factored.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def certified_model(
         Phi: local rows (n_local, k2).
         k: modes of the answer; None takes all, with one basis.
         space: residuals of these modes; None makes them at the materials of the scene.
-        about: other fields of :class:`reduction.certified.model.CertifiedModel`.
+        about: other fields of :class:`softgrasp.reduction.certified.model.CertifiedModel`.
 
     Raises:
         SolverError: a factorisation failed.

@@ -9,18 +9,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from softgrasp.study.bench.driver import (
-    Goal,
-    goal_rows,
-    growth,
-    list_bench,
-    number,
-    open_console,
-    parse_list,
-    parse_ranks,
-    show_goals,
-    write_bench,
-)
+from softgrasp.study.bench import driver
+from softgrasp.study.bench.driver import Goal, number
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker
 
@@ -64,7 +54,10 @@ def parse_sizes(text: str) -> list[tuple[str, int]]:
         typer.BadParameter: anything else.
     """
     advice = "size; write 2d:1000 or 3d:50000 with at least 20 unknowns"
-    return [(kind or "2d", int(size)) for kind, size in parse_list(text, r"(?:(2d|3d)?:)?([2-9]\d|[1-9]\d\d+)", advice)]
+    return [
+        (kind or "2d", int(size))
+        for kind, size in driver.parse_list(text, r"(?:(2d|3d)?:)?([2-9]\d|[1-9]\d\d+)", advice)
+    ]
 
 
 def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
@@ -76,10 +69,10 @@ def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
         n = [row["n_e"] for row in own]
         memory = [row["memory_mb"] - row["memory_base_mb"] for row in own]
         result[str(ranks)] = {
-            "assembly": growth(n, [row["seconds"]["assembly"] for row in own]),
-            "factor": growth(n, [row["seconds"]["factor"] for row in own]),
-            "step": growth(n, [row["step_us"]["ts"] for row in own]),
-            "memory": growth(n, [m if m > MEMORY_FLOOR_MB else 0.0 for m in memory]),
+            "assembly": driver.growth(n, [row["seconds"]["assembly"] for row in own]),
+            "factor": driver.growth(n, [row["seconds"]["factor"] for row in own]),
+            "step": driver.growth(n, [row["step_us"]["ts"] for row in own]),
+            "memory": driver.growth(n, [m if m > MEMORY_FLOOR_MB else 0.0 for m in memory]),
         }
     return result
 
@@ -163,7 +156,7 @@ def show(console: Console, rows: Sequence[Row]) -> None:
         parts = [f"{name} {power:.2f}" for name, power in powers.items() if power is not None]
         if parts:
             console.print(f"growth exponents in n_e over the 2D sizes, {ranks} rank(s): {', '.join(parts)}")
-    show_goals(console, goals(rows))
+    driver.show_goals(console, goals(rows))
 
 
 def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, ...]:
@@ -222,11 +215,16 @@ def main(
     large: Annotated[bool, typer.Option("--large", help=f"also 1e6 (2D) and 2e5 (3D), {LARGE_STEPS} steps")] = False,
 ) -> None:
     """See HELP."""
-    console = open_console(175)
-    rows = collect(console, parse_sizes(sizes), parse_ranks(ranks), repeats, large)
+    console = driver.open_console(175)
+    rows = collect(console, parse_sizes(sizes), driver.parse_ranks(ranks), repeats, large)
     show(console, rows)
-    content = {"command": "bench_forward", "rows": rows, "exponents": exponents(rows), "goals": goal_rows(goals(rows))}
-    files = write_bench(
+    content = {
+        "command": "bench_forward",
+        "rows": rows,
+        "exponents": exponents(rows),
+        "goals": driver.goal_rows(goals(rows)),
+    }
+    files = driver.write_bench(
         out, "bench", content, csv_table(rows), table_of([row for row in rows if "error" not in row]).markdown()
     )
-    list_bench(console, [*files, *draw(out / "bench.png", rows)], any("error" in row for row in rows))
+    driver.list_bench(console, [*files, *draw(out / "bench.png", rows)], any("error" in row for row in rows))

@@ -21,6 +21,7 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
+from softgrasp.study.bench.driver import growth, parse_list
 from softgrasp.study.reduce.result import Point
 from softgrasp.study.reduce.sweep import sweep
 from softgrasp.study.report.files import write_json
@@ -115,35 +116,26 @@ def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
     )
 
 
-def exponent(rows: Sequence[MeshRow], key: str) -> float:
-    """Slope of log time against log n_e by least squares; nan for one mesh."""
-    if len(rows) < 2:
-        return math.nan
-    n_e, seconds = (np.log([getattr(row, k) for row in rows]) for k in ("n_e", key))
-    return float(np.polyfit(n_e, seconds, 1)[0])
-
-
-def break_even(rows: Sequence[MeshRow]) -> float:
+def break_even(rows: Sequence[MeshRow]) -> float | None:
     """n_e from which a reduced run is faster than a full one, by the straight line through log times."""
     if len(rows) < 2:
-        return math.nan
+        return None
     n_e = np.log([row.n_e for row in rows])
     ratio = np.log([row.time_full / row.time_online for row in rows])
     slope, constant = np.polyfit(n_e, ratio, 1)
-    return float(np.exp(-constant / slope)) if slope > 0 else math.nan
+    return float(np.exp(-constant / slope)) if slope > 0 else None
 
 
 def findings(rows: Sequence[MeshRow]) -> dict[str, Any]:
     """Exponents, spread of the online time, break-even mesh; None where one mesh does not tell."""
-    online = [row.time_online for row in rows]
-    values = {
-        "exponent_full": exponent(rows, "time_full"),
-        "exponent_offline": exponent(rows, "time_offline"),
-        "exponent_online": exponent(rows, "time_online"),
+    n_e, online = [row.n_e for row in rows], [row.time_online for row in rows]
+    return {
+        "exponent_full": growth(n_e, [row.time_full for row in rows]),
+        "exponent_offline": growth(n_e, [row.time_offline for row in rows]),
+        "exponent_online": growth(n_e, online),
         "online_spread": max(online) / min(online),
         "break_even_n_e": break_even(rows),
     }
-    return {key: value if math.isfinite(value) else None for key, value in values.items()}
 
 
 def show(console: Console, rows: Sequence[MeshRow], trends: dict[str, Any], title: str) -> None:
@@ -242,16 +234,12 @@ def parse_sizes(text: str) -> list[int]:
     Raises:
         typer.BadParameter: a part is no number from 50 on.
     """
-    result = []
-    for part in text.split(","):
-        try:
-            value = float(part)
-        except ValueError:
-            value = math.nan
-        if not 50 <= value < 1e9:
-            raise typer.BadParameter(f"{part!r} is no number of unknowns; give numbers from 50 on, such as 1e3,1e4")
-        result.append(round(value))
-    return result
+    advice = "number of unknowns; give numbers from 50 on, such as 1e3,1e4"
+    sizes = [round(float(part)) for part in parse_list(text, r"([0-9.]+(?:e[0-9]+)?)", advice)]
+    for size in sizes:
+        if not 50 <= size < 1e9:
+            raise typer.BadParameter(f"'{size}' is no {advice}")
+    return sizes
 
 
 def main(

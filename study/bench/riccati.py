@@ -12,17 +12,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from softgrasp.study.bench.driver import (
-    Goal,
-    goal_rows,
-    growth,
-    list_bench,
-    number,
-    open_console,
-    parse_list,
-    parse_ranks,
-    show_goals,
-)
+from softgrasp.study.bench import driver
+from softgrasp.study.bench.driver import Goal, number
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker
 
@@ -55,7 +46,7 @@ def parse_meshes(text: str) -> list[int]:
     Raises:
         typer.BadParameter: anything else.
     """
-    return [int(part) for part in parse_list(text, r"([2-9]|[1-9]\d+)", "number of cells; write 10,20,40")]
+    return [int(part) for part in driver.parse_list(text, r"([2-9]|[1-9]\d+)", "number of cells; write 10,20,40")]
 
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
@@ -102,7 +93,7 @@ class Record:
         """Write the file."""
         self.file.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": "bench_riccati", "beta": self.beta, "rows": self.rows, "peers": self.peers}
-        report |= {"exponents": exponents(self.rows), "goals": goal_rows(goals(self.rows))}
+        report |= {"exponents": exponents(self.rows), "goals": driver.goal_rows(goals(self.rows))}
         self.file.write_text(json.dumps(report, indent=2) + "\n")
 
 
@@ -122,7 +113,7 @@ def exponents(rows: Sequence[Row]) -> dict[str, float | None]:
     good = [entry for entry in flat(rows) if "error" not in entry and entry["nx"] >= 20]
     for key in sorted({(entry["method"], entry["ranks"]) for entry in good}):
         own = [entry for entry in good if (entry["method"], entry["ranks"]) == key]
-        result[f"{key[0]}, {key[1]} rank(s)"] = growth([e["states"] for e in own], [e["seconds"] for e in own])
+        result[f"{key[0]}, {key[1]} rank(s)"] = driver.growth([e["states"] for e in own], [e["seconds"] for e in own])
     return result
 
 
@@ -196,7 +187,7 @@ def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
     for label, power in exponents(rows).items():
         if power is not None:
             console.print(f"growth exponent of the time in 2n from nx = 20 on, {label}: {power:.2f}")
-    show_goals(console, goals(rows))
+    driver.show_goals(console, goals(rows))
 
 
 def csv_table(rows: Sequence[Row]) -> Table:
@@ -298,8 +289,8 @@ def main(
     resume: Annotated[bool, typer.Option("--resume", help="keep the good rows of bench_riccati.json in --out")] = False,
 ) -> None:
     """See HELP."""
-    meshes, counts = parse_meshes(sizes), parse_ranks(ranks)
-    console = open_console(160)
+    meshes, counts = parse_meshes(sizes), driver.parse_ranks(ranks)
+    console = driver.open_console(160)
     record = Record(out / "bench_riccati.json", beta)
     if resume:
         record.resume()
@@ -310,4 +301,4 @@ def main(
     (out / "bench_riccati.md").write_text(markdown(rows, others))
     files = [out / "bench_riccati.json", out / "bench_riccati.md", csv_table(rows).write_csv(out / "bench_riccati.csv")]
     files += draw(out / "bench_riccati.png", rows, others)
-    list_bench(console, files, any("error" in entry for entry in [*rows, *flat(rows)]))
+    driver.list_bench(console, files, any("error" in entry for entry in [*rows, *flat(rows)]))

@@ -32,7 +32,7 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.timing import timed
+from softgrasp.study.shell.timing import repeated
 
 METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
 REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
@@ -67,10 +67,8 @@ def run_method(comm: MPI.Intracomm, problem: RiccatiProblem, name: str, repeats:
     def solve() -> None:
         solution[:] = [METHODS[name]().solve(problem)]
 
-    times = [timed(comm, solve)]
-    while len(times) < repeats and sum(times) <= REPEAT_SECONDS:
-        times.append(timed(comm, solve))
-    return solution[0], float(np.median(times))
+    seconds = float(np.median(repeated(comm, solve, repeats, REPEAT_SECONDS)))
+    return solution[0], seconds
 
 
 def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str = "") -> dict[str, Any]:

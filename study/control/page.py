@@ -12,7 +12,7 @@ from softgrasp.study.control.result import TITLES, ControlStudy
 from softgrasp.study.control.tables import BOX_HEADER, box_rows, loop_table, reduced_table, summary_rows
 from softgrasp.study.pictures.animation import speed_up
 from softgrasp.study.report.equation_control import control_text
-from softgrasp.study.report.origin import made_with, origin
+from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section
 
 CAPTIONS = {
@@ -25,6 +25,8 @@ CAPTIONS = {
     "plant unstable or without certificate; on the upper edge those with an error above 100 %.",
     "retune.png": "Excess cost over the box when the basis stays that of the scene's parameter. Red crosses: no stable "
     "gain.",
+    "bode.png": "The loop at each input, all others closed, on the controller's own plant, sampled and held; marked: "
+    "the crossover and its phase margin.",
     "decay.png": "Decay rates of the lowest modes without feedback and with the gains.",
 }
 
@@ -59,12 +61,19 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     ]
     if study.bases:
         parts += _reduced(study, pick("errors.png"))
+    if study.margins is not None:
+        from softgrasp.study.control.bode import MARGIN_HEADER, margin_rows, margin_text  # brings Matplotlib
+
+        rows, text = margin_rows(study.margins), margin_text(study.margins)
+        parts.append(
+            Section("Margins of the small controller", text, header=MARGIN_HEADER, rows=rows, figures=pick("bode.png"))
+        )
     for i, r in enumerate(study.retuned):
         text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
         own = [] if i else pick("retune.png")
         parts.append(Section("" if i else "Re-tuning", text, header=BOX_HEADER, rows=box_rows(r), figures=own))
     about: list[tuple[str, Any]] = [("n_s", layout.n_s), ("n_e", layout.n_e), ("states", layout.states)]
-    about += made_with(origin(scene, layout.comm.size))
+    about += provenance(origin(scene, layout.comm.size))
     about += [(f"time {k}", f"{v:.3g} s") for k, v in seconds.items()]
     about += [(f"solver {k}", f"{v:.3g} s") for k, v in study.design.solution.seconds.items()]
     return [*parts, Section("Made with", rows=about)]
@@ -76,7 +85,7 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
         "Each equation is projected on N basis vectors and solved; its gain is judged on the full plant. The bases "
         "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
         f"The excess cost is J/J* - 1 on the modes kept; the bound beside it is proved for the whole plant by the "
-        f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with the optimal feedback after that."
+        f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with room for what is to come after it."
     )
     table = reduced_table(study.bases)
     parts = [Section(table.title, text, header=table.header, rows=table.rows, figures=figures)]

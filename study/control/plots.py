@@ -15,6 +15,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.orders import BasisGains, fast_order
 from softgrasp.lqr.reduced.bases import A_PRIORI
+from softgrasp.study.control.bode import figure_bode
 from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned, a_priori
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories, figure_loop_move
@@ -175,6 +176,8 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
         files += figure_reduced(study.bases, out / "errors.png")
     if study.retuned:
         files += figure_retune(study.retuned, out / "retune.png")
+    if study.margins is not None:
+        files += figure_bode(study.margins, out / "bode.png")
     # rounding of the eigenvalues of the lowest modes
     noise = 1e-13 * max(float(np.abs(p).max(initial=0.0)) for p in poles.values())
     files += figure_decay(poles, out / "decay.png", noise=noise)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
+from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.reduced.retune import BoxPoint
@@ -122,6 +124,11 @@ class ControlStudy:
     loops: LoopRuns
     notes: tuple[Note, ...]
 
+    @cached_property
+    def margins(self) -> LoopMargins | None:
+        """Of the loop under the small controller, on the plant that it was made for."""
+        return loop_margins(self.controller.controller, int(self.design.actuation.delay)) if self.controller else None
+
     @property
     def findings(self) -> list[str]:
         """Sentences of the diagnosis."""
@@ -176,7 +183,7 @@ def gain_result(
         "stable": quality.stable,
         "findings": [finding.sentence for finding in d.diagnosis.findings],
         "damping_enough": d.diagnosis.damping_enough,
-        "controller": _controller(controller, tick),
+        "controller": _controller(controller, tick, int(d.actuation.delay)),
         "notes": [note.text for note in notes],
         "time": {**seconds, "solver": dict(solution.seconds)},
         "memory_peak_mb": peak_memory_mb(layout.comm),
@@ -216,12 +223,13 @@ def _retuned(r: Retuned) -> dict[str, Any]:
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}
 
 
-def _controller(controller: CertifiedController | None, tick: float) -> dict[str, Any] | None:
+def _controller(controller: CertifiedController | None, tick: float, delay: int) -> dict[str, Any] | None:
     if controller is None:
         return None
-    c = controller.controller
+    c, margins = controller.controller, loop_margins(controller.controller, delay)
     return {"method": controller.method, "N": c.plant.N, "period": c.period, "time_tick": tick,
-            "sampled_radius": controller.radius.value}  # fmt: skip
+            "sampled_radius": controller.radius.value,
+            "margins": {"axes": [asdict(axis) for axis in margins.axes], "distance": margins.distance}}  # fmt: skip
 
 
 def _loop(study: ControlStudy) -> dict[str, Any]:

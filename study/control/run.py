@@ -65,7 +65,7 @@ def run_control(
         SoftgraspError: with one sentence.
     """
     session = Session("control", path, overrides, out, console, quiet, pictures, empty)
-    model, sentence = with_control(session.model(session.scene()))
+    model, sentence = with_control(session.model(session.scene(), steps=False))
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
     watch, restart = Stopwatch(session.comm), restart_folder(model, out)

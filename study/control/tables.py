@@ -43,6 +43,14 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
     if full.saturated:
         rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
     rows += controller_rows(study.controller, study.tick)
+    if study.margins is not None:
+        low, high, phase = study.margins.together
+        text = (
+            f"gain x {low:.3g} to {high:.3g}, phase {phase:.3g} deg"
+            if high < 1e3
+            else f"gain x {low:.3g} or more, phase {phase:.3g} deg"
+        )
+        rows.append(("its margins, all inputs at once", text))
     rows += [("re-tuned", _fast(r)) for r in study.retuned]
     stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
     return [*rows, ("time: ARE, reduced, loop", stages)]

@@ -14,7 +14,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.objects import in_words
 from softgrasp.study.effects.plots import figure_effects
 from softgrasp.study.effects.result import EffectsStudy, Finding, listed
-from softgrasp.study.report.origin import made_with
+from softgrasp.study.report.origin import provenance
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session
@@ -72,7 +72,7 @@ def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: 
         *([proofs.section()] if proofs.rows else []),
         Section("How it is judged", rows=how),
         Section("Size", rows=list(study.sizes.items())),
-        Section("Made with", rows=[*made_with(result), ("time", f"{time.perf_counter() - session.begin:.1f} s")]),
+        Section("Made with", rows=[*provenance(result), ("time", f"{time.perf_counter() - session.begin:.1f} s")]),
     ]
     return Page(f"{scene.name}: effects", sections, {"effects.csv": csv_table(study)}, files)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.accuracy.estimate import estimate
+from softgrasp.fem.accuracy.adapt import judged
 from softgrasp.fem.errors import SoftgraspError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | N
     if not certify and cost > max(CHEAP, seconds):
         return None, []
     try:
-        return estimate(model), []
+        return judged(model), []
     except SoftgraspError as error:
         if certify:
             raise
@@ -92,9 +92,11 @@ def warnings(result: MeshEstimate | None) -> list[str]:
         return []
     texts = []
     if result.obstacle:
+        sure = "not reached" if result.estimate > (result.tolerance or 0.0) else "not certain to be reached"
         texts.append(
-            f"tissue.refine.tolerance = {result.tolerance:g} is not reached: the error of the deformation is about "
-            f"{percent(result.estimate)} at n_e = {result.n_e}, since {result.obstacle}."
+            f"tissue.refine.tolerance = {result.tolerance:g} is {sure}: the error of the deformation is about "
+            f"{percent(result.estimate)} (bound {percent(result.bound)}) at n_e = {result.n_e}, since "
+            f"{result.obstacle}."
         )
     if result.shift > 0:
         texts.append(

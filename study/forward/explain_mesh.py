@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from softgrasp.fem.model.refined import scene_ends
+from softgrasp.fem.mesh.singular import expected_order
+from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.study.forward.accuracy import judge, percent
 
 if TYPE_CHECKING:
@@ -61,8 +62,8 @@ def mesh_report(model: Model) -> MeshReport:
         reports[key] = reports.get(key, 0) + 1
     kinds = tuple(EndReport(k, n, a) for (k, a), n in sorted(reports.items(), key=lambda item: item[0][1]))
     graded = refine is not None and refine.grading != "off"
-    full = 2.0 * scene.tissue.order
-    order = full if graded else min([full, *(2 * end.alpha for end in kinds)])
+    edges = graded and tissue.dimension == 3 and not by_lines(scene)
+    order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
     judged, _ = judge(model, 0.0, False)
     if judged is None:
         return MeshReport(kinds, order, graded, None, None, None, None)

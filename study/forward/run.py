@@ -19,7 +19,7 @@ from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.equation import equation
-from softgrasp.study.report.origin import made_with, origin
+from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section, equation_text
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
@@ -68,7 +68,9 @@ def run_simulate(
         task = bar.add_task("steps", total=scene.time.steps)
 
         def progress(run: Run) -> None:
-            bar.update(task, completed=run.reached)
+            newton = run.midpoint.figures()
+            kind = "steps" if newton is None else f"steps ({newton.mean:.2g} iterations each)"
+            bar.update(task, completed=run.reached, description=kind)
 
         options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
         try:
@@ -136,5 +138,5 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
         Section("Equation", code=equation_text(equation(scene))),
         Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
         Section("Size", rows=rows),
-        Section("Made with", rows=made_with(origin(scene, sizes.ranks))),
+        Section("Made with", rows=provenance(origin(scene, sizes.ranks))),
     ]

@@ -32,11 +32,13 @@ class Outcome:
         value: the measured number; None when there is none.
         text: the refusal or failure in words, or a remark on the number.
         refused: it ended by one of our own errors.
+        error: name of the exception that ended the textbook way.
     """
 
     value: float | None
     text: str = ""
     refused: bool = False
+    error: str = ""
 
     def __str__(self) -> str:
         """Number and remark as a table shows them."""
@@ -160,7 +162,8 @@ def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
         try:
             result = work(*arguments)
         except Exception as error:  # the point of the comparison is how it fails
-            return Outcome(None, f"{type(error).__name__}: {_short(error)}")
+            name = type(error).__name__
+            return Outcome(None, f"{name}: {_short(error)}", error=name)
     if isinstance(result, Outcome):
         return result
     value = float(result)

@@ -101,7 +101,7 @@ def brief(case: HardCase) -> tuple[str, str, str, str, str]:
     verdict = case.verdict if case.ok else "fail, refused" if case.verdict == "refused" else "fail"
     if len(textbook) > WORDS:
         value = case.textbook.value
-        textbook = textbook.split(":")[0].split(",")[0] if value is None else f"{value:.2g}"
+        textbook = case.textbook.error or (textbook if value is None else f"{value:.2g}")
     if len(here) > WORDS:
         here = "no number" if case.here.value is None else f"{case.here.value:.2g}"
     return name, bound, here, textbook, verdict

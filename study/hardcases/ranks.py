@@ -70,7 +70,7 @@ def judge(command: list[str], patience: float, healthy: float, sentence: str) ->
     if status is None:
         return Outcome(float("inf"), f"hangs, still waiting after {patience:g} times a healthy run")
     if status == 0:
-        return Outcome(None, "ended with status 0, nobody noticed")
+        return Outcome(None, "status 0, nobody noticed")
     if sentence not in output:
         return Outcome(None, f"ended without saying '{sentence}'")
     said = next((line.strip() for line in output.splitlines() if sentence and sentence in line), f"status {status}")

@@ -7,7 +7,7 @@ from typing import Any
 
 from softgrasp import package_version
 from softgrasp.study.hardcases.cases import Family, HardCase
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import machine
 
 
@@ -87,7 +87,7 @@ class HardCaseResult:
 
     def to_dict(self) -> dict[str, Any]:
         """What result.json holds."""
-        result: dict[str, Any] = plain(
+        result: dict[str, Any] = to_json(
             {
                 "command": "hardcases",
                 "version": package_version(),

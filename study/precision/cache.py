@@ -19,7 +19,7 @@ from softgrasp.fem.errors import Interrupted, agree
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 
 FORMAT = 3  # of the cached files
 
@@ -63,7 +63,7 @@ class Cache:
             self.hits += 1
             return [_revived(of, row) for row in rows]
         self.misses += 1
-        rows = json.loads(json.dumps([plain(asdict(value)) for value in measure()]))  # type: ignore[call-overload]
+        rows = json.loads(json.dumps([to_json(asdict(value)) for value in measure()]))  # type: ignore[call-overload]
         with agree(self.comm):
             if self.comm.rank == 0:
                 self._write(self.path(kind, key), {"kind": kind, "key": key, "value": rows})

@@ -10,8 +10,9 @@ CAPTIONS = {
     "forward": (
         "Relative error of the deformation, the outputs against the hand over the run, against the time of a whole run "
         "(mesh, assembly, factor, steps). In the grey band the error of the reference is the larger one. "
-        "Along a thin line the mesh stays and the steps grow. Right: order in space at the most steps, and change "
-        "through the time step on every mesh."
+        "Along a thin line the mesh stays and the steps grow; open marks: even meshes. Right: error against the "
+        "unknowns, with the order in n_e^(1/d) and in brackets that of the theory, 2 alpha at the singular ends on "
+        "even meshes; change through the time step on every mesh."
     ),
     "reduced": (
         "Relative error of the deformation, the outputs against the hand, against the full run on the same mesh and "

@@ -21,6 +21,7 @@ class Slope:
         against: what x is.
         power: exponent.
         count: points behind it.
+        expected: exponent of the theory, where there is one.
     """
 
     question: str
@@ -28,6 +29,7 @@ class Slope:
     against: str
     power: float
     count: int
+    expected: float | None = None
 
 
 def seconds_of(point: WorkPoint) -> float:
@@ -57,18 +59,25 @@ def pareto[P: WorkPoint](
     return front
 
 
-def series_of[P: WorkPoint](points: Sequence[P]) -> dict[str, list[P]]:
-    """Points by their line, in the order of the first ones."""
+def series_of[P: WorkPoint](points: Sequence[P], name: Callable[[P], str] | None = None) -> dict[str, list[P]]:
+    """Points by their line, or by another name, in the order of the first ones."""
     lines: dict[str, list[P]] = {}
     for p in points:
-        lines.setdefault(p.series, []).append(p)
+        lines.setdefault(p.series if name is None else name(p), []).append(p)
     return lines
 
 
-def slope(question: str, series: str, against: str, x: Sequence[float], y: Sequence[float]) -> list[Slope]:
+def slope(
+    question: str,
+    series: str,
+    against: str,
+    x: Sequence[float],
+    y: Sequence[float],
+    expected: float | None = None,
+) -> list[Slope]:
     """The slope of y against x; nothing where they do not tell one."""
     power = power_law(x, y)
-    return [] if power is None else [Slope(question, series, against, power, len(x))]
+    return [] if power is None else [Slope(question, series, against, power, len(x), expected)]
 
 
 def power_law(x: Sequence[float], y: Sequence[float]) -> float | None:

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 
+from softgrasp.fem.accuracy.adapt import build_to_tolerance
 from softgrasp.fem.fields.probe import Probe, make_probe
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
@@ -15,7 +16,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.probe import Places, run_probed
 from softgrasp.study.precision.series import TimedRun
-from softgrasp.study.precision.settings import Setting, variant
+from softgrasp.study.precision.settings import Setting, own_setting, variant
 from softgrasp.study.shell.timing import medians
 
 BURST_SECONDS = 0.05  # of the steps in each repeat after the first, which is the whole run
@@ -37,7 +38,7 @@ class FullRuns:
     def __init__(self, scene: Scene, places: Places, reference: Array, cache: Cache, guard: Guard) -> None:
         self.scene, self.places, self.cache, self.guard = scene, places, cache, guard
         self.reference = reference.tolist() if scene.effects.rotation else None
-        self.repeats = scene.study.repeats
+        self.repeats, self.dimension = scene.study.repeats, places.dimension
         self._mesh: tuple[Setting, Model, Probe, dict[str, float]] | None = None
 
     def variant(self, setting: Setting, snapshots: str = "none") -> Scene:
@@ -47,7 +48,7 @@ class FullRuns:
     def run(self, setting: Setting, repeats: int | None = None) -> TimedRun:
         """Times, sizes and the trajectory of a setting."""
         count = self.repeats if repeats is None else repeats
-        key = {"setting": [setting.cells, setting.order, setting.steps, setting.solver, setting.rtol], "repeats": count}
+        key = {"setting": setting.parameters | {"rtol": setting.rtol}, "repeats": count}
         self.guard.next(setting.label)
         return self.cache.get("run", key, TimedRun, lambda: [self._measure(setting, count)])[0]
 
@@ -59,10 +60,14 @@ class FullRuns:
         self._mesh = None
         comm = self.cache.comm
         seconds: dict[str, list[float]] = {"mesh": [], "assembly": []}
-        build(self.variant(setting), comm=comm)
+        scene = self.variant(setting)
+        if setting.refine == "scene":  # one mesh whatever the steps, which its passes depend on a little
+            scene = self.variant(own_setting(self.scene))
+        make = build_to_tolerance if setting.refine == "scene" else build
+        make(scene, comm=comm)
         for _ in range(repeats):
             gc.collect()
-            model = build(self.variant(setting), comm=comm)
+            model = make(scene, comm=comm)
             for stage, values in seconds.items():
                 values.append(model.watch.seconds[stage])
             if comm.bcast(sum(map(sum, seconds.values()))) > BUILD_SECONDS:

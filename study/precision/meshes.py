@@ -1,21 +1,26 @@
-"""Uniform meshes of a box for a study: multiples of one smallest mesh, and the order in which they converge."""
+"""Meshes of a study: even ones of a box that halve their cells, and tolerances of graded ones."""
 
 from __future__ import annotations
 
 from math import ceil
 
 import numpy as np
-from scipy.optimize import brentq
 
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.settings import Setting, least_steps
 
-WORK = {2: 5e7, 3: 6e6}  # unknowns times steps of the finest run of a reference: 10 to 30 s on a quiet core
-UNKNOWNS = {2: 150_000, 3: 60_000}
+POINT_WORK = {2: 8e6, 3: 1e6}  # unknowns times steps of a point of the diagram
 FEW_STEPS = 60  # least of a run
 PARTS = 16  # of the scene's cells along an edge, at most, in one cell of the smallest mesh
 STRETCH = 1.35  # of a cell of the smallest mesh against one of the scene's
-MULTIPLES = sorted({m * 2**i for m in (4, 5, 6) for i in range(8)} | {1, 2, 3})  # neighbours differ by at most 3/2
+EVEN = 4  # meshes of each order
+ORDERS = (1, 2, 3)
+FASTEST, SLOWEST = 0.2, 0.6  # errors of graded meshes fall about as their tolerances, by 0.3
+# Tolerances of the a-priori graded meshes of the diagram, by dimension and order.
+GOALS = {
+    2: {1: (0.3, 0.1, 0.03), 2: (0.1, 0.03, 0.01, 3e-3, 1e-3), 3: (0.1, 0.03, 0.01, 3e-3, 1e-3)},
+    3: {1: (0.3, 0.1), 2: (0.3, 0.1, 0.03), 3: (0.3, 0.1)},
+}
 
 
 def edges(scene: Scene) -> list[list[float]]:
@@ -30,7 +35,7 @@ def edges(scene: Scene) -> list[list[float]]:
 
 
 def fits(cells: int, shares: list[float]) -> bool:
-    """Whether all coordinates lie on lines of a uniform mesh."""
+    """Whether all coordinates lie on lines of an even mesh."""
     return all(abs(cells * s - round(cells * s)) < 1e-6 for s in shares)
 
 
@@ -56,84 +61,27 @@ def smallest_mesh(scene: Scene) -> tuple[int, ...]:
     return tuple(max(1, round(n / 4)) for n in cells)
 
 
-def nested_meshes(scene: Scene) -> tuple[tuple[int, ...], ...]:
-    """Multiples of the smallest mesh up to what the work allows, coarse to fine; empty on a mesh file.
-
-    The scene's own number of cells plays no part in how fine they get.
-    """
+def even_meshes(scene: Scene, order: int) -> list[tuple[int, ...] | None]:
+    """The finest even meshes of a box, each with half the cells of the next; of a mesh file, the file."""
     if scene.tissue.cells is None:
-        return ()
-    unit, steps, d = smallest_mesh(scene), few_steps(scene), len(scene.tissue.cells)
-    meshes: list[tuple[int, ...]] = []
-    for k in MULTIPLES:
-        cells = tuple(k * n for n in unit)
-        unknowns = Setting(cells, 2, steps).unknowns(d)
-        if not meshes or (unknowns <= UNKNOWNS[d] and unknowns * steps <= WORK[d]):
-            meshes.append(cells)
-    return tuple(meshes)
-
-
-def halved_meshes(scene: Scene, most: int) -> tuple[tuple[int, ...], ...]:
-    """Of these meshes, the finest ones that double the cells from one to the next."""
-    meshes = nested_meshes(scene)
-    doubled = [c for c in meshes if (c[0] // meshes[0][0]).bit_count() == 1]
-    return tuple(doubled[-most:])
+        return [None]
+    unit, d = smallest_mesh(scene), len(scene.tissue.cells)
+    meshes = [unit]
+    while True:
+        cells = tuple(2 * n for n in meshes[-1])
+        if Setting(cells, order, 1).unknowns(d) * few_steps(scene) > POINT_WORK[d]:
+            return list(meshes[-EVEN:])
+        meshes.append(cells)
 
 
 def few_steps(scene: Scene) -> int:
-    """Steps of the runs on the finest meshes."""
+    """Steps of the runs on fine meshes."""
     n = scene.time.steps
     return n // 2 if n >= 2 * max(FEW_STEPS, least_steps(scene)) else n
 
 
-def corner_exponent(poisson: float) -> float:
-    """Exponent alpha of u ~ r^alpha where a held side meets a free one at a right angle, plane strain.
-
-    sin(alpha pi / 2)^2 = ((kappa + 1)^2 - 4 alpha^2) / (4 kappa), kappa = 3 - 4 nu [Williams 1952].
-    """
-    kappa = 3 - 4 * poisson
-
-    def off(alpha: float) -> float:
-        return float(np.sin(alpha * np.pi / 2) ** 2 - ((kappa + 1) ** 2 - 4 * alpha**2) / (4 * kappa))
-
-    return float(brentq(off, 0.3, 1.0)) if off(1.0) > 0 else 1.0  # nu <= 0: no more than a kink in the strains
-
-
-def singular_order(scene: Scene) -> float:
-    """Order of the outputs in the cells of a uniform mesh, 2 alpha for every element order; not collective.
-
-    u ~ r^alpha at the ends of the contact zone: 1/2 where it ends within a side, :func:`corner_exponent` where it ends
-    with its side.
-    """
-    tissue, box = scene.tissue, scene.contact.box
-    size, origin = tissue.size or [], tissue.origin or [0.0] * len(tissue.size or [])
-    held = {axis for axis, _ in scene.contact.axes(len(size))}
-    for axis in held:
-        if box is None:
-            break
-        low, high = ([(c[a] - origin[a]) / size[a] for a in range(len(size))] for c in box)
-        if any(low[a] > 1e-9 or high[a] < 1 - 1e-9 for a in range(len(size)) if a != axis):
-            return 1.0
-    materials = [tissue.material, *(layer.material for layer in tissue.layers.values())]
-    return 2 * min(corner_exponent(m.lam / (2 * (m.lam + m.mu))) for m in materials)
-
-
-def observed_order(sizes: list[float], changes: list[float]) -> float | None:
-    """Order p of values a + c h^p at three sizes h, coarse to fine, from their two changes.
-
-    None without one between 0.05 and 6.
-    """
-    if not min(changes) > 0:
-        return None
-    h = np.array(sizes) / sizes[-1]
-
-    def off(p: float) -> float:
-        return float((h[0] ** p - h[1] ** p) / (h[1] ** p - h[2] ** p) - changes[0] / changes[1])
-
-    return float(brentq(off, 0.05, 6.0)) if off(0.05) < 0 < off(6.0) else None
-
-
-def limit_weights(sizes: list[float], orders: list[float]) -> np.ndarray:
-    """Weights w of values a + sum_i c_i h^p_i at as many sizes as terms, a = sum w v."""
-    terms = np.array([[1.0, *((h / sizes[-1]) ** p for p in orders)] for h in sizes])
-    return np.asarray(np.linalg.inv(terms)[0])
+def contraction(changes: list[float]) -> float:
+    """By what errors fall from mesh to mesh, from the last changes of the solution: the larger ones are cautious."""
+    if len(changes) < 2 or not changes[-2] > 0:
+        return SLOWEST
+    return float(np.clip(changes[-1] / changes[-2], FASTEST, SLOWEST))

@@ -28,11 +28,11 @@ from softgrasp.study.precision.points import (
 )
 from softgrasp.study.precision.result import LoopReference, RiccatiReference, WorkStudy
 from softgrasp.study.precision.series import TimedRun
-from softgrasp.study.precision.tables import points_table, question_table, slope_table
+from softgrasp.study.precision.tables import budget_table, points_table, question_table, slope_table
 from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation_control import control_text
-from softgrasp.study.report.files import plain
-from softgrasp.study.report.origin import command_line, made_with, origin, peak_memory_mb
+from softgrasp.study.report.files import to_json
+from softgrasp.study.report.origin import command_line, origin, peak_memory_mb, provenance
 from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -63,7 +63,7 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
         "command": "study",
         **origin(study.scene, comm.size),
         **study.to_dict(),
-        "answers": plain(answers),
+        "answers": to_json(answers),
         "memory_peak_mb": peak_memory_mb(comm),
         "time": {"total": comm.allreduce(time.perf_counter() - session.begin, MPI.MAX)},
     }
@@ -122,6 +122,9 @@ def show(console: Console, study: WorkStudy, commands: list[dict[str, str]]) -> 
         console.print(f"{titles}: left out, {reason}", markup=False)
     for full in _paper_run(study):
         console.print(f"The paper: {PAPER_FULL} s for the full run, here {full.seconds:.3g} s; {PAPER}.", markup=False)
+    for budget in study.error_budgets:
+        console.print(_narrow(budget_table(budget)))
+        console.print(budget.sentence, markup=False, soft_wrap=True)
     for answer, lines in zip(study.answers, commands, strict=True):
         style = "bold" if answer.met else "bold red"
         for k, sentence in enumerate(answer.sentences):
@@ -166,6 +169,8 @@ def _sections(
                 for name, (a, b) in parts]  # fmt: skip
         rows.append(("runs behind it", "; ".join(s.label for s in truth.settings)))
         sections.append(Section("Reference", text=truth.note, rows=rows))
+    for budget in study.error_budgets:
+        sections += [Section(f"Error budget of {budget.label}", text=budget.sentence), budget_table(budget).section()]
     sections.append(Section("Size", rows=_sizes(study)))
     answered = {name: question for name, question in study.questions.items() if question.points}
     feedback = [name for name in answered if name in CONTROL]
@@ -215,4 +220,4 @@ def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
     ]
     if paper_of(study.scene) == "forward":
         rows.append(("the paper", f"{PAPER_FULL} s full, {PAPER}, own machine"))
-    return [*rows, *made_with(result), ("time of this study", seconds_text(result["time"]["total"]))]
+    return [*rows, *provenance(result), ("time of this study", seconds_text(result["time"]["total"]))]

@@ -9,7 +9,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import Formatter, LogLocator
 
 from softgrasp.reduction.registry import METHODS
@@ -21,7 +20,7 @@ from softgrasp.study.precision.tables import error_outputs
 from softgrasp.study.reduce.plots import LOOKS, SPARE
 from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 
-ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s")}
+ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s"), 3: (GREEN, "^")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))
 FRONT: dict[str, Any] = {"color": HAND, "lw": 1.6, "alpha": 0.35, "zorder": 1}
 THIN: dict[str, Any] = {"lw": 0.6, "alpha": 0.6, "zorder": 2}
@@ -83,28 +82,28 @@ def figure_forward(
     """
     good = [p for p in usable(points) if p.series != "solver"]
     with paper_style():
-        figure = plt.figure(figsize=(WIDTH, 4.3), layout="constrained")
+        figure = plt.figure(figsize=(WIDTH, 4.6), layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
         ax, space, time = (figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))
         for line in series_of(sorted(good, key=lambda p: p.steps)).values():
+            look = _look(line[-1])
+            ax.plot([p.seconds for p in line], [p.error for p in line], **look, **THIN)
+        for line in on_meshes(good).values():
             last = line[-1]
-            colour, marker = ORDER_LOOK[last.order]
-            ax.plot([p.seconds for p in line], [p.error for p in line], color=colour, marker=marker, ms=3.2, **THIN)
-            if last.cells is not None:
-                ax.annotate(
-                    "x".join(map(str, last.cells)), (last.seconds, last.error), (7, 3), textcoords="offset points",
-                    fontsize=6, color=colour, zorder=9, path_effects=[withStroke(linewidth=2.0, foreground="white")],
-                )  # fmt: skip
+            ax.annotate(
+                f"n = {last.n_e}", (last.seconds, last.error), (4, 6 * last.order - 14), fontsize=6,
+                textcoords="offset points", color=ORDER_LOOK[last.order][0],
+            )  # fmt: skip
         solvers = [p for p in usable(points) if p.series == "solver"]
-        ax.plot([p.seconds for p in solvers], [p.error for p in solvers], ls="", marker="x", ms=4, color=GREEN)
+        ax.plot([p.seconds for p in solvers], [p.error for p in solvers], ls="", marker="x", ms=4, color=HAND)
         draw_front(ax, points)
         axes_log(ax, "time of a run [s]", "relative error of the deformation")
         handles = [
-            Line2D([], [], color=colour, marker=marker, ms=3.2, label=f"P{order}; along a line: steps", **THIN)
-            for order, (colour, marker) in ORDER_LOOK.items()
-            if any(p.order == order for p in good)
-        ]
-        handles += [Line2D([], [], ls="", marker="x", ms=4, color=GREEN, label="other solvers"), front_handle()]
+            Line2D([], [], label=f"{name}; along a line: steps" if line[0].refine != "off" else name,
+                   **_look(line[0]), **THIN)
+            for name, line in on_meshes(good).items()
+        ]  # fmt: skip
+        handles += [Line2D([], [], ls="", marker="x", ms=4, color=HAND, label="other solvers"), front_handle()]
         if paper:
             ax.axvline(PAPER_FULL, **LINE)
             handles.append(Line2D([], [], label=f"paper, {PAPER_FULL} s (no error given)", **LINE))
@@ -118,27 +117,29 @@ def figure_forward(
         return save(figure, out_png)
 
 
+def _look(p: ForwardPoint) -> dict[str, Any]:
+    """Colour by order; filled marks on graded meshes."""
+    colour, marker = ORDER_LOOK[p.order]
+    return {"color": colour, "marker": marker, "ms": 3.2, "mfc": "none" if p.refine == "off" else colour}
+
+
 def _orders(space: Any, time: Any, points: Sequence[ForwardPoint], slopes: Sequence[Slope]) -> None:
-    """Error against the cells at the most steps, and change against the steps."""
-    for order, (colour, marker) in ORDER_LOOK.items():
-        line = on_meshes(points, order)
-        if not line:
-            continue
-        power = next((s.power for s in slopes if s.series == f"P{order}" and "cells" in s.against), None)
-        label = f"P{order}" + ("" if power is None else f", slope {power:.2f}")
-        x, y = [(p.cells or (0,))[0] for p in line], [p.error for p in line]
-        space.plot(x, y, color=colour, marker=marker, ms=3.2, lw=0.9, label=label)
-    axes_log(space, "cells along an edge", "error")
+    """Error against n_e at the most steps, and change against the steps."""
+    for name, line in on_meshes(points).items():
+        found = next((s for s in slopes if s.series == name and "n_e" in s.against), None)
+        label = name if found is None else f"{name}: {-found.power:.2f} ({-(found.expected or 0):.2g})"
+        space.plot([p.n_e for p in line], [p.error for p in line], lw=0.9, label=label, **_look(line[0]))
+    axes_log(space, "tissue unknowns $n_e$", "error")
     for line in over_steps(points).values():
-        colour, marker = ORDER_LOOK[line[0].order]
-        time.plot([p.steps for p in line], [p.error_time for p in line], color=colour, marker=marker, ms=2.4, **THIN)
+        time.plot([p.steps for p in line], [p.error_time for p in line], **(_look(line[0]) | {"ms": 2.4}), **THIN)
     powers = [s.power for s in slopes if s.against == "change in time against steps"]
     if powers:
-        time.plot([], [], color=BLUE, label=f"slope {np.median(powers):.2f}", **THIN)
+        time.plot([], [], color=BLUE, label=f"slope {np.median(powers):.2f} (-2)", **THIN)
     axes_log(time, "time steps", "change against the\nmost steps")
-    for ax in (space, time):
-        if ax.get_legend_handles_labels()[0]:
-            ax.legend(loc="best", fontsize=6.5, handlelength=1.4)
+    if space.get_legend_handles_labels()[0]:
+        space.legend(loc="best", fontsize=5, handlelength=1.4, title="order (theory)", title_fontsize=5)
+    if powers:
+        time.legend(loc="best", fontsize=6.5, handlelength=1.4)
 
 
 def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out_png: Path) -> tuple[Path, ...]:

@@ -6,8 +6,8 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any, ClassVar
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.study.precision.settings import Setting
-from softgrasp.study.report.files import plain
+from softgrasp.study.precision.settings import Refine, Setting
+from softgrasp.study.report.files import to_json
 
 QUESTIONS = ("forward", "reduced", "bases", "riccati", "reduced_riccati", "loop")
 CONTROL = ("riccati", "reduced_riccati", "loop")  # of these, the ones about feedback
@@ -81,7 +81,7 @@ class WorkPoint:
         values = {
             f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None or f.default is MISSING
         }
-        return {"question": self.question, **{name: plain(value) for name, value in values.items()}}
+        return {"question": self.question, **{name: to_json(value) for name, value in values.items()}}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ class RunPoint(WorkPoint):
             the largest value.
         error_range: between what the error of the deformation lies, given that of the reference.
         p50, p99, max: quantiles of the seconds of a step; inf for an unstable model.
-        cells, order, steps, solver, rtol: of the full model.
+        cells, order, steps, solver, rtol, refine: of the full model, see :class:`Setting`.
     """
 
     cells: tuple[int, ...] | None
@@ -101,6 +101,7 @@ class RunPoint(WorkPoint):
     steps: int
     solver: str
     rtol: float | None
+    refine: Refine
     error_deformation: float
     error_displacement: float
     error_range: tuple[float, float]
@@ -111,12 +112,12 @@ class RunPoint(WorkPoint):
     @property
     def setting(self) -> Setting:
         """Of the full run, or of that behind a reduced model."""
-        return Setting(self.cells, self.order, self.steps, self.solver, self.rtol or 1e-10)
+        return Setting(self.cells, self.order, self.steps, self.solver, self.rtol or 1e-10, self.refine)
 
     @property
     def parameters(self) -> dict[str, Any]:
         """What names the run in result.json."""
-        return {"cells": self.cells, "order": self.order, "steps": self.steps, "solver": self.solver}
+        return self.setting.parameters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +128,7 @@ class ForwardPoint(RunPoint):
         n_e, states: unknowns.
         dt, mesh, assembly, factor, per_step: step of the scheme, and seconds of the stages [s].
         error_time: change of the deformation against the most steps on the same mesh; None for the most steps.
+        error_solver: against the usual solver on the same mesh and steps; None for that.
     """
 
     question: ClassVar[str] = "forward"
@@ -138,6 +140,7 @@ class ForwardPoint(RunPoint):
     factor: float
     per_step: float
     error_time: float | None = None
+    error_solver: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,6 +222,7 @@ class ReducedRiccatiPoint(WorkPoint):
     error_P: float  # noqa: N815
     error_K: float  # noqa: N815
     cost_excess: float
+    cost_excess_at_most: float
     abscissa_full: float
     time_are: float
     stable: bool

@@ -36,6 +36,11 @@ class Places:
     names: tuple[str, ...]
     points: tuple[Array, ...]
 
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return int(self.points[0].shape[1])
+
 
 @dataclass(frozen=True)
 class Probed:

@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
@@ -17,7 +18,7 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.engines import ENGINES, EngineName, factor, small_svd
+from softgrasp.reduction.engines import ENGINES, EngineName, Factor, factor, small_svd
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper, prepared, run
 from softgrasp.reduction.projection import project
@@ -89,8 +90,7 @@ class ReducedRuns:
         section = self.scene.reduction.model_copy(update={"N": list(sizes)})
         key = {
             "method": name, "N": list(sizes), "inner": section.inner, "engine": section.engine,
-            "energy": section.energy,
-            "setting": [self.setting.cells, self.setting.order, self.setting.steps, self.setting.solver],
+            "energy": section.energy, "setting": self.setting.parameters,
         }  # fmt: skip
 
         def sweep() -> list[TimedModel]:
@@ -117,7 +117,8 @@ class ReducedRuns:
         own = ("error", "error_deformation", "times", "values")
         return ReducedPoint(
             name, label, model.time_online, error, model.stable and finite, method=name, cells=setting.cells,
-            order=setting.order, steps=setting.steps, solver=setting.solver, rtol=None, mesh=setting.mesh,
+            order=setting.order, steps=setting.steps, solver=setting.solver, rtol=None, refine=setting.refine,
+            mesh=setting.mesh,
             error_deformation=error, error_displacement=displacement, error_range=self.truth.range_of(error),
             error_full=model.error, error_full_deformation=model.error_deformation,
             error_outputs_full=errors_of(series, full.series)[0] if finite else float("inf"), scratch=scratch,
@@ -183,14 +184,13 @@ def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Que
     points: list[BasisPoint] = []
     for engine in ENGINES:
         runs.guard.next(f"engine {engine}")
-        s = reduced.setting
-        key = {"engine": engine, "setting": [s.cells, s.order, s.steps], "repeats": scene.study.repeats}
+        key = {"engine": engine, "setting": reduced.setting.parameters, "repeats": scene.study.repeats}
 
         def sweep(engine: EngineName = engine) -> list[BasisPoint]:
             X = reduced.full()[0].snapshots.Z
             if X.size * comm.size > WIDEST and engine == "svd":
                 return []
-            return [_factored(comm, X, engine, t, scene.study.repeats) for t in ENGINE_TOLERANCES]
+            return _factored(comm, X, engine, scene.study.repeats)
 
         points += runs.cache.get("basis", key, BasisPoint, sweep)
     slopes: list[Slope] = []
@@ -201,22 +201,28 @@ def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Que
     return Question(tuple(points), tuple(slopes), full)
 
 
-def _factored(comm: MPI.Intracomm, X: Array, engine: EngineName, tolerance: float, repeats: int) -> BasisPoint:
-    """Factor, keep what the tolerance asks for, and measure what is left. Collective."""
+def _factored(comm: MPI.Intracomm, X: Array, engine: EngineName, repeats: int) -> list[BasisPoint]:
+    """Factor, keep what each tolerance asks for, and measure what is left. Collective."""
     square = float(total(comm, np.array([np.sum(X * X)]))[0])
+    factors: list[Factor] = []
+    seconds = statistics.median(repeated(comm, lambda: factors.append(factor(comm, X, engine)), repeats, LONG))
+    f, points = factors[-1], []
 
-    def vectors() -> Array:
-        f = factor(comm, X, engine)
+    def vectors(tolerance: float) -> Array:
         u, s, _ = small_svd(comm, f.R)
         tail = np.sqrt(np.append(np.cumsum((s**2)[::-1])[::-1][1:], 0.0)) * f.scale
         keep = min(int(np.argmax(tail <= tolerance * np.sqrt(square))) + 1, len(s))
         return np.asarray(f.Q @ u[:, :keep])
 
-    times = repeated(comm, vectors, repeats, LONG)
-    U = vectors()
-    rest = X - U @ total(comm, U.T @ X)
-    error = float(np.sqrt(total(comm, np.array([np.sum(rest * rest)]))[0] / square))
-    off = float(np.abs(total(comm, U.T @ U) - np.eye(U.shape[1])).max())
-    label = f"{engine}, tolerance {tolerance:g}, {U.shape[1]} vectors"
-    return BasisPoint(engine, label, statistics.median(times), error, error <= 1.1 * tolerance, tolerance=tolerance,
-                      columns=U.shape[1], orthonormality=off)  # fmt: skip
+    for tolerance in ENGINE_TOLERANCES:
+        U = vectors(tolerance)
+        rest = X - U @ total(comm, U.T @ X)
+        error = float(np.sqrt(total(comm, np.array([np.sum(rest * rest)]))[0] / square))
+        off = float(np.abs(total(comm, U.T @ U) - np.eye(U.shape[1])).max())
+        more = statistics.median(repeated(comm, partial(vectors, tolerance), repeats, LONG))
+        label = f"{engine}, tolerance {tolerance:g}, {U.shape[1]} vectors"
+        points.append(
+            BasisPoint(engine, label, seconds + more, error, error <= 1.1 * tolerance, tolerance=tolerance,
+                       columns=U.shape[1], orthonormality=off)
+        )  # fmt: skip
+    return points

@@ -6,38 +6,18 @@ from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import Any
 
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
 from softgrasp.study.precision.series import Series, TimedRun
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 
 ADVICE = {
-    "space": "finer meshes than the time allows here",
+    "space": "a finer mesh than the time allows here",
     "time": "more steps, time.steps",
     "mixed": "more steps, time.steps, on finer meshes",
 }
-
-
-@dataclass(frozen=True)
-class Limit:
-    """Outputs in the limit of fine meshes.
-
-    Attributes:
-        values: (steps + 1, 2 p) [m].
-        gap: what they may be off, same shape.
-        order: that the meshes show, None without one.
-        expected: order that the singular ends leave; None where there is one mesh only.
-        extrapolated: the values are not those of the finest mesh.
-    """
-
-    values: Array
-    gap: Array
-    order: float | None
-    expected: float | None
-    extrapolated: bool
 
 
 @dataclass(frozen=True)
@@ -47,7 +27,6 @@ class Truth:
     Attributes:
         series: the solution.
         space, time, mixed: parts of the estimate, each (deformation, displacement).
-        limit: in space.
         settings: that were run.
         note: one sentence or more.
     """
@@ -56,7 +35,6 @@ class Truth:
     space: tuple[float, float]
     time: tuple[float, float]
     mixed: tuple[float, float]
-    limit: Limit
     settings: tuple[Setting, ...]
     note: str
 
@@ -83,15 +61,13 @@ class Truth:
     @property
     def need(self) -> str:
         """What would make that part smaller."""
-        part = self.largest_part
-        return "a finer mesh" if part == "space" and self.limit.expected is None else ADVICE[part]
+        return ADVICE[self.largest_part]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "note": self.note, "error": self.error, "error_displacement": self.error_displacement,
-            "space": self.space, "time": self.time, "mixed": self.mixed, "order": self.limit.order,
-            "expected_order": self.limit.expected, "extrapolated": self.limit.extrapolated,
+            "space": self.space, "time": self.time, "mixed": self.mixed,
             "settings": [s.label for s in self.settings],
         }  # fmt: skip
 
@@ -240,6 +216,51 @@ class Answer:
 
 
 @dataclass(frozen=True)
+class Part:
+    """One source of error.
+
+    Attributes:
+        name: of the source.
+        error: that it leaves [1].
+        share: of the sum of all parts [1].
+        wasted: whole digits below a tenth of the largest part, which nobody sees.
+        halved_by: setting that halves it; empty where none that was tried does.
+        cost: time of that setting over the time now [1]; None without one.
+    """
+
+    name: str
+    error: float
+    share: float = 0.0
+    wasted: int = 0
+    halved_by: str = ""
+    cost: float | None = None
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """Where the digits of one setting are lost; the largest part first.
+
+    Attributes:
+        label: the setting in words.
+        parts: sources of error.
+        missing: sources that are no part of it, with the reason.
+    """
+
+    label: str
+    parts: tuple[Part, ...]
+    missing: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """The largest part, and what is computed for nothing."""
+        first = self.parts[0]
+        text = f"Of the error of {self.label}, {first.name} carries {100 * first.share:.0f} %"
+        text += f" and is halved by {first.halved_by}, in {first.cost:.2g} of the time." if first.cost else "."
+        wasted = [f"{p.wasted} of {p.name}" for p in self.parts if p.wasted]
+        return text + (f" Digits that nobody sees: {', '.join(wasted)}." if wasted else "")
+
+
+@dataclass(frozen=True)
 class WorkStudy:
     """All that one study found.
 
@@ -248,6 +269,7 @@ class WorkStudy:
         truth: solution that outputs are compared with; None when no question needed it.
         questions: by name, in the order of :data:`softgrasp.study.precision.points.QUESTIONS`.
         answers: to a tolerance and a budget.
+        error_budgets: of the scene's own setting and of the one that answers; none without the forward question.
         measured_for_the_answers: points beside those of the questions.
         measured, cached: runs made now and taken from the cache.
     """
@@ -256,6 +278,7 @@ class WorkStudy:
     truth: Truth | None
     questions: dict[str, Question]
     answers: tuple[Answer, ...]
+    error_budgets: tuple[ErrorBudget, ...]
     measured_for_the_answers: tuple[WorkPoint, ...]
     measured: int
     cached: int
@@ -286,7 +309,7 @@ class WorkStudy:
             for name, q in self.questions.items()
             if isinstance(q.reference, RiccatiReference | ReducedReference | LoopReference)
         }
-        result: dict[str, Any] = plain(
+        result: dict[str, Any] = to_json(
             {
                 "repeats": self.scene.study.repeats,
                 "reference": None if self.truth is None else self.truth.to_dict(),
@@ -294,6 +317,7 @@ class WorkStudy:
                 "points": {name: self.questions[name].rows for name in self.points},
                 "pareto": {name: [p.label for p in pareto(points)] for name, points in self.points.items()},
                 "slopes": [asdict(s) for s in self.slopes],
+                "error_budgets": [asdict(b) for b in self.error_budgets],
                 "skipped": self.skipped,
                 "measured_for_the_answers": [p.to_row() for p in self.measured_for_the_answers],
                 "runs": {"measured": self.measured, "cached": self.cached},

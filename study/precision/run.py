@@ -10,26 +10,30 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import TaskProgressColumn
 
+from softgrasp.fem.accuracy.adapt import build_to_tolerance
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.model.build import build
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.refined import scene_ends
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.reduction.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
+from softgrasp.study.precision.balance import companion, error_budget
 from softgrasp.study.precision.cache import Cache, Guard
-from softgrasp.study.precision.forward import ask_forward, forward_settings
+from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
-from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
+from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RiccatiPoint, RunPoint
+from softgrasp.study.precision.predict import Predictor
 from softgrasp.study.precision.probe import find_places
 from softgrasp.study.precision.reduced import ask_bases, ask_reduced
-from softgrasp.study.precision.result import Answer, Question, Truth, WorkStudy
+from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_riccati, settings_of
 from softgrasp.study.precision.riccati_reduced import ask_reduced_riccati
 from softgrasp.study.precision.settings import own_setting, variant
-from softgrasp.study.precision.truth import make_plan, make_truth
+from softgrasp.study.precision.truth import LADDER, make_truth
 from softgrasp.study.reduce.sweep import chosen_methods
 from softgrasp.study.shell.session import Session
 
@@ -102,7 +106,7 @@ def study_scene(
     """
     request = request or Request()
     names = request.questions
-    model = build(variant(scene, own_setting(scene)), comm=comm)
+    model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
     guard = Guard(comm, progress)
     store = Cache(cache, comm, scene)
     runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store, guard)
@@ -115,25 +119,29 @@ def study_scene(
     with interruptible(False) as guard.stop:
         guard.count = count_points(scene, control, [name for name in names if not (refused and name in CONTROL)])
         if set(names) - set(CONTROL):
-            truth = make_truth(scene, runs)
-            questions |= forward_questions(scene, runs, truth, names)
+            truth = make_truth(scene, runs, request.tolerance)
+            questions |= forward_questions(model, runs, truth, names)
             answers, measured = answer(scene, runs, truth, questions, request)
         if not refused:
             questions |= control_questions(control, names)
+    budgets = error_budgets(scene, runs, questions, answers, measured) if "forward" in questions else ()
     return WorkStudy(
         scene=scene,
         truth=truth,
         questions={name: questions[name] for name in names},
         answers=tuple(answers),
+        error_budgets=budgets,
         measured_for_the_answers=tuple(measured),
         measured=store.misses,
         cached=store.hits,
     )
 
 
-def forward_questions(scene: Scene, runs: FullRuns, truth: Truth, names: Sequence[str]) -> dict[str, Question]:
+def forward_questions(model: Model, runs: FullRuns, truth: Truth, names: Sequence[str]) -> dict[str, Question]:
     """Full model, reduced models, and bases. Collective."""
-    questions = {"forward": ask_forward(scene, runs, truth)} if "forward" in names else {}
+    questions, scene = {}, runs.scene
+    if "forward" in names:
+        questions["forward"] = ask_forward(runs, truth, scene_ends(runs.cache.comm, model.space.mesh, model.scene))
     asks = {"reduced": ask_reduced, "bases": ask_bases}
     if not set(names) & set(asks):
         return questions
@@ -161,6 +169,28 @@ def answer(
     return by_tolerance + by_budget, answers.measured
 
 
+def error_budgets(
+    scene: Scene,
+    runs: FullRuns,
+    questions: dict[str, Question],
+    answers: Sequence[Answer],
+    measured: Sequence[RunPoint],
+) -> tuple[ErrorBudget, ...]:
+    """Of the scene's own setting, and of the one that answers a tolerance."""
+    points = [*measured, *(p for question in questions.values() for p in question.points)]
+    forward = [p for p in points if isinstance(p, ForwardPoint)]
+    reduced = [p for p in points if isinstance(p, ReducedPoint)]
+    riccati = [p for p in points if isinstance(p, RiccatiPoint)]
+    skipped = {name: question.skipped for name, question in questions.items() if question.skipped}
+    predictor = Predictor(scene, forward, runs.dimension)
+    asked = [a.full.point.setting for a in answers if a.kind == "tolerance" and a.full is not None]
+    result = []
+    for setting in dict.fromkeys([own_setting(scene), *asked]):
+        model = companion(predictor.predict(setting).error, reduced)
+        result.append(error_budget(scene, predictor, setting, forward, model, reduced, riccati, skipped))
+    return tuple(result)
+
+
 def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Question]:
     """Riccati equation, reduced equations, closed loop; one that fails is left out with its reason. Collective."""
     questions = {}
@@ -176,13 +206,14 @@ def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Q
 
 def count_points(scene: Scene, control: ControlRuns, names: Sequence[str]) -> int:
     """About how many points the questions have, for the time left."""
+    d = control.layout.dimension
     counts = {
-        "forward": len(forward_settings(scene, control.layout.dimension)),
+        "forward": sum(map(len, mesh_series(scene, d))) * len(SHARES) + len(solver_settings(scene)),
         "reduced": 1 + len(chosen_methods(scene.reduction)),
         "bases": 1 + len(ENGINES),
         "riccati": 1 + len(settings_of(control)),
         "reduced_riccati": 1 + len(BASES),
         "loop": 1 + CONTROLLERS,
     }
-    truth = len(make_plan(scene).settings) if set(names) - set(CONTROL) else 0
+    truth = len(LADDER) if set(names) - set(CONTROL) else 0
     return truth + sum(counts[name] for name in names) or 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,7 +13,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.switch import changed
 
 LEAST_STEPS = 4  # of a run
-Group = tuple[tuple[int, ...] | None, int]  # cells and order of a mesh
+Refine = float | Literal["off", "scene"]
+Group = tuple[tuple[int, ...] | None, int, Refine]  # cells, order and grading of a mesh
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,13 @@ class Setting:
     """How the full model is solved.
 
     Attributes:
-        cells: of the structured box; None on a mesh file.
-        order: of the displacement, 1 or 2.
+        cells: of an even mesh of the structured box; None on a mesh file and on graded meshes.
+        order: of the displacement, 1 to 3.
         steps: equal time steps.
         solver: linear solver.
         rtol: tolerance of an iterative one.
+        refine: tolerance of the a-priori graded mesh, "off" for even cells or those of a file, "scene" for the
+            scene's own [tissue.refine].
     """
 
     cells: tuple[int, ...] | None
@@ -33,12 +36,15 @@ class Setting:
     steps: int
     solver: str = "auto"
     rtol: float = 1e-10
+    refine: Refine = "off"
 
     @property
     def mesh(self) -> str:
         """Mesh and order in words."""
+        if self.refine == "scene":
+            return f"the scene's graded mesh, P{self.order}"
         shape = "mesh file" if self.cells is None else " x ".join(map(str, self.cells))
-        return f"{shape}, P{self.order}"
+        return f"{shape if self.refine == 'off' else f'graded {self.refine:.2g}'}, P{self.order}"
 
     @property
     def label(self) -> str:
@@ -47,32 +53,48 @@ class Setting:
         return f"{self.mesh}, {self.steps} steps{tail}"
 
     @property
-    def overrides(self) -> list[str]:
-        """Arguments of ``--set`` that give this setting."""
-        cells = [] if self.cells is None else [f"tissue.cells={list(self.cells)}"]
+    def family(self) -> str:
+        """Kind of mesh and order: meshes of one family are one series in space."""
+        return f"{'even' if self.refine == 'off' else 'graded'} P{self.order}"
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What names the run in result.json; without the grading where there is none."""
+        refine = {} if self.refine == "off" else {"refine": self.refine}
+        return {"cells": self.cells, "order": self.order, "steps": self.steps, "solver": self.solver} | refine
+
+    def overrides(self, scene: Scene) -> list[str]:
+        """Arguments of ``--set`` that give this setting of a scene."""
+        mesh = [] if self.cells is None else [f"tissue.cells={list(self.cells)}"]
+        if isinstance(self.refine, float):
+            mesh = [f"tissue.refine={{tolerance={self.refine:g},passes=0}}"]
+        elif self.refine == "off" and scene.tissue.refine is not None:
+            mesh.append("tissue.refine=false")
         rtol = [f"time.rtol={self.rtol:g}"] if self.solver == "cg" else []
-        return [*cells, f"tissue.order={self.order}", f"time.steps={self.steps}", f"time.solver={self.solver}", *rtol]
+        return [*mesh, f"tissue.order={self.order}", f"time.steps={self.steps}", f"time.solver={self.solver}", *rtol]
 
     @property
     def group(self) -> Group:
         """Mesh and order, whatever the steps."""
-        return self.cells, self.order
+        return self.cells, self.order, self.refine
 
     def unknowns(self, d: int) -> int:
-        """About how many tissue unknowns a structured mesh has."""
+        """About how many tissue unknowns an even mesh of a box has; 0 for others."""
         return 0 if self.cells is None else d * int(np.prod([self.order * n + 1 for n in self.cells]))
 
 
 def scene_setting(scene: Scene) -> Setting:
     """The scene's own setting."""
-    cells = None if scene.tissue.cells is None else tuple(scene.tissue.cells)
-    return Setting(cells, scene.tissue.order, scene.time.steps, scene.time.solver, scene.time.rtol)
+    tissue, time = scene.tissue, scene.time
+    cells = None if tissue.cells is None or tissue.refine is not None else tuple(tissue.cells)
+    refine: Refine = "off" if tissue.refine is None else "scene"
+    return Setting(cells, tissue.order, time.steps, time.solver, time.rtol, refine)
 
 
 def own_setting(scene: Scene) -> Setting:
     """The scene's mesh, order and steps, as the forward diagram names them."""
     own = scene_setting(scene)
-    return Setting(own.cells, own.order, own.steps)
+    return Setting(own.cells, own.order, own.steps, refine=own.refine)
 
 
 def least_steps(scene: Scene) -> int:
@@ -94,10 +116,14 @@ def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: 
     """
 
     def edit(table: dict[str, Any]) -> None:
+        tissue = table["tissue"]
         if setting.cells is not None:
-            table["tissue"]["cells"] = list(setting.cells)
-        table["tissue"].pop("refine", None)  # which may choose cells of its own: the series is one of even meshes
-        table["tissue"]["order"] = setting.order
+            tissue["cells"] = list(setting.cells)
+        if setting.refine != "scene":
+            tissue.pop("refine", None)
+        if isinstance(setting.refine, float):
+            tissue["refine"] = {"tolerance": setting.refine, "passes": 0}
+        tissue["order"] = setting.order
         table["time"] |= {"steps": setting.steps, "solver": setting.solver, "rtol": setting.rtol}
         table["output"] = table.get("output", {}) | {"snapshots": snapshots, "every": 1}
         if reference is not None:

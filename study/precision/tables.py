@@ -22,7 +22,7 @@ from softgrasp.study.precision.points import (
     RunPoint,
     WorkPoint,
 )
-from softgrasp.study.precision.result import WorkStudy
+from softgrasp.study.precision.result import ErrorBudget, WorkStudy
 from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
 from softgrasp.study.report.tables import Table
 
@@ -112,14 +112,26 @@ def _why(p: WorkPoint) -> str:
     return "missed" if isinstance(p, BasisPoint) else "unstable"
 
 
+def budget_table(budget: ErrorBudget) -> Table:
+    """Every part with its share, what halves it at which cost, and its digits below a tenth of the largest part."""
+    rows: list[tuple[Any, ...]] = [
+        (p.name, p.error, f"{100 * p.share:.2g} %" if p.share > 1e-3 else "< 0.1 %", p.halved_by or "-",
+         "-" if p.cost is None else f"{p.cost:.2g} x", p.wasted or "-")
+        for p in budget.parts
+    ]  # fmt: skip
+    rows += [(name, "-", "-", reason, "-", "-") for name, reason in budget.missing]
+    header = ("error of", "relative", "share", "halved by", "in a time of", "wasted digits")
+    return Table(header, rows, f"error budget of {budget.label}")
+
+
 def slope_table(study: WorkStudy) -> Table:
     """Question, series, what against what, power, points."""
     rows = [
         (s.question.replace("_", " "), SERIES_TITLES.get(s.question, {}).get(s.series, s.series), s.against,
-         f"{s.power:+.2f}", s.count)
+         f"{s.power:+.2f}", "" if s.expected is None else f"{s.expected:+.2f}", s.count)
         for s in study.slopes
     ]  # fmt: skip
-    return Table(("question", "series", "of", "power", "points"), rows, "slopes, x^power")
+    return Table(("question", "series", "of", "power", "theory", "points"), rows, "slopes, x^power")
 
 
 def points_table(study: WorkStudy) -> Table:

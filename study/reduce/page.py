@@ -18,7 +18,7 @@ from softgrasp.study.reduce.tables import (
     refused_table,
     time_table,
 )
-from softgrasp.study.report.origin import made_with, origin
+from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section
 
 CAPTIONS = {
@@ -70,7 +70,7 @@ def sections(study: ReductionStudy, seconds: Mapping[str, float], files: Sequenc
         ("states", layout.states),
         ("steps", scene.time.steps),
     ]
-    about += made_with(origin(scene, layout.comm.size))
+    about += provenance(origin(scene, layout.comm.size))
     about += [(f"time {key}", f"{value:.3g} s") for key, value in seconds.items()]
     return [*parts, *box_sections(study), Section("Made with", rows=about)]
 

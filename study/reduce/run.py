@@ -34,7 +34,7 @@ from softgrasp.study.reduce.tables import (
     time_table,
 )
 from softgrasp.study.reduce.times import full_times, speed_notes, speed_of
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -69,15 +69,26 @@ def run_reduce(
     quiet: bool = False,
     pictures: bool = True,
     empty: bool = False,
+    tolerance: float | None = None,
 ) -> dict[str, Any]:
-    """Reduce a scene file by all its methods and write the results. Collective.
+    """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
 
     Raises:
         SoftgraspError: with one sentence.
     """
+    if tolerance is not None:
+        overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
     session = Session("reduce", path, overrides, out, console, quiet, pictures, empty)
     scene = session.scene()
     names = check_scene(scene)
+    if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
+        from softgrasp.study.reduce.certify import run_certify  # only certified models pay for it
+
+        return run_certify(session, scene)
+    if scene.effects.finite_strain is not None:
+        from softgrasp.study.reduce.strain_run import run_strain  # models of another kind
+
+        return run_strain(session, scene)
     model = session.model(scene)
     watch = Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
@@ -184,7 +195,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
         },
         "memory_peak_mb": peak_memory_mb(model.system.layout.comm),
     }
-    return dict(plain(result))
+    return dict(to_json(result))
 
 
 def _about(s: Sweep) -> dict[str, Any]:

@@ -164,5 +164,6 @@ def inner_note(sweeps: Sequence[Sweep]) -> str:
 
 def point_table(study: ReductionStudy) -> Table:
     """All points, numbers in full."""
-    names = tuple(f.name for f in fields(Point))
+    units = {"spectral_abscissa": " [1/s]", "time_offline": " [s]", "time_setup": " [s]", "time_online": " [s]"}
+    names = tuple(f.name + units.get(f.name, "") for f in fields(Point))
     return Table(("method", *names), [(s.method.key, *astuple(p)) for s in study.sweeps for p in s.points])

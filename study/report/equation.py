@@ -50,7 +50,7 @@ def equation(scene: Scene) -> Equation:
 
     fall = "(q_s'' - g)" if heavy else "q_s''"
     drag = ("- alpha G q_s'",) if dragged else ()
-    left = ("M_ee z''", *(("D_ee z'",) if damped else ()), "K_ee z")
+    left = ("M_ee z''", *(("D_ee z'",) if damped else ()), "f(z)" if effects.finite_strain else "K_ee z")
     rows = [("tissue", left, (f"-G {fall}", *drag))]
     forces = ["M_hand q_s''"]
     if two_way:
@@ -73,7 +73,9 @@ def _motion(scene: Scene) -> str:
 
 def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
     effects, layers = scene.effects, "sum over layers of " if scene.tissue.layers else ""
+    law = [] if effects.finite_strain is None else [f"f(z) = dW/dz, W(F) {effects.finite_strain.law}, F = I + grad z"]
     result = [
+        *law,
         "q_s: translations" + (" and small angles" if effects.rotation else "") + " of the hand",
         "z = q_e - T q_s: displacement of the tissue against the rigid motion T q_s",
         "G = M_es + M_ee T; K_es = -K_ee T",

@@ -12,12 +12,12 @@ from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
 
 
-def plain(value: Any) -> Any:
+def to_json(value: Any) -> Any:
     """A value that JSON can hold: what is not finite becomes None."""
     if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): to_json(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [plain(v) for v in value]
+        return [to_json(v) for v in value]
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, float | np.floating):
@@ -34,5 +34,5 @@ def write_scene(out: Path, scene: Scene) -> Path:
 
 def write_json(path: Path, result: dict[str, Any]) -> Path:
     """Write a result; what is not finite becomes null. Not collective: call on one rank."""
-    path.write_text(json.dumps(plain(result), indent=2, allow_nan=False) + "\n")
+    path.write_text(json.dumps(to_json(result), indent=2, allow_nan=False) + "\n")
     return path

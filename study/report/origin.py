@@ -58,7 +58,7 @@ def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int,
     return f"{launch}softgrasp {command} {shlex.quote(str(path))}{sets}{options}"
 
 
-def made_with(result: dict[str, Any]) -> list[tuple[str, Any]]:
+def provenance(result: dict[str, Any]) -> list[tuple[str, Any]]:
     """Rows on where the numbers of a result come from, see :func:`softgrasp.study.report.origin.origin`."""
     names = {"version": "softgrasp", "machine": "machine", "ranks": "ranks", "scene_hash": "scene hash"}
     return [(name, result[key]) for key, name in names.items()]

@@ -93,8 +93,12 @@ class Session:
         self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
         return scene
 
-    def model(self, scene: Scene) -> Model:
+    def model(self, scene: Scene, steps: bool = True) -> Model:
         """Build a scene and print its size and what its mesh warns of. Collective.
+
+        Args:
+            scene: the scene.
+            steps: whether a tolerance of its mesh is refused that its time steps cannot carry.
 
         Raises:
             SoftgraspError: the scene cannot be built.
@@ -104,7 +108,7 @@ class Session:
         else:
             from softgrasp.fem.accuracy.adapt import build_to_tolerance  # only scenes with graded cells pay for it
 
-            model = build_to_tolerance(scene, self.comm)
+            model = build_to_tolerance(scene, self.comm, steps)
         layout = model.system.layout
         sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
         self.console.print(sizes)

@@ -11,7 +11,7 @@ import scipy.linalg
 import skfem
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.accuracy.adapt import build_to_tolerance, judged
 from softgrasp.fem.accuracy.estimate import difference, estimate, next_order, reduced
 from softgrasp.fem.accuracy.marking import cell_products, indicators, prolong
 from softgrasp.fem.accuracy.small import run_small, small_model, static_solves
@@ -109,6 +109,14 @@ def test_tolerance_is_reached_and_estimated(comm: MPI.Intracomm, tolerance: floa
     assert run.energy_drift < 1e-12
 
 
+def test_cubic_elements_are_estimated_by_those_of_order_four(comm: MPI.Intracomm) -> None:
+    fine = simulate(build(with_refine(make_scene(TIP), 3, 1e-4), comm=comm))
+    model = build(with_refine(make_scene(TIP), 3, 0.1), comm=comm)
+    true, result = error(deformation(simulate(model)), deformation(fine)), estimate(model)
+    assert 0.4 <= result.estimate / true <= 1.1
+    assert result.bound >= true
+
+
 def test_mesh_file_reaches_its_tolerance(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     steps = {"steps": 150}
     scenes = [l_scene(mpi_tmp_path, comm, order=o, refine={"tolerance": t}) for o, t in ((2, 2e-2), (3, 1e-3))]
@@ -128,15 +136,24 @@ def test_passes_end_at_most_and_say_so(comm: MPI.Intracomm) -> None:
     assert model.system.layout.n_e <= 1500
     assert model.accuracy is not None
     assert model.accuracy.obstacle == "tissue.refine.most = 1500 unknowns allow no finer mesh"
-    data["tissue"]["refine"] = {"tolerance": 1e-3, "passes": 0}
-    model = build_to_tolerance(Scene.model_validate(data | {"time": {"steps": 1200}}), comm)
+    data["tissue"]["refine"] = {"tolerance": 1e-2, "passes": 1}
+    model = build_to_tolerance(Scene.model_validate(data), comm)
     assert model.accuracy is not None
-    assert model.accuracy.obstacle == "tissue.refine.passes = 0 are used up"
+    assert model.accuracy.obstacle == "tissue.refine.passes = 1 are used up"
+    data["tissue"]["refine"] = {"tolerance": 1e-2, "passes": 0}
+    model = build_to_tolerance(Scene.model_validate(data), comm)
+    assert model.accuracy is None  # the a-priori mesh
+    result = judged(model)
+    assert (result.tolerance, result.obstacle) == (1e-2, "tissue.refine.passes = 0 allow none")
 
 
 def test_tolerance_below_the_steps_is_refused(comm: MPI.Intracomm) -> None:
     with pytest.raises(SceneError, match=r"is below the error .* that time.steps = 60 leave on any mesh: use at least"):
         build_to_tolerance(with_refine(make_scene(TIP), 2, 1e-3), comm)
+    # feedback has steps of its own
+    model = build_to_tolerance(with_refine(make_scene(TIP), 2, 1e-2), comm, steps=False)
+    assert model.accuracy is not None
+    assert model.accuracy.time_error > 1e-2
 
 
 def test_time_error_is_that_of_the_steps(comm: MPI.Intracomm) -> None:

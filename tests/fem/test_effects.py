@@ -12,7 +12,6 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.effects.objects import counting, difference
 from tests.helpers.models import (
     LAYERS,
     absolute,
@@ -85,35 +84,6 @@ def test_layers_share_their_forms_and_add_only_their_components(
     assert sorted(model.inventory.operators) == sorted([*parts, "M_ee", "K_ee", "T", "G", "D_ee"])
     undamped = build(make_scene(tissue={"layers": {"core": LAYERS["core"]}}), comm=comm)
     assert "D_ee" not in undamped.inventory.operators
-
-
-def objects_of_a_run(comm: MPI.Intracomm, **tables: Any) -> dict[str, int]:
-    """What PETSc's own log counts as created by build and run, by class; it knows nothing of our bookkeeping."""
-    with counting(comm) as made:
-        simulate(build(make_scene(**tables), comm=comm))
-    return made
-
-
-def test_petsc_counts_the_same_objects_for_effects_that_are_off(comm: MPI.Intracomm) -> None:
-    bare = objects_of_a_run(comm)
-    assert bare["Matrix"] > 5  # three parts, M, K and S, and what assembly needs
-    for effects in NEUTRAL:
-        assert objects_of_a_run(comm, effects=effects) == bare, effects
-    for effects in (GRAVITY, WEIGHT, {"reaction": True}):  # on, but they share what is there
-        assert objects_of_a_run(comm, effects=effects) == bare, effects
-    assert difference(objects_of_a_run(comm, effects=VISCOUS), bare) == {"Vector": 1}  # K z of the last step
-    two = objects_of_a_run(comm, tissue={"layers": {"core": LAYERS["core"]}})
-    assert two["Matrix"] > bare["Matrix"]  # the count can tell
-
-
-def test_petsc_counts_no_object_made_in_a_step(comm: MPI.Intracomm) -> None:
-    """As many for twice the steps, with everything on and with everything off."""
-    everything = GRAVITY | RAYLEIGH | {"reaction": True, "rotation": True}
-    for effects in ({}, everything):
-        short, long = (
-            objects_of_a_run(comm, effects=effects, output={"snapshots": "none"}, time={"steps": n}) for n in (30, 60)
-        )
-        assert short == long
 
 
 def work_of_a_run(model: Model) -> dict[str, int]:

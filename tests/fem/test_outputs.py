@@ -11,7 +11,6 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.forward.result import simulate_result
 from tests.helpers.models import CUBE, gather_rows, make_scene
 
 pytestmark = pytest.mark.ranks
@@ -36,11 +35,6 @@ def test_the_node_that_is_taken_is_named(comm: MPI.Intracomm, point: list[float]
         make_scene(outputs({"kind": "node", "point": point})), build(make_scene(), comm=comm).system
     )
     assert output.place == place
-
-
-def test_a_result_says_where_its_outputs_are(comm: MPI.Intracomm) -> None:
-    model = build(make_scene(time={"steps": 3}), comm=comm)
-    assert simulate_result(model, simulate(model)).places == {"tip": "node (0, 0), the free one farthest from the hand"}
 
 
 TURN = {"effects": {"rotation": True}, "motion": {"target": [0.3, 0.2, 0.1]}}

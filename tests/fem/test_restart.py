@@ -11,22 +11,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import h5py
-import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.disk import MARGIN, check_room
-from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError
+from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import read_manifest, write_arrays, write_manifest
-from softgrasp.study.cli import app
-from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.precision.cache import Cache
-from softgrasp.study.precision.riccati import Refusal
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.ranks
@@ -163,76 +157,12 @@ def test_snapshots_stream_through_the_smallest_buffer(
         assert np.array_equal(file["steps"], memory.steps)
 
 
-def mesh_scene(comm: MPI.Intracomm, folder: Path, height: float) -> Scene:
-    """The block on a mesh in two files, of which the one with the numbers changes with the height. Collective."""
-    if comm.rank == 0:
-        x, y = np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 2, 7))
-        points = np.column_stack([x.ravel(), np.where(y.ravel() == 0, -height, y.ravel())])
-        low = np.array([4 * j + i for j in range(6) for i in range(3)])
-        corners = np.column_stack([low, low + 1, low + 5, low + 4])
-        cells = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-        meshio.write(folder / "block.xdmf", meshio.Mesh(points, [("triangle", cells)]))
-    comm.Barrier()
-    base = make_scene(time={"steps": 12}).model_dump(mode="json", by_alias=True, exclude_none=True)
-    base["tissue"] = {"mesh": str(folder / "block.xdmf"), "material": base["tissue"]["material"]}
-    return Scene.model_validate(base)
-
-
-def test_a_mesh_that_changed_in_its_second_file_does_not_go_on(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
-    """Neither a run nor the points of a study."""
-    scene = mesh_scene(comm, mpi_tmp_path, 0.0)
-    named, kept = (mpi_tmp_path / "block.xdmf").read_bytes(), Cache(mpi_tmp_path / "cache", comm, scene)
-    assert kept.get("point", {}, Refusal, lambda: [Refusal("1")]) == [Refusal("1")]
-    with pytest.raises(Interrupted):
-        simulate(build(scene, comm=comm), RunOptions(mpi_tmp_path, until=6))
-    again = mesh_scene(comm, mpi_tmp_path, 0.0)
-    assert simulate(build(again, comm=comm), RunOptions(mpi_tmp_path, resume=True)).steps_timed == 6
-    kept = Cache(mpi_tmp_path / "cache", comm, again)
-    assert kept.get("point", {}, Refusal, lambda: [Refusal("2")]) == [Refusal("1")]
-    other = mesh_scene(comm, mpi_tmp_path, 0.5)
-    assert (mpi_tmp_path / "block.xdmf").read_bytes() == named
-    with pytest.raises(CheckpointError, match="a file that the scene names is not what it was"):
-        simulate(build(other, comm=comm), RunOptions(mpi_tmp_path, resume=True))
-    fresh = Cache(mpi_tmp_path / "cache", comm, other)
-    assert fresh.get("point", {}, Refusal, lambda: [Refusal("2")]) == [Refusal("2")]
-
-
 @pytest.fixture
 def small_files() -> Iterator[Callable[[int], None]]:
     """Limit the size of the files of this process."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-def test_fields_without_room_leave_a_restart_file(
-    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With room again the run ends as the whole run does."""
-    scene = make_scene(tissue={"cells": [3, 6]}, time={"steps": 12}, output={"frames": 6})
-    model = build(scene, comm=comm)
-    frames = Frames(model, mpi_tmp_path, pictures=False)
-    free = iter([2**30, 2**30, 2**30, 100])
-    monkeypatch.setattr("softgrasp.fem.disk.shutil.disk_usage", lambda path: SimpleNamespace(free=next(free)))
-    options = RunOptions(mpi_tmp_path, frame=frames, begin=frames.begin, keep=frames.keep)
-    with pytest.raises(ResourceError, match=r"100 are free on the disk; free the disk; .*go on from step 6"):
-        simulate(model, options)
-    assert all(path.exists() for path in frames.close())
-    rest = simulate(model, RunOptions(mpi_tmp_path, resume=True))
-    assert np.array_equal(rest.final, simulate(build(scene, comm=comm)).final)
-
-
-@pytest.mark.parametrize("output", [{"fields": "vtu"}, {"fields": "none", "snapshots": "hdf5"}])
-def test_a_limit_on_files_is_one_sentence(
-    comm: MPI.Intracomm, mpi_tmp_path: Path, small_files: Callable[[int], None], output: dict[str, str]
-) -> None:
-    scene = make_scene(tissue={"cells": [3, 6]}, time={"steps": 12}, output=output)
-    model = build(scene, comm=comm)
-    frames = Frames(model, mpi_tmp_path, pictures=False)
-    small_files(2**18)  # less than the libraries may add at the end
-    with pytest.raises(ResourceError, match=r"no file may pass 262144 bytes here; raise the limit"):
-        simulate(model, RunOptions(mpi_tmp_path, frame=frames, begin=frames.begin))
-    frames.close()
 
 
 def test_room_counts_all_ranks_and_the_size_so_far(
@@ -251,13 +181,6 @@ def test_room_counts_all_ranks_and_the_size_so_far(
     check_room(comm, [own], 100, reserve=7)
     with pytest.raises(ResourceError, match="are free on the disk"):
         check_room(comm, [own], 100, reserve=8)
-
-
-@pytest.mark.parametrize("below", ["", "deeper"])
-def test_an_out_that_is_a_file_is_refused_before_the_scene_is_read(mpi_tmp_path: Path, below: str) -> None:
-    (mpi_tmp_path / "file").touch()
-    with pytest.raises(SceneError, match=r"--out .*file is a file; name a folder"):
-        app(["simulate", "no.toml", "--out", str(mpi_tmp_path / "file" / below)], standalone_mode=False)
 
 
 @pytest.mark.serial

@@ -47,7 +47,7 @@ def write(comm: MPI.Intracomm, folder: Path, d: int, order: int, **extra: Any) -
     writer.rename("fields", "a run")
     writer.write(0.0, zero, zero, 0 * q, 0 * q)
     writer.write(0.5, zero, zero, q, 2 * q)
-    writer.write(1.0, (model.system.layout.nodes @ affine(d).T).ravel(), zero, 0 * q, 0 * q)
+    writer.write(np.float64(1.0), (model.system.layout.nodes @ affine(d).T).ravel(), zero, 0 * q, 0 * q)
     (path,) = writer.close()
     comm.Barrier()
     return path

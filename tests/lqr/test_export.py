@@ -19,7 +19,6 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller, layout_hash, load_gain, save_gain
-from softgrasp.lqr.loop.export import to_pymor, to_python_control
 from softgrasp.lqr.loop.full import ClosedLoop
 from softgrasp.lqr.loop.small import ReducedLoop
 from softgrasp.lqr.loop.small_plant import Shapes, SmallPlant, galerkin
@@ -27,6 +26,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import hand_target, rest
+from softgrasp.reduction.basis import ReductionError
 from tests.helpers.models import close, gather_rows, make_scene, same_everywhere
 
 pytestmark = pytest.mark.ranks
@@ -233,11 +233,10 @@ def test_what_does_not_fit_is_refused(small: tuple[SmallPlant, Shapes, Array]) -
         Controller(K[:, 1:], x_bar, u_bar, plant)
     with pytest.raises(ControlError, match="period"):
         Controller(K, x_bar, u_bar, plant, period=0.0)
-    for export in (to_python_control, to_pymor):  # before either package is imported
-        with pytest.raises(ControlError, match="shape"):
-            export(plant, K[:1])
-        with pytest.raises(ControlError, match="finite"):
-            export(plant, np.nan * K)
+    with pytest.raises(ReductionError, match="shape"):
+        plant.lti().under(K[:1])
+    with pytest.raises(ReductionError, match="finite"):
+        plant.lti().under(np.nan * K)
 
 
 # --- other packages
@@ -245,24 +244,25 @@ def test_what_does_not_fit_is_refused(small: tuple[SmallPlant, Shapes, Array]) -
 
 def test_python_control_sees_the_same_plant(problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array]) -> None:
     plant, _, K = small
-    out = to_python_control(plant, K)
-    assert out.plant.output_labels == ["tip_x", "tip_y"]
-    assert out.plant.state_labels[:4] == ["q_1", "q_2", "v_1", "v_2"]
-    assert out.plant.nstates == plant.N
-    ours = np.linalg.eigvals(np.linalg.solve(plant.E, plant.A + plant.B @ K))
-    theirs = out.closed_loop.poles()
-    assert close(np.sort(ours.real), np.sort(theirs.real)) < 1e-9  # eigenvalues of one matrix
+    ours, closed = plant.lti().to_control(), plant.lti().under(K).to_control()
+    assert ours.output_labels == ["tip_x [m]", "tip_y [m]"]
+    assert ours.input_labels == ["force_x [N]", "force_y [N]"]
+    assert ours.state_labels[:4] == ["q_x [m]", "q_y [m]", "v_x [m/s]", "v_y [m/s]"]
+    assert ours.nstates == plant.N
+    poles = np.linalg.eigvals(np.linalg.solve(plant.E, plant.A + plant.B @ K))
+    theirs = closed.poles()
+    assert close(np.sort(poles.real), np.sort(theirs.real)) < 1e-9  # eigenvalues of one matrix
     assert theirs.real.max() < 0
-    assert out.closed_loop.nstates == plant.N
+    assert closed.nstates == plant.N
     # their own LQR, with their sign of the gain, from the exported plant
     weight = Q * plant.C.T @ plant.C
-    G, _, _ = control.lqr(out.plant, (weight + weight.T) / 2, R * np.eye(2), method="scipy")
+    G, _, _ = control.lqr(ours, (weight + weight.T) / 2, R * np.eye(2), method="scipy")
     assert close(-np.asarray(G), K) < 1e-6  # SciPy's equation solver, twice, on matrices of condition 1e4
     # a step of the target as an initial condition: their simulation against ReducedLoop
     x_bar, _ = plant.rest_at(AIM)
     start = plant.rest_at(np.zeros(2))[0]
     times = np.linspace(0.0, 2.0, 21)
-    theirs_y = control.initial_response(out.closed_loop, times, start - x_bar).outputs
+    theirs_y = control.initial_response(closed, times, start - x_bar).outputs
     ours_y = ReducedLoop(plant, 0.001).run(K, plant.rest_at(AIM), 2000, (problem.Q, problem.R)).outputs[::100]
     assert (
         close(ours_y - plant.C @ x_bar, theirs_y.T) < 1e-4
@@ -272,19 +272,18 @@ def test_python_control_sees_the_same_plant(problem: RiccatiProblem, small: tupl
 def test_pymor_sees_the_same_plant(small: tuple[SmallPlant, Shapes, Array]) -> None:
     plant, _, K = small
     if MPI.COMM_WORLD.size > 1:
-        with pytest.raises(ControlError, match="export it on one"):
-            to_pymor(plant, K)
+        with pytest.raises(ReductionError, match="load it there"):
+            plant.lti().to_pymor()
         return
-    out = to_pymor(plant, K)
-    assert out.plant.order == plant.N
+    theirs, their_loop = plant.lti().to_pymor(), plant.lti().under(K).to_pymor()
+    assert theirs.order == plant.N
     for s in (0.3 + 1.0j, 5.0j, 40.0j):
         ours = plant.C @ np.linalg.solve(s * plant.E - plant.A, plant.B)
-        assert close(out.plant.transfer_function.eval_tf(s), ours) < 1e-9  # one solve each
+        assert close(theirs.transfer_function.eval_tf(s), ours) < 1e-9  # one solve each
+        assert close(plant.lti().at([s])[0], ours) < 1e-9  # the same
         closed = plant.C @ np.linalg.solve(s * plant.E - plant.A - plant.B @ K, plant.B)
-        assert close(out.closed_loop.transfer_function.eval_tf(s), closed) < 1e-9  # one solve, as above
-    poles = out.closed_loop.poles()
-    assert poles.real.max() < 0
-    assert (out.gain == K).all()
+        assert close(their_loop.transfer_function.eval_tf(s), closed) < 1e-9  # one solve, as above
+    assert their_loop.poles().real.max() < 0
 
 
 def test_start_state_round_trip(problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array]) -> None:

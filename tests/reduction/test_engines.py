@@ -1,24 +1,17 @@
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
-import typer
 from mpi4py import MPI
-from typer.testing import CliRunner
 
 from softgrasp.fem.petsc import on_root, total
 from softgrasp.reduction.engines import ENGINES, EngineName, factor, magnitude, small_svd
 from softgrasp.reduction.states import BasisError
 from softgrasp.reduction.svd_like import balanced, form, svd_like_pairs
 from softgrasp.reduction.truncation import Columns, Part, Truncation, allocate, counts_of, needed
-from softgrasp.study.bench import bases as bench_bases
-from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.bases import known_matrix, parse_shapes, right_down_to, spectrum_of
-from softgrasp.study.shell.processes import IN_MPI_JOB
 from tests.helpers.models import Array, close, same_everywhere
 
 pytestmark = pytest.mark.ranks
@@ -48,26 +41,6 @@ def decaying(n: int, m: int, decades: float, rank: int | None = None, seed: int 
 
 
 # --- accuracy
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("complex_valued", [False, True])
-def test_singular_values_are_right_down_to_the_stated_limit(
-    comm: MPI.Intracomm, engine: EngineName, complex_valued: bool
-) -> None:
-    n, m = 3000, 150
-    X = known_matrix(comm, n, m, complex_valued)
-    f = factor(comm, np.asfortranarray(np.hstack([X.real, X.imag])) if complex_valued else X, engine)
-    s = small_svd(comm, f.R[:, :m] + 1j * f.R[:, m:] if complex_valued else f.R)[1] * f.scale
-    limit = 1e-6 if engine == "gram" else 1e-9  # the 1e-10 at its 600 columns: see the next test
-    assert right_down_to(s, spectrum_of(m), 1e-8) <= limit  # 8 digits
-    assert same_everywhere(comm, s)
-
-
-def test_default_is_right_to_1e_8_down_to_1e_10(comm: MPI.Intracomm) -> None:
-    X = known_matrix(comm, 6000, 400, False)
-    f = factor(comm, X)
-    assert right_down_to(f.scale * small_svd(comm, f.R)[1], spectrum_of(400), 1e-8) <= 1e-10  # the numbers
 
 
 def test_gram_keeps_nothing_below_its_floor(comm: MPI.Intracomm) -> None:
@@ -347,37 +320,3 @@ def test_sizes_that_do_not_fit_are_refused(rule: dict[str, Any], words: str) -> 
 def test_rules_that_make_no_sense_are_refused(rule: dict[str, Any]) -> None:
     with pytest.raises(BasisError):
         Truncation(**rule)
-
-
-def test_shapes_of_the_benchmark() -> None:
-    assert parse_shapes("100x10, 200x4") == [(100, 10), (200, 4)]
-    with pytest.raises(typer.BadParameter, match="is no shape"):
-        parse_shapes("10x100")
-
-
-def test_benchmark_measures_every_engine(comm: MPI.Intracomm) -> None:
-    row = bench_bases.measure(900, 200, 1, comm)
-    names = {"tsqr", "svd", "svd_all", "gram", "psd_tsqr", "psd_gram"}
-    assert set(row["engines"]) == (names | {"numpy", "psd_numpy"} if comm.size == 1 else names)
-    for name, found in row["engines"].items():
-        assert found["off"] < 1e-12, name  # rounding
-        assert found["seconds"] > 0
-        # Gram has half the digits; svd stops at 60 of 200 values, the last of them 1.8e-5
-        assert found["rough"] <= found["right"] < (1e-6 if name != "svd" else 2e-5), name
-    assert bench_bases.missed([row]) == []
-    row["engines"]["tsqr"]["right"] = 2e-10
-    assert "goal 1e-10" in bench_bases.missed([row])[0]
-
-
-def test_benchmark_prints_one_table_and_fails_with_its_workers(
-    mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bench_bases, "launch_worker", lambda name, spec, ranks: {"error": "no"})
-    for variable in IN_MPI_JOB:
-        monkeypatch.delenv(variable, raising=False)
-    folder = mpi_tmp_path / str(MPI.COMM_WORLD.rank)
-    done = CliRunner().invoke(app, ["bases", "--sizes", "40x8", "--ranks", "1", "--out", str(folder)])
-    assert done.exit_code == 1
-    assert "40 x 8, 1 rank(s): no" in done.stdout
-    assert (folder / "bench_bases.json").is_file()
-    assert (folder / "bench_bases.csv").read_text().startswith("engine,rows,columns,ranks,seconds")

@@ -21,13 +21,12 @@ from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.design.scene import actuation, with_control
 from softgrasp.lqr.loop.controller import Controller, load_gain
-from softgrasp.lqr.loop.export import to_python_control
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.plots import drawn, figure_reduced, unstable
 from softgrasp.study.control.result import settled
 from softgrasp.study.control.run import run_control
-from softgrasp.study.report.files import plain
+from softgrasp.study.report.files import to_json
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene
 
@@ -108,14 +107,12 @@ def test_the_loop_costs_what_the_riccati_equation_says(result: dict[str, Any]) -
 def test_every_stable_gain_has_a_proved_bound(result: dict[str, Any]) -> None:
     points = [p for points in result["reduced"].values() for p in points]
     points = [p for p in [*points, *(p for r in result["retune"] for p in r["points"])] if p["stable"]]
-    assert len([p for p in points if p["cost_excess_at_most"] is not None]) > 10
+    assert len(points) > 10
     for p in points:
-        if p["cost_excess_at_most"] is None:  # infinite: the gap is more than the cost itself
-            assert p["cost_excess"] > 0.02
-            continue
         # the excess of the loop without end, from an X with a residual of 1e-10 that the bound does not share
-        assert p["cost_excess_at_most"] >= p["cost_excess"] * (1 - 1e-6) - 1e-12, p
-        assert p["cost_excess_at_most"] <= 100 * p["cost_excess"] + 1e-9, p  # 5 to 30 measured
+        after = 1e-2 if p["cost_excess"] > 1 else 1e-6  # a loop worse than none pays more after the end
+        assert p["cost_excess_at_most"] >= p["cost_excess"] * (1 - after) - 1e-12, p
+        assert p["cost_excess_at_most"] <= 30 * p["cost_excess"] + 2e-12, p  # 24 measured where little is to come
 
 
 class _StopError(Exception):
@@ -195,11 +192,13 @@ def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
     assert controller.plant.N == result["controller"]["N"] == 12
     u = controller.step(np.zeros(2), np.zeros(2))
     assert np.linalg.norm(u) == pytest.approx(np.hypot(5, 3), rel=1e-4)  # |K_T d| = |d|, at the error of this gain
-    exported = to_python_control(controller.plant, controller.K)
-    assert exported.plant.output_labels == result["loop"]["output_names"] == [n.split()[0] for n in table[0][3:5]]
+    exported = controller.plant.lti()
+    labels = [name.split()[0] for name in exported.to_control().output_labels]
+    assert labels == result["loop"]["output_names"] == [n.split()[0] for n in table[0][3:5]]
     small = controller.plant
     poles = np.linalg.eigvals(np.linalg.solve(small.E, small.A + small.B @ controller.K))
-    assert exported.closed_loop.poles().real.max() == pytest.approx(poles.real.max(), rel=1e-9)  # one matrix, twice
+    closed = exported.under(controller.K).to_control()
+    assert closed.poles().real.max() == pytest.approx(poles.real.max(), rel=1e-9)  # one matrix, twice
     assert result["controller"]["sampled_radius"] < 1
     model = build(load_scene(SCENES / "paper_lqr.toml", SMALL), comm=MPI.COMM_WORLD)
     gain, target = load_gain(out / "gain.npz", model.system.layout)
@@ -350,7 +349,8 @@ def test_outputs_that_see_only_the_hand(tmp_path: Path, method: str) -> None:
     assert controller.plant.N == 4
     u = controller.step(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     assert np.allclose(u, [4.0, 3.0 - np.sqrt(40)], rtol=0, atol=1e-9)  # as above
-    assert to_python_control(controller.plant, controller.K).plant.output_labels == ["arm_x", "arm_y"]
+    labels = controller.plant.lti().to_control().output_labels
+    assert [name.split()[0] for name in labels] == ["arm_x", "arm_y"]
 
 
 def test_a_scene_without_control_watches_tip_and_turning_hand() -> None:
@@ -395,7 +395,7 @@ def test_small_helpers() -> None:
     t = np.arange(5.0)
     assert settled(t, np.array([1.0, 0.5, 0.005, 0.02, 0.001])) == 4.0
     assert settled(t, np.array([1.0, 0.5, 0.005, 0.001, 0.02])) is None
-    assert plain({"a": [np.float64(np.nan), np.inf, 1.0, np.int64(2)], "b": True}) == {
+    assert to_json({"a": [np.float64(np.nan), np.inf, 1.0, np.int64(2)], "b": True}) == {
         "a": [None, None, 1.0, 2],
         "b": True,
     }

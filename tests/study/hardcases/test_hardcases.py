@@ -138,7 +138,7 @@ def test_only_our_own_errors_are_refusals() -> None:
     assert here(refuse) == Outcome(None, "no number", refused=True)
     with pytest.raises(ZeroDivisionError):
         here(bug)
-    assert textbook(bug) == Outcome(None, "ZeroDivisionError: a bug")
+    assert textbook(bug) == Outcome(None, "ZeroDivisionError: a bug", error="ZeroDivisionError")
     assert textbook(lambda: math.nan).text == "not a number"
 
 

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-import io
-import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import pytest
-from mpi4py import MPI
-from rich.console import Console
-
 from softgrasp.reduction.registry import METHODS, PAPER_METHODS
-from softgrasp.study.bench.meshes import MeshRow, break_even, exponent, run_mesh_study
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.result import Point, Sweep, best, kept_points, nearest
 from softgrasp.study.reduce.sweep import FURTHER, chosen_methods
@@ -83,24 +75,3 @@ def test_table_shows_the_deformation_first_and_the_split() -> None:
         "method": "componentwise POD, fixed solid modes", "99.9 %": "-", "N": "14", "V_e": "5+5", "deform.": "1.0e-02",
         "state": "2.0e-02", "energy": "2.0e-02", "1e-1": "14", "1e-2": "14", "1e-3": "-", "stable N": "not 30",
     }  # fmt: skip
-
-
-def test_mesh_study_of_small_meshes(mpi_tmp_path: Path, comm: MPI.Intracomm) -> None:
-    console = Console(file=io.StringIO(), quiet=comm.rank != 0)
-    result = run_mesh_study([300, 1200], 60, "psd_fixed_relative", 14, mpi_tmp_path, console, comm)
-    assert [row["N"] for row in result["rows"]] == [14, 14]
-    assert all(row["stable"] and row["error"] < 0.02 for row in result["rows"])  # 10 tissue columns, a coarse run
-    if comm.rank == 0:
-        assert json.loads((mpi_tmp_path / "mesh_study.json").read_text())["rows"] == result["rows"]
-        assert (mpi_tmp_path / "mesh_study.png").stat().st_size > 5000
-
-
-def test_exponent_and_break_even_mesh() -> None:
-    rows = [
-        MeshRow(8, n, 1.0, 1e-6 * n**1.5, 1e-5 * n, 1e-3, 1e-3, 14, 1e-3, 1e-2, True) for n in (10**3, 10**4, 10**5)
-    ]
-    assert exponent(rows, "time_full") == pytest.approx(1.5)
-    assert exponent(rows, "time_offline") == pytest.approx(1.0)
-    assert exponent(rows, "time_online") == pytest.approx(0.0, abs=1e-12)  # rounding
-    assert break_even(rows) == pytest.approx(100.0)  # 1e-6 n^1.5 = 1e-3
-    assert np.isnan(exponent(rows[:1], "time_full"))

@@ -1,0 +1,289 @@
+"""Reduced models of tissue at finite strain, z = Phi a with Phi' M Phi = I, the hand as their input.
+
+    a'' + D a' + dW_r/da = -G (a_s - g) [- alpha G v_s],   D = alpha I + sum_l beta_l K_l (mu K_mu + lambda K_lambda)_l
+
+W_r lives on sampled cells (`cells.py`), is affine in lambda and mu, and is stepped by its own discrete gradient
+(`stepper.py`), so that the model keeps its energy |a'|^2 / 2 + W_r. It answers inside what it was trained on: Lamé
+constants, accelerations of the hand, and the coordinates that its training runs reached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.system import LayerMaterial
+from softgrasp.reduction.model import ModelError, Outputs
+from softgrasp.reduction.strain.cells import Cells, Potential
+from softgrasp.reduction.strain.stepper import Problem, march
+
+TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
+SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
+REACH, SMALL = 2.0, 0.02  # times what the training runs reached, of coordinates above this share of the largest
+LOAD_STEPS, NEWTON_STEPS = 10, 30  # on the way to an equilibrium
+
+
+@dataclass(frozen=True)
+class Box:
+    """What a model was trained on.
+
+    Attributes:
+        lam, mu: least and largest Lamé constant of every layer [Pa], (layers, 2).
+        load: least and largest a_s - g of the hand, by degree of freedom, (n_s, 2) [m/s^2, rad/s^2].
+        reach: largest |a_i| of the training runs, (k,).
+    """
+
+    lam: Array
+    mu: Array
+    load: Array
+    reach: Array
+
+    def refuse(self, materials: tuple[LayerMaterial, ...]) -> str:
+        """Why materials lie outside; empty inside."""
+        for i, m in enumerate(materials):
+            for key, value, (low, high) in (("lambda", m.lam, self.lam[i]), ("mu", m.mu, self.mu[i])):
+                if not low * (1 - SLACK) <= value <= high * (1 + SLACK):
+                    return f"{key} = {value:g} Pa of layer {i + 1} is outside the training range [{low:g}, {high:g}] Pa"
+        return ""
+
+    def refuse_load(self, load: Array) -> str:
+        """Why accelerations a_s - g (steps, n_s) lie outside; empty inside."""
+        room = SLACK * np.abs(self.load).max(initial=0.0)
+        for i, (low, high) in enumerate(self.load):
+            least, most = float(load[:, i].min(initial=0.0)), float(load[:, i].max(initial=0.0))
+            if least < low - room or most > high + room:
+                return (
+                    f"the hand's acceleration in degree of freedom {i + 1} spans [{least:.4g}, {most:.4g}], outside "
+                    f"the training range [{low:.4g}, {high:.4g}]"
+                )
+        return ""
+
+    def refuse_states(self, a: Array) -> str:
+        """Why coordinates (steps + 1, k) lie outside; empty inside."""
+        # what is small beside the largest coordinate cannot spoil a run
+        ratio = np.abs(a).max(axis=0) / np.maximum(self.reach, SMALL * self.reach.max(initial=1e-300))
+        i = int(np.argmax(ratio))
+        if ratio[i] <= REACH:
+            return ""
+        return f"the run takes coordinate {i + 1} to {ratio[i]:.2g} times what the training runs reached"
+
+
+@dataclass(frozen=True)
+class StrainRun:
+    """What a reduced run at finite strain returns.
+
+    Attributes:
+        times: (steps + 1,) [s].
+        a, v: reduced displacements and velocities, (steps + 1, k).
+        q_s, v_s: hand, (steps + 1, n_s).
+        outputs: y, (steps + 1, p) [m].
+        output_names: one per component.
+        problem, load: what was stepped.
+        evaluations: of the force, in the mean of a step.
+        restarts: fresh tangents.
+        engine: "C" or "NumPy".
+    """
+
+    times: Array
+    a: Array
+    v: Array
+    q_s: Array
+    v_s: Array
+    outputs: Array
+    output_names: tuple[str, ...]
+    problem: Problem = field(repr=False)
+    load: Array = field(repr=False)
+    evaluations: float
+    restarts: int
+    engine: str
+
+    @cached_property
+    def energy(self) -> Array:
+        """|v|^2 / 2 + W_r of every state [J], (steps + 1,)."""
+        return np.asarray(self.problem.potential.energy(self.a) + (self.v**2).sum(axis=1) / 2)
+
+    @cached_property
+    def energy_drift(self) -> float:
+        """Largest |E_n - E_0 - work + loss| over the largest of the four seen, dimensionless."""
+        step = np.diff(self.a, axis=0)  # 2 w
+        work = np.concatenate([[0.0], np.cumsum(np.einsum("ti,ti->t", step, self.load))])
+        lost = np.cumsum(np.einsum("ti,ij,tj->t", step, self.problem.D, step, optimize=True)) / self.problem.dt
+        lost = np.concatenate([[0.0], lost])
+        defect = np.abs(self.energy - self.energy[0] - work + lost).max()
+        scale = max(float(np.abs(x).max()) for x in (self.energy, work, lost))
+        return float(defect) / scale if scale > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class SmallStrainModel:
+    """A model at one parameter and one time step, everything made that a run needs.
+
+    Attributes:
+        model: it comes from.
+        problem: potential, damping, tangent at rest, step.
+        gravity: acceleration of free fall, (n_s,).
+        outside: runs outside of the training box are allowed.
+    """
+
+    model: StrainModel
+    problem: Problem
+    gravity: Array
+    outside: bool = False
+
+    def equilibrium(self) -> Array:
+        """The a with dW_r/da = G g, by Newton's method under growing load, (k,).
+
+        Raises:
+            ModelError: there is none within reach.
+        """
+        potential, full = self.problem.potential, self.model.G @ self.gravity
+        a = np.zeros(len(full))
+        for share in np.linspace(0, 1, LOAD_STEPS + 1)[1:] if full.any() else ():
+            for _ in range(NEWTON_STEPS):
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    rest = share * full - potential.force(a)
+                if np.linalg.norm(rest) <= 1e-12 * np.linalg.norm(full):
+                    break
+                if not np.isfinite(rest).all():
+                    raise ModelError("the reduced body folds on the way to its equilibrium under gravity")
+                a = a + np.linalg.solve(potential.tangent(a), rest)
+            else:
+                raise ModelError("Newton's method found no equilibrium of the reduced body under gravity")
+        return a
+
+    def run(
+        self, hand: tuple[Array, Array], *, a0: Array | None = None, tol: float = TOLERANCE, engine: str = ""
+    ) -> StrainRun:
+        """Run under a prescribed hand; online, not collective.
+
+        Args:
+            hand: q_s and v_s, (steps + 1, n_s) each.
+            a0: start at rest, (k,); None is the undeformed body.
+            tol: residual of a step over the largest load seen.
+            engine: see :func:`softgrasp.reduction.strain.stepper.march`.
+
+        Raises:
+            ModelError: shapes do not fit, or the hand or the run leaves the training box.
+            SolverError: a step did not converge.
+        """
+        model, dt = self.model, self.problem.dt
+        q, v = (np.asarray(x, dtype=float) for x in hand)
+        n_s = model.G.shape[1]
+        if q.shape != v.shape or q.ndim != 2 or q.shape[1] != n_s or len(q) < 2:
+            raise ModelError(f"the hand's tables have shapes {q.shape} and {v.shape}; both must be (steps + 1, {n_s})")
+        c = np.diff(v, axis=0) / dt - self.gravity
+        self._check(model.box.refuse_load(c))
+        if model.in_space:
+            c = c + model.alpha * (v[1:] + v[:-1]) / 2
+        load = -c @ model.G.T
+        start = np.zeros(model.k) if a0 is None else a0
+        done = march(self.problem, load, start, np.zeros(model.k), tol, engine)
+        self._check(model.box.refuse_states(done.a))
+        y = done.a @ model.outputs.C_z.T + q @ model.outputs.C_s.T
+        times = dt * np.arange(float(len(q)))
+        return StrainRun(
+            times, done.a, done.v, q, v, y, model.outputs.names, self.problem, load, done.evaluations, done.restarts,
+            done.engine,
+        )  # fmt: skip
+
+    def _check(self, reason: str) -> None:
+        if reason and not self.outside:
+            raise ModelError(f"{reason}; train the model there, or allow it with outside=True and check the result")
+
+
+@dataclass(frozen=True)
+class StrainModel:
+    """Reduced model of tissue at finite strain for all lambda and mu of its training box.
+
+    Attributes:
+        cells: sampled cells, in reduced coordinates.
+        K_mu, K_lambda: linear stiffness of every layer at 1 Pa, (layers, k, k).
+        G: Phi' G at the densities of the projection, (k, n_s).
+        materials: of the projection, one a layer.
+        outputs: y = C_z a + C_s q_s.
+        box: what it was trained on.
+        cells_full: number of cells of the body.
+        alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
+        gravity: acceleration of free fall (n_s,), or None.
+        tau, residual: of the weights, asked for and reached; 0 where no cell is left out.
+        error_galerkin: in z of the model with all cells, over the training runs.
+        layout, Phi: local rows of the lift (n_local, k), or None.
+        scene_hash: of the scene it was made for.
+        seconds: offline, by stage.
+    """
+
+    cells: Cells
+    K_mu: Array
+    K_lambda: Array
+    G: Array
+    materials: tuple[LayerMaterial, ...]
+    outputs: Outputs
+    box: Box
+    cells_full: int
+    alpha: float = 0.0
+    in_space: bool = False
+    gravity: Array | None = None
+    tau: float = 0.0
+    residual: float = 0.0
+    error_galerkin: float = 0.0
+    layout: BlockLayout | None = None
+    Phi: Array | None = None
+    scene_hash: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def k(self) -> int:
+        """Displacements."""
+        return len(self.cells.B)
+
+    @property
+    def N(self) -> int:
+        """Dimension of the first-order model, the hand's 2 n_s included."""
+        return 2 * (self.k + int(self.G.shape[1]))
+
+    def at(
+        self,
+        dt: float,
+        materials: tuple[LayerMaterial, ...] | None = None,
+        gravity: Array | None = None,
+        *,
+        outside: bool = False,
+    ) -> SmallStrainModel:
+        """The model at new materials and a time step; online, not collective.
+
+        Args:
+            dt: step [s].
+            materials: one a layer; None takes those of the projection.
+            gravity: acceleration of free fall (n_s,) [m/s^2]; None takes that of the scene.
+            outside: allow what the model was not trained on.
+
+        Raises:
+            ModelError: materials outside the training box, of another density, or too many.
+        """
+        materials = self.materials if materials is None else materials
+        if len(materials) != len(self.materials):
+            raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")
+        if any(m.rho != old.rho for m, old in zip(materials, self.materials, strict=True)):
+            raise ModelError("a model at finite strain keeps the densities it was made with; reduce the scene again")
+        reason = self.box.refuse(materials)
+        if reason and not outside:
+            raise ModelError(f"{reason}; train the model there, or allow it with outside=True and check the result")
+        own = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
+        g = np.zeros(self.G.shape[1]) if own is None else own
+        K = [m.mu * a + m.lam * b for m, a, b in zip(materials, self.K_mu, self.K_lambda, strict=True)]
+        D = self.alpha * np.eye(self.k) + sum(m.beta * each for m, each in zip(materials, K, strict=True))
+        return SmallStrainModel(self, Problem(Potential(self.cells, materials), D, sum(K), dt), g, outside)
+
+    def displacement(self, a: Array) -> Array:
+        """Deformation z = Phi a, local rows (n_local, m), of coordinates (m, k).
+
+        Raises:
+            ModelError: the model was loaded without its lift.
+        """
+        if self.Phi is None:
+            raise ModelError("the model holds no lift; load it with the layout of its mesh")
+        return np.asarray(self.Phi @ a.T)

@@ -1,0 +1,270 @@
+"""Runs of a reduced model of tissue at finite strain: Broyden's method on an inverse kept from step to step.
+
+    S w + f_alg(a_n, w) = h,   h = s v_n + l_n,   S = s^2 I + s D,   s = 2 / dt
+    a_{n+1} = a_n + 2 w,   v_{n+1} = 2 s w - v_n
+
+solved by Broyden's method [Broyden65] on a k x k inverse, with the discrete gradient f_alg, 2 w' f_alg =
+W_r(a_{n+1}) - W_r(a_n), so that |v|^2 / 2 + W_r changes by the work 2 w'l less the loss 2 s w'D w, to the tolerance of
+the solve. `stepper.c` takes whole runs; it is compiled when it is first needed, once for a machine, into a cache folder
+(`$XDG_CACHE_HOME/softgrasp`). Without a compiler NumPy takes the same steps, about thirty times slower, and says so.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.strain.cells import Potential
+
+SOURCE = Path(__file__).with_name("stepper.c")
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fopenmp-simd", "-shared", "-fPIC")
+DECLARATION = """int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight,
+  const double *lam, const double *mu, const double *S, double s, const double *load, int steps, double tol,
+  double floor, double *J, double *A, double *V, long *counts);"""
+MOST, HALVINGS, RENEWALS = 15, 10, 3  # iterations before a fresh tangent, halvings of a correction, fresh tangents
+GROWTH = 4.0  # of the residual, above which a correction is refused
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One reduced model at one parameter and one step.
+
+    Attributes:
+        potential: W_r and its discrete gradient.
+        D: damping, (k, k) [1/s].
+        K: tangent at rest, (k, k) [1/s^2]: the first inverse is (S + K)^-1.
+        dt: step [s].
+    """
+
+    potential: Potential
+    D: Array
+    K: Array
+    dt: float
+
+    @property
+    def S(self) -> Array:
+        """s^2 I + s D."""
+        s = 2 / self.dt
+        return np.asarray(s * s * np.eye(len(self.K)) + s * self.D)
+
+
+@dataclass(frozen=True)
+class March:
+    """What a run of the stepper returns.
+
+    Attributes:
+        a, v: coordinates and rates, (steps + 1, k).
+        evaluations: of the force, in the mean of a step.
+        restarts: fresh tangents.
+        engine: "C" or "NumPy".
+    """
+
+    a: Array
+    v: Array
+    evaluations: float
+    restarts: int
+    engine: str
+
+
+def march(problem: Problem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
+    """All steps under loads l (steps, k). Not collective but where the potential is distributed.
+
+    Args:
+        problem: what is stepped.
+        load: l_n at the step midpoints.
+        a0, v0: start, (k,).
+        tol: |residual| over the largest |h| seen; rounding of the force is enough in any case.
+        engine: "C" or "NumPy"; empty takes C where there is a compiler, NumPy with a warning where not.
+
+    Raises:
+        SolverError: a step did not converge; names step, time, cell and law.
+    """
+    steps, k = load.shape
+    A, V = np.zeros((steps + 1, k)), np.zeros((steps + 1, k))
+    A[0], V[0] = a0, v0
+    library = None if engine == "NumPy" or problem.potential.comm is not None else compiled()
+    if engine == "C" and library is None:
+        raise SolverError("the compiled stepper is not available here; leave the engine out")
+    J = np.linalg.inv(problem.S + problem.K)
+    if library is not None:
+        failed, counts = _march_c(library, problem, load, tol, J, A, V)
+    else:
+        failed, counts = _March(problem, tol, J).run(load, A, V)
+    if failed:
+        raise SolverError(_sentence(problem, failed - 1, counts[2]))
+    return March(A, V, counts[0] / max(steps, 1), counts[1], "NumPy" if library is None else "C")
+
+
+def _sentence(problem: Problem, step: int, point: int) -> str:
+    cells = problem.potential.cells
+    where = ""
+    if 0 <= point < len(cells.weight):
+        place = ", ".join(f"{x:.3g}" for x in cells.centre[point])
+        where = f"; the last trial with J <= 0 was in the cell at ({place})"
+    return (
+        f"the reduced model ({cells.law}) did not converge in step {step} (t = {step * problem.dt:.4g} s){where}; "
+        "take a smaller step, a stiffer material or a slower motion"
+    )
+
+
+def _march_c(library: Any, problem: Problem, load: Array, tol: float, J: Array, A: Array, V: Array) -> Any:
+    ffi, lib = library
+    packed = problem.potential.packed
+    counts = ffi.new("long[3]")
+
+    def pointer(x: Array) -> Any:
+        return ffi.cast("double *", x.ctypes.data)
+
+    arrays = [*packed.arrays, np.ascontiguousarray(problem.S)]
+    load = np.ascontiguousarray(load)
+    failed = lib.softgrasp_march(
+        packed.law, packed.d, load.shape[1], packed.p, *map(pointer, arrays), 2 / problem.dt, pointer(load), len(load),
+        tol, problem.potential.rounding, pointer(J), pointer(A), pointer(V), counts,
+    )  # fmt: skip
+    if failed < 0:
+        raise MemoryError("the reduced run does not fit into memory")
+    return failed, list(counts)
+
+
+class _March:
+    """The steps of `stepper.c` in NumPy, line by line."""
+
+    def __init__(self, problem: Problem, tol: float, J: Array) -> None:
+        self.potential, self.S, self.s, self.tol, self.J = problem.potential, problem.S, 2 / problem.dt, tol, J
+        self.h = np.zeros(len(J))
+        self.scale, self.floor, self.counts = 0.0, problem.potential.rounding, [0, 0, -1]
+
+    def run(self, load: Array, A: Array, V: Array) -> tuple[int, list[int]]:
+        old = older = np.zeros(len(self.J))
+        for n, now in enumerate(load):
+            self.potential.begin(A[n])
+            self.h = self.s * V[n] + now
+            w = self._solve(2 * old - older)
+            if w is None:
+                return n + 1, self.counts
+            A[n + 1], V[n + 1] = A[n] + 2 * w, 2 * self.s * w - V[n]
+            old, older = w, old
+        return 0, self.counts
+
+    def _residual(self, w: Array) -> Array | None:
+        self.counts[0] += 1
+        f, bad = self.potential.discrete(w)
+        if f is None:
+            self.counts[2] = bad
+            return None
+        return np.asarray(self.S @ w + f - self.h)
+
+    def _solve(self, w: Array) -> Array | None:
+        R = self._residual(w)
+        if R is None:
+            w = np.zeros_like(w)
+            R = self._residual(w)
+            if R is None:
+                return None
+        size, h = np.linalg.norm(R), np.linalg.norm(self.h)
+        self.scale = max(self.scale, h if self.scale > 0 else max(h, size))  # at rest h is zero
+        iteration, renewed = 0, 0
+        while not size <= max(self.tol * self.scale, self.floor):
+            iteration += 1
+            found = None if iteration % MOST == 0 else self._correct(w, R, -(self.J @ R), renewed > 0)
+            if found is None:
+                if renewed == RENEWALS or not self._renew(w, R):
+                    return None
+                renewed += 1
+                self.counts[1] += 1
+                continue
+            p, rest = found
+            J_y, y = self.J @ (rest - R), p @ self.J
+            den = p @ J_y
+            if abs(den) > 0.1 * (p @ p):
+                self.J += np.outer((p - J_y) / den, y)
+            w, R, size = w + p, rest, np.linalg.norm(rest)
+        return w
+
+    def _correct(self, w: Array, R: Array, p: Array, halve: bool) -> tuple[Array, Array] | None:
+        """A correction that is taken, and the residual after it; an old inverse is renewed before any is halved."""
+        for _ in range(HALVINGS if halve else 1):
+            rest = self._residual(w + p)
+            if rest is not None and np.linalg.norm(rest) < GROWTH * np.linalg.norm(R):
+                return p, rest
+            p = p / 2
+        return None
+
+    def _renew(self, w: Array, R: Array) -> bool:
+        """Inverse of the tangent at w by differences of the residual."""
+        step = 1e-7 * (np.linalg.norm(w) + 1e-3)
+        columns = [self._residual(w + step * e) for e in np.eye(len(w))]
+        good = [c for c in columns if c is not None]
+        if len(good) < len(columns):
+            return False
+        self.J = np.linalg.inv((np.array(good).T - R[:, None]) / step)
+        return True
+
+
+@functools.cache
+def compiled() -> Any:
+    """(ffi, library) of `stepper.c`, or None with a warning where it cannot be compiled."""
+    try:
+        from cffi import FFI  # it comes with FFCx, not with every online machine
+
+        path = _library()
+        ffi = FFI()
+        ffi.cdef(DECLARATION)
+        return ffi, ffi.dlopen(str(path))
+    except (ImportError, OSError, subprocess.SubprocessError) as error:
+        reason = (str(getattr(error, "stderr", "") or "") or str(error)).strip().splitlines()[:1]
+        warnings.warn(
+            f"reduced runs at finite strain step in NumPy, about thirty times slower, for want of a compiled stepper "
+            f"({''.join(reason)}); install cffi and a C compiler, or name one in CC",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return None
+
+
+def _library() -> Path:
+    """The shared library in the cache folder, made there unless it is there; its name says source and machine."""
+    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise OSError("there is no C compiler")
+    key = hashlib.sha256("\0".join((SOURCE.read_text(), compiler, *FLAGS, _processor())).encode()).hexdigest()[:20]
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "softgrasp"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        root = Path(tempfile.mkdtemp(prefix="softgrasp-"))  # of this process alone
+    path = root / f"stepper-{key}.so"
+    if not path.exists():
+        # several ranks may compile at once: each its own file, and the last one stays
+        handle, name = tempfile.mkstemp(dir=root, suffix=".so")
+        os.close(handle)
+        command = [*compiler.split(), *FLAGS, str(SOURCE), "-o", name, "-lm"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+            os.replace(name, path)
+        finally:
+            Path(name).unlink(missing_ok=True)
+    return path
+
+
+def _processor() -> str:
+    """What -march=native depends on: a home folder may serve several kinds of machine."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        return f"{sys.platform} {platform.machine()} {platform.processor()}"

@@ -1,0 +1,356 @@
+"""Training of reduced models at finite strain from full runs: basis, Galerkin's model on all cells, sampled cells.
+
+Basis: cotangent lift (Phi, M Phi) with z = Phi a and Phi' M Phi = I [PM16]. Cells by energy-conserving
+sampling and weighting [FCA15]: xi >= 0, most of them zero, with
+
+    |sum_e xi_e g_e - sum_e g_e| <= tau |sum_e g_e|,   g_e = the cell's part of dW_r/da, stacked over training states.
+
+The states are those of the model on all cells, which is what the sampled one is to repeat. tau is half of that model's
+own error unless another is asked for: a smaller one would cost cells that the basis makes nothing of.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.mesh.tissue_mesh import cell_nodes
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import Array, on_root, times_columns, total
+from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.inner import Rows, Weight
+from softgrasp.reduction.model import Lift, ModelError
+from softgrasp.reduction.parameters import thinned
+from softgrasp.reduction.pod import pod_part
+from softgrasp.reduction.projection import project_outputs
+from softgrasp.reduction.replay import FullRun, full_run
+from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.strain.cells import Cells, Potential
+from softgrasp.reduction.strain.compare import Reference, StrainErrors, errors_of, reference_of
+from softgrasp.reduction.strain.model import Box, SmallStrainModel, StrainModel, StrainRun
+from softgrasp.reduction.strain.nnls import nnls, on_one_rank
+from softgrasp.reduction.truncation import Columns
+
+SNAPSHOTS = 400  # behind a basis, of all runs together
+STATES = 80  # of each run behind the weights
+ENTRIES = 1 << 26  # of the matrix of their forces, which one rank takes: 512 MB
+TAUS = (1e-4, 3e-2)  # least and largest tau chosen from the error of the model on all cells
+
+
+@dataclass
+class Training:
+    """Full runs of one scene, at several materials or motions, and what models of every size share.
+
+    Attributes:
+        model: the scene.
+        runs: full runs; the model must be asked for nothing outside of them.
+        Phi: largest basis, local rows (n_local, k).
+        cells: all cells of this rank.
+        offset: number of this rank's first cell.
+        references: the runs in terms of the basis.
+        seconds: spent, by stage.
+    """
+
+    model: Model
+    runs: tuple[FullRun, ...]
+    Phi: Array
+    cells: Cells
+    offset: int
+    references: tuple[Reference, ...]
+    seconds: dict[str, float] = field(default_factory=dict)
+    _galerkin: dict[int, tuple[StrainRun, ...]] = field(default_factory=dict)
+
+    @cached_property
+    def whole(self) -> StrainModel:
+        """The largest model on the cells of this rank, every weight 1. Collective."""
+        system, Phi = self.model.system, self.Phi
+        comm, layout = system.layout.comm, system.layout
+        K_mu, K_lambda = (
+            np.stack([_symmetric(total(comm, Phi.T @ times_columns(A, Phi))) for A in matrices])
+            for matrices in ([x.K_mu.ee for x in system.layers], [x.K_lambda.ee for x in system.layers])
+        )
+        outputs = project_outputs(make_outputs(self.model.scene, system), Lift(layout, Phi, Phi))
+        G, K_mu, K_lambda = comm.bcast((total(comm, Phi.T @ system.G), K_mu, K_lambda))
+        count = comm.allreduce(int(self.cells.cell.max(initial=-1)) + 1)
+        return StrainModel(
+            self.cells, K_mu, K_lambda, G, system.materials, outputs, self._box(), count, system.damping.alpha,
+            system.damping.in_space, system.gravity, layout=layout, Phi=Phi, scene_hash=scene_hash(self.model.scene),
+        )  # fmt: skip
+
+    def _box(self) -> Box:
+        materials = [run.model.system.materials for run in self.runs]
+        lam, mu = (np.array([[getattr(m, key) for m in each] for each in materials]) for key in ("lam", "mu"))
+        g = self.model.system.gravity
+        c = [np.diff(run.trajectory.v_s, axis=0) / run.dt - (0.0 if g is None else g) for run in self.runs]
+        least, most = np.min([x.min(axis=0) for x in c], axis=0), np.max([x.max(axis=0) for x in c], axis=0)
+        reach = np.max([np.abs(r.a).max(axis=0) for r in self.references], axis=0)
+        ends = [np.stack([x.min(axis=0), x.max(axis=0)], axis=1) for x in (lam, mu)]
+        load = np.stack([np.minimum(least, 0.0), np.maximum(most, 0.0)], axis=1)
+        return Box(ends[0], ends[1], load, reach)
+
+    def leading(self, k: int) -> StrainModel:
+        """The model of k displacements on all cells."""
+        whole = self.whole
+        if not 0 < k <= whole.k:
+            raise ReductionError(f"k = {k} must lie between 1 and the {whole.k} columns of the basis")
+        return replace(
+            whole,
+            cells=whole.cells.leading(k),
+            K_mu=whole.K_mu[:, :k, :k],
+            K_lambda=whole.K_lambda[:, :k, :k],
+            G=whole.G[:k],
+            outputs=replace(whole.outputs, C_z=whole.outputs.C_z[:, :k]),
+            box=replace(whole.box, reach=whole.box.reach[:k]),
+            Phi=self.Phi[:, :k],
+        )
+
+    def galerkin(self, k: int) -> tuple[StrainRun, ...]:
+        """All training runs of the model on all cells; made once for each k. Collective.
+
+        Raises:
+            SolverError: a run did not converge.
+        """
+        if k not in self._galerkin:
+            with self._stage("galerkin"):
+                model = self.leading(k)
+                self._galerkin[k] = tuple(self._run_all(model, run) for run in self.runs)
+        return self._galerkin[k]
+
+    def _run_all(self, model: StrainModel, run: FullRun) -> StrainRun:
+        comm, materials = self.model.system.layout.comm, run.model.system.materials
+        small = model.at(run.dt, materials, outside=True)
+        if comm.size > 1:
+            shared = Potential(model.cells, materials, comm)
+            small = replace(small, problem=replace(small.problem, potential=shared))
+        return _replay(small, run)
+
+    def galerkin_error(self, k: int) -> float:
+        """Error in z of :meth:`galerkin` over all training runs. Collective."""
+        pairs = zip(self.references, self.galerkin(k), strict=True)
+        return errors_of([reference.missed(run.a, run.v) for reference, run in pairs]).z
+
+    def reduce(self, N: int, tau: float | None = None) -> StrainModel:
+        """A model of dimension N on sampled cells. Collective; the weights are found on one rank.
+
+        Args:
+            N: the hand's 2 n_s and two for each displacement.
+            tau: of the weights; None takes half of the Galerkin error, within 1e-4 and 3e-2.
+
+        Raises:
+            ReductionError: N does not fit, or no weights reach tau.
+            SolverError: a run did not converge.
+        """
+        (model,) = self.family(N, [tau])
+        return model
+
+    def family(self, N: int, taus: Sequence[float | None]) -> list[StrainModel]:
+        """Models of one dimension at several tau; the forces are gathered once. Collective."""
+        comm, k = self.model.system.layout.comm, displacements(self.model.system, N)
+        error, all_cells = self.galerkin_error(k), self.leading(k)
+        with self._stage("forces"):
+            G = self._forces(k)
+            C, c = on_one_rank(comm, G)
+        models, counts = [], comm.allgather(G.shape[1])
+        for tau in taus:
+            goal = float(np.clip(error / 2, *TAUS)) if tau is None else tau
+            with self._stage("weights"):
+                weights = on_root(comm, partial(nnls, C, c, goal))
+                xi = weights.x[sum(counts[: comm.rank]) :][: counts[comm.rank]]
+                cells = gathered(comm, all_cells.cells.sampled(xi), self.offset)
+            found = replace(all_cells, cells=cells, tau=goal, residual=weights.residual, error_galerkin=error)
+            models.append(replace(found, seconds=dict(self.seconds)))
+        return models
+
+    def _forces(self, k: int) -> Array:
+        """Every cell's part of dW_r/da at the training states, (states k, cells of this rank)."""
+        cells = self.cells.leading(k)
+        count = int(cells.cell.max(initial=-1)) + 1
+        states = int(np.clip(ENTRIES // (k * self.whole.cells_full * len(self.runs)), 20, STATES))
+        rows = []
+        for run, done in zip(self.runs, self.galerkin(k), strict=True):
+            potential = Potential(cells, run.model.system.materials)
+            for a in done.a[np.unique(np.linspace(1, len(done.a) - 1, states).round().astype(int))]:
+                each = np.einsum("aijq,ijq->aq", cells.B, potential.weighted_stress(a), optimize=True)
+                rows.append(np.stack([np.bincount(cells.cell, row, count) for row in each]))
+        return np.concatenate(rows)
+
+    @contextmanager
+    def _stage(self, key: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        spent = self.model.system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+        self.seconds[key] = self.seconds.get(key, 0.0) + spent
+
+
+def displacements(system: BlockSystem, N: int) -> int:
+    """Number k of a model of dimension N = 2 n_s + 2 k.
+
+    Raises:
+        ReductionError: there is none.
+    """
+    hand = 2 * system.layout.n_s
+    if hand + 2 > N or N % 2:
+        raise ReductionError(f"N = {N} does not fit; it must be the {hand} columns of the hand plus an even number")
+    return (N - hand) // 2
+
+
+def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
+    """Phi, local rows (n_local, k), Phi' M Phi = I: POD of z, of one run with v too, in the mass product. Collective.
+
+    Both weigh the same. The velocities of one run hold shapes that its displacements pass too fast; several runs
+    have these shapes, and their velocities would only crowd out the soft ones.
+
+    Raises:
+        BasisError: the snapshots carry fewer columns, or are zero or not finite.
+    """
+    layout, n = system.layout, system.layout.n_local
+    parts = [thinned(run, -(-SNAPSHOTS // len(runs))).Z for run in runs]
+    X = np.asfortranarray(np.hstack([Z[:n] for Z in parts]))
+    if len(parts) == 1:
+        V = np.asfortranarray(parts[0][n:])
+        q, p = (float(layout.comm.allreduce(np.vdot(Y, times_columns(system.M_ee, Y)))) for Y in (X, V))
+        X = np.asfortranarray(np.hstack([X, V * (q / p) ** 0.5 if p > 0 else V]))
+    rows, mass = Rows(layout, 1, hand=False), Weight(system.M_hand, system.M_ee)
+    empty = np.zeros((0, 0))
+    part = pod_part(
+        "deformation", rows, X, (mass,), "tsqr", lambda halves: Columns(empty, empty, halves[0][1], empty), k
+    )
+    if k > part.rank:
+        most = 2 * (layout.n_s + part.rank)
+        raise BasisError(f"more displacements than the snapshots carry above rounding; ask for N <= {most}", most=most)
+    (columns,) = part.columns(k)
+    return columns.e_q
+
+
+def train(model: Model, runs: Sequence[Trajectory | FullRun], N: int) -> Training:
+    """Basis for models up to dimension N, and all cells in its coordinates. Collective.
+
+    Args:
+        model: scene with effects.finite_strain.
+        runs: full runs to train on; a trajectory is at the materials and the motion of ``model``.
+        N: largest dimension, the hand's 2 n_s included.
+
+    Raises:
+        ReductionError: the scene has no finite strain, or the snapshots carry fewer columns.
+        SceneError: a run kept no snapshots, or stands still.
+    """
+    system, points = model.system, model.system.points
+    if points is None:
+        raise ReductionError("the scene has no effects.finite_strain; softgrasp.reduce makes its linear models")
+    fulls = tuple(run if isinstance(run, FullRun) else full_run(model, run) for run in runs)
+    if not fulls:
+        raise ReductionError("there is no full run to train on; give at least one")
+    begin = time.perf_counter()
+    Phi = basis_of(system, [run.snapshots for run in fulls], displacements(system, N))
+    seconds = {"basis": system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)}
+    d = points.d
+    B = times_columns(points.B, Phi).reshape(d, d, -1, Phi.shape[1]).transpose(3, 0, 1, 2)
+    mesh = model.space.mesh.mesh
+    offset = int(mesh.topology.index_map(d).local_range[0])
+    numbers = points.cell - offset
+    centres = mesh.geometry.x[cell_nodes(mesh), :d].mean(axis=1)
+    ones, B = np.ones(len(points.vol)), np.ascontiguousarray(B)
+    cells = Cells(points.law, B, points.vol, ones, points.layer, numbers, centres[numbers])
+    return Training(model, fulls, Phi, cells, offset, tuple(reference_of(run, Phi) for run in fulls), seconds)
+
+
+def reduce_strain(
+    model: Model, runs: Trajectory | FullRun | Sequence[Trajectory | FullRun], N: int = 14, tau: float | None = None
+) -> StrainModel:
+    """Reduced model of a scene with effects.finite_strain, trained on full runs of it. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
+    >>> rom = sg.reduce_strain(model, sg.simulate(model), N=14)
+    >>> rom.N, rom.cells.count < 64
+    (14, True)
+
+    Args:
+        model: the scene.
+        runs: one full run, or several; the model answers inside the box of their materials and motions.
+        N: dimension, the hand's 2 n_s included.
+        tau: of the weights of the sampled cells; None takes half of the error of the model on all cells.
+
+    Raises:
+        ReductionError: no finite strain, N does not fit, or no weights reach tau.
+        SceneError: a run kept no snapshots, or stands still.
+        SolverError: a reduced run did not converge.
+    """
+    several = [runs] if isinstance(runs, Trajectory | FullRun) else runs
+    return train(model, several, N).reduce(N, tau)
+
+
+def replay_strain(
+    rom: StrainModel, model: Model, run: Trajectory | FullRun, *, outside: bool = False, engine: str = ""
+) -> StrainRun:
+    """Run a reduced model at finite strain under the hand of a full run, from its start. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce_strain(model, run, N=14)
+    >>> sg.replay_strain(rom, model, run).energy_drift < 1e-8
+    True
+
+    Args:
+        rom: which.
+        model: gives the materials of a trajectory.
+        run: the full run; a :class:`softgrasp.reduction.replay.FullRun` has materials of its own.
+        outside: allow what the model was not trained on.
+        engine: see :func:`softgrasp.reduction.strain.stepper.march`.
+
+    Raises:
+        ModelError: the run lies outside the training box, or there is no equilibrium to start in.
+        SceneError: see :func:`softgrasp.reduction.replay.full_run`.
+        SolverError: a step did not converge.
+    """
+    full = run if isinstance(run, FullRun) else full_run(model, run)
+    return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full, engine)
+
+
+def _replay(small: SmallStrainModel, full: FullRun, engine: str = "") -> StrainRun:
+    a0 = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
+    return small.run(full.hand, a0=a0, engine=engine)
+
+
+def errors_strain(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajectory | FullRun) -> StrainErrors:
+    """How far a reduced run is from a full one: deformation, its velocity, energy norm. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce_strain(model, run, N=20)
+    >>> sg.errors_strain(rom, sg.replay_strain(rom, model, run), model, run).z < 0.01
+    True
+
+    Args and errors as in :func:`replay_strain`, which makes the reduced run; the model must hold its lift.
+    """
+    if rom.Phi is None:
+        raise ModelError("the model holds no lift; load it with the layout of its mesh")
+    full = run if isinstance(run, FullRun) else full_run(model, run)
+    return reference_of(full, rom.Phi).errors(reduced_run.a, reduced_run.v)
+
+
+def gathered(comm: MPI.Intracomm, cells: Cells, offset: int) -> Cells:
+    """The cells of all ranks, numbered over the body, on every rank. Collective."""
+    parts = comm.allgather(replace(cells, cell=cells.cell + offset))
+    rows = {
+        key: np.concatenate([getattr(p, key) for p in parts]) for key in ("weight", "xi", "layer", "cell", "centre")
+    }
+    B = np.ascontiguousarray(np.concatenate([p.B for p in parts], axis=-1))
+    return Cells(cells.law, B, **rows)
+
+
+def _symmetric(X: Array) -> Array:
+    return np.asarray((X + X.T) / 2)

@@ -1,0 +1,236 @@
+"""Hard cases of certified reduced models: motions, materials and scenes that nobody trained for, and damaged files."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import scipy.linalg
+
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.petsc import Array, to_scipy
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.system import BlockSystem
+from softgrasp.reduction.certified.archive import load_certified, save_certified
+from softgrasp.reduction.certified.certificate import CertifiedRun
+from softgrasp.reduction.certified.model import CertifiedModel
+from softgrasp.reduction.certified.residual import ResidualSpace
+from softgrasp.reduction.certified.training import certified_model, scene_drive
+from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, textbook
+
+KV = "effects.damping={kind='kelvin-voigt', beta=0.002}"
+MESH = ("tissue.cells=[4, 8]", "time={steps=300, end=3.0}")
+CONTRAST = (
+    "tissue.layers={low={box=[[0.0, 0.0], [1.0, 0.5]], material={lambda=500000.0, mu=500000.0, rho=1.0}, beta=0.0}}"
+)
+SAG = ("effects.gravity={g=[1.0, -9.0]}", "time={steps=300, end=3.0, start='equilibrium'}")
+TRAINING = ((50.0, 50.0), (30.0, 20.0), (500.0, 20.0), (30.0, 500.0), (500.0, 500.0))
+ROUNDING = 1e-9  # of the solution: the bound is exact in exact arithmetic
+TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One question to a certified model.
+
+    Attributes:
+        case: in words.
+        scene: overrides of the scene that the model is trained on.
+        at: lambda and mu [Pa].
+        motion: overrides of the question alone.
+        k, k2: modes of the answer, and of the basis that certifies it.
+        refuse: the answer must be refused.
+    """
+
+    case: str
+    scene: tuple[str, ...] = (KV,)
+    at: tuple[float, float] = (60.0, 45.0)
+    motion: tuple[str, ...] = ()
+    k: int = 12
+    k2: int = 36
+    refuse: bool = False
+
+
+QUESTIONS = (
+    Asked("a parameter between those of the training"),
+    Asked("ten times faster", motion=("motion.duration=0.3",), refuse=True),
+    Asked("another direction than trained", motion=("motion.target=[3.0, -5.0]",), refuse=True),
+    Asked("lambda / mu = 100", at=(5000.0, 50.0)),
+    Asked("lambda / mu = 1e4", at=(5e5, 50.0)),
+    Asked("lambda < 0", at=(-20.0, 50.0)),
+    Asked("mu a tenth of the least trained", at=(30.0, 2.0), refuse=True),
+    Asked("a layer 1e4 times as stiff", scene=(KV, CONTRAST)),
+    Asked("viscosity with omega beta dt > 10", scene=("effects.damping={kind='kelvin-voigt', beta=5.0}",)),
+    Asked("no damping, 300 s", scene=(), motion=("time={steps=30000, end=300.0}",), refuse=True),
+    Asked("start in equilibrium under gravity", scene=(KV, *SAG)),
+    Asked("hand driven by a force, coupled both ways", scene=(KV, "effects.reaction=true", "motion.drive='force'")),
+    Asked("a hand that does not move", motion=("motion={profile='hold', drive='motion'}",)),
+    Asked("one mode", k=1),
+    Asked("one basis, k2 = k", k=36),
+)
+
+
+def pod(model: Model, k: int) -> Array:
+    """K-orthonormal POD modes of displacements and velocities of full runs over the box, (n_e, k)."""
+    root = np.linalg.cholesky(to_scipy(model.system.K_ee).toarray())
+    n, columns = model.system.layout.n_local, []
+    for lam, mu in TRAINING:
+        snapshots = full(model, lam, mu)[1]
+        z, v = snapshots.Z[:n, ::6], snapshots.Z[n:, ::6]
+        columns += [z, v * np.linalg.norm(z) / max(float(np.linalg.norm(v)), EPS)]
+    U = np.linalg.svd(root.T @ np.hstack(columns), full_matrices=False)[0]
+    return np.asfortranarray(scipy.linalg.solve_triangular(root.T, U[:, :k], lower=False))
+
+
+def full(model: Model, lam: float, mu: float) -> tuple[BlockSystem, Snapshots]:
+    """The full run at a parameter, with all states."""
+    first = model.system.materials[0]
+    materials = tuple(replace(m, lam=m.lam * lam / first.lam, mu=m.mu * mu / first.mu) for m in model.system.materials)
+    system = model.system.with_materials(materials)
+    snapshots = simulate(replace(model, system=system)).snapshots
+    if snapshots is None:
+        raise ValueError("the scene keeps no snapshots in memory")
+    return system, snapshots
+
+
+@cache
+def trained(scene: tuple[str, ...], k: int, k2: int) -> tuple[Model, CertifiedModel]:
+    """A scene and its certified model."""
+    model = make("paper_forward", *MESH, *scene)
+    return model, certified_model(model, pod(model, k2), k=k, tolerance=TOLERANCE)
+
+
+def true_error(system: BlockSystem, s: Snapshots, model: CertifiedModel, run: CertifiedRun, coupled: bool) -> Array:
+    """Energy norm of the error at every step, and ``ROUNDING`` of the largest of the solution taken off."""
+    n, hand, lift, x = system.layout.n_local, 2 * system.layout.n_s, model.fine.lift, run.trajectory.x.T
+    if lift is None:
+        raise ValueError("the model has no lift")
+    Phi = lift.L_q[:, hand : hand + model.k]
+    K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
+
+    def norm(z: Array, v: Array, v_s: Array) -> Array:
+        square = (z * (K @ z)).sum(0) + (v * (M @ v)).sum(0)
+        if coupled:
+            square += (v_s * (2 * system.G.T @ v + (system.M_hand + system.M_rigid) @ v_s)).sum(0)
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
+
+    z, v = s.Z[:n], s.Z[n:]
+    off = norm(z - Phi @ x[hand : hand + model.k], v - Phi @ x[hand + model.k :], s.v_s - run.trajectory.v_s.T)
+    return np.maximum(off - ROUNDING * norm(z, v, s.v_s).max(), 0.0)
+
+
+def share(error: Array, bound: Array) -> float:
+    """Largest true error over its bound at one step."""
+    shown = error > 0
+    return float(np.max(error[shown] / np.maximum(bound[shown], np.finfo(float).tiny), initial=0.0))
+
+
+def asked_row(i: int, asked: Asked) -> HardCase:
+    """One question: the bound against the truth, and the difference of two bases taken for the error."""
+    model, certified = trained(asked.scene, asked.k, asked.k2)
+    question = make("paper_forward", *MESH, *asked.scene, *asked.motion) if asked.motion else model
+    drive, materials = scene_drive(question.scene, model.system.M_hand, 1), certified.materials(*asked.at)
+    run = certified.run(materials, drive, allow=True)
+    c = run.certificate
+    system, snapshots = full(question, *asked.at)
+    error = true_error(system, snapshots, certified, run, model.system.two_way and drive.hand is None)
+
+    def answer() -> float:
+        if asked.refuse:
+            certified.run(materials, drive)
+        return share(error, c.energy.values)
+
+    ours = here(answer)
+    if not ours.refused:
+        factor = certified.norms.static_factor(materials)
+        ours = replace(ours, text=f"relative bound {c.reduction:.2g}, static factor {factor:.2g}")
+    plain = Outcome(None, "no second basis")
+    if c.estimate is not None:
+        plain = textbook(share, error, c.estimate.values)
+    reason = "a bound holds at every step"
+    if asked.refuse:
+        reason = f"the bound {c.reduction:.2g} is above the tolerance {TOLERANCE:g}"
+    return HardCase(asked.case, i + 1, ours, plain, None if asked.refuse else 1.0, reason)
+
+
+def file_rows(first: int) -> Iterator[HardCase]:
+    """Model files that are not what was written, or of another mesh."""
+    certified = trained((KV,), 12, 36)[1]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "certified.h5"
+        save_certified(certified, path)
+        other = make("paper_forward", "tissue.cells=[5, 10]")
+        with h5py.File(path, "r") as file:
+            at = file["certificate/static"].id.get_offset()
+
+        def load(layout: Any) -> float:
+            load_certified(path, layout)
+            return 0.0
+
+        def read() -> Outcome:
+            with h5py.File(path, "r") as file:
+                change = np.linalg.norm(file["certificate/static"][()] - certified.norms.static)
+            return Outcome(None, "h5py reads it" + (f", its triangle off by {change:.1g}" if change else ""))
+
+        yield HardCase(
+            "a file of another mesh", first, here(load, other.system.layout), textbook(read), None, "another mesh"
+        )
+        data = bytearray(path.read_bytes())
+        data[at + 6] ^= 0x10  # one bit of the exponent of the first entry
+        path.write_bytes(data)
+        yield HardCase("a bit flipped in a triangle", first + 1, here(load, None), textbook(read), None, "a hash")
+
+
+def certified_rows(quick: bool) -> Iterator[HardCase]:
+    """All questions, then files."""
+    for i, asked in enumerate(QUESTIONS):
+        if not quick or i in (0, 1, 3, 12, 14):
+            yield asked_row(i, asked)
+    yield from file_rows(len(QUESTIONS) + 1)
+
+
+def residual_rows(quick: bool) -> Iterator[HardCase]:
+    """Norms of residuals that cancel to a small share of their terms, in natural modes: K phi = omega^2 M phi."""
+    model = make("paper_forward", *MESH)
+    stiffness, mass = (to_scipy(A).toarray() for A in (model.system.K_ee, model.system.M_ee))
+    G = model.system.G
+    squares, Phi = scipy.linalg.eigh(stiffness, mass, subset_by_index=[0, 3])
+    space = ResidualSpace(model.system, model.system.materials)
+    space.extend(np.asfortranarray(Phi))
+    norms = space.norms()
+    space.destroy()
+    C = np.hstack([G, mass @ Phi, stiffness @ Phi])
+    gram = C.T @ np.linalg.solve(mass, C)
+    T = np.hstack(norms.columns(norms.mass, model.system.materials)[:3])
+    length = float(np.sqrt(G[:, 0] @ np.linalg.solve(mass, G[:, 0])))
+    scale = float(np.linalg.norm(squares * np.sqrt(np.diag(gram)[2:6])))
+    for power in (0, -4, -8) if quick else range(0, -11, -2):
+        small = 10.0**power
+        c = np.concatenate([[small, 0.0], -squares, np.ones(4)])
+
+        def off(found: float, exact: float = small * length) -> float:
+            return abs(found / exact - 1)
+
+        ours = here(off, float(np.linalg.norm(T @ c)))
+        plain = textbook(off, float(np.sqrt(np.maximum(c @ gram @ c, 0.0))))
+        part = small * length / scale
+        reason = "a thousand roundings of its terms"
+        yield HardCase(f"{part:.0e} of its terms", part, ours, plain, 1e3 * EPS / part, reason)
+
+
+FAMILIES = (
+    Family("certified", "Reduced models outside their training", "case", "true error / bound",
+           "difference of two bases as bound",
+           "A proved bound holds where the training says nothing, and refuses what it cannot vouch for; the difference "
+           "of two bases is an estimate, which may be too small.", certified_rows, axis="listed"),
+    Family("residual", "Norms of small residuals", "residual / its terms", "relative error of the norm", "Gram matrix",
+           "A Gram matrix squares the columns and stalls at 1e-8 of them; a triangle follows the residual down to "
+           "rounding [BEOR14].", residual_rows),
+)  # fmt: skip

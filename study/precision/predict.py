@@ -1,0 +1,120 @@
+"""Error and time of settings that were not run, from the points of the forward diagram."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from softgrasp.fem.scene.scene import Scene
+from softgrasp.study.precision.fit import interpolate
+from softgrasp.study.precision.forward import over_steps, step_counts
+from softgrasp.study.precision.meshes import GOALS, POINT_WORK
+from softgrasp.study.precision.points import ForwardPoint
+from softgrasp.study.precision.settings import Group, Setting, least_steps
+
+LARGEST = {2: 300_000, 3: 60_000}  # unknowns of a setting that no run of the diagram tried
+GROWTH = 8.0  # and its work over that of the largest point
+SAFETY = 0.9  # of the tolerance that a predicted error may use
+SURE = 0.1  # of an error, at least, is the mesh's
+BETWEEN = 4  # tolerances of graded meshes a decade
+BEYOND = 100.0  # below the smallest one of the diagram
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a setting is expected to give.
+
+    Attributes:
+        setting: which.
+        n_e: unknowns.
+        error: relative error of the deformation.
+        seconds: of a whole run.
+        point: of the diagram, when the setting was run for it.
+    """
+
+    setting: Setting
+    n_e: float
+    error: float
+    seconds: float
+    point: ForwardPoint | None = None
+
+
+class Predictor:
+    """Error and time of any setting: error <= space(mesh) + time(steps).
+
+    The change between s and S steps of order 2 is (1 - (s / S)^2) of the error with s, and the error with S is a
+    quarter of that with S / 2. Graded meshes between and beyond those run follow them in their tolerance.
+
+    Args:
+        scene: the study's scene.
+        points: of the forward diagram.
+        d: 2 or 3.
+    """
+
+    def __init__(self, scene: Scene, points: Sequence[ForwardPoint], d: int) -> None:
+        self.scene, self.dimension = scene, d
+        runs = [p for p in points if p.series != "solver"]
+        self.runs: dict[Setting, ForwardPoint] = {}
+        self.space: dict[Group, ForwardPoint] = {}  # the most steps on every mesh
+        for p in runs:
+            self.learn(p)
+        changing = over_steps(runs)
+        # the mesh with the most steps tried tells about time, the most accurate of those
+        best = {name: -self.space[line[0].setting.group].error for name, line in changing.items()}
+        name = max(changing, key=lambda name: (len(changing[name]), best[name]), default="")
+        most = max((p.steps for p in runs if p.series == name), default=1)
+        self.time = {p.steps: (p.error_time or 0.0) / (1 - (p.steps / most) ** 2) for p in changing.get(name, ())}
+
+    def learn(self, point: ForwardPoint) -> None:
+        """Take in a measured point."""
+        self.runs[point.setting], group = point, point.setting.group
+        if group not in self.space or self.space[group].steps <= point.steps:
+            self.space[group] = point
+
+    def graded(self, order: int) -> dict[float, ForwardPoint]:
+        """The graded meshes of an order that were run, by tolerance."""
+        return {p.refine: p for p in self.space.values() if p.order == order and isinstance(p.refine, float)}
+
+    def time_error(self, steps: int) -> float:
+        """Error through the time step; order 2 beyond the steps tried."""
+        return interpolate(steps, list(self.time), list(self.time.values()), -2.0) if self.time else 0.0
+
+    def space_of(self, point: ForwardPoint) -> float:
+        """What the mesh of a point leaves, less its steps; the two may cancel in what was measured."""
+        return max(point.error - self.time_error(point.steps), SURE * point.error)
+
+    def space_error(self, setting: Setting) -> float:
+        """Error through the mesh."""
+        return self.predict(setting).error - self.time_error(setting.steps)
+
+    def predict(self, setting: Setting) -> Prediction:
+        """Error, unknowns and seconds of a setting on a mesh that was run, or on a graded one."""
+        known, line = self.space.get(setting.group), self.graded(setting.order)
+
+        def at(value: Callable[[ForwardPoint], float]) -> float:
+            if known is not None:
+                return value(known)
+            return interpolate(float(setting.refine), list(line), [value(p) for p in line.values()])
+
+        error = at(self.space_of) + self.time_error(setting.steps)
+        seconds = at(lambda p: p.mesh + p.assembly + p.factor) + setting.steps * at(lambda p: p.per_step)
+        return Prediction(setting, at(lambda p: p.n_e), error, seconds, self.runs.get(setting))
+
+    def candidates(self) -> list[Prediction]:
+        """Settings of the diagram, other steps on their meshes, and graded meshes of other tolerances."""
+        base, least = self.scene.time.steps, least_steps(self.scene)
+        meshes = [replace(p.setting, solver="auto") for p in self.space.values()]
+        for order in GOALS[self.dimension]:
+            line = sorted(self.graded(order))
+            if len(line) > 1:
+                decades = [10 ** (-k / BETWEEN) for k in range(2, 40)]
+                goals = [float(f"{g:.2g}") for g in decades if line[0] / BEYOND <= g <= line[-1]]
+                meshes += [Setting(None, order, 1, refine=g) for g in goals if g not in line]
+        counts = sorted({max(least, round(base * 2 ** (k / 2))) for k in range(-10, 7)} | set(step_counts(base, least)))
+        return [self.predict(replace(mesh, steps=n)) for mesh in meshes for n in counts]
+
+    def affordable(self, prediction: Prediction) -> bool:
+        """Whether a setting may be run to measure it."""
+        d, n = self.dimension, prediction.n_e
+        quick = n <= LARGEST[d] and n * prediction.setting.steps <= GROWTH * POINT_WORK[d]
+        return prediction.point is not None or quick

@@ -1,0 +1,1 @@
+"""``softgrasp query``: what a certified model answers, with its error."""

@@ -1,0 +1,208 @@
+"""Reduced models at finite strain: trained on the scene's run alone or over a box, tested on runs that trained none."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import qmc
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.run.simulate import simulate
+from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
+from softgrasp.reduction.replay import FullRun
+from softgrasp.reduction.strain.compare import Reference, errors_of, reference_of
+from softgrasp.reduction.strain.model import StrainModel
+from softgrasp.reduction.strain.training import Training, replay_strain, train
+from softgrasp.study.reduce.result import FullTimes
+from softgrasp.study.reduce.strain_result import Family, StrainPoint, StrainStudy, Test
+from softgrasp.study.shell.timing import median_seconds
+
+SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
+CELLS_AT = (14, 24)  # N at which tau is varied
+TAUS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
+MOTIONS = 4  # held out
+SHARES = (0.9, 0.6)  # of the scene's own move, held out from models that are trained on it alone
+RUNS, SETUPS = 31, 15  # behind each median of the online time and of the set-up
+
+Place = tuple[float, float]
+"""Lamé constants of the first layer [Pa]."""
+
+Say = Callable[[str, int, int], None]
+"""Called with what is done, its number and how many there are."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """A full run that trained no model."""
+
+    kind: str
+    full: FullRun
+
+
+def measure_strain(model: Model, own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
+    """Train, test and time. Collective.
+
+    Raises:
+        SolverError: a full or a reduced run did not converge.
+        ReductionError: the snapshots carry no model.
+    """
+    sizes = sizes_of(model)
+    box_runs, held, none = _box_runs(model, own, say)
+    first, near = model.system.materials[0], []
+    for share in SHARES if _has_target(model) else ():
+        target = [share * x for x in model.scene.motion.target or []]
+        near.append(Held("motion", _full(model, (first.lam, first.mu), target)))
+    families = []
+    for key, runs, tests in (("own", [own], near), ("box", box_runs, held)):
+        if len(runs) > 1 or key == "own":
+            families.append(_family(key, model, runs, tests, sizes, say))
+    return StrainStudy(own, tuple(families), times, linear_error(model, own), none)
+
+
+def sizes_of(model: Model) -> list[int]:
+    """N of the scene, or :data:`SIZES`; those that no model can have are left out."""
+    options, hand = model.scene.reduction, 2 * model.system.layout.n_s
+    chosen = options.N if "N" in options.model_fields_set else SIZES
+    return sorted({N for N in chosen if hand < N and N % 2 == 0})
+
+
+def linear_error(model: Model, own: FullRun) -> float:
+    """|z - z_linear|_F / |z|_F of linear elasticity on the same scene. Collective."""
+    effects = model.scene.effects.model_copy(update={"finite_strain": None})
+    scene = model.scene.model_copy(update={"effects": effects})
+    comm, n = model.system.layout.comm, model.system.layout.n_local
+    system = replace(model.system, points=None)
+    run = simulate(replace(model, scene=scene, system=system, watch=Stopwatch(comm)))
+    assert run.snapshots is not None
+    Z, other = own.snapshots.Z[:n], run.snapshots.Z[:n]
+    missed, whole = comm.allreduce(np.array([np.sum((Z - other) ** 2), np.sum(Z**2)]))
+    return float(np.sqrt(missed / whole))
+
+
+def _full(model: Model, place: Place, target: list[float] | None) -> FullRun:
+    """A full run elsewhere; what fails says where. Collective."""
+    lam, mu = place
+    try:
+        return run_at(model if target is None else moved_to(model, target), lam, mu)
+    except SolverError as error:
+        where = f"lambda = {lam:g}, mu = {mu:g} Pa" + ("" if target is None else f", target {target}")
+        raise SolverError(
+            f"full run at {where}: {error}; narrow reduction.lambda_range, mu_range or motions"
+        ) from error
+
+
+def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list[Held], str]:
+    """Training runs over the box of materials and motions, held-out runs inside it, and why there are none."""
+    reason, first = outside(model), model.system.materials[0]
+    places = [] if reason else training_of(model)
+    tests = [] if reason else [p for p in grid_of(model) if not any(np.allclose(p, q) for q in places)]
+    targets = mirrored(model) if _has_target(model) else []
+    here = (first.lam, first.mu)
+    jobs: list[tuple[str, Place, list[float] | None]] = [("train", place, None) for place in places]
+    jobs += [("train", here, target) for target in targets]
+    if places:
+        jobs += [("material", place, None) for place in tests if not np.allclose(place, here)]
+    if targets:
+        jobs += [("motion", here, target) for target in _inside(model)]
+    done: list[Held] = []
+    for i, (kind, place, target) in enumerate(jobs):
+        say("full runs", i, len(jobs))
+        done.append(Held(kind, _full(model, place, target)))
+    held = [h for h in done if h.kind != "train"]
+    return [own, *(h.full for h in done if h.kind == "train")], held, reason
+
+
+def _has_target(model: Model) -> bool:
+    motion = model.scene.motion
+    return motion.drive == "motion" and motion.profile == "quintic" and any(motion.target or [])
+
+
+def _inside(model: Model) -> list[list[float]]:
+    """Targets between the mirrored ones, evenly spread; the same at every call."""
+    target = np.abs(np.array(model.scene.motion.target))
+    points = 2 * qmc.Halton(len(target), scramble=False).random(MOTIONS + 1)[1:] - 1
+    return [(0.95 * target * point).tolist() for point in points]
+
+
+def _family(
+    key: str, model: Model, runs: Sequence[FullRun], held: Sequence[Held], sizes: Sequence[int], say: Say
+) -> Family:
+    comm, refused = model.system.layout.comm, {}
+    training = None
+    for N in sorted(sizes, reverse=True):
+        try:
+            training = train(model, runs, N)
+            break
+        except ReductionError as error:
+            refused[N] = error.reason
+    if training is None:
+        raise ReductionError(f"no N of {list(sizes)} fits: {'; '.join(refused.values())}")
+    references = [reference_of(h.full, training.Phi) for h in held]
+    fitting = [N for N in sizes if N not in refused]
+    points, curves, models = [], [], {}
+    for i, N in enumerate(fitting):
+        say(f"models trained on {len(runs)} run(s)", i, len(fitting))
+        taus = [None, *TAUS] if N in CELLS_AT else [None]
+        for tau, rom in zip(taus, training.family(N, taus), strict=True):
+            point = _measure(training, rom, held, references)
+            curves.append(point)
+            if tau is None:
+                points.append(point)
+                models[N] = rom
+    tests = tuple(_test(h, reference, models.values()) for h, reference in zip(held, references, strict=True))
+    size = comm.allreduce(len(training.cells.weight)) if comm.size > 1 else len(training.cells.weight)
+    return Family(key, training.whole.box, len(runs), tuple(points), tuple(curves), tests, models, refused, size)
+
+
+def _measure(
+    training: Training, rom: StrainModel, held: Sequence[Held], references: Sequence[Reference]
+) -> StrainPoint:
+    """Errors on training runs and on held-out ones, drift, times."""
+    pairs = list(zip(training.references, training.runs, strict=True))
+    done = [replay_strain(rom, run.model, run, outside=True) for _, run in pairs]
+    trained = errors_of([r.missed(x.a, x.v) for (r, _), x in zip(pairs, done, strict=True)])
+    own = training.references[0].errors(done[0].a, done[0].v)
+    worst = {kind: _worst(rom, kind, held, references) for kind in ("material", "motion")}
+    full, comm = training.runs[0], training.model.system.layout.comm
+    small = rom.at(full.dt, outside=True)  # few cells may overshoot
+    start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
+    online = median_seconds(comm, lambda: small.run(full.hand, a0=start), RUNS)
+    setup = median_seconds(comm, lambda: rom.at(full.dt).problem.potential.packed, SETUPS)
+    return StrainPoint(
+        N=rom.N, k=rom.k, tau=rom.tau, residual=rom.residual, cells=rom.cells.count,
+        error_own=own.z, error_own_velocity=own.v, error_own_energy_norm=own.energy_norm,
+        error_training=trained.z, error_galerkin=rom.error_galerkin, floor=training.references[0].floor(rom.k),
+        error_materials=worst["material"], error_motions=worst["motion"],
+        drift=max(run.energy_drift for run in done), evaluations=done[0].evaluations, engine=done[0].engine,
+        time_offline=sum(rom.seconds.values()), time_setup=setup, time_online=online,
+    )  # fmt: skip
+
+
+def _worst(rom: StrainModel, kind: str, held: Sequence[Held], references: Sequence[Reference]) -> float | None:
+    errors = [_error(rom, h, r) for h, r in zip(held, references, strict=True) if h.kind == kind]
+    return max((e for e in errors if e is not None), default=None)
+
+
+def _error(rom: StrainModel, held: Held, reference: Reference) -> float | None:
+    """Error in z on a held-out run; None where the model refuses it."""
+    try:
+        run = replay_strain(rom, held.full.model, held.full)
+    except ReductionError:
+        return None
+    return reference.errors(run.a, run.v).z
+
+
+def _test(held: Held, reference: Reference, models: Iterable[StrainModel]) -> Test:
+    first = held.full.model.system.materials[0]
+    target = tuple(held.full.trajectory.q_s[-1].tolist())
+    return Test(held.kind, first.lam, first.mu, target, {m.N: _error(m, held, reference) for m in models})
+
+
+def median_of(values: Sequence[float]) -> float | None:
+    """Median, None of nothing."""
+    return statistics.median(values) if values else None

@@ -1,0 +1,122 @@
+"""Figures of reduced models at finite strain: errors against N and cells, sampled cells on the body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from softgrasp.fem.fields.picture import PictureMesh
+from softgrasp.reduction.strain.model import StrainModel
+from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
+from softgrasp.study.pictures.style import (
+    BLUE,
+    COLUMN,
+    GREEN,
+    HAND,
+    ORANGE,
+    OUTLINE,
+    PURPLE,
+    WIDTH,
+    colour_map,
+    paper_style,
+    save,
+)  # fmt: skip
+from softgrasp.study.reduce.strain_measure import CELLS_AT
+from softgrasp.study.reduce.strain_page import TITLES
+from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy
+
+
+def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Path]:
+    """Figures. Rank 0 only."""
+    files = list(figure_errors(study, out / "strain_errors.png"))
+    last = study.families[-1]
+    shown = [last.models[N] for N in CELLS_AT if N in last.models]
+    if picture is not None and shown:
+        files += figure_cells(picture, shown, out / "cells.png")
+    return files
+
+
+def figure_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
+    """Errors against N, and against the number of cells."""
+    colours = dict(zip((f.key for f in study.families), (BLUE, ORANGE), strict=False))
+    with paper_style():
+        figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 3.4), sharey=True, layout="constrained")
+        for f in study.families:
+            _pair(left, [p.N for p in f.points], f.points, colours[f.key], TITLES[f.key])
+            left.plot([p.N for p in f.points], [p.error_galerkin for p in f.points], ls=":", color=colours[f.key])
+            for N, colour in zip(CELLS_AT, (GREEN, PURPLE), strict=True):
+                points = sorted((p for p in f.curves if p.N == N), key=lambda p: p.cells)
+                if f is study.families[-1] and points:
+                    _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {TITLES[f.key]}")
+                    right.axhline(points[0].error_galerkin, ls=":", color=colour)
+        for ax, label in ((left, "$N$"), (right, "sampled cells")):
+            ax.axhline(study.linear, color="#888888", lw=0.9, ls=(0, (4, 3)))
+            ax.set(yscale="log", xlabel=label)
+            ax.yaxis.set_major_locator(LogLocator(numticks=12))
+            ax.yaxis.set_minor_formatter(NullFormatter())
+            ax.grid(axis="y", color="#e6e6e6", lw=0.5)
+            ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2, labelspacing=0.25)
+        at = {"xy": (0.99, study.linear), "xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+        right.annotate("linear elasticity", **at, fontsize=6.5)
+        left.set_ylabel("error of the deformation $z$")
+        return tuple(save(figure, out_png))
+
+
+def _pair(ax: Any, x: Sequence[int], points: Sequence[StrainPoint], colour: str, label: str) -> None:
+    """Filled marks for training runs, open ones for the largest held-out error."""
+    ax.plot(x, [p.error_training for p in points], "o-", color=colour, ms=3.4, label=label)
+    held = [max((e for e in (p.error_materials, p.error_motions) if e is not None), default=np.nan) for p in points]
+    if not np.isnan(held).all():
+        ax.plot(x, held, "o--", color=colour, ms=3.8, fillstyle="none", label=f"{label}, held out")
+
+
+def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: Path) -> tuple[Path, ...]:
+    """Sampled cells on the body at rest, coloured by their weight."""
+    flat = seen(picture.points)
+    size = np.ptp(flat, axis=0)
+    height = min(4.0, 1.1 + (WIDTH / 2 if len(models) > 1 else COLUMN) * float(size[1] / size[0]) * 0.8)
+    weights = [_weights(m) for m in models]
+    norm = Normalize(0.0, max(float(x.max()) for _, x in weights))
+    with paper_style():
+        figure, axes = plt.subplots(
+            1, len(models), figsize=(WIDTH if len(models) > 1 else COLUMN, height), squeeze=False, layout="constrained"
+        )
+        for ax, model, (cells, xi) in zip(axes[0], models, weights, strict=True):
+            if picture.dimension == 2:
+                ax.add_collection(
+                    PolyCollection(list(flat[picture.cells]), facecolors="#f4f4f4", edgecolors="#d0d0d0", lw=0.3)
+                )
+                colours = colour_map()(norm(xi))
+                ax.add_collection(
+                    PolyCollection(list(flat[picture.cells[cells]]), facecolors=colours, edgecolors=OUTLINE, lw=0.5)
+                )
+                polygons = hand_polygons(picture)[0]
+                ax.add_collection(PolyCollection(polygons, facecolors=HAND, edgecolors=HAND, lw=0.3, zorder=4))
+            else:
+                ax.add_collection(LineCollection(shadow(flat, picture.facets), colors=OUTLINE, linewidths=0.8))
+                x = seen(picture.points[picture.cells[cells]].mean(axis=1))
+                ax.scatter(
+                    x[:, 0], x[:, 1], c=xi, norm=norm, cmap=colour_map(), s=14, edgecolors=OUTLINE, linewidths=0.3
+                )
+            ax.set_title(f"N = {model.N}: {len(cells)} of {model.cells_full} cells", pad=4)
+            ax.autoscale_view()
+            ax.set_aspect("equal")
+            ax.axis("off")
+        figure.colorbar(
+            ScalarMappable(norm, colour_map()), ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell"
+        )
+        return tuple(save(figure, out_png))
+
+
+def _weights(model: StrainModel) -> tuple[np.ndarray, np.ndarray]:
+    """Cells with their weights xi = weight / vol."""
+    cells, first = np.unique(model.cells.cell, return_index=True)
+    return cells, model.cells.xi[first]
