@@ -68,7 +68,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class Packed:
-    """What `stepper.c` takes: B (p / LANES, k, d d, LANES), weight, lam and mu (p,); points that fill up weigh nothing."""
+    """What `stepper.c` takes: B (p / LANES, k, d d, LANES), weight, lam, mu (p,); what fills up p weighs nothing."""
 
     law: int
     d: int
