@@ -7,7 +7,7 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check lint bench paper pictures clean
+.PHONY: help env demo test check lint bench paper pictures docs clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -53,6 +53,9 @@ pictures: demo ## make the README's pictures again
 	$(BIN)/softgrasp effects franka_muscle
 	cp out/franka_muscle-effects/effects.png docs/effects.png
 	$(BIN)/python tools/draw_rooms.py docs/rooms.png
+
+docs: $(STAMP) ## build the documentation into out/site, with all links checked
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 clean: ## remove .venv, out and caches
 	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache

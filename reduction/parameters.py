@@ -55,7 +55,7 @@ def grid_of(model: Model) -> list[tuple[float, float]]:
 def training_of(model: Model) -> list[tuple[float, float]]:
     """Lamé constants of the runs that train bases beside the scene's own."""
     train = model.scene.reduction.train
-    if train == "corners":
+    if isinstance(train, str):
         lam, mu = box_of(model)
         return [(a, b) for a in lam for b in mu]
     return [(a, b) for a, b in train]
@@ -64,8 +64,8 @@ def training_of(model: Model) -> list[tuple[float, float]]:
 def mirrored(model: Model) -> list[list[float]]:
     """Targets of the runs that train models at finite strain beside the scene's own."""
     chosen, target = model.scene.reduction.motions, model.scene.motion.target or []
-    if chosen != "mirrored":
-        return [list(each) for each in chosen]
+    if chosen == "own" or not isinstance(chosen, str):
+        return [] if chosen == "own" else [list(each) for each in chosen]
     signs = product(*((1.0, -1.0) if x else (1.0,) for x in target))
     return [[s * x for s, x in zip(each, target, strict=True)] for each in signs][1:]
 
@@ -89,7 +89,12 @@ def box_materials(model: Model) -> list[tuple[LayerMaterial, ...]]:
 
 def run_at(model: Model, lam: float, mu: float) -> FullRun:
     """The full run at other constants. Collective."""
-    system = model.system.with_materials(materials_at(model, lam, mu))
+    return run_with(model, materials_at(model, lam, mu))
+
+
+def run_with(model: Model, materials: tuple[LayerMaterial, ...]) -> FullRun:
+    """The full run at other materials. Collective."""
+    system = model.system.with_materials(materials)
     other = replace(model, system=system, watch=Stopwatch(system.layout.comm))
     return full_run(other, simulate(other))
 

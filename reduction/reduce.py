@@ -6,7 +6,7 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.basis import Basis, ReductionError
 from softgrasp.reduction.engines import EngineName
 from softgrasp.reduction.inner import InnerName
 from softgrasp.reduction.model import ReducedModel
@@ -55,9 +55,11 @@ def reduce(
 
     Raises:
         SceneError: the run kept no snapshots, or the body is at rest in all of them.
+        ReductionError: finite strain, see :func:`softgrasp.reduction.strain.training.reduce_strain`.
         BasisError: the method is unknown, or it has no basis of N columns.
         SolverError: a factorisation failed.
     """
+    _check_linear(model)
     full = run if isinstance(run, FullRun) else full_run(model, run)
     states = States(model.system, ((full.model.system, full.snapshots),))
     return project_scene(make_basis(method, states, N, inner, engine), model)
@@ -68,5 +70,15 @@ def project_scene(basis: Basis, model: Model) -> ReducedModel:
 
     Raises:
         SolverError: the mass matrix cannot be factored.
+        ReductionError: the scene has finite strain.
     """
+    _check_linear(model)
     return project(basis, model.system, make_outputs(model.scene, model.system), scene_hash(model.scene))
+
+
+def _check_linear(model: Model) -> None:
+    if model.system.points is not None:
+        raise ReductionError(
+            f"scene {model.scene.name} has effects.finite_strain, and this model would be linear; "
+            "softgrasp.reduce_strain(model, runs, N) makes its reduced models"
+        )

@@ -35,6 +35,10 @@ if TYPE_CHECKING:
     from softgrasp.reduction.reduce import reduce as reduce
     from softgrasp.reduction.replay import errors as errors
     from softgrasp.reduction.replay import replay as replay
+    from softgrasp.reduction.strain.archive import load_strain as load_strain
+    from softgrasp.reduction.strain.training import errors_strain as errors_strain
+    from softgrasp.reduction.strain.training import reduce_strain as reduce_strain
+    from softgrasp.reduction.strain.training import replay_strain as replay_strain
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: ranks share the cores
     os.environ.setdefault(_variable, "1")
@@ -53,8 +57,12 @@ _FACE = {
     "reduce": "reduction.reduce",
     "replay": "reduction.replay",
     "errors": "reduction.replay",
+    "reduce_strain": "reduction.strain.training",
+    "replay_strain": "reduction.strain.training",
+    "errors_strain": "reduction.strain.training",
     "save": "reduction.archive",
     "load": "reduction.archive",
+    "load_strain": "reduction.strain.archive",
     "problem": "lqr.design",
     "design": "lqr.design",
     "solve": "lqr.riccati",
@@ -66,8 +74,9 @@ _FACE = {
 """What a user imports -> the module that has it."""
 
 __all__ = [
-    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors", "load",
-    "load_scene", "make_controller", "problem", "reduce", "replay", "save", "shipped_scenes", "simulate", "solve",
+    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors",
+    "errors_strain", "load", "load_scene", "load_strain", "make_controller", "problem", "reduce", "reduce_strain",
+    "replay", "replay_strain", "save", "shipped_scenes", "simulate", "solve",
 ]  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from softgrasp.fem.effects.damping import Damping
+from softgrasp.fem.effects.finite_strain import FiniteStrain
 from softgrasp.fem.effects.gate import Effect, Gate, Problem
 from softgrasp.fem.effects.gravity import Gravity
 from softgrasp.fem.effects.layers import Layers
@@ -12,6 +13,6 @@ from softgrasp.fem.effects.rotation import Rotation
 __all__ = ["EFFECTS", "Effect", "Gate", "Problem"]
 
 EFFECTS: dict[str, Effect] = {
-    effect.name: effect for effect in (Gravity(), Damping(), Reaction(), Rotation(), Layers())
+    effect.name: effect for effect in (Gravity(), Damping(), Reaction(), Rotation(), Layers(), FiniteStrain())
 }
 """All effects by name, in the order in which they are reported."""

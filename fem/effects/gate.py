@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from softgrasp.fem.effects.sag import Sag
+from softgrasp.fem.effects.sag import Gradient, Sag
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import LayerMaterial
 
@@ -56,6 +56,7 @@ class Problem:
         omega: lowest angular frequencies of the clamped tissue [1/s], ascending; empty when not computed.
         zeta: damping ratio of each of them [1].
         sag: the tissue at rest under its weight.
+        response: gradient of the linear static response to the largest acceleration of the hand, and to gravity if on.
     """
 
     scene: Scene
@@ -67,6 +68,7 @@ class Problem:
     omega: tuple[float, ...]
     zeta: tuple[float, ...]
     sag: Sag
+    response: Gradient
 
 
 class Effect(Protocol):

@@ -15,11 +15,13 @@ class Gradient:
         largest: in any cell [1]; at the edge of the contact zone it grows with every refinement.
         typical: smallest number that at most `SMALL_SHARE` of the volume exceeds [1].
         share: of the volume above `SMALL_STRAIN` [1].
+        rms: root of its mean square over the volume [1].
     """
 
     largest: float
     typical: float
     share: float
+    rms: float
 
     @property
     def linear(self) -> bool:

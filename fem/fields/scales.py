@@ -15,13 +15,14 @@ from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import BlockSystem
 
 
-def measure(model: Model, omega: Array, Phi: Array) -> Problem:
-    """Length, masses, damping ratios and sag of a model. Collective.
+def measure(model: Model, omega: Array, Phi: Array, a: Array) -> Problem:
+    """Length, masses, damping ratios, sag and static response of a model. Collective.
 
     Args:
         model: the model.
         omega: lowest angular frequencies [1/s], (k,), may be empty.
         Phi: their M-orthonormal modes, local rows (n_local, k).
+        a: largest acceleration of the hand, (n_s,).
 
     Raises:
         SolverError: the static problem cannot be solved.
@@ -29,6 +30,7 @@ def measure(model: Model, omega: Array, Phi: Array) -> Problem:
     mesh, system = model.space.mesh, model.system
     low, high = bounding_box(mesh.mesh.comm, mesh.mesh.geometry.x[:, : mesh.dimension])
     mass, inertia = rigid_inertia(model)
+    sag, response = measure_sag(model, a)
     return Problem(
         scene=model.scene,
         dimension=mesh.dimension,
@@ -38,7 +40,8 @@ def measure(model: Model, omega: Array, Phi: Array) -> Problem:
         tissue_inertia=inertia,
         omega=tuple(omega.tolist()),
         zeta=tuple(damping_ratios(system, omega, Phi).tolist()),
-        sag=measure_sag(model),
+        sag=sag,
+        response=response,
     )
 
 

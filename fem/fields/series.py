@@ -72,12 +72,12 @@ class SeriesWriter:
         OSError: the directory cannot be made.
     """
 
-    def __init__(self, model: Model, directory: Path, name: str = "fields") -> None:
+    def __init__(self, model: Model, directory: str | Path, name: str = "fields") -> None:
         space, d = model.space, model.space.layout.dimension
-        self.comm, self.directory, self.d = space.layout.comm, directory, d
+        self.comm, self.directory, self.d = space.layout.comm, Path(directory), d
         with agree(self.comm):
             if self.comm.rank == 0:
-                directory.mkdir(parents=True, exist_ok=True)
+                self.directory.mkdir(parents=True, exist_ok=True)
         self.rename(name)
         self.full, self.stress = FullField(model), CellStress(model)
         rows, _, points = dolfinx.plot.vtk_mesh(space.V)

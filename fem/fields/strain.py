@@ -30,12 +30,13 @@ def gradient(model: Model, z: Array) -> Gradient:
     edges = x[:, 1:] - x[:, :1]
     size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))
     volume = np.abs(np.linalg.det(edges))
-    large, whole = total(comm, np.array([volume[size > SMALL_STRAIN].sum(), volume.sum()]))
+    parts = np.array([volume[size > SMALL_STRAIN].sum(), volume.sum(), volume @ size**2])
+    large, whole, square = total(comm, parts)
     # cells of equal volume may make the share exactly; rounding must not decide
     limit = SMALL_SHARE * whole * (1 + 1e-9)
     steepest = _top(np.column_stack([size, volume]), limit)
     merged = _top(np.concatenate(comm.allgather(steepest)), limit)
-    return Gradient(float(merged[0, 0]), float(merged[-1, 0]), float(large / whole))
+    return Gradient(float(merged[0, 0]), float(merged[-1, 0]), float(large / whole), float(np.sqrt(square / whole)))
 
 
 def _top(rows: Array, limit: float) -> Array:

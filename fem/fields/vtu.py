@@ -157,7 +157,7 @@ class Collection:
         """Append the file of an instant t [s]."""
         with self.path.open("r+b") as stream:
             stream.seek(-len(self.END), 2)
-            line = f'<DataSet timestep="{t!r}" part="0" file="{file.relative_to(self.path.parent)}"/>\n'
+            line = f'<DataSet timestep="{float(t)!r}" part="0" file="{file.relative_to(self.path.parent)}"/>\n'
             stream.write(line.encode() + self.END)
 
 

@@ -35,7 +35,8 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
     layout, each = space.layout, len(weights)
     B = make_gradient(layout.comm, gradients, _free_nodes(space)[V.dofmap.list[:cells]], (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
-    return Points(B, vol, np.repeat(layer, each), cell, d, effect.law, effect.tol)
+    places = (x[:, None, 0] + at @ edges).reshape(-1, d)
+    return Points(B, vol, np.repeat(layer, each), cell, places, d, effect.law, effect.tol)
 
 
 def _free_nodes(space: Discretisation) -> Ints:

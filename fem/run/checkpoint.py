@@ -42,6 +42,7 @@ class RestartState:
         energies: dissipated, at the start, largest [J].
         residual_first: relative residual of the first solve.
         forces: on the hand so far, shape (n, n_s); None where the motion is prescribed.
+        newton_rows, newton_numbers: what the iterations of finite strain remember; None where the steps are linear.
     """
 
     run: str
@@ -60,6 +61,8 @@ class RestartState:
     energies: Array
     residual_first: float
     forces: Array | None = None
+    newton_rows: Array | None = None
+    newton_numbers: Array | None = None
 
     def arrays(self) -> dict[str, Any]:
         """What goes into this rank's file, by its name there."""

@@ -71,7 +71,9 @@ class ForceDrive:
 
         (M_hand + kappa (M_rigid - theta G'Y)) a = u + weight - M_rigid c_0 - G'(theta (x - Y c_0) - s v),
 
-    c_0 = alpha v - g, theta = s^2 + alpha s.
+    c_0 = alpha v - g, theta = s^2 + alpha s. With finite strain w is no linear function of c; the hand's equation
+    M_hand a + M_rigid c = u + weight - G'(theta w - s v) then turns the load of the tissue into -G c = G (c_1 + C G'w)
+    with C = kappa theta (M_hand + kappa M_rigid)^-1, and the tissue's step is solved under it.
     """
 
     def __init__(
@@ -95,8 +97,12 @@ class ForceDrive:
             GY = total(system.layout.comm, system.G.T @ self.Y)
             self.GY = (GY + GY.T) / 2
             self.lhs = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
+        finite = system.two_way and system.points is not None
+        if finite:
+            self.lhs = system.M_hand + self.kappa * system.M_rigid
         self.inverse = np.linalg.inv(self.lhs)
-        self.solve = self._two_way if system.two_way else self._one_way  # chosen once, not in every step
+        # chosen once, not in every step
+        self.solve = self._finite if finite else self._two_way if system.two_way else self._one_way
 
     def _checked(self, force: Force) -> Force:
         """The force, with a look at the shape of its first value."""
@@ -151,6 +157,17 @@ class ForceDrive:
         self.c[n] = -c
         midpoint.accelerate(c)
         self._move(n, a)
+
+    def _finite(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
+        """The same with finite strain: the hand's equation is part of the tissue's. Collective."""
+        v, layout = self.v[n], self.system.layout
+        u = self._applied(n) + self.weight
+        c0 = self.alpha * v - self.g
+        pull = -midpoint.s * total(layout.comm, self.system.G.T @ state.array[layout.n_local :])
+        a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
+        midpoint.solve_midpoint(-(self.kappa * a + c0), self.kappa * self.theta * self.inverse)
+        self.c[n] = midpoint.c
+        self._move(n, -(midpoint.c + c0) / self.kappa)
 
     def _move(self, n: int, a: Array) -> None:
         v = self.v[n]

@@ -19,14 +19,29 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softgrasp.fem.errors import SceneError, SolverError
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.solve.held import held_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from softgrasp.fem.system import BlockSystem
+
+if TYPE_CHECKING:
+    from softgrasp.fem.run.finite_strain import NewtonFigures
+
+
+def make_midpoint(
+    system: BlockSystem, dt: float, solver: SolverName, rtol: float = 1e-10, reproducible: Reproducible = "auto"
+) -> TissueMidpoint:
+    """The step of a system, linear or of finite strain; arguments as for `TissueMidpoint`. Collective."""
+    if system.points is None:
+        return TissueMidpoint(system, dt, solver, rtol, reproducible)
+    from softgrasp.fem.run.finite_strain import FiniteStrainMidpoint  # only scenes with finite strain pay for it
+
+    return FiniteStrainMidpoint(system, dt, solver, rtol, reproducible)
 
 
 def midpoint_matrix(system: BlockSystem, dt: float) -> PETSc.Mat:
@@ -74,6 +89,7 @@ class TissueMidpoint:
         solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
+        parts: further matrices to hold, consumed.
 
     Attributes:
         held: operators on the rows held.
@@ -92,12 +108,11 @@ class TissueMidpoint:
         solver: SolverName,
         rtol: float = 1e-10,
         reproducible: Reproducible = "auto",
+        parts: tuple[PETSc.Mat, ...] = (),
     ) -> None:
-        if system.points is not None:
-            raise SceneError("effects.finite_strain cannot be run yet; set it to false")
         self.system, self.dt, self.s = system, dt, 2 / dt
         whole, ordered = factor_on_every_rank(system.layout, solver, reproducible), solver == "cholesky"
-        self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered)
+        self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered, parts)
         self.G, self.rows = self.held.G, self.held.rows
         self.K2 = self.held.K
         self.K2.scale(-2.0)
@@ -186,11 +201,12 @@ class TissueMidpoint:
     def _held_z(self, state: TissueState) -> PETSc.Vec:
         return self.z if self.held.whole else state.z
 
-    def solve_midpoint(self, c: Array) -> None:
+    def solve_midpoint(self, c: Array, C: Array | None = None) -> None:
         """Solve S w = h + G c, once a step. Collective.
 
         Args:
             c: load, (n_s,); kept, not copied: leave it as it is until the next solve.
+            C: of finite strain only.
         """
         np.add(self.pending, c, out=self.added_array)
         self.coupling.multAdd(self.added, self.r_here, self.r_here)
@@ -298,6 +314,17 @@ class TissueMidpoint:
         square = total(self.system.layout.comm, np.array([np.dot(load, load)]))[0]
         with self.held.agree():
             return self.solver.check(self.r, self.w, "the midpoint", float(np.sqrt(square)))
+
+    def figures(self) -> NewtonFigures | None:
+        """How the steps converged; None where they are linear. Collective."""
+        return None
+
+    def memory(self) -> dict[str, Array]:
+        """What a restart needs beside r and the state."""
+        return {}
+
+    def recall(self, rows: Array | None, numbers: Array | None) -> None:
+        """Take over what :meth:`memory` gave, after :meth:`join`. Collective."""
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""

@@ -128,6 +128,23 @@ def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
     return np.zeros((steps, n_s))
 
 
+def largest_acceleration(scene: Scene, n_s: int, M_hand: Array) -> Array:
+    """The largest acceleration that a motion, or a force on the bare hand, gives the hand [m/s^2, rad/s^2], (n_s,).
+
+    Raises:
+        SceneError: a CSV file does not fit.
+    """
+    if scene.motion.profile == "quintic":
+        target = np.zeros(n_s)
+        target[: len(scene.motion.target or [])] = scene.motion.target or []
+        return np.asarray(10 / np.sqrt(3) / scene.motion.duration**2 * target)
+    if scene.motion.drive == "motion":
+        a = motion_table(scene, n_s).a
+    else:
+        a = np.linalg.solve(M_hand, force_values(scene, n_s, M_hand).T).T
+    return np.asarray(a[int(np.argmax(np.abs(a).max(axis=1)))])
+
+
 def driven_table(M_hand: Array, force: Array, dt: float, q0: Array, v0: Array) -> HandTable:
     """Midpoint rule for the free hand M_hand a = u: exact for the given mean forces."""
     a = np.linalg.solve(M_hand, force.T).T

@@ -19,7 +19,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
 from softgrasp.fem.run.interrupt import interruptible
-from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.run.midpoint import make_midpoint
 from softgrasp.fem.run.motion import driven_table, force_values, motion_table
 from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
@@ -77,7 +77,7 @@ class Run(Stepped):
         self.end = scene.time_end
         dt, solver = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
         with model.watch.stage("factor"):
-            midpoint = TissueMidpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
+            midpoint = make_midpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
         solver = solver[0], solver[1] + midpoint.solver.remark
         self.name: str = system.layout.comm.bcast(secrets.token_hex(6))
         kept, fresh = scene.output, None if options.resume else self.name
@@ -107,8 +107,7 @@ class Run(Stepped):
         return points, regions
 
     def _make_drive(self, force: Force | None) -> Drive:
-        scene, system = self.model.scene, self.model.system
-        n_s = system.layout.n_s
+        scene, system, n_s = self.model.scene, self.model.system, self.model.system.layout.n_s
         zero = np.zeros(n_s)
         if force is not None:
             return ForceDrive(system, force, self.midpoint, self.steps, zero, zero)
@@ -216,6 +215,7 @@ class Run(Stepped):
             energies=np.array([midpoint.dissipated, self.initial_energy, self.peak_energy]),
             residual_first=self.residual_first,
             forces=None if self.drive.u is None else self.drive.u[:n],
+            **midpoint.memory(),
         )
 
     def restore(self, saved: RestartState) -> None:
@@ -248,11 +248,11 @@ class Run(Stepped):
         for vector in (self.state.z, self.state.v, midpoint.r):
             vector.stateIncrease()
         midpoint.join(self.state)
+        midpoint.recall(saved.newton_rows, saved.newton_numbers)
 
     def trajectory(self) -> Trajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
-        system, outputs = self.model.system, self.outputs
-        comm = system.layout.comm
+        outputs, comm = self.outputs, self.layout.comm
         y = total(comm, self.local_outputs * np.concatenate([np.full(o.size, o.weight) for o in outputs]))
         rigid = self.drive.q @ np.vstack([o.C_s for o in outputs]).T
         y += rigid
@@ -275,6 +275,7 @@ class Run(Stepped):
             seconds=seconds,
             steps_timed=self.counted,
             force=self.force(),
+            newton=self.midpoint.figures(),
         )
 
 

@@ -91,7 +91,8 @@ class Stepped(ABC):
             if cause is None and self.midpoint.held.whole and self.layout.comm.size > 1:
                 raise  # of this rank alone, while the others step on: the command must end all ranks
             text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
-            raise SolverError(f"step {self.reached + 1} of {self.steps}: {text}") from error
+            t = (self.reached + 1) * self.dt
+            raise SolverError(f"step {self.reached + 1} of {self.steps}, to t = {t:.6g} s: {text}") from error
         if self.reached != step:
             raise SolverError(
                 f"{self.solver[0]}: TS stopped at step {self.reached} of {step} (reason {ts.getConvergedReason()})"

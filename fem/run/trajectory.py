@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
+
+if TYPE_CHECKING:
+    from softgrasp.fem.run.finite_strain import NewtonFigures
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,7 @@ class Trajectory:
         steps_timed: steps taken since the run was started or resumed.
         force: mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with
             two-way coupling what a prescribed motion takes; None when one-way coupling leaves it unknown.
+        newton: how the steps of finite strain converged; None where they are linear.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=60"])
@@ -50,6 +55,7 @@ class Trajectory:
     seconds: dict[str, float] = field(default_factory=dict)
     steps_timed: int = 0
     force: Array | None = None
+    newton: NewtonFigures | None = None
 
     @property
     def output_names(self) -> tuple[str, ...]:

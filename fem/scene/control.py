@@ -63,15 +63,40 @@ class Reduction(Section):
         "layer, 0.8 to 2.4 times with effects.finite_strain",
     )
 
-    train: Literal["corners"] | list[Range] = Field(
+    train: Literal["corners", "greedy"] | list[Range] = Field(
         "corners",
         description="[lambda, mu] of full runs that train bases beside the scene's own, for the tests at other "
-        "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none",
+        "parameters [Pa]; corners: those of lambda_range and mu_range; empty: none; greedy: builds one certified model",
     )
-    motions: Literal["mirrored"] | list[list[float]] = Field(
-        "mirrored",
-        description="targets [m] of further full runs that train models with effects.finite_strain; mirrored: the "
-        "scene's own with other signs; empty: none",
+    certify: Literal["off", "two", "proof", "estimate"] = Field(
+        "off",
+        description="build one model that knows its error [no unit]: by two bases and a proof, by a proof or an "
+        "estimate alone",
+    )
+    tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
+        1e-2, description="relative error that a certified model is built to, and above which it refuses [1]"
+    )
+    norm: Literal["energy", "output"] = Field(
+        "energy", description="what the tolerance is about [no unit]: energy norm of the deformation, or the outputs"
+    )
+    grid: Annotated[int, Field(ge=1)] = Field(
+        20, description="values of lambda and of mu, logarithmically over their ranges, where the greedy looks [1]"
+    )
+    layers: Literal["together", "apart"] = Field(
+        "together",
+        description="layers keep their ratios to the first [no unit], or each has the factors of the box for itself, "
+        "at as many points, spread evenly",
+    )
+    add: Annotated[int, Field(ge=1)] = Field(4, description="modes that each full run of the greedy adds [1]")
+    max_N: Annotated[int, Field(ge=1)] = Field(200, description="largest N of the greedy's basis [1]")
+    validation: Annotated[int, Field(ge=0)] = Field(
+        0, description="random parameters where full runs test the certified model afterwards [1]"
+    )
+    motions: Literal["auto", "own", "unit", "mirrored"] | list[list[float]] = Field(
+        "auto",
+        description="motions that train [no unit]: own, the scene's; unit, every freedom of the hand by itself, for "
+        "certified models; mirrored, the scene's with other signs too, or further targets [m], with "
+        "effects.finite_strain; auto: own, and mirrored with that effect",
     )
 
     @model_validator(mode="after")

@@ -30,6 +30,7 @@ class Held:
         S: matrix of the step; whoever factors it owns it.
         D: damping matrix, or None.
         M: mass, only beside D.
+        parts: further matrices that were asked for, on the same rows; whoever asked owns them.
     """
 
     layout: BlockLayout
@@ -41,6 +42,7 @@ class Held:
     S: PETSc.Mat
     D: PETSc.Mat | None
     M: PETSc.Mat | None
+    parts: tuple[PETSc.Mat, ...] = ()
 
     def agree(self) -> AbstractContextManager[None]:
         """Guard of a block that is a rank's own affair when it holds everything, and collective otherwise. Collective.
@@ -70,7 +72,9 @@ class Held:
                     A.destroy()
 
 
-def held_operators(system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool) -> Held:
+def held_operators(
+    system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool, parts: tuple[PETSc.Mat, ...] = ()
+) -> Held:
     """Operators of a system on the owned rows, or on all. Collective.
 
     Args:
@@ -78,6 +82,7 @@ def held_operators(system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool
         S: matrix of the step, consumed.
         whole: every rank holds all rows.
         ordered: in the order of elimination; all rows then.
+        parts: further matrices, consumed.
     """
     layout, D = system.layout, system.damping.matrix
     M = None if D is None else system.M_ee
@@ -86,19 +91,23 @@ def held_operators(system: BlockSystem, S: PETSc.Mat, whole: bool, ordered: bool
         K = system.K_ee.copy()
         if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
             K.convert("baij")
-        return Held(layout, False, None, slice(0, layout.n_local), K, np.asfortranarray(system.G), S, D, M)
+        return Held(layout, False, None, slice(0, layout.n_local), K, np.asfortranarray(system.G), S, D, M, parts)
     K, step = whole_copy(system.K_ee), whole_copy(S)
     D, M = (None if A is None else whole_copy(A) for A in (D, M))
-    S.destroy()
+    whole_parts = tuple(whole_copy(A) for A in parts)
+    for A in (S, *parts):
+        A.destroy()
     G = rows_on_all(layout.comm, system.G)
     if not ordered:
         K.convert("baij")
-        return Held(layout, True, None, slice(first, last), K, np.asfortranarray(G), step, D, M)
+        return Held(layout, True, None, slice(first, last), K, np.asfortranarray(G), step, D, M, whole_parts)
     dissection = dissect(K, layout.dimension)
     K, step = _moved(dissection, K), _moved(dissection, step)
     D, M = (None if A is None else _moved(dissection, A) for A in (D, M))
     order = dissection.order
-    return Held(layout, True, order, order.rows_of(first, last), K, np.asfortranarray(order.enter(G)), step, D, M)
+    whole_parts = tuple(_moved(dissection, A) for A in whole_parts)
+    G = np.asfortranarray(order.enter(G))
+    return Held(layout, True, order, order.rows_of(first, last), K, G, step, D, M, whole_parts)
 
 
 def _moved(dissection: Dissection, A: PETSc.Mat) -> PETSc.Mat:

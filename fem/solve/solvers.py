@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.fem.errors import SolverError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import PETSc, petsc_options, whole_copy
-from softgrasp.fem.solve.cholesky import OrderedFactor, factor_blocks
+from softgrasp.fem.solve.cholesky import VANISHING_PIVOT, OrderedFactor, factor_blocks
 from softgrasp.fem.solve.order import dissect
 
 SolverName = Literal["cholesky", "mumps", "cg"]
@@ -153,6 +153,26 @@ class TissueSolver:
         y.destroy()
         e.destroy()
         return value
+
+    def renew(self, A: PETSc.Mat) -> bool:
+        """Factor A, of the pattern and the rows of S, in the place of S; whether that worked. Collective.
+
+        ``S`` itself keeps its numbers where blocks are factored, and :meth:`check` is of no use afterwards.
+        """
+        P = self.ksp.getOperators()[0]
+        if "sbaij" in P.getType():
+            A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            A.convert("sbaij", P)
+        else:
+            A.copy(P, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self.ksp.setOperators(P)  # else PETSc does not see that the numbers changed
+        try:
+            self.ksp.setUp()
+        except PETSc.Error as error:
+            if error.ierr in VANISHING_PIVOT:
+                return False
+            raise
+        return not self.ksp.getPC().getFailedReason()
 
     def destroy(self) -> None:
         """Free solver and matrix. Collective."""

@@ -12,7 +12,7 @@ from softgrasp.fem.system import BlockSystem
 
 
 def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Time | None = None) -> Array:
-    """Static displacement relative to the hand, K_ee z = G g; local rows (n_local,) [m]. Collective.
+    """Static displacement relative to the hand, K_ee z = G g or f(z) = G g; local rows (n_local,) [m]. Collective.
 
     Args:
         system: the operators.
@@ -20,10 +20,14 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
         time: tolerance and reproducibility of the scene.
 
     Raises:
-        SolverError: the stiffness is singular or the residual too large.
+        SolverError: the stiffness is singular or the residual too large, or the loads of finite strain do not converge.
     """
     if system.gravity is None:
         return np.zeros(system.layout.n_local)
+    if system.points is not None:
+        from softgrasp.fem.solve.finite_statics import finite_equilibrium
+
+        return finite_equilibrium(system, solver)
     load, where = (system.G @ system.gravity)[:, None], "the static equilibrium"
     time = time or Time(steps=1, rtol=1e-12)
     return solve_columns(

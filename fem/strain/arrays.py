@@ -18,8 +18,7 @@ def identity(H: Array) -> Array:
 
 def double_dot(A: Array, B: Array) -> Array:
     """A : B, (Q,)."""
-    product = A * B
-    return np.asarray(product.reshape(-1, A.shape[-1]).sum(axis=0))
+    return np.asarray(np.einsum("ijq,ijq->q", A, B))
 
 
 def cofactor(A: Array) -> Array:

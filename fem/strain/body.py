@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from mpi4py import MPI
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.strain.laws import Start
+from softgrasp.fem.strain.arrays import double_dot
+from softgrasp.fem.strain.laws import Start, green, stretches
 from softgrasp.fem.strain.points import Points
 from softgrasp.fem.system import LayerMaterial
 
@@ -59,11 +62,51 @@ class Body:
         """The law at the start of a step. Collective."""
         return self.law.start(self.gradient(z))
 
-    def step(self, start: Start, w: PETSc.Vec, f: PETSc.Vec) -> Array:
-        """Force f [N] of the discrete gradient from z to z + 2 w, NaN where J_1 forbids it; J_1, (Q,). Collective."""
-        P, J = self.law.step(start, self.gradient(w), self.lam, self.mu)
+    def step(self, start: Start, w: PETSc.Vec, f: PETSc.Vec) -> bool:
+        """Force f [N] of the discrete gradient from z to z + 2 w; whether the rank has a stress. Collective."""
+        P, self.J = self.law.step(start, self.gradient(w), self.lam, self.mu)
         self._collect(P if P is not None else self.H, f)  # all ranks take part in the product
-        return J
+        return P is not None
+
+    def refuse(self, start: Start, comm: MPI.Intracomm | None) -> None:
+        """Refuse a state that the law does not describe: an inverted cell, or one pressed too far. Collective.
+
+        Args:
+            start: the law at the state.
+            comm: ranks that share the points; None where each has them all.
+
+        Raises:
+            SolverError: the message names law, cell, J and stretch.
+        """
+        J, place = self.lowest(1 + start.j, comm)
+        least, where = self._least_stretch(start, comm) if self.law.least_stretch else (1.0, place)
+        if J > 0 and least >= self.law.least_stretch:
+            return
+        text = (
+            f"det F = {J:.3g} in the cell at {place}" if J <= 0 else f"a stretch of {least:.3g} in the cell at {where}"
+        )
+        raise SolverError(
+            f"finite strain ({self.law.name}): {text}, where the law describes no solid; take "
+            "effects.finite_strain.law = 'neo-hooke', a gentler motion or a stiffer material"
+        )
+
+    def lowest(self, values: Array, comm: MPI.Intracomm | None) -> tuple[float, str]:
+        """Smallest of values in the points, and where it is. Collective if ``comm`` is given."""
+        best: tuple[float, tuple[float, ...]] = (np.inf, ())
+        if len(values):
+            i = int(np.argmin(values))
+            best = float(values[i]), tuple(self.points.X[i].tolist())
+        value, place = best if comm is None else min(comm.allgather(best))
+        return value, "(" + ", ".join(f"{x:.3g}" for x in place) + ")"
+
+    def _least_stretch(self, start: Start, comm: MPI.Intracomm | None) -> tuple[float, str]:
+        """Smallest principal stretch; it is above the limit where E is small."""
+        E, limit = green(start.extra), self.law.least_stretch
+        values = np.ones(self.shape[2])
+        doubtful = double_dot(E, E) > (1 - limit**2) ** 2 / 4
+        if doubtful.any():
+            values[doubtful] = stretches(start.extra[:, :, doubtful])
+        return self.lowest(values, comm)
 
     def _collect(self, P: Array, f: PETSc.Vec) -> None:
         np.multiply(P, self.points.vol, out=self.H)

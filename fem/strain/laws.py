@@ -110,7 +110,8 @@ class Volumetric(Law):
     def start(self, H: Array) -> Start:
         """See :class:`Law`."""
         j = volume_change(H)
-        return Start(identity(H), j, np.log1p(j))
+        with np.errstate(invalid="ignore", divide="ignore"):  # an inverted start is refused by its J
+            return Start(identity(H), j, np.log1p(j))
 
     def step(self, start: Start, half: Array, lam: Array, mu: Array) -> tuple[Array | None, Array]:
         """See :class:`Law`."""
@@ -122,7 +123,7 @@ class Volumetric(Law):
         dj *= 2
         old = 1 + start.j
         new = old + dj
-        if not new.min(initial=np.inf) > 0:  # also where it is not a number
+        if not np.minimum.reduce(new, initial=np.inf) > 0:  # also where it is not a number
             return None, new
         x = dj / old
         x += TINY

@@ -32,6 +32,7 @@ class Points:
         vol: weight of each point [m^d, in 2D times the thickness], (Q,); they sum to the volume of the rank's cells.
         layer: number of the material of each point, (Q,).
         cell: global number of the cell of each point, (Q,).
+        X: place of each point at rest [m], (Q, d).
         d: space dimension.
         law: name of the material's law.
         tol: relative tolerance of the equations of a step [1].
@@ -41,6 +42,7 @@ class Points:
     vol: Array
     layer: Ints
     cell: Ints
+    X: Array
     d: int
     law: LawName
     tol: float
@@ -105,8 +107,8 @@ def whole_points(points: Points, comm: MPI.Intracomm, columns: Ints | None = Non
     if columns is not None:
         B = B[:, columns]
     B.sort_indices()
-    vol, layer, cell = (rows_on_all(comm, part) for part in (points.vol, points.layer, points.cell))
-    return replace(points, B=_petsc(B, B.shape, d, MPI.COMM_SELF), vol=vol, layer=layer, cell=cell)
+    vol, layer, cell, X = (rows_on_all(comm, part) for part in (points.vol, points.layer, points.cell, points.X))
+    return replace(points, B=_petsc(B, B.shape, d, MPI.COMM_SELF), vol=vol, layer=layer, cell=cell, X=X)
 
 
 def _petsc(B: scipy.sparse.csr_matrix, size: object, d: int, comm: MPI.Intracomm) -> PETSc.Mat:

@@ -8,11 +8,14 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.care import care, lyapunov
-from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.dense.care import balance, care, lyapunov, smallest_singular_value
+from softgrasp.lqr.plant.checks import EPS, ControlError
 
 FAST_RESIDUAL = 1e-9  # relative to C'QC; the structured plant in energy scaling reaches 1e-13
 FAST_BACKWARD = 1e-12  # relative to all four terms, where P is so large that C'QC drowns in their rounding
+# Distance of a Hamiltonian matrix to a singular one, over its norm, that is the rounding of a projection: the paper's
+# bases with too few columns show 1e-20 to 8e-14, all others 4e-10 or more.
+UNSEEN = 1e4 * EPS
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,11 @@ def solve_reduced(matrices: ReducedMatrices) -> Array:
 
 
 def fast_solution(m: ReducedMatrices) -> Array | None:
-    """P_N without balancing, or None when it is not accurate or not stabilising."""
+    """P_N without balancing, or None when it is not accurate or not stabilising.
+
+    Raises:
+        ControlError: see :func:`check_seen`.
+    """
     n = m.N
     lu, pivots, info = scipy.linalg.lapack.dgetrf(m.E)
     if info:
@@ -66,9 +73,11 @@ def fast_solution(m: ReducedMatrices) -> Array | None:
     hamiltonian = np.empty((2 * n, 2 * n), order="F")
     hamiltonian[:n, :n], hamiltonian[:n, n:] = A, -c * G
     hamiltonian[n:, :n], hamiltonian[n:, n:] = H / -c, -A.T
-    _, stable, real, _, U, _, info = scipy.linalg.lapack.dgees(_left, hamiltonian, sort_t=1, overwrite_a=1)
+    _, stable, real, imag, U, _, info = scipy.linalg.lapack.dgees(_left, hamiltonian, sort_t=1, overwrite_a=1)
     if info or stable != n or not real[:n].max() < -1e-10 * np.abs(real).max():
         return None
+    if real[:n].max() > -(EPS**0.25) * np.hypot(real, imag).max():
+        check_seen(A, G, H, float(imag[np.argmax(real[:n])]))
     lu_1, pivots_1, info = scipy.linalg.lapack.dgetrf(U[:n, :n].T)
     if info:
         return None
@@ -84,6 +93,25 @@ def fast_solution(m: ReducedMatrices) -> Array | None:
     half, _ = scipy.linalg.lapack.dgetrs(lu, pivots, Y, trans=1)
     P, _ = scipy.linalg.lapack.dgetrs(lu, pivots, half.T, trans=1)
     return np.asarray((P + P.T) / 2)
+
+
+def check_seen(A: Array, G: Array, H: Array, omega: float) -> None:
+    """The Hamiltonian matrix is farther from one with the eigenvalue i omega than a projection rounds.
+
+    A rigid motion that inputs do not reach or outputs do not see makes a quadruple eigenvalue 0, which rounding moves
+    by eps^(1/4): a solution exists then, but another one on another number of ranks.
+
+    Raises:
+        ControlError: it is not.
+    """
+    scale, weight = balance(A, G, H)
+    a, g, h = A / scale[:, None] * scale, G / scale[:, None] / scale * weight, H * scale[:, None] * scale / weight
+    hamiltonian = np.block([[a, -g], [-h, -a.T]])
+    if smallest_singular_value(hamiltonian, 1j * omega) <= UNSEEN * float(np.linalg.norm(hamiltonian)):
+        raise ControlError(
+            f"the reduced equation of order {len(A)} has a solution by rounding alone: a mode that does not decay by "
+            "itself is not reached by the inputs or not seen by the outputs; take another order N"
+        )
 
 
 def _residual(A: Array, G: Array, H: Array, Y: Array) -> tuple[Array, float]:

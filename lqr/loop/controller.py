@@ -151,7 +151,7 @@ class Controller:
         x_bar, u_bar = self.plant.rest_at(q_bar)
         return replace(self, x_bar=x_bar, u_bar=u_bar)
 
-    def save(self, path: Path) -> Path:
+    def save(self, path: str | Path) -> Path:
         """Write everything into one .npz file. Not collective: call it on one rank.
 
         Raises:
@@ -169,10 +169,10 @@ class Controller:
         arrays |= {"K": self.K, "x_bar": self.x_bar, "u_bar": self.u_bar}
         if self.limits is not None:
             arrays["limits"] = self.limits
-        return write_npz(path, meta, arrays)
+        return write_npz(Path(path), meta, arrays)
 
     @classmethod
-    def load(cls, path: Path, scene_hash: str | None = None, layout_hash: str | None = None) -> Controller:
+    def load(cls, path: str | Path, scene_hash: str | None = None, layout_hash: str | None = None) -> Controller:
         """Read a file of :meth:`save`.
 
         Args:
@@ -182,7 +182,7 @@ class Controller:
         Raises:
             ControlError: the file is missing, damaged, or made for something else.
         """
-        meta, arrays = read_npz(path, {"scene_hash": scene_hash, "layout_hash": layout_hash})
+        meta, arrays = read_npz(Path(path), {"scene_hash": scene_hash, "layout_hash": layout_hash})
         try:
             small = {key: arrays[f"plant_{key}"] for key in ("E", "A", "B", "C", "f", "S_q", "S_v")}
             return cls(

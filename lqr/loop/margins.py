@@ -112,7 +112,7 @@ def _axis(name: str, omega: Array, loop: np.ndarray) -> AxisMargins:
     """Margins from the crossings of |l| = 1 and of arg l = -180 degrees, interpolated in log w."""
     gain, phase, log_w = np.log(np.abs(loop)), np.unwrap(np.angle(-loop)), np.log(omega)  # phase 0: l is negative
     # at the highest frequency, z = -1, the loop is real: a crossing if it is negative
-    factors = [1 / abs(loop[-1])] if loop[-1].real < 0 else []
+    factors = [float(1 / abs(loop[-1]))] if loop[-1].real < 0 else []
     turns = np.floor((phase + np.pi) / (2 * np.pi))  # of the nearest multiple of 360 degrees
     rest = phase - 2 * np.pi * turns
     for i in np.flatnonzero((rest[:-1] * rest[1:] <= 0) & (np.abs(np.diff(rest)) < np.pi)):

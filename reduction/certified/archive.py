@@ -68,7 +68,7 @@ def _append(model: CertifiedModel, path: Path, key: str) -> None:
     with h5py.File(path, "r+") as file:
         group = file.create_group(GROUP)
         group.attrs["format"] = FORMAT
-        group.attrs["about"] = json.dumps(about)
+        group["about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)  # attributes end at 64 kB
         group["static"], group["mass"], group["compliance"] = norms.static, norms.mass, model.compliance
         for i, T in enumerate(norms.shape or ()):
             group[f"shape/{i}"] = T
@@ -116,7 +116,7 @@ def _read(path: Path, lift: bool) -> dict[str, Any]:
             for name in ("sha256", "sha256_lift") if lift else ("sha256",):
                 if group.attrs[name] != _digest(file, lift=name != "sha256"):
                     raise ModelError(f"{path} is damaged: it is not what was written; reduce the scene again")
-            about = json.loads(group.attrs["about"])
+            about = json.loads(group["about"][()].tobytes())
             drive = None
             for name in ("finer", "drive"):
                 if name in group:
@@ -133,7 +133,7 @@ def _read(path: Path, lift: bool) -> dict[str, Any]:
         mesh = MeshNumber(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))
     kept = {key: about[key] for key in ("k", "certify", "tolerance", "norm", "training", "mesh_key")}
     if box is not None:
-        box = Box(tuple(box["lam"]), tuple(box["mu"]))
+        box = Box(tuple(box["lam"]), tuple(box["mu"]), box["apart"])
     return {**kept, "norms": norms, "compliance": compliance, "box": box, "mesh": mesh, "drive": drive}
 
 
@@ -153,7 +153,7 @@ def _digest(file: h5py.File, lift: bool) -> str:
     """SHA-256 of all numbers of the lift, or of all others with what the file says about them."""
     digest = hashlib.sha256()
     if not lift:
-        digest.update((file.attrs["model"] + file[GROUP].attrs["about"]).encode())
+        digest.update(file.attrs["model"].encode())
         for name in ("drive", "finer"):
             if name in file[GROUP]:
                 digest.update(repr(sorted((k, str(v)) for k, v in file[f"{GROUP}/{name}"].attrs.items())).encode())

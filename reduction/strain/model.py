@@ -23,7 +23,7 @@ from softgrasp.reduction.strain.stepper import Problem, march
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
-REACH = 2.0  # times what the training runs reached: runs of a kind that trained none go to 2.5 times and more
+REACH, SMALL = 2.0, 0.02  # times what the training runs reached, of coordinates above this share of the largest
 LOAD_STEPS, NEWTON_STEPS = 10, 30  # on the way to an equilibrium
 
 
@@ -64,7 +64,8 @@ class Box:
 
     def refuse_states(self, a: Array) -> str:
         """Why coordinates (steps + 1, k) lie outside; empty inside."""
-        ratio = np.abs(a).max(axis=0) / np.where(self.reach > 0, self.reach, np.inf)
+        # what is small beside the largest coordinate cannot spoil a run
+        ratio = np.abs(a).max(axis=0) / np.maximum(self.reach, SMALL * self.reach.max(initial=1e-300))
         i = int(np.argmax(ratio))
         if ratio[i] <= REACH:
             return ""

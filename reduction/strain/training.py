@@ -30,15 +30,15 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.basis import ReductionError
 from softgrasp.reduction.inner import Rows, Weight
-from softgrasp.reduction.model import Lift
+from softgrasp.reduction.model import Lift, ModelError
 from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.pod import pod_part
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.states import BasisError
 from softgrasp.reduction.strain.cells import Cells, Potential
-from softgrasp.reduction.strain.compare import Reference, errors_of, reference_of
-from softgrasp.reduction.strain.model import Box, StrainModel, StrainRun
+from softgrasp.reduction.strain.compare import Reference, StrainErrors, errors_of, reference_of
+from softgrasp.reduction.strain.model import Box, SmallStrainModel, StrainModel, StrainRun
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
 from softgrasp.reduction.truncation import Columns
 
@@ -122,11 +122,18 @@ class Training:
             SolverError: a run did not converge.
         """
         if k not in self._galerkin:
-            comm = self.model.system.layout.comm
             with self._stage("galerkin"):
                 model = self.leading(k)
-                self._galerkin[k] = tuple(replay_strain(model, run, comm=comm, outside=True) for run in self.runs)
+                self._galerkin[k] = tuple(self._run_all(model, run) for run in self.runs)
         return self._galerkin[k]
+
+    def _run_all(self, model: StrainModel, run: FullRun) -> StrainRun:
+        comm, materials = self.model.system.layout.comm, run.model.system.materials
+        small = model.at(run.dt, materials, outside=True)
+        if comm.size > 1:
+            shared = Potential(model.cells, materials, comm)
+            small = replace(small, problem=replace(small.problem, potential=shared))
+        return _replay(small, run)
 
     def galerkin_error(self, k: int) -> float:
         """Error in z of :meth:`galerkin` over all training runs. Collective."""
@@ -285,26 +292,54 @@ def reduce_strain(
 
 
 def replay_strain(
-    rom: StrainModel, full: FullRun, *, comm: MPI.Intracomm | None = None, outside: bool = False
+    rom: StrainModel, model: Model, run: Trajectory | FullRun, *, outside: bool = False, engine: str = ""
 ) -> StrainRun:
-    """Repeat a full run with a reduced model: its materials, its hand, its start.
+    """Run a reduced model at finite strain under the hand of a full run, from its start. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce_strain(model, run, N=14)
+    >>> sg.replay_strain(rom, model, run).energy_drift < 1e-8
+    True
 
     Args:
         rom: which.
-        full: the run.
-        comm: ranks that share the cells of the model; None where every rank has all of them.
+        model: gives the materials of a trajectory.
+        run: the full run; a :class:`softgrasp.reduction.replay.FullRun` has materials of its own.
         outside: allow what the model was not trained on.
+        engine: see :func:`softgrasp.reduction.strain.stepper.march`.
 
     Raises:
         ModelError: the run lies outside the training box, or there is no equilibrium to start in.
+        SceneError: see :func:`softgrasp.reduction.replay.full_run`.
         SolverError: a step did not converge.
     """
-    small = rom.at(full.dt, full.model.system.materials, outside=outside)
-    if comm is not None and comm.size > 1:
-        shared = Potential(rom.cells, full.model.system.materials, comm)
-        small = replace(small, problem=replace(small.problem, potential=shared))
+    full = run if isinstance(run, FullRun) else full_run(model, run)
+    return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full, engine)
+
+
+def _replay(small: SmallStrainModel, full: FullRun, engine: str = "") -> StrainRun:
     a0 = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
-    return small.run(full.hand, a0=a0)
+    return small.run(full.hand, a0=a0, engine=engine)
+
+
+def errors_strain(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajectory | FullRun) -> StrainErrors:
+    """How far a reduced run is from a full one: deformation, its velocity, energy norm. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce_strain(model, run, N=20)
+    >>> sg.errors_strain(rom, sg.replay_strain(rom, model, run), model, run).z < 0.01
+    True
+
+    Args and errors as in :func:`replay_strain`, which makes the reduced run; the model must hold its lift.
+    """
+    if rom.Phi is None:
+        raise ModelError("the model holds no lift; load it with the layout of its mesh")
+    full = run if isinstance(run, FullRun) else full_run(model, run)
+    return reference_of(full, rom.Phi).errors(reduced_run.a, reduced_run.v)
 
 
 def gathered(comm: MPI.Intracomm, cells: Cells, offset: int) -> Cells:

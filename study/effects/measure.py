@@ -158,6 +158,7 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     holders.append(("step.", run.midpoint.held))
     if run.midpoint.held.order is not None:
         holders.append(("step.order.", run.midpoint.held.order))
+    holders += [("points.", p) for p in (system.points, getattr(run.midpoint, "body", None)) if p is not None]
     for layer in system.layers:
         holders += [(f"{key}[{layer.name}].", getattr(layer, key)) for key in ("K_mu", "K_lambda", "M_1")]
     seen: set[int] = set()

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.layout import BlockLayout
 
 TRIAL_ZETA = 0.01  # ratio of the first mode; silicone and passive tissue lie above, so it is a careful guess
+TRIAL_LAW = "neo-hooke"
 Table = dict[str, Any]
 
 
@@ -137,6 +138,8 @@ def _value(scene: Scene, name: str) -> tuple[str, float | None, str]:
     if name == "damping" and damping is not None:
         text = f"beta = {damping.beta:g} s"
         return (f"{text}, alpha = {damping.alpha:g} 1/s", None, "") if damping.alpha else (text, damping.beta, "s")
+    if name == "finite_strain" and scene.effects.finite_strain is not None:
+        return scene.effects.finite_strain.law, None, ""
     if name == "layers":
         return f"{', '.join(scene.tissue.layers)} instead of tissue.material everywhere", None, ""
     return f"hand.inertia = {_inertia(scene.hand.inertia)} kg m2" if name == "rotation" else "on", None, ""
@@ -164,9 +167,18 @@ def _with(scene: Scene, name: str, scales: Scales) -> Switch:
         law = {"kind": "kelvin-voigt", "beta": beta}
         other = changed(scene, lambda table: table["effects"].update(damping=law))
         return Switch(name, False, f"beta = {beta:.3g} s: zeta_1 = {TRIAL_ZETA:g}", other, "", beta, "s")
+    if {name, *_named(scene)} >= {"rotation", "finite_strain"}:
+        return Switch(name, False, "", None, "effects.rotation and effects.finite_strain exclude each other")
     if name == "rotation":
         return _turning(scene, scales)
+    if name == "finite_strain":
+        other = changed(scene, lambda table: table["effects"].update(finite_strain={"law": TRIAL_LAW}))
+        return Switch(name, False, TRIAL_LAW, other)
     return Switch(name, False, "on", changed(scene, lambda table: table["effects"].update({name: True})))
+
+
+def _named(scene: Scene) -> list[str]:
+    return [name for name, effect in EFFECTS.items() if effect.active(scene)]
 
 
 def _turning(scene: Scene, scales: Scales) -> Switch:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from softgrasp.fem.effects.finite_strain import linear_error
 from softgrasp.fem.fields.strain import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
@@ -107,12 +108,13 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     z, t = Z[:, int(np.argmax(sizes))], times[int(np.argmax(sizes))]
     if most is not None and total(system.layout.comm, np.array([np.dot(most[1], most[1])]))[0] > sizes.max():
         t, z = most
-    steep = gradient(model, z)
-    if not steep.linear:
+    steep = None if system.points is not None else gradient(model, z)
+    if steep is not None and not steep.linear:
         texts.append(
             f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
             f"body at t = {t:.3g} s, at most {steep.largest:.2g}: linear elasticity assumes small strains and "
-            "rotations."
+            f"rotations, and is off by about {linear_error(steep.rms):.2g} of the deformation here"
+            + ("." if scene.effects.rotation else "; set effects.finite_strain.law = 'neo-hooke'.")
         )
     texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
     return texts + inexact(

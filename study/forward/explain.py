@@ -14,6 +14,7 @@ from softgrasp.fem.fields.scales import measure
 from softgrasp.fem.fields.strain import SMALL_STRAIN
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import Need, factor_bytes, need
+from softgrasp.fem.run.motion import largest_acceleration
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
@@ -130,7 +131,7 @@ def explain_model(model: Model) -> Explanation:
         omega, Phi = lowest_modes(system, min(MODES, layout.n_e))
     else:
         omega, Phi = np.zeros(0), np.zeros((layout.n_local, 0))
-    problem = measure(model, omega, Phi)
+    problem = measure(model, omega, Phi, largest_acceleration(scene, layout.n_s, system.M_hand))
     reports = {
         key: EffectReport(e.active(scene), e.term, e.operators(scene), e.cost, e.gate(problem))
         for key, e in EFFECTS.items()
@@ -174,11 +175,11 @@ def _warnings(
     texts = locking(poisson, scene.tissue.order)
     if len(omega):
         texts += coarse(float(omega[0]), dt, scene.time_end, "the first period")
-    if effects["gravity"].on and not sag.gradient.linear:
+    if effects["gravity"].on and not sag.gradient.linear and not effects["finite_strain"].on:
         texts.append(
             f"At rest under its weight the tissue would sag by {sag.largest:.2g} m and |grad z| would be above "
             f"{SMALL_STRAIN} in {sag.gradient.share:.0%} of the body, at most {sag.gradient.largest:.2g}: linear "
-            "elasticity assumes small strains and rotations."
+            f"elasticity assumes small strains and rotations, effects.finite_strain does not."
         )
     if scene.effects.rotation:
         texts += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgrasp.fem.columns import Columns, hand_columns
+from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import PETSc
@@ -16,6 +17,9 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.report.tables import Table
+
+if TYPE_CHECKING:
+    from softgrasp.fem.run.finite_strain import NewtonFigures
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,7 @@ class Simulation:
             "output_final": run.outputs[-1].tolist(),
             "output_places": self.places,
             "energy_drift": run.energy_drift,
+            **self._newton(),
             **({"force_peak": self.force_peak} if run.force is not None else {}),
             "time": {
                 **stages,
@@ -121,6 +126,13 @@ class Simulation:
             "warnings": list(self.warnings),
         }
 
+    def _newton(self) -> dict[str, Any]:
+        newton = self.run.newton
+        if newton is None:
+            return {}
+        keys = {"mean": newton.mean, "max": newton.max, "factors": newton.factors, "min_J": newton.min_det}
+        return {"newton": {**keys, "divided": newton.divided}}
+
     def rows(self) -> list[tuple[str, str]]:
         """The short table of a run as label and text."""
         run, seconds, steps = self.run, self.run.seconds, self.scene.time.steps
@@ -132,6 +144,7 @@ class Simulation:
             *self.places.items(),
             *([("largest force on the hand", ", ".join(loads))] if loads else []),
             ("energy drift", f"{run.energy_drift:.1e}"),
+            *([("iterations", newton_text(run.newton))] if run.newton else []),
             ("residual, first and last", f"{run.residuals[0]:.1e}, {run.residuals[1]:.1e}"),
             ("solver", run.solver[0]),
             ("", run.solver[1]),
@@ -149,6 +162,15 @@ class Simulation:
             header += [f"{c.label} [{c.load_unit}]" for c in self.hand("force")]
             parts.append(np.vstack([np.full(n_s, np.nan), run.force]))
         return Table(tuple(header), np.column_stack(parts).tolist())
+
+
+def newton_text(newton: NewtonFigures) -> str:
+    """How the steps of finite strain converged, in words."""
+    parts = f", {counted(newton.divided, 'step')} in parts" if newton.divided else ""
+    return (
+        f"{newton.mean:.3g} a step, at most {newton.max}, {counted(newton.factors, 'new tangent')}{parts}; "
+        f"smallest det F {newton.min_det:.3g}"
+    )
 
 
 def simulate_result(model: Model, run: Trajectory, warnings: Sequence[str] = ()) -> Simulation:

@@ -68,7 +68,9 @@ def run_simulate(
         task = bar.add_task("steps", total=scene.time.steps)
 
         def progress(run: Run) -> None:
-            bar.update(task, completed=run.reached)
+            newton = run.midpoint.figures()
+            kind = "steps" if newton is None else f"steps ({newton.mean:.2g} iterations each)"
+            bar.update(task, completed=run.reached, description=kind)
 
         options = RunOptions(out, resume, until, progress, frames, join, frames.keep)
         try:

@@ -69,15 +69,22 @@ def run_reduce(
     quiet: bool = False,
     pictures: bool = True,
     empty: bool = False,
+    tolerance: float | None = None,
 ) -> dict[str, Any]:
-    """Reduce a scene file by all its methods and write the results. Collective.
+    """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
 
     Raises:
         SoftgraspError: with one sentence.
     """
+    if tolerance is not None:
+        overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
     session = Session("reduce", path, overrides, out, console, quiet, pictures, empty)
     scene = session.scene()
     names = check_scene(scene)
+    if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
+        from softgrasp.study.reduce.certify import run_certify  # only certified models pay for it
+
+        return run_certify(session, scene)
     if scene.effects.finite_strain is not None:
         from softgrasp.study.reduce.strain_run import run_strain  # models of another kind
 

@@ -69,7 +69,7 @@ def test_no_key_ends_in_a_traceback(change: str) -> None:
 
 
 FILES: dict[str, tuple[bytes, str]] = {
-    "latin": (TEXT.encode().replace(b'name = "', b'name = "\xe9', 1), r"is not UTF-8 text (line 1)"),
+    "latin": (TEXT.encode().replace(b'name = "', b'name = "\xe9', 1), r"is not UTF-8 text (line 2)"),
     "utf16": (TEXT.encode("utf-16"), "is not UTF-8 text"),
     "nul": (TEXT.encode() + b"\0", "not valid TOML"),
     "brackets": (TEXT.encode() + b"\nx=" + b"[" * 3000 + b"]" * 3000, "too many brackets"),

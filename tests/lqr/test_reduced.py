@@ -269,6 +269,18 @@ def test_energy_scaling_keeps_the_span_and_the_fast_way_agrees_with_the_careful_
         assert same_everywhere(problem.layout.comm, fast)
 
 
+@pytest.mark.parametrize(("name", "cells"), [("pod_fixed_solid", 2), ("pod_decomposed", 2), ("componentwise_pod", 5)])
+def test_what_rounding_alone_solves_is_refused(name: str, cells: int) -> None:
+    """Too few columns hide the hand from the outputs; the last digits then decide on a gain of any size."""
+    changes = {"tissue": {"cells": [cells, 2 * cells]}, "control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}]}}
+    problem = make_problem(build(make_scene(DAMPED, changes), comm=MPI.COMM_WORLD))
+    bases = make_family(name, problem, DenseRiccati().solve(problem).factor)
+    with pytest.raises(ControlError, match=r"by rounding alone|not detectable"):
+        reduce_riccati(problem, bases.at(6))
+    reduced = reduce_riccati(problem, bases.at(8))
+    assert closed_loop(reduced.matrices, reduced.P_N).real.max() < 0
+
+
 def test_weighted_pod_is_refused_when_the_hand_is_light() -> None:
     """W = (E + E')/2 is indefinite for a light hand; scikit-fem's E says the same."""
     _, problem, solution = plant()

@@ -19,6 +19,7 @@ from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.study.bench import forward as bench_forward
 from softgrasp.study.bench import forward_rows as bench_worker
 from softgrasp.study.bench.__main__ import app
+from softgrasp.study.bench.driver import growth
 from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop
 from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.processes import IN_MPI_JOB
@@ -105,9 +106,9 @@ def test_methods_take_turns_and_none_is_always_first() -> None:
 
 def test_exponents_of_made_up_costs_come_back() -> None:
     n = [956, 10_198, 99_856]
-    assert bench_forward.growth(n, [2e-6 * m**1.37 for m in n]) == pytest.approx(1.37, rel=1e-12)  # rounding of log
-    assert bench_forward.growth(n[:1], [1.0]) is None
-    assert bench_forward.growth(n, [0.0, 0.0, 5.0]) is None
+    assert growth(n, [2e-6 * m**1.37 for m in n]) == pytest.approx(1.37, rel=1e-12)  # rounding of log
+    assert growth(n[:1], [1.0]) is None
+    assert growth(n, [0.0, 0.0, 5.0]) is None
     powers = bench_forward.exponents([made_up(m) for m in n])["1"]
     # rounding of log
     assert powers == pytest.approx({"assembly": 1.0, "factor": 1.5, "step": 1.1, "memory": 1.0}, rel=1e-12)

@@ -151,7 +151,7 @@ def test_missing_idle_and_coarse(comm: MPI.Intracomm) -> None:
         time={"steps": 2},
     )
     result = explain(scene, comm)
-    assert result.missing == ("damping",)
+    assert result.missing == ("damping", "finite_strain")
     assert result.idle == ("gravity", "reaction")
     assert any("steps" in w and "coarse" in w for w in result.warnings)
 

@@ -1,0 +1,386 @@
+"""The midpoint step of a hyperelastic body: an energy-conserving discrete gradient, solved with a tangent that is kept.
+
+With w = z_mid - z_n, s = 2/dt, pi = M v and the force f_alg of `softgrasp.fem.strain.laws`, which does the work
+2 w'f_alg = W(z_n + 2 w) - W(z_n), the step of `softgrasp.fem.run.midpoint` becomes
+
+    R(w) = (s^2 M + s D) w + f_alg(z_n, w) - s pi_n - G c = 0,   z_{n+1} = z_n + 2 w,   s pi_{n+1} = 2 s^2 M w - s pi_n:
+
+the linear step with one more load, -(f_alg - K z_mid). The energy W + v'pi/2 changes by the work 2 c'G'w of the load,
+less what D dissipates, and by 2 w'R; so a step ends with a bit of a correction that makes w'R = 0 to first order.
+A step that does not converge is taken in 2, 4, .. 16 parts under the same load.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.petsc import SAME, Array, PETSc, total
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.solve.solvers import Reproducible, SolverName
+from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.newton import QuasiNewton, Root
+from softgrasp.fem.strain.points import whole_points
+from softgrasp.fem.system import BlockSystem
+
+PARTS = 16  # most of a step
+KEPT = 2  # steps that the first guess is extrapolated from
+
+
+@dataclass(frozen=True)
+class NewtonFigures:
+    """How the steps of a run converged.
+
+    Attributes:
+        mean, max: iterations of a step [1].
+        factors: tangents factored after the linear one.
+        min_det: smallest det F at the end of any step.
+        divided: steps taken in parts.
+    """
+
+    mean: float
+    max: int
+    factors: int
+    min_det: float
+    divided: int
+
+
+@dataclass
+class Counts:
+    """What a restart needs of the figures, of the rule for a new tangent, and the largest |s pi + G c| so far."""
+
+    iterations: int = 0
+    steps: int = 0
+    most: int = 0
+    factors: int = 0
+    divided: int = 0
+    first: int = -1  # iterations of the first step with this tangent
+    spent: int = 0  # iterations above these since then
+    min_det: float = np.inf
+    scale: float = 0.0
+
+
+class FiniteStrainMidpoint(TissueMidpoint):
+    """The step for a system with points; arguments and calls are those of the linear step.
+
+    Attributes:
+        r: s pi_n on the rows held, in place of the linear step's right-hand side.
+        counts: see there.
+        price: about how many iterations cost as much as a tangent and its factor, from sizes: the same in every run.
+    """
+
+    def __init__(
+        self,
+        system: BlockSystem,
+        dt: float,
+        solver: SolverName,
+        rtol: float = 1e-10,
+        reproducible: Reproducible = "auto",
+    ) -> None:
+        points, s = system.points, 2 / dt
+        assert points is not None
+        inertia = system.M_ee.copy()
+        inertia.scale(s * s)
+        parts = (inertia, viscosity(system, s)) if system.damping.active else (inertia,)
+        super().__init__(system, dt, solver, rtol, reproducible, parts)
+        self.comm: MPI.Intracomm = system.layout.comm
+        self.dot: Callable[[Array, Array], float] = np.dot
+        if self.comm.size > 1 and not self.held.whole:
+            self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
+        if self.held.whole:
+            points = whole_points(points, self.comm, self.held.enter(np.arange(system.layout.n_e)))
+        self.body, self.tol = Body(points, system.materials), points.tol
+        self.inertia, self.drag = (*self.held.parts, None)[:2]
+        for part in self.held.parts:
+            part.convert("aij")
+        self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
+        self.trial_array, self.f_array, self.y_array = (x.array_w for x in (self.trial, self.f, self.y))
+        self.newton = QuasiNewton(self._residual, self._apply, self._renew_from, self.dot)
+        self.past: deque[Array] = deque(maxlen=KEPT)
+        self.tangent_at: Array | None = None
+        self.counts, self.price = Counts(), self._price()
+        self.parts, self.jump, self.C = 1, None, None
+        self.load = self.right = np.zeros_like(self.r_array)
+        self.last = 0.0
+        self._propagate = self._carry_on
+
+    parts: int  # into which the step in work is divided
+    jump: Array | None  # of the velocity over a divided step
+    C: Array | None  # load that the hand adds per G'w
+
+    def _price(self) -> float:
+        if self.solver.name == "cg":
+            return 8.0
+        nz = self.solver.ksp.getPC().getFactorMatrix().getInfo()["nz_used"]
+        return float(np.clip(nz / (4 * self.system.layout.n_e), 8, 100))
+
+    def _pulled(self, w: Array) -> Array:
+        pull = self.G.T @ w
+        return pull if self.held.whole else total(self.comm, pull)
+
+    # ---- the state
+
+    def start(self, state: TissueState) -> None:
+        """Set s pi_n = s M v and the law at z; the tangent there unless z = 0. Collective."""
+        self.join(state)
+        y = state.z.duplicate()
+        self.system.M_ee.mult(state.v, y)
+        self.r.array_w[:] = self.s * self.held.gather(y.array_r)
+        y.destroy()
+        self.c = self.pending = np.zeros_like(self.c)
+        self.past.clear()
+        z = self.at.array_r.copy()
+        if self.dot(z, z) > 0 or self.tangent_at is not None:
+            self._renew(z)
+        self.counts = Counts(min_det=self.counts.min_det)
+
+    def join(self, state: TissueState) -> None:
+        """Take a state over whose r is set. Collective."""
+        if self.held.whole:
+            self.z.array_w[:] = self.held.gather(state.z.array_r)
+        self._arrive(self._held_z(state), check=True)
+
+    def _arrive(self, z: PETSc.Vec, check: bool = False) -> None:
+        """Evaluate the law at z, where the next step starts, and refuse what it does not describe. Collective."""
+        self.at, self.begin = z, self.body.start(z)
+        self.counts.min_det = min(self.counts.min_det, 1 + float(self.begin.j.min(initial=np.inf)))
+        if check or not self.body.law.barrier:
+            self.body.refuse(self.begin, None if self.held.whole else self.comm)
+
+    def energy(self, state: TissueState) -> float:
+        """Energy W(z) + v'pi/2 [J] of the state just reached. Collective."""
+        W = self.over_ranks(self.body.energy(self._held_z(state)))
+        v, momentum = state.array[len(self.x_array) :], self.r_array[self.rows] / self.s
+        return W + float(total(self.comm, np.array([np.dot(v, momentum)]))[0]) / 2
+
+    def figures(self) -> NewtonFigures:
+        """How the steps converged. Collective."""
+        counts, least = self.counts, self.counts.min_det
+        least = least if self.held.whole else float(self.comm.allreduce(least, MPI.MIN))
+        mean = counts.iterations / max(counts.steps, 1)
+        return NewtonFigures(mean, counts.most, counts.factors, least, counts.divided)
+
+    def memory(self) -> dict[str, Array]:
+        """What a restart needs beside r and the state: tangent, pairs, last steps, counts; rows as they are held."""
+        pairs = [part for p, q, _ in self.newton.pairs for part in (p, q)]
+        tangent = [] if self.tangent_at is None else [self.tangent_at]
+        rows = [self.held.leave(x) for x in (*tangent, *self.past, *pairs)]
+        sizes = [len(tangent), len(self.past), len(self.newton.pairs)]
+        numbers = np.array([*sizes, *vars(self.counts).values()], dtype=float)
+        return {"newton_rows": np.array(rows).reshape(len(rows), len(self.r_array)), "newton_numbers": numbers}
+
+    def recall(self, rows: Array | None, numbers: Array | None) -> None:
+        """Take over what :meth:`memory` gave, after :meth:`join`. Collective."""
+        if rows is None or numbers is None:
+            return
+        tangents, past, pairs = (int(n) for n in numbers[:3])
+        kept = [self.held.enter(x) for x in rows]
+        if tangents:
+            self._renew(kept[0])
+        self.past = deque(kept[tangents : tangents + past], maxlen=KEPT)
+        self.newton.pairs.clear()
+        for i in range(pairs):
+            p, q = kept[tangents + past + 2 * i :][:2]
+            self.newton.pairs.append((p, q, 1 / self.dot(p, q)))
+        for (name, kind), value in zip(Counts.__annotations__.items(), numbers[3:], strict=True):
+            setattr(self.counts, name, int(value) if kind == "int" else float(value))
+
+    # ---- a step
+
+    def solve_midpoint(self, c: Array, C: Array | None = None) -> None:
+        """Solve R(w) = 0 under the load G (c + C G'w), once a step; ``self.c`` is c + C G'w then. Collective.
+
+        Args:
+            c: load, (n_s,).
+            C: what the hand adds as it yields, (n_s, n_s), symmetric positive definite; None for a hand that does not.
+
+        Raises:
+            SolverError: no convergence, not even in parts of the step; the message names the cell with the smallest J.
+        """
+        self.C, self.jump, counts = C, None, self.counts
+        self.load = self.G @ c
+        self.right = self.r_array + self.load
+        counts.scale = max(counts.scale, float(np.sqrt(self.dot(self.right, self.right))))
+        guess = self._guess()
+        if counts.first >= 0 and counts.spent >= self.price:
+            self._renew(self.at.array_r + guess) or self._renew(self.at.array_r)
+        root = self._find(guess)
+        if root.spent < 0:
+            root = self._divided()
+        self.w.array_w[:] = root.x
+        counts.first = root.spent if counts.first < 0 else counts.first
+        counts.spent += max(root.spent - counts.first, 0)
+        counts.iterations, counts.steps = counts.iterations + root.spent, counts.steps + 1
+        counts.most = max(counts.most, root.spent)
+        self.past.appendleft(root.x.copy())
+        self.c = c if C is None else c + C @ self._pulled(root.x)
+
+    def _guess(self) -> Array:
+        past = self.past
+        return 2 * past[0] - past[1] if len(past) == KEPT else past[0] if past else np.zeros_like(self.w_array)
+
+    def _find(self, guess: Array) -> Root:
+        """The root, moved to w'R = 0 by a small part of a correction made before. Collective."""
+        target = max(self.tol * self.parts * self.counts.scale, 4 * self.body.rounding)
+        root = self.newton.find(guess, target)
+        self.last = root.norm / (self.parts * self.counts.scale) if self.counts.scale > 0 else 0.0
+        slopes = [self.dot(root.x, q) for _, q, _ in self.newton.pairs]
+        if root.spent < 1 or not slopes:
+            return root
+        i, work = int(np.argmax(np.abs(slopes))), self.dot(root.x, root.R)
+        if abs(work) > 0.1 * abs(slopes[i]):
+            return root
+        return root._replace(x=root.x - work / slopes[i] * self.newton.pairs[i][0])
+
+    def _residual(self, w: Array) -> tuple[Array, float]:
+        """R(w) and its norm, infinite where the law has no stress. Collective."""
+        n = self.parts  # s is n times as large in a part of a step
+        self.trial.stateIncrease()
+        self.trial_array[:] = w
+        fine = self.body.step(self.begin, self.trial, self.f)
+        if not (fine if self.held.whole else self.comm.allreduce(fine, MPI.LAND)):
+            return w, np.inf
+        self.inertia.mult(self.trial, self.y)
+        R: Array = self.f_array - self.right
+        R += self.y_array if n == 1 else n * n * self.y_array
+        if self.drag is not None:
+            self.drag.mult(self.trial, self.y)
+            R += n * self.y_array
+        if self.C is not None:
+            R -= self.G @ (self.C @ self._pulled(w))
+        return R, float(np.sqrt(self.dot(R, R)))
+
+    def _apply(self, q: Array) -> Array:
+        """(S - G C G')^-1 q for the tangent factored last. Collective."""
+        self.trial_array[:] = q
+        self.trial.stateIncrease()
+        self._solve(self.trial, self.solved)
+        x: Array = self.solved.array_r.copy()
+        if self.C is not None:
+            x += self.Y @ np.linalg.solve(np.linalg.inv(self.C) - self._pulled(self.Y), self._pulled(x))
+        return x
+
+    def _renew_from(self, w: Array) -> bool:
+        return self._renew(self.at.array_r + w)
+
+    def _renew(self, z: Array) -> bool:
+        """Factor K(z) + s D + s^2 M; whether that worked. Collective."""
+        self.trial.array_w[:] = z
+        S = self.body.tangent(self.trial)
+        S.axpy(float(self.parts**2), self.inertia, SAME)
+        if self.drag is not None:
+            S.axpy(float(self.parts), self.drag, SAME)
+        self.newton.pairs.clear()
+        counts = self.counts
+        counts.factors, counts.first, counts.spent = counts.factors + 1, -1, 0
+        self.tangent_at = z.copy()
+        if not self.solver.renew(S):
+            return False
+        if hasattr(self, "Y"):
+            C, self.C = self.C, None
+            self.Y = np.column_stack([self._apply(g) for g in self.G.T])
+            self.C = C
+        return True
+
+    # ---- parts of a step
+
+    def _divided(self) -> Root:
+        """The step in 2 to 16 parts under the same load: its w, and the jump of the velocity. Collective.
+
+        Raises:
+            SolverError: no number of parts converges, or a hand that feels the tissue would need them.
+        """
+        at, r, lost = self.at, self.r_array.copy(), self.dissipated
+        while not self.system.two_way and self.parts < PARTS:
+            self.parts *= 2
+            self.at = at.copy()
+            root = self._taken()
+            self.at.destroy()
+            self.at, self.begin = at, self.body.start(at)
+            if root.spent >= 0:
+                self.parts, self.past = 1, deque(maxlen=KEPT)
+                self.counts.divided += 1
+                self._renew(at.array_r + root.x)
+                return root
+            self.r.array_w[:], self.dissipated, self.jump = r, lost, None
+        reason = "the hand feels the tissue, so that no step is divided" if self.parts == 1 else "16 parts did not help"
+        self.parts = 1
+        J, place = self.body.lowest(self.body.J, None if self.held.whole else self.comm)
+        raise SolverError(
+            f"finite strain ({self.body.law.name}): no convergence ({reason}); in the cell at {place} the last trial "
+            f"has det F = {J:.3g}: take more time.steps, a finer mesh or a gentler motion"
+        )
+
+    def _taken(self) -> Root:
+        """All parts of a step, each with a tangent of its own; count < 0 where one of them fails. Collective."""
+        w, jump, count = np.zeros_like(self.r_array), np.zeros_like(self.r_array), 0
+        for _ in range(self.parts):
+            self.begin, self.right = self.body.start(self.at), self.parts * self.r_array + self.load
+            self._renew(self.at.array_r.copy())
+            root = self._find(np.zeros_like(w))
+            if root.spent < 0:
+                return root
+            self.w.array_w[:] = root.x
+            self._add_momentum()
+            self.at.axpy(2.0, self.w)
+            w, jump, count = w + root.x, 2 * self.s * self.parts * root.x - jump, count + root.spent
+        self.jump = jump
+        return root._replace(x=w, spent=count)
+
+    # ---- the end of a step
+
+    def advance(self, old: TissueState, new: TissueState) -> None:
+        """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry momentum and law on. Collective."""
+        v = None if self.jump is None else old.v.array_r + self.jump[self.rows]
+        super().advance(old, new)
+        if v is not None:
+            new.v.array_w[:] = v
+
+    def _carry_on(self, z: PETSc.Vec) -> None:
+        if self.jump is None:
+            self._add_momentum()
+        self._arrive(z)
+
+    def _add_momentum(self) -> None:
+        """S pi -> 2 s^2 M w - s pi, in a part of a step with its own s, and what the drag takes. Collective."""
+        self.inertia.mult(self.w, self.y)
+        self.r.axpby(2.0 * self.parts, -1.0, self.y)
+        if self.drag is not None:
+            self.drag.mult(self.w, self.y)
+            self.dissipated += 2 * self.parts * float(np.dot(self.w_array, self.y_array))
+
+    def residual(self) -> float:
+        """|R| of the last step over the largest |s pi + G c| so far; the step was checked."""
+        return self.last
+
+    def destroy(self) -> None:
+        """Free all PETSc objects. Collective."""
+        self.body.destroy()
+        for item in (
+            self.body.points.B if self.held.whole else None,
+            *self.held.parts,
+            self.trial,
+            self.f,
+            self.y,
+            self.solved,
+        ):
+            if item is not None:
+                item.destroy()
+        super().destroy()
+
+
+def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:
+    """S D with D = alpha M + beta K [+ layers], with the pattern of M. Collective."""
+    damping = system.damping
+    result = system.M_ee.copy()
+    result.scale(s * damping.alpha)
+    if damping.beta:
+        result.axpy(s * damping.beta, system.K_ee, SAME)
+    if damping.matrix is not None:
+        result.axpy(s, damping.matrix, SAME)
+    return result

@@ -1,0 +1,354 @@
+"""Trains certified models of a scene: full runs where the greedy asks for them, modes that they add, sizes, mesh.
+
+X = [z, tau v] of a full run, less its projection on Phi in K_r, gives its leading POD modes to Phi; tau makes both
+halves equally long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from softgrasp.fem.accuracy import estimate as accuracy
+from softgrasp.fem.accuracy.small import run_small
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import Array, on_root, times_columns, total
+from softgrasp.reduction.certified.certificate import MeshNumber
+from softgrasp.reduction.certified.greedy import REASONS, Greedy, Round, greedy, start
+from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.motion import Materials
+from softgrasp.reduction.certified.residual import ResidualSpace
+from softgrasp.reduction.certified.training import certified_model, scene_drive
+from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
+
+COLUMNS = 200  # states of a full run that its modes are taken from
+CACHED = 3e8  # entries of full runs that are kept, in case a point comes again: 2.4 GB over all ranks
+SHARE = 0.5  # of the tolerance that the larger basis may use, so that the smaller one has the rest
+RANDOM = 100  # parameters beside the grid where the finished model is looked at
+PLACES = 4  # trained parameters at which the mesh is estimated
+CHUNK = 50  # parameters that are looked at together
+SEED = 20
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Full runs at random parameters against the estimate by two bases.
+
+    Attributes:
+        n: runs.
+        factor: largest ratio of the true error to the estimate.
+        worst: largest relative true error.
+        share: of the box, in the measure of the sampling, above which the error exceeds ``factor`` times the estimate
+            with a probability of 5 % at most.
+    """
+
+    n: int
+    factor: float
+    worst: float
+    share: float
+
+
+def motions_of(model: Model) -> list[Model]:
+    """The scene's own motion, or one for every freedom of the hand: the tissue is linear in the motion.
+
+    Raises:
+        SceneError: unit motions of a motion that is no quintic one.
+    """
+    scene, n_s = model.scene, model.system.layout.n_s
+    if scene.reduction.motions != "unit":
+        return [model]
+    target = np.zeros(n_s)
+    if scene.motion.target is None or scene.motion.drive == "force":
+        raise SceneError("reduction.motions = 'unit' needs a prescribed quintic motion; use 'own' here")
+    target[: len(scene.motion.target)] = scene.motion.target
+    result, size = [], float(np.abs(target).max())
+    for j in range(n_s):
+        turned = j >= model.system.layout.dimension
+        own = [0.0] * n_s
+        own[j] = float(target[j]) or (size / model.system.layout.extent if turned else size)
+        other = scene.model_copy(update={"motion": scene.motion.model_copy(update={"target": own})})
+        other._directory = scene._directory
+        result.append(replace(model, scene=other))
+    return result
+
+
+class Trainer:
+    """The full model of a scene, the basis grown from it, and the grid of its box. Collective.
+
+    Args:
+        model: the scene; ``reduction`` says how.
+        Phi: modes to go on from, local rows (n_local, k); None: none.
+
+    Raises:
+        SceneError: the scene's own material lies outside the box, or its motions cannot be trained.
+        SolverError: a factorisation failed.
+    """
+
+    def __init__(self, model: Model, Phi: Array | None = None) -> None:
+        if reason := outside(model):
+            raise SceneError(f"{reason}; a certified model needs its box around the scene's own material")
+        if model.system.points is not None:
+            raise SceneError("effects.finite_strain makes the tissue nonlinear; the bound holds for linear tissue only")
+        self.model, self.models = model, motions_of(model)
+        self.comm = model.system.layout.comm
+        lam, mu = box_of(model)
+        layers = model.scene.reduction.layers == "apart" and len(model.system.materials) > 1
+        self.box = Box((lam[0], lam[1]), (mu[0], mu[1]), layers)
+        count = model.scene.reduction.grid
+        axis = np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
+        draws = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
+        if layers:
+            draws = qmc.Halton(2 * len(model.system.materials), scramble=False).random(count**2)
+        self.parameters = self.at(draws)
+        self.points = [(m[0].lam, m[0].mu) for m in self.parameters]
+        self.reference = materials_at(model, float(np.sqrt(lam[0] * lam[1])), float(np.sqrt(mu[0] * mu[1])))
+        self.space = ResidualSpace(model.system, self.reference)
+        self.drives = [scene_drive(m.scene, m.system.M_hand, 1) for m in self.models]
+        self.Phi = np.zeros((model.system.layout.n_local, 0))
+        self._runs: dict[int, list[Array]] = {}
+        self.full_runs = 0
+        if Phi is not None:
+            self._append(Phi)
+
+    def at(self, draws: Array) -> list[Materials]:
+        """Materials of the box at coordinates of the unit cube, logarithmically, (n, layers or 1, 2)."""
+        own = self.model.system.materials
+        low, high = np.log([self.box.lam, self.box.mu]).T
+        factors = np.exp(low + draws.reshape(len(draws), -1, 2) * (high - low)) / (own[0].lam, own[0].mu)
+        factors = np.broadcast_to(factors, (len(draws), len(own), 2)).tolist()
+        return [
+            tuple(replace(m, lam=m.lam * a, mu=m.mu * b) for m, (a, b) in zip(own, each, strict=True))
+            for each in factors
+        ]
+
+    def _append(self, Phi: Array) -> None:
+        self.Phi = np.asfortranarray(np.hstack([self.Phi, Phi]))
+        self.space.extend(Phi)
+        self.certified = certified_model(
+            self.model, self.Phi, space=self.space, box=self.box, drive=self.drives[0],
+            norm=self.model.scene.reduction.norm,
+        )  # fmt: skip
+
+    def train(self, i: int) -> int:
+        """Full runs at a point, and the modes that they add; the number of modes then. Collective.
+
+        Raises:
+            SolverError: a run failed.
+        """
+        if i not in self._runs:
+            runs = [run_with(m, self.parameters[i]) for m in self.models]
+            self.full_runs += len(runs)
+            self._runs[i] = [thinned(run.snapshots, COLUMNS).Z for run in runs]
+            entries = 2.0 * self.model.system.layout.n_e * COLUMNS * len(runs)
+            while len(self._runs) * entries > CACHED and len(self._runs) > 1:
+                self._runs.pop(next(iter(self._runs)))
+        for Z in self._runs[i]:
+            new = self._leading(Z, self.model.scene.reduction.add)
+            if new.shape[1]:
+                self._append(new)
+        return self.Phi.shape[1]
+
+    def _less(self, X: Array) -> Array:
+        """X without its projection on Phi in K_r, twice. Collective."""
+        K = self.space.system.K_ee
+        for _ in range(2):
+            if self.Phi.shape[1]:
+                X = X - self.Phi @ total(self.comm, times_columns(K, self.Phi).T @ X)
+        return np.asfortranarray(X)
+
+    def _leading(self, Z: Array, count: int) -> Array:
+        """Leading POD modes of what Phi does not hold of a run, orthonormal in K_r with Phi. Collective."""
+        n = len(Z) // 2
+        z, v = self._less(Z[:n]), self._less(Z[n:])
+        K = self.space.system.K_ee
+        lengths = [float(np.sqrt(total(self.comm, (x * times_columns(K, x)).sum(axis=0)).sum())) for x in (z, v)]
+        if lengths[0] == 0 and lengths[1] == 0:
+            return np.zeros((n, 0))
+        X = np.hstack([z, v * (lengths[0] / lengths[1] if lengths[0] > 0 and lengths[1] > 0 else 1.0)])
+        gram = total(self.comm, X.T @ times_columns(K, X))
+        squares, V = on_root(self.comm, lambda: np.linalg.eigh((gram + gram.T) / 2))
+        pick = [j for j in range(len(squares) - 1, -1, -1) if squares[j] > 1e-14 * squares[-1]][:count]
+        modes = self._less(X @ (V[:, pick] / np.sqrt(squares[pick])))
+        for j in range(len(pick)):  # what rounding left
+            x = modes[:, j]
+            x -= modes[:, :j] @ total(self.comm, modes[:, :j].T @ times_columns(K, x[:, None]))[:, 0]
+            x /= np.sqrt(total(self.comm, (x[:, None] * times_columns(K, x[:, None])).sum(axis=0))[0])
+        return modes
+
+    def bound(self, indices: Sequence[int]) -> list[float]:
+        """Relative bounds of the basis at some points of the grid, the largest of all motions. Collective."""
+        return self.bounds_at([self.parameters[i] for i in indices], self.certified)
+
+    def bounds_at(self, many: Sequence[Materials], model: CertifiedModel) -> list[float]:
+        """The same at any materials and for any model; the ranks share the work. Collective."""
+        mine, values = many[self.comm.rank :: self.comm.size], np.zeros(len(many))
+        for drive in self.drives if mine else ():
+            own = np.array([run.certificate.reduction for run in model.run_batch(mine, drive)])
+            share = values[self.comm.rank :: self.comm.size]
+            np.maximum(share, own, out=share)
+        parts = self.comm.allgather(values[self.comm.rank :: self.comm.size])
+        for rank, part in enumerate(parts):
+            values[rank :: self.comm.size] = part
+        return [float(value) for value in values]
+
+    def checked(self) -> list[Materials]:
+        """The grid and random parameters of the box."""
+        return [*self.parameters, *self.random(RANDOM, SEED)]
+
+    def random(self, n: int, seed: int) -> list[Materials]:
+        """Random materials of the box, the same on every rank."""
+        width = len(self.model.system.materials) if self.box.apart else 1
+        return self.at(np.random.default_rng(seed).uniform(size=(n, width, 2)))
+
+    def destroy(self) -> None:
+        """Free the factors. Collective."""
+        self.space.destroy()
+
+
+def train_key(model: Model) -> str:
+    """What a training depends on: two of one key may go on from each other."""
+    keys = model.scene.reduction.model_dump(
+        include={"lambda_range", "mu_range", "grid", "layers", "add", "motions", "norm"}
+    )
+    others = ("name", "description", "reduction", "study", "output", "control")
+    return f"{scene_hash(model.scene, others)} {sorted(keys.items())}"
+
+
+def state_of(model: CertifiedModel) -> Greedy:
+    """The greedy's state in a model that was saved on the way."""
+    rounds = tuple(Round(**entry) for entry in model.training["rounds"])
+    return Greedy(rounds, np.array(model.training["known"], dtype=float))
+
+
+def history(trainer: Trainer, state: Greedy) -> dict[str, Any]:
+    """What a greedy did, as :attr:`softgrasp.reduction.certified.model.CertifiedModel.training` keeps it."""
+    return {
+        "key": train_key(trainer.model),
+        "rounds": [asdict(r) for r in state.rounds],
+        "known": state.known.tolist(),
+        "points": trainer.points,
+        "chosen": [trainer.points[r.at] for r in state.rounds],
+        "reason": state.reason,
+        "full_runs": trainer.full_runs,
+    }
+
+
+def build_certified(
+    trainer: Trainer,
+    tolerance: float,
+    state: Greedy | None = None,
+    progress: Callable[[Greedy, CertifiedModel], None] = lambda state, model: None,
+) -> CertifiedModel:
+    """Run the greedy to a tolerance, and choose the small basis. Collective.
+
+    Args:
+        trainer: at the basis of ``state``.
+        tolerance: relative.
+        state: of an earlier training to go on from.
+        progress: called after every round with the model so far, which can be saved and gone on from.
+
+    Returns:
+        The model; ``training["reason"]`` says how the greedy ended, ``training["proved"]`` the largest bound over the
+        grid and random parameters. It has the tolerance whether or not that was reached: what is above is refused.
+    """
+    options, count = trainer.model.scene.reduction, len(trainer.points)
+    hand = 2 * trainer.model.system.layout.n_s
+    middle = (options.grid // 2) * (options.grid + 1)
+
+    def after(state: Greedy) -> None:
+        progress(state, replace(trainer.certified, training=history(trainer, state)))
+
+    goal = tolerance if options.certify == "proof" else SHARE * tolerance
+    most = max(1, (options.max_N - hand) // 2)
+    state = greedy(trainer.train, trainer.bound, state or start(count), middle, goal, most, after)
+    model = replace(trainer.certified, training=history(trainer, state), tolerance=tolerance)
+    many = trainer.checked()
+    if options.certify != "proof":
+        model = smallest(trainer, model, many, tolerance)
+    proved = trainer.bounds_at(many, model)
+    about = {"proved": max(proved), "checked": len(many), "why": REASONS[state.reason]}
+    drive = scene_drive(trainer.model.scene, trainer.model.system.M_hand)
+    certify = "estimate" if options.certify == "estimate" and model.certify == "two" else model.certify
+    return replace(model, training={**model.training, **about}, drive=drive, certify=certify)
+
+
+def smallest(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> CertifiedModel:
+    """The same with the least leading basis whose certificate is within the tolerance everywhere. Collective.
+
+    Where none is, all modes make the answer, with one basis and its own bound.
+    """
+    low, high, best = 0, model.k2, model
+    while high - low > 1:
+        k = (low + high) // 2
+        part = replace(model, k=k, certify="two")
+        if within(trainer, part, many, tolerance):
+            high, best = k, part
+        else:
+            low = k
+    return best
+
+
+def within(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> bool:
+    """Whether the certificate is within the tolerance everywhere; points that fail move to the front. Collective."""
+    for at in range(0, len(many), CHUNK):
+        bounds = trainer.bounds_at(many[at : at + CHUNK], model)
+        if max(bounds) > tolerance:
+            many.insert(0, many.pop(at + int(np.argmax(bounds))))
+            return False
+    return True
+
+
+def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
+    """Estimate of the error of the mesh at some parameters, relative to the deformation. Collective.
+
+    Raises:
+        SoftgraspError: the mesh has no estimate.
+    """
+    scene = model.scene
+    if scene.tissue.refine is not None:
+        other = accuracy.next_order(model)
+    else:
+        other = build(accuracy.comparison(scene, accuracy.COMPARED[0]), comm=model.system.layout.comm)
+    estimates = []
+    for place in places:
+        systems = ((m, m.system.with_materials(place)) for m in (model, other))
+        pair = [accuracy.reduced(replace(m, system=system)) for m, system in systems]
+        runs = [run_small(small).deformation for small in pair]
+        estimates.append(accuracy.difference(pair[0], pair[1], runs[1], runs[0])[0])
+    return MeshNumber(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
+
+
+def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
+    """Full runs at n random parameters: how far the estimate is off, and how sure that is. Collective.
+
+    With c the largest ratio seen, the share of the box where the error exceeds c times the estimate is at most
+    1 - 0.05^(1/n) with a confidence of 95 %.
+    """
+    factors, errors = [], []
+    layout = trainer.model.system.layout
+    modes = trainer.Phi[:, : model.k]
+    for place in trainer.random(n, SEED + 1):
+        full = run_with(trainer.models[0], place)
+        run = model.run(full.model.system.materials, trainer.drives[0], allow=True)
+        steps, hand = full.snapshots.steps, 2 * layout.n_s
+        a, b = np.split(run.trajectory.x[steps, hand:].T, 2)
+        d = full.snapshots.Z - np.vstack([modes @ a, modes @ b])
+        error = np.sqrt(2 * tissue_energy(full.model.system, d).max())
+        estimate = run.certificate.estimate
+        errors.append(error / np.sqrt(2 * full.energy.max()))
+        factors.append(error / float(estimate.largest) if estimate is not None else np.nan)
+    return Validation(n, float(max(factors)), float(max(errors)), float(1 - 0.05 ** (1 / n)))
+
+
+def tissue_energy(system: Any, Z: Array) -> Array:
+    """(z'Kz + v'Mv) / 2 of columns [z; v], local rows. Collective."""
+    n = system.layout.n_local
+    local = (Z[:n] * times_columns(system.K_ee, Z[:n])).sum(axis=0)
+    local += (Z[n:] * times_columns(system.M_ee, Z[n:])).sum(axis=0)
+    return total(system.layout.comm, local) / 2

@@ -1,0 +1,127 @@
+"""Pages of the documentation that are made from the source: scene keys, tutorials and notebooks, references, changes.
+
+A hook of MkDocs; `make docs` runs it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import jupytext
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import softgrasp
+from softgrasp.study.shell.schema import full_schema
+
+ROOT = Path(__file__).parents[1]
+ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control"}
+MORE = {
+    "fem": ["fem.fields.series.SeriesWriter"],
+    "reduction": ["reduction.model.ReducedModel", "reduction.model.SmallModel", "reduction.lti.LTI"],
+    "lqr": ["lqr.loop.margins.loop_margins", "lqr.loop.margins.LoopMargins"],
+}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are made."""
+    pages = {"scene.md": scene_keys(full_schema()), "references.md": (ROOT / "REFERENCES.md").read_text()}
+    pages["api.md"] = python_names()
+    pages["changes.md"] = (ROOT / "CHANGELOG.md").read_text()
+    for path in sorted((ROOT / "demos").glob("demo_*.py")):
+        name = path.stem.removeprefix("demo_")
+        book = jupytext.read(path)
+        pages[f"tutorials/{name}.md"] = tutorial(name, book)
+        pages[f"tutorials/{name}.ipynb"] = jupytext.writes(book, fmt="ipynb")
+    for name, text in pages.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def python_names() -> str:
+    """What `import softgrasp` gives, in the order of the rooms, and some classes that it returns."""
+    text = [
+        "# Python",
+        "What `import softgrasp as sg` gives; a name is loaded when it is used. A function is collective only if it "
+        "says so.",
+    ]
+    for room, title in ROOMS.items():
+        names = [f"{module}.{name}" for name, module in softgrasp._FACE.items() if module.split(".")[0] == room]
+        text += [f"## {title}", *(f"::: softgrasp.{name}" for name in [*names, *MORE[room]])]
+    return "\n\n".join(text) + "\n"
+
+
+def tutorial(name: str, book: Any) -> str:
+    """A page with the text and the code of a script in cells."""
+    parts = [cell.source if cell.cell_type == "markdown" else f"```python\n{cell.source}\n```" for cell in book.cells]
+    note = f"*The same as a [notebook]({name}.ipynb); the script is `demos/demo_{name}.py`, which the tests run.*"
+    return "\n\n".join([parts[0], note, *parts[1:]])
+
+
+def scene_keys(schema: dict[str, Any]) -> str:
+    """All keys of a scene, a table a section, from the JSON schema."""
+    text = [
+        "# Scene keys",
+        "A scene is a TOML file. Every key has a unit; what is not given takes its default. `softgrasp schema` "
+        "prints the same as a JSON schema, which editors use to complete and check keys.",
+    ]
+    seen: list[str] = []
+
+    def section(path: str, table: dict[str, Any]) -> None:
+        rows, below = [], []
+        for key, entry in table["properties"].items():
+            where = f"{path}.{key}" if path else key
+            names = re.findall(r'"\$ref": "#/\$defs/(\w+)"', json.dumps(entry))
+            parts = [(n, schema["$defs"][n]) for n in names if "properties" in schema["$defs"][n]]
+            below += [(where, n, part) for n, part in parts if n not in seen]
+            seen.extend(n for n, _ in parts if n not in seen)
+            default = _shown(entry["default"]) if "default" in entry else ""
+            default = "required" if key in table.get("required", []) else default
+            rows.append(f"| `{key}` | {_kind(entry, schema)} | {default} | {_safe(entry.get('description', ''))} |")
+        text.append(f"## `{path or 'top of the file'}`" if path else "## Top of the file")
+        if path and table.get("description"):
+            text.append(_safe(table["description"].split("\n\n")[0].replace("\n", " ")))
+        text.append("\n".join(["| key | takes | default | meaning |", "| --- | --- | --- | --- |", *rows]))
+        for where, _, part in below:
+            section(where, part)
+
+    section("", schema)
+    return "\n\n".join(text) + "\n"
+
+
+def _safe(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "none"
+    if value in ({}, []) or isinstance(value, dict):
+        return ""
+    return f"`{json.dumps(value)}`"
+
+
+def _kind(entry: dict[str, Any], schema: dict[str, Any]) -> str:
+    """Type of a key in words."""
+    if "$ref" in entry:
+        target = schema["$defs"][entry["$ref"].rsplit("/", 1)[-1]]
+        return "table" if "properties" in target else _kind(target, schema)
+    if "enum" in entry:
+        return " or ".join(f"`{_shown(v).strip('`')}`" for v in entry["enum"])
+    if "const" in entry:
+        return _shown(entry["const"])
+    for word in ("anyOf", "oneOf", "allOf"):
+        if word in entry:
+            kinds = [_kind(e, schema) for e in entry[word] if e.get("type") != "null"]
+            return " or ".join(dict.fromkeys(kinds))
+    kind = entry.get("type", "")
+    if kind == "array":
+        items = entry.get("items") or (entry.get("prefixItems") or [{}])[0]
+        inner = _kind(items, schema) if isinstance(items, dict) else ""
+        return f"list of {inner}" if inner else "list"
+    if kind == "object":
+        return "table"
+    return {"integer": "whole number", "number": "number", "string": "text", "boolean": "true or false"}.get(kind, kind)
