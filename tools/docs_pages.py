@@ -14,14 +14,22 @@ import jupytext
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+import softgrasp
 from softgrasp.study.shell.schema import full_schema
 
 ROOT = Path(__file__).parents[1]
+ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control"}
+MORE = {
+    "fem": ["fem.fields.series.SeriesWriter"],
+    "reduction": ["reduction.model.ReducedModel", "reduction.model.SmallModel", "reduction.lti.LTI"],
+    "lqr": ["lqr.loop.margins.loop_margins", "lqr.loop.margins.LoopMargins"],
+}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made."""
     pages = {"scene.md": scene_keys(full_schema()), "references.md": (ROOT / "REFERENCES.md").read_text()}
+    pages["api.md"] = python_names()
     pages["changes.md"] = (ROOT / "CHANGELOG.md").read_text()
     for path in sorted((ROOT / "demos").glob("demo_*.py")):
         name = path.stem.removeprefix("demo_")
@@ -31,6 +39,19 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
     return files
+
+
+def python_names() -> str:
+    """What `import softgrasp` gives, in the order of the rooms, and some classes that it returns."""
+    text = [
+        "# Python",
+        "What `import softgrasp as sg` gives; a name is loaded when it is used. A function is collective only if it "
+        "says so.",
+    ]
+    for room, title in ROOMS.items():
+        names = [f"{module}.{name}" for name, module in softgrasp._FACE.items() if module.split(".")[0] == room]
+        text += [f"## {title}", *(f"::: softgrasp.{name}" for name in [*names, *MORE[room]])]
+    return "\n\n".join(text) + "\n"
 
 
 def tutorial(name: str, book: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from softgrasp.reduction.certified.trainer import (
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
 from softgrasp.study.forward.result import simulate_result
+from softgrasp.study.reduce.certify_check import BoxCheck, check_box
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import origin, peak_memory_mb, provenance
 from softgrasp.study.report.page import Section
@@ -41,6 +43,16 @@ from softgrasp.study.shell.timing import median_seconds
 FILE = "certified.h5"
 REPEATS = 7  # behind the median time of a query
 KEPT = ("scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver")
+
+CAPTIONS = {
+    "certified_box.png": "Relative error of the deformation over the box, in the energy norm: the proved bound, the "
+    "estimate by two bases, and the truth from full runs at parameters that were not trained.",
+    "certified_greedy.png": "The greedy: largest bound on its grid after every round, and where it ran the full model "
+    "(numbers: rounds; a place may come again). With two bases it goes on to half the tolerance: the rest is for "
+    "the small basis.",
+    "certified_sizes.png": "Leading parts of the basis: bound over true error at the tests (line: median, bar: from "
+    "least to largest), and largest error against the time of an answer, beside the time of a full run.",
+}
 
 
 def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
@@ -69,7 +81,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
                 bar.update(task, completed=float(min(share, 0.99)))
             r, (lam, mu) = state.rounds[-1], trainer.points[state.rounds[-1].worst]
             bar.console.print(
-                f"round {len(state.rounds)}: k = {r.k}, largest bound {r.bound:.1e} at ({lam:.3g}, {mu:.3g}), "
+                f"round {len(state.rounds)}: k = {r.k}, largest bound {_shown(r.bound)} at ({lam:.3g}, {mu:.3g}), "
                 f"{r.evaluations} evaluations, {r.seconds:.1f} s",
                 markup=False,
             )
@@ -83,23 +95,35 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     finally:
         trainer.destroy()
     with watch.stage("mesh"):
-        mesh = _mesh(model, certified)
+        mesh = _mesh(model, trainer, certified)
     tested = {} if validation is None else {"validation": asdict(validation)}
     certified = replace(certified, mesh=mesh, training={**certified.training, **tested})
     save_certified(certified, file)
-    result = certify_result(model, certified, watch)
+    with watch.stage("tests"):
+        check = check_box(model, certified)
+    result = certify_result(model, certified, check, watch)
 
     def page() -> Page:
-        return Page(
-            f"{scene.name}: certified reduced model", sections(model, certified, result),
-            {"greedy.csv": greedy_table(certified)}, [file],
-        )  # fmt: skip
+        drawn: list[Path] = []
+        if session.pictures:
+            from softgrasp.study.reduce.certify_plots import draw  # brings Matplotlib
+
+            drawn = draw(session.out, certified, check, tolerance)
+        tables = {"greedy.csv": greedy_table(certified)}
+        if check is not None:
+            tables["tests.csv"] = tests_table(check)
+        parts = sections(model, certified, result, drawn)
+        return Page(f"{scene.name}: certified reduced model", parts, tables, [*drawn, file])
 
     files = session.write(scene, result, page)
     for sentence in sentences(certified, result):
         console.print(sentence, markup=False)
     list_files(console, files)
     return result
+
+
+def _shown(bound: float) -> str:
+    return f"{bound:.1e}" if np.isfinite(bound) else "above 1"
 
 
 def _range(pair: tuple[float, float]) -> str:
@@ -120,16 +144,16 @@ def _earlier(model: Model, file: Path) -> tuple[Greedy | None, Array | None]:
     return state_of(old), old.fine.lift.L_q[:, hand : hand + old.k2]
 
 
-def _mesh(model: Model, certified: CertifiedModel) -> MeshNumber | None:
+def _mesh(model: Model, trainer: Trainer, certified: CertifiedModel) -> MeshNumber | None:
     """What is known of the mesh at some of the trained parameters; None where it has no estimate."""
-    places = list(dict.fromkeys(tuple(place) for place in certified.training["chosen"]))[:PLACES]
+    places = list(dict.fromkeys(trainer.parameters[r["at"]] for r in certified.training["rounds"]))[:PLACES]
     try:
         return mesh_number(model, places)
     except SoftgraspError:
         return None
 
 
-def certify_result(model: Model, certified: CertifiedModel, watch: Stopwatch) -> dict[str, Any]:
+def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | None, watch: Stopwatch) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
     first, comm = model.system.materials[0], model.system.layout.comm
     with watch.stage("full"):
@@ -168,10 +192,22 @@ def certify_result(model: Model, certified: CertifiedModel, watch: Stopwatch) ->
             "own": own,
             **{key: value for key, value in training.items() if key not in ("known", "points", "key")},
         },
+        "tests": None if check is None else asdict(check),
         "time": {**watch.seconds, "query": query},
         "memory_peak_mb": peak_memory_mb(comm),
     }
     return dict(to_json(result))
+
+
+def tests_table(check: BoxCheck) -> Table:
+    """One row a size and test."""
+    rows = [
+        (s.k, s.k2, t.lam, t.mu, t.truth, t.estimate if np.isfinite(t.estimate) else None, t.bound, t.effectivity)
+        for s in check.sizes
+        for t in s.tested
+    ]
+    header = ("k", "k2", "lambda [Pa]", "mu [Pa]", "true error", "estimate", "bound", "bound / true error")
+    return Table(header, rows, "Tests")
 
 
 def greedy_table(certified: CertifiedModel) -> Table:
@@ -179,7 +215,7 @@ def greedy_table(certified: CertifiedModel) -> Table:
     hand, points = 2 * len(certified.fine.parts["M_hand"]), certified.training["points"]
     rows = [
         (
-            i + 1, *(f"{x:.4g}" for x in points[r["at"]]), r["k"], hand + 2 * r["k"], f"{r['bound']:.1e}",
+            i + 1, *(f"{x:.4g}" for x in points[r["at"]]), r["k"], hand + 2 * r["k"], _shown(r["bound"]),
             *(f"{x:.4g}" for x in points[r["worst"]]), r["evaluations"], f"{r['seconds']:.1f}",
         )
         for i, r in enumerate(certified.training["rounds"])
@@ -217,18 +253,29 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
     lines += about["own"]["reasons"]
     query, full = time["query"], time["full"]
     lines.append(f"A query takes {query * 1e3:.3g} ms, a full run {full * 1e3:.3g} ms with its factor.")
+    if result["tests"] is not None:
+        own, count = result["tests"]["own"], len(result["tests"]["own"]["tested"])
+        ratios = [t["bound"] / t["truth"] for t in own["tested"] if t["truth"]]
+        true = max(t["truth"] for t in own["tested"])
+        lines.append(
+            f"Against {count} full runs between the corners of the box: true error at most {true:.1e}, bound "
+            f"{np.median(ratios):.3g} times as large in the median, {max(ratios):.3g} at most."
+        )
     if query > full:
         lines.append("A query takes longer than a full run here: the model is worth it on a finer mesh only.")
     return lines
 
 
-def sections(model: Model, certified: CertifiedModel, result: dict[str, Any]) -> list[Section]:
+def sections(
+    model: Model, certified: CertifiedModel, result: dict[str, Any], drawn: Sequence[Path] = ()
+) -> list[Section]:
     """Parts of the page."""
+    figures = [(file, CAPTIONS[file.name]) for name in CAPTIONS for file in drawn if file.name == name]
     scene, comm = model.scene, model.system.layout.comm
     rows = provenance(origin(scene, comm.size))
     rows += [(f"time {key}", f"{value:.3g} s") for key, value in result["time"].items()]
     return [
-        Section("What holds", text="\n\n".join(sentences(certified, result))),
+        Section("What holds", text="\n\n".join(sentences(certified, result)), figures=figures),
         greedy_table(certified).section("Each round runs the full model where the proved bound was largest."),
         Section("Made with", rows=rows),
     ]

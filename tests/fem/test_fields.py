@@ -22,7 +22,9 @@ pytestmark = pytest.mark.ranks
 EXACT = 1e-14  # coordinates of order 1 times rounding
 
 
-def make_model(comm: MPI.Intracomm, d: int, order: int, **extra: Any) -> Model:
+def make_model(
+    comm: MPI.Intracomm, d: int, order: int, rotation: bool = True, finite_strain: Any = None, **extra: Any
+) -> Model:
     size, cells = ([1.0, 2.0], [3, 6]) if d == 2 else ([1.0, 0.5, 2.0], [2, 2, 4])
     top = 1.4
     tissue = {"size": size, "cells": cells, "order": order, "material": {"young": 10.0, "poisson": 0.3, "rho": 1.0}}
@@ -33,7 +35,7 @@ def make_model(comm: MPI.Intracomm, d: int, order: int, **extra: Any) -> Model:
             "tissue": tissue,
             "contact": {"sides": ["left", "right"], "box": [[0.0] * (d - 1) + [top], size]},
             "hand": {"mass": 1.0, "inertia": 1.0, "reference": [0.2] * d},
-            "effects": {"rotation": True},
+            "effects": {"rotation": rotation} | ({"finite_strain": finite_strain} if finite_strain else {}),
             "time": {"steps": 2, "end": 1.0},
         }
     )

@@ -16,6 +16,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.fields.series import SeriesWriter
+from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import note_of
 from tests.fem.test_fields import EXACT, hand_of, make_model, turned
 
@@ -104,6 +105,29 @@ def test_stress_of_a_known_gradient(comm: MPI.Intracomm, mpi_tmp_path: Path, d: 
         stress = grid.cell_data.GetArray("stress")  # the names that ParaView shows
         assert [stress.GetComponentName(i) for i in range(6)] == ["xx", "yy", "zz", "xy", "yz", "xz"]
     comm.Barrier()
+
+
+@pytest.mark.parametrize("law", ["neo-hooke", "stvk"])
+def test_cauchy_stress_of_finite_strain(comm: MPI.Intracomm, law: str) -> None:
+    """Uniaxial stretch by a finite amount, and the same turned: the stress turns with it. By hand in 3D."""
+    model = make_model(comm, 3, 1, rotation=False, finite_strain={"law": law})
+    stretch, (c, s) = np.diag([1.2, 0.95, 0.9]), (np.cos(0.7), np.sin(0.7))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    lam, mu = model.system.materials[0].lam, model.system.materials[0].mu
+    J, b = np.prod(np.diag(stretch)), stretch**2
+    if law == "neo-hooke":
+        expected = (mu * (b - np.eye(3)) + lam * np.log(J) * np.eye(3)) / J
+    else:
+        E = (b - np.eye(3)) / 2
+        expected = stretch @ (2 * mu * E + lam * np.trace(E) * np.eye(3)) @ stretch / J
+    at = model.space.V.tabulate_dof_coordinates()
+    cells = CellStress(model)
+    for R in (np.eye(3), turn):
+        strain, stress, _ = cells(at @ (R @ stretch - np.eye(3)).T)
+        sigma = (R @ expected @ R.T)[[0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
+        np.testing.assert_allclose(stress, np.tile(sigma, (len(stress), 1)), atol=1e-12)  # rounding of order 10
+        green = ((b - np.eye(3)) / 2)[[0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
+        np.testing.assert_allclose(strain, np.tile(green, (len(strain), 1)), atol=1e-14)
 
 
 def test_meshio_reads_the_same(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
