@@ -28,7 +28,7 @@ assert abs(run.q_s[-1] - [5, 3]).max() < 1e-12  # a prescribed motion ends where
 assert run.energy_drift < 1e-12  # the midpoint rule conserves quadratic invariants: rounding only
 
 # %% [markdown]
-# New material: $K = \mu K_\mu + \lambda K_\lambda$ is combined again. A stiffer body follows the hand more closely.
+# New material: `K = mu K_mu + lambda K_lambda` is combined again. A stiffer body follows the hand more closely.
 
 # %%
 lag = {}
