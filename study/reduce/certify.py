@@ -95,7 +95,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     finally:
         trainer.destroy()
     with watch.stage("mesh"):
-        mesh = _mesh(model, certified)
+        mesh = _mesh(model, trainer, certified)
     tested = {} if validation is None else {"validation": asdict(validation)}
     certified = replace(certified, mesh=mesh, training={**certified.training, **tested})
     save_certified(certified, file)
@@ -140,9 +140,9 @@ def _earlier(model: Model, file: Path) -> tuple[Greedy | None, Array | None]:
     return state_of(old), old.fine.lift.L_q[:, hand : hand + old.k2]
 
 
-def _mesh(model: Model, certified: CertifiedModel) -> MeshNumber | None:
+def _mesh(model: Model, trainer: Trainer, certified: CertifiedModel) -> MeshNumber | None:
     """What is known of the mesh at some of the trained parameters; None where it has no estimate."""
-    places = list(dict.fromkeys(tuple(place) for place in certified.training["chosen"]))[:PLACES]
+    places = list(dict.fromkeys(trainer.parameters[r["at"]] for r in certified.training["rounds"]))[:PLACES]
     try:
         return mesh_number(model, places)
     except SoftgraspError:

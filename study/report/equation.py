@@ -88,9 +88,10 @@ def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
         result.append("one-way: the hand does not feel the tissue, M_ss = M_hand, M_se = 0, K_ss = K_se = 0")
     if effects.damping is not None:
         beta = "beta K_ee" if not layered(scene) else "sum over layers of beta K"
-        D = f"alpha M_ee + {beta}" if effects.damping.alpha else beta
+        damping = f"alpha M_ee + {beta}" if effects.damping.alpha else beta
         result.append(
-            f"D_ee = {D}, D_es = -D_ee T" + (" + alpha G: dragged in space" if dragged else ": a rigid move is free")
+            f"D_ee = {damping}, D_es = -D_ee T"
+            + (" + alpha G: dragged in space" if dragged else ": a rigid move is free")
         )
         if effects.reaction:
             result.append("D_se = D_es', D_ss = T' D_ee T" + (" + alpha (R' M R - T' M_ee T)" if dragged else ""))
