@@ -89,7 +89,12 @@ def box_materials(model: Model) -> list[tuple[LayerMaterial, ...]]:
 
 def run_at(model: Model, lam: float, mu: float) -> FullRun:
     """The full run at other constants. Collective."""
-    system = model.system.with_materials(materials_at(model, lam, mu))
+    return run_with(model, materials_at(model, lam, mu))
+
+
+def run_with(model: Model, materials: tuple[LayerMaterial, ...]) -> FullRun:
+    """The full run at other materials. Collective."""
+    system = model.system.with_materials(materials)
     other = replace(model, system=system, watch=Stopwatch(system.layout.comm))
     return full_run(other, simulate(other))
 

@@ -8,7 +8,6 @@ from softgrasp.study.shell.streams import quiet_imports
 quiet_imports()
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +17,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.study.query.command import query
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
+from softgrasp.study.shell.options import Empty, NoPictures, Out, Overrides, Pdf, Quiet, SceneFile, check_folder
 
 LIST_WIDTH = 200  # [letters]
 app = typer.Typer(
@@ -26,51 +26,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Simulate a rigid robot hand that holds soft tissue. Start with: softgrasp simulate SCENE",
 )
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", "-s", help="override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"),
-]
-
-
-def _folder(out: Path | None) -> Path | None:
-    """Refuse a folder that cannot be one before anything is computed."""
-    if out is not None:
-        there = next(path for path in (out, *out.absolute().parents) if path.exists())
-        if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
-            why = "cannot be written to" if there.is_dir() else "is a file"
-            raise SceneError(f"--out {out}: {there} {why}; name a folder, which is made if it is missing")
-    return out
-
-
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        "--out",
-        "-o",
-        help="folder for result.json, tables, pictures and report.html; out/SCENE-COMMAND if it is not given",
-        callback=_folder,
-    ),
-]
-Empty = Annotated[
-    bool, typer.Option("--empty", help="first remove the results that an earlier run has left in the folder")
-]
-Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
-NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")]
-
-
-def _scenes(start: str) -> list[str]:
-    """Scenes that ship and TOML files and folders below, for the shell's completion."""
-    from softgrasp.fem.scene.file import shipped_scenes
-
-    below = Path(start if start.endswith("/") else f"{start}x").parent
-    near = [f"{p}/" if p.is_dir() else str(p) for p in below.glob("*") if p.is_dir() or p.suffix == ".toml"]
-    return [name for name in (*shipped_scenes(), *near) if name.startswith(start)]
-
-
-SceneFile = Annotated[
-    Path,
-    typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship", autocompletion=_scenes),
-]
 
 
 def _show_version(show: bool) -> None:
@@ -158,6 +113,7 @@ def compare(
     out: Out = None,
     no_pictures: NoPictures = False,
     empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Show in which keys, numbers and trajectories two runs differ."""
     from softgrasp.study.runs.listing import run_compare
@@ -181,7 +137,9 @@ def explain(
     scene: SceneFile,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="also write result.json and report.html into this folder", callback=_folder),
+        typer.Option(
+            "--out", "-o", help="also write result.json and report.html into this folder", callback=check_folder
+        ),
     ] = None,
     set_: Overrides = None,
     empty: Empty = False,
@@ -205,6 +163,7 @@ def simulate(
         bool, typer.Option("--certify", help="estimate the error of mesh and time step, whatever it costs")
     ] = False,
     empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
     from softgrasp.study.forward.run import run_simulate
@@ -242,6 +201,7 @@ def sweep(
     quiet: Quiet = False,
     no_pictures: NoPictures = False,
     empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Simulate a scene at many values of its keys; resumes; `mpiexec -n N` runs N points at a time."""
     from softgrasp.study.runs.run import run_sweep
@@ -282,6 +242,7 @@ def reduce(
     quiet: Quiet = False,
     no_pictures: NoPictures = False,
     empty: Empty = False,
+    pdf: Pdf = False,
     tolerance: Annotated[
         str | None,
         typer.Option(help="build one model that proves its error over the scene's box, to this relative error: 1e-2"),
@@ -308,13 +269,19 @@ def control(
     set_: Overrides = None,
     quiet: Quiet = False,
     no_pictures: NoPictures = False,
+    gain_only: Annotated[
+        bool, typer.Option("--gain-only", help="only the Riccati equation and the controllers: no loop, no pictures")
+    ] = False,
     empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
     from softgrasp.study.control.run import run_control
 
     out = out or default_folder("control", scene)
-    run_control(scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty)
+    run_control(
+        scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty, gain_only=gain_only
+    )
 
 
 @app.command()
@@ -337,6 +304,7 @@ def study(
     ] = None,
     quiet: Quiet = False,
     empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
     from softgrasp.study.precision.answer import parse_budget, parse_tolerance
@@ -359,7 +327,12 @@ def study(
 
 @app.command()
 def effects(
-    scene: SceneFile, out: Out = None, set_: Overrides = None, quiet: Quiet = False, empty: Empty = False
+    scene: SceneFile,
+    out: Out = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""
     from softgrasp.study.effects.run import run_effects
@@ -374,6 +347,7 @@ def hardcases(
     family: Annotated[str | None, typer.Option(help="one family of cases only")] = None,
     quiet: Quiet = False,
     empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Run the suite of hard cases: stay stable, or refuse with a reason."""
     from softgrasp.study.hardcases.run import run_hardcases

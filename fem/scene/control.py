@@ -82,6 +82,11 @@ class Reduction(Section):
     grid: Annotated[int, Field(ge=1)] = Field(
         20, description="values of lambda and of mu, logarithmically over their ranges, where the greedy looks [1]"
     )
+    layers: Literal["together", "apart"] = Field(
+        "together",
+        description="layers keep their ratios to the first [no unit], or each has the factors of the box for itself, "
+        "at as many points, spread evenly",
+    )
     add: Annotated[int, Field(ge=1)] = Field(4, description="modes that each full run of the greedy adds [1]")
     max_N: Annotated[int, Field(ge=1)] = Field(200, description="largest N of the greedy's basis [1]")
     validation: Annotated[int, Field(ge=0)] = Field(

@@ -133,7 +133,7 @@ def _read(path: Path, lift: bool) -> dict[str, Any]:
         mesh = MeshNumber(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))
     kept = {key: about[key] for key in ("k", "certify", "tolerance", "norm", "training", "mesh_key")}
     if box is not None:
-        box = Box(tuple(box["lam"]), tuple(box["mu"]))
+        box = Box(tuple(box["lam"]), tuple(box["mu"]), box["apart"])
     return {**kept, "norms": norms, "compliance": compliance, "box": box, "mesh": mesh, "drive": drive}
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import isclose
 from typing import Any, Literal
 
 import numpy as np
@@ -38,10 +39,14 @@ TOGETHER = 4_000_000  # entries of the states of a batch that march at once: 32 
 
 @dataclass(frozen=True)
 class Box:
-    """Ranges of lambda and mu of the first layer [Pa], at its density in the projection; others keep their ratios."""
+    """Ranges of lambda and mu of the first layer [Pa], at its density in the projection.
+
+    The other layers keep their ratios to it, or, ``apart``, each has the same factors for itself.
+    """
 
     lam: tuple[float, float]
     mu: tuple[float, float]
+    apart: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,14 +119,17 @@ class CertifiedModel:
         """Whether these lie in the box: a motion depends on lambda / rho and mu / rho alone, one-way."""
         if self.box is None:
             return True
-        first, own = materials[0], self.fine.materials[0]
-        scale = own.rho / first.rho
-        near = all(
-            np.allclose((m.lam, m.mu, m.rho, m.beta), (o.lam, o.mu, o.rho, o.beta), rtol=1e-9, atol=0)
-            for m, o in zip(materials, self.materials(first.lam, first.mu, first.rho), strict=True)
-        )
-        pairs = ((first.lam * scale, self.box.lam), (first.mu * scale, self.box.mu))
-        return near and all(low * (1 - 1e-9) <= value <= high * (1 + 1e-9) for value, (low, high) in pairs)
+        own, first = self.fine.materials, self.fine.materials[0]
+        ratios = [(m.lam / o.lam, m.mu / o.mu, m.rho / o.rho) for m, o in zip(materials, own, strict=True)]
+        alike = slice(2 if self.box.apart else 0, 3)
+        near = all(isclose(x, y) for r in ratios for x, y in list(zip(r, ratios[0], strict=True))[alike])
+        near = near and all(isclose(m.beta, o.beta) for m, o in zip(materials, own, strict=True))
+        limits = [
+            (low * (1 - 1e-9) <= x / r[2] * base <= high * (1 + 1e-9))
+            for r in ratios
+            for x, base, (low, high) in ((r[0], first.lam, self.box.lam), (r[1], first.mu, self.box.mu))
+        ]
+        return near and all(limits)
 
     def run(
         self,

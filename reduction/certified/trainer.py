@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import qmc
 
 from softgrasp.fem.accuracy import estimate as accuracy
 from softgrasp.fem.accuracy.small import run_small
@@ -18,19 +19,20 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.certified.certificate import MeshNumber
 from softgrasp.reduction.certified.greedy import REASONS, Greedy, Round, greedy, start
 from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_model, scene_drive
-from softgrasp.reduction.parameters import box_of, materials_at, outside, run_at, thinned
+from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
 
 COLUMNS = 200  # states of a full run that its modes are taken from
 CACHED = 3e8  # entries of full runs that are kept, in case a point comes again: 2.4 GB over all ranks
 SHARE = 0.5  # of the tolerance that the larger basis may use, so that the smaller one has the rest
 RANDOM = 100  # parameters beside the grid where the finished model is looked at
 PLACES = 4  # trained parameters at which the mesh is estimated
+ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
 CHUNK = 50  # parameters that are looked at together
 SEED = 20
 
@@ -97,10 +99,15 @@ class Trainer:
         self.model, self.models = model, motions_of(model)
         self.comm = model.system.layout.comm
         lam, mu = box_of(model)
-        self.box = Box((lam[0], lam[1]), (mu[0], mu[1]))
-        low, high, count = np.log([lam[0], mu[0]]), np.log([lam[1], mu[1]]), model.scene.reduction.grid
-        axes = np.exp(np.linspace(low, high, count)) if count > 1 else np.exp((low + high) / 2)[None]
-        self.points = [(float(a), float(b)) for a in axes[:, 0] for b in axes[:, 1]]
+        layers = model.scene.reduction.layers == "apart" and len(model.system.materials) > 1
+        self.box = Box((lam[0], lam[1]), (mu[0], mu[1]), layers)
+        count = model.scene.reduction.grid
+        axis = np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
+        draws = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 1, 2)
+        if layers:
+            draws = qmc.Halton(2 * len(model.system.materials), scramble=False).random(count**2)
+        self.parameters = self.at(draws)
+        self.points = [(m[0].lam, m[0].mu) for m in self.parameters]
         self.reference = materials_at(model, float(np.sqrt(lam[0] * lam[1])), float(np.sqrt(mu[0] * mu[1])))
         self.space = ResidualSpace(model.system, self.reference)
         self.drives = [scene_drive(m.scene, m.system.M_hand, 1) for m in self.models]
@@ -110,9 +117,16 @@ class Trainer:
         if Phi is not None:
             self._append(Phi)
 
-    def materials(self, i: int) -> tuple[LayerMaterial, ...]:
-        """Materials at a point of the grid."""
-        return materials_at(self.model, *self.points[i])
+    def at(self, draws: Array) -> list[Materials]:
+        """Materials of the box at coordinates of the unit cube, logarithmically, (n, layers or 1, 2)."""
+        own = self.model.system.materials
+        low, high = np.log([self.box.lam, self.box.mu]).T
+        factors = np.exp(low + draws.reshape(len(draws), -1, 2) * (high - low)) / (own[0].lam, own[0].mu)
+        factors = np.broadcast_to(factors, (len(draws), len(own), 2)).tolist()
+        return [
+            tuple(replace(m, lam=m.lam * a, mu=m.mu * b) for m, (a, b) in zip(own, each, strict=True))
+            for each in factors
+        ]
 
     def _append(self, Phi: Array) -> None:
         self.Phi = np.asfortranarray(np.hstack([self.Phi, Phi]))
@@ -129,7 +143,7 @@ class Trainer:
             SolverError: a run failed.
         """
         if i not in self._runs:
-            runs = [run_at(m, *self.points[i]) for m in self.models]
+            runs = [run_with(m, self.parameters[i]) for m in self.models]
             self.full_runs += len(runs)
             self._runs[i] = [thinned(run.snapshots, COLUMNS).Z for run in runs]
             entries = 2.0 * self.model.system.layout.n_e * COLUMNS * len(runs)
@@ -152,12 +166,16 @@ class Trainer:
     def _leading(self, Z: Array, count: int) -> Array:
         """Leading POD modes of what Phi does not hold of a run, orthonormal in K_r with Phi. Collective."""
         n = len(Z) // 2
-        z, v = self._less(Z[:n]), self._less(Z[n:])
         K = self.space.system.K_ee
-        lengths = [float(np.sqrt(total(self.comm, (x * times_columns(K, x)).sum(axis=0)).sum())) for x in (z, v)]
-        if lengths[0] == 0 and lengths[1] == 0:
+
+        def length(x: Array) -> float:
+            return float(np.sqrt(total(self.comm, (x * times_columns(K, x)).sum(axis=0)).sum()))
+
+        left = [(x, length(x), length(Z_x)) for Z_x in (Z[:n], Z[n:]) for x in (self._less(Z_x),)]
+        parts = [(x, own) for x, own, whole in left if own > ROUNDING * whole]  # the rest is rounding, not motion
+        if not parts:
             return np.zeros((n, 0))
-        X = np.hstack([z, v * (lengths[0] / lengths[1] if lengths[0] > 0 and lengths[1] > 0 else 1.0)])
+        X = np.hstack([x * (parts[0][1] / own) for x, own in parts])
         gram = total(self.comm, X.T @ times_columns(K, X))
         squares, V = on_root(self.comm, lambda: np.linalg.eigh((gram + gram.T) / 2))
         pick = [j for j in range(len(squares) - 1, -1, -1) if squares[j] > 1e-14 * squares[-1]][:count]
@@ -170,9 +188,9 @@ class Trainer:
 
     def bound(self, indices: Sequence[int]) -> list[float]:
         """Relative bounds of the basis at some points of the grid, the largest of all motions. Collective."""
-        return self.bounds_at([self.materials(i) for i in indices], self.certified)
+        return self.bounds_at([self.parameters[i] for i in indices], self.certified)
 
-    def bounds_at(self, many: Sequence[tuple[LayerMaterial, ...]], model: CertifiedModel) -> list[float]:
+    def bounds_at(self, many: Sequence[Materials], model: CertifiedModel) -> list[float]:
         """The same at any materials and for any model; the ranks share the work. Collective."""
         mine, values = many[self.comm.rank :: self.comm.size], np.zeros(len(many))
         for drive in self.drives if mine else ():
@@ -184,15 +202,14 @@ class Trainer:
             values[rank :: self.comm.size] = part
         return [float(value) for value in values]
 
-    def checked(self) -> list[tuple[LayerMaterial, ...]]:
+    def checked(self) -> list[Materials]:
         """The grid and random parameters of the box."""
-        return [materials_at(self.model, *place) for place in [*self.points, *self.random(RANDOM, SEED)]]
+        return [*self.parameters, *self.random(RANDOM, SEED)]
 
-    def random(self, n: int, seed: int) -> list[tuple[float, float]]:
-        """Random (lambda, mu) of the box, logarithmically, the same on every rank."""
-        low, high = np.log([self.box.lam, self.box.mu]).T
-        draws = np.random.default_rng(seed).uniform(size=(n, 2))
-        return [(float(a), float(b)) for a, b in np.exp(low + draws * (high - low))]
+    def random(self, n: int, seed: int) -> list[Materials]:
+        """Random materials of the box, the same on every rank."""
+        width = len(self.model.system.materials) if self.box.apart else 1
+        return self.at(np.random.default_rng(seed).uniform(size=(n, width, 2)))
 
     def destroy(self) -> None:
         """Free the factors. Collective."""
@@ -201,7 +218,9 @@ class Trainer:
 
 def train_key(model: Model) -> str:
     """What a training depends on: two of one key may go on from each other."""
-    keys = model.scene.reduction.model_dump(include={"lambda_range", "mu_range", "grid", "add", "motions", "norm"})
+    keys = model.scene.reduction.model_dump(
+        include={"lambda_range", "mu_range", "grid", "layers", "add", "motions", "norm"}
+    )
     others = ("name", "description", "reduction", "study", "output", "control")
     return f"{scene_hash(model.scene, others)} {sorted(keys.items())}"
 
@@ -264,9 +283,7 @@ def build_certified(
     return replace(model, training={**model.training, **about}, drive=drive, certify=certify)
 
 
-def smallest(
-    trainer: Trainer, model: CertifiedModel, many: list[tuple[LayerMaterial, ...]], tolerance: float
-) -> CertifiedModel:
+def smallest(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> CertifiedModel:
     """The same with the least leading basis whose certificate is within the tolerance everywhere. Collective.
 
     Where none is, all modes make the answer, with one basis and its own bound.
@@ -282,7 +299,7 @@ def smallest(
     return best
 
 
-def within(trainer: Trainer, model: CertifiedModel, many: list[tuple[LayerMaterial, ...]], tolerance: float) -> bool:
+def within(trainer: Trainer, model: CertifiedModel, many: list[Materials], tolerance: float) -> bool:
     """Whether the certificate is within the tolerance everywhere; points that fail move to the front. Collective."""
     for at in range(0, len(many), CHUNK):
         bounds = trainer.bounds_at(many[at : at + CHUNK], model)
@@ -292,7 +309,7 @@ def within(trainer: Trainer, model: CertifiedModel, many: list[tuple[LayerMateri
     return True
 
 
-def mesh_number(model: Model, places: Sequence[tuple[float, float]]) -> MeshNumber:
+def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
     """Estimate of the error of the mesh at some parameters, relative to the deformation. Collective.
 
     Raises:
@@ -305,11 +322,11 @@ def mesh_number(model: Model, places: Sequence[tuple[float, float]]) -> MeshNumb
         other = build(accuracy.comparison(scene, accuracy.COMPARED[0]), comm=model.system.layout.comm)
     estimates = []
     for place in places:
-        systems = ((m, m.system.with_materials(materials_at(m, *place))) for m in (model, other))
+        systems = ((m, m.system.with_materials(place)) for m in (model, other))
         pair = [accuracy.reduced(replace(m, system=system)) for m, system in systems]
         runs = [run_small(small).deformation for small in pair]
         estimates.append(accuracy.difference(pair[0], pair[1], runs[1], runs[0])[0])
-    return MeshNumber(tuple((float(a), float(b)) for a, b in places), tuple(estimates))
+    return MeshNumber(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
 
 
 def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
@@ -322,7 +339,7 @@ def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
     layout = trainer.model.system.layout
     modes = trainer.Phi[:, : model.k]
     for place in trainer.random(n, SEED + 1):
-        full = run_at(trainer.models[0], *place)
+        full = run_with(trainer.models[0], place)
         run = model.run(full.model.system.materials, trainer.drives[0], allow=True)
         steps, hand = full.snapshots.steps, 2 * layout.n_s
         a, b = np.split(run.trajectory.x[steps, hand:].T, 2)

@@ -159,7 +159,7 @@ def show(console: Console, rows: Sequence[Row]) -> None:
     driver.show_goals(console, goals(rows))
 
 
-def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, Path]:
+def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, ...]:
     """Per-step time against size for every method, log-log, 2D full and 3D hollow, on one rank (else the fewest)."""
     import matplotlib.pyplot as plt
 

@@ -167,7 +167,7 @@ def show(console: Console, rows: Sequence[MeshRow], trends: dict[str, Any], titl
         )
 
 
-def draw(path: Path, rows: Sequence[MeshRow], trends: dict[str, Any]) -> tuple[Path, Path]:
+def draw(path: Path, rows: Sequence[MeshRow], trends: dict[str, Any]) -> tuple[Path, ...]:
     """Times against n_e; PNG and PDF."""
     import matplotlib.pyplot as plt
 

@@ -207,7 +207,7 @@ def markdown(rows: Sequence[Row], peers: Sequence[Row]) -> str:
     return table + "".join(f"\n- {peer_line(peer)}" for peer in peers) + "\n"
 
 
-def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, Path]:
+def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, ...]:
     """Time against states for every method on the fewest ranks, peers as single marks, log-log."""
     import matplotlib.pyplot as plt
 

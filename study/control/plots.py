@@ -28,7 +28,7 @@ from softgrasp.study.pictures.style import (
     PURPLE,
     SKY,
     UNSTABLE,
-    WIDTH,
+    direct_labels,
     paper_style,
     save,
 )
@@ -64,12 +64,13 @@ def unstable(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
     return [r.N for r in bad], [getattr(r, key) if getattr(r, key) <= TOP else float("nan") for r in bad]
 
 
-def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, Path]:
+def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]:
     """Relative error of P, of K, and excess cost against N for all methods; unstable gains marked; PNG and PDF."""
     ran = [s for s in bases if s.reports]
     bad = False
     with paper_style():
-        figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 3.1), layout="constrained", sharex=True)
+        figure, axes = plt.subplots(3, 1, figsize=(COLUMN + 1.8, 6.6), sharex=True)
+        figure.subplots_adjust(left=0.13, right=0.66, bottom=0.07, top=0.93, hspace=0.16)
         for ax, (key, label) in zip(axes, QUANTITIES, strict=True):
             for j, s in enumerate(ran):
                 ax.plot(*drawn(s, key), **_look(s))
@@ -87,9 +88,15 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, Pa
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
             ax.grid(axis="y", color="#e6e6e6", lw=0.5)
             ax.set_axisbelow(True)
-            ax.set_title(label, pad=8)
-            ax.set_xlabel("$N$")
-        figure.legend(handles=_entries(ran, bad), loc="outside upper center", ncols=3, columnspacing=1.4)
+            ax.set_ylabel(label)
+            ends = [(drawn(s, key), s) for s in ran]
+            direct_labels(
+                ax, [(N[-1], v[-1], TITLES[s.name], LOOKS[s.name][0]) for (N, v), s in ends if len(N) and v[-1] > 0]
+            )
+        axes[-1].set_xlabel("$N$, order of the reduced equation")
+        if bad:
+            text = "unstable loop; on the edge: error above 1"
+            figure.legend(handles=[Line2D([], [], label=text, **CROSS)], loc="upper left", borderaxespad=0.2)
         return save(figure, out_png)
 
 
@@ -98,40 +105,39 @@ def _look(basis: BasisGains) -> dict[str, Any]:
     return {"color": colour, "ls": dashes, "marker": marker, "ms": 3.4, "mfc": "none", "mew": 0.9, "lw": 1.1}
 
 
-def _entries(ran: Sequence[BasisGains], bad: bool) -> list[Line2D]:
-    entries = [Line2D([], [], label=TITLES[s.name], **_look(s)) for s in ran]
-    return [*entries, Line2D([], [], label="unstable loop; on the edge: error > 1", **CROSS)] if bad else entries
-
-
-def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, Path]:
+def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]:
     """Excess cost of the re-tuned gains over the box of lambda and mu, one panel a basis; PNG and PDF."""
     with paper_style():
         count = len(retuned)
         figure, axes = plt.subplots(
-            1, count, figsize=(max(COLUMN, 0.5 * WIDTH * count), 2.7), squeeze=False, sharey=True, layout="constrained"
+            count, 1, figsize=(COLUMN + 0.8, 0.4 + 2.3 * count), squeeze=False, sharex=True, layout="constrained"
         )
         values = [p.cost_excess for r in retuned for p in r.points if p.stable]
         low, high = min(values, default=LOWEST), max(values, default=TOP)
         low, high = max(low, LOWEST) / 1.5, max(high, 10 * LOWEST) * 1.5
         norm = LogNorm(low, high)
         picture: Any = None
-        for ax, r in zip(axes[0], retuned, strict=True):
+        for ax, r in zip(axes[:, 0], retuned, strict=True):
             lam = [p.materials[0].lam for p in r.points]
             mu = [p.materials[0].mu for p in r.points]
             fine = [i for i, p in enumerate(r.points) if p.stable]
             picture = ax.scatter(
-                [lam[i] for i in fine], [mu[i] for i in fine], s=260, marker="s", norm=norm, cmap="viridis_r",
+                [lam[i] for i in fine], [mu[i] for i in fine], s=900, marker="s", norm=norm, cmap="viridis_r",
                 c=[max(r.points[i].cost_excess, LOWEST) for i in fine],
             )  # fmt: skip
+            for i in fine:  # the number on its colour, white on dark
+                value = max(r.points[i].cost_excess, LOWEST)
+                ink = "white" if norm(value) > 0.45 else "black"
+                ax.text(lam[i], mu[i], f"{value:.0e}", ha="center", va="center", fontsize=6.5, color=ink)
             rest = [i for i in range(len(lam)) if i not in fine]
             ax.plot([lam[i] for i in rest], [mu[i] for i in rest], "x", color=UNSTABLE, ms=8, mew=1.6)
-            ax.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]")
+            ax.set(xscale="log", yscale="log", ylabel=r"$\mu$ [Pa]")
             ax.margins(0.25)
             _few_ticks(ax, sorted(set(lam)), sorted(set(mu)))
             ax.set_title(f"{TITLES[r.name]}, $N = {r.N}$")
-        axes[0, 0].set_ylabel(r"$\mu$ [Pa]")
+        axes[-1, 0].set_xlabel(r"$\lambda$ [Pa]")
         if picture is not None:
-            figure.colorbar(picture, ax=axes[0].tolist(), label=QUANTITIES[2][1])
+            figure.colorbar(picture, ax=axes[:, 0].tolist(), label=QUANTITIES[2][1])
         return save(figure, out_png)
 
 

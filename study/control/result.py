@@ -146,7 +146,18 @@ def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, 
         study: what was found.
         seconds: of the stages.
     """
-    d = study.design
+    return gain_result(study.design, study.controller, study.tick, study.notes, seconds) | {
+        "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
+        "refused": {b.name: b.refused for b in study.bases if b.refused},
+        "retune": [_retuned(r) for r in study.retuned],
+        "loop": _loop(study),
+    }
+
+
+def gain_result(
+    d: Design, controller: CertifiedController | None, tick: float, notes: Sequence[Note], seconds: dict[str, float]
+) -> dict[str, Any]:
+    """The keys of ``result.json`` that need no closed loop. Collective."""
     problem, solution, quality, layout = d.problem, d.solution, d.quality, d.problem.layout
     return {
         "command": "control",
@@ -170,14 +181,10 @@ def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, 
         "sampled_certified": quality.sampled is not None and quality.sampled.certified,
         "sampled_exact": quality.sampled is not None and quality.sampled.exact,
         "stable": quality.stable,
-        "findings": study.findings,
+        "findings": [finding.sentence for finding in d.diagnosis.findings],
         "damping_enough": d.diagnosis.damping_enough,
-        "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
-        "refused": {b.name: b.refused for b in study.bases if b.refused},
-        "retune": [_retuned(r) for r in study.retuned],
-        "controller": _controller(study),
-        "loop": _loop(study),
-        "notes": [note.text for note in study.notes],
+        "controller": _controller(controller, tick, int(d.actuation.delay)),
+        "notes": [note.text for note in notes],
         "time": {**seconds, "solver": dict(solution.seconds)},
         "memory_peak_mb": peak_memory_mb(layout.comm),
     }
@@ -216,12 +223,12 @@ def _retuned(r: Retuned) -> dict[str, Any]:
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}
 
 
-def _controller(study: ControlStudy) -> dict[str, Any] | None:
-    if study.controller is None or study.margins is None:
+def _controller(controller: CertifiedController | None, tick: float, delay: int) -> dict[str, Any] | None:
+    if controller is None:
         return None
-    c, margins = study.controller.controller, study.margins
-    return {"method": study.controller.method, "N": c.plant.N, "period": c.period, "time_tick": study.tick,
-            "sampled_radius": study.controller.radius.value,
+    c, margins = controller.controller, loop_margins(controller.controller, delay)
+    return {"method": controller.method, "N": c.plant.N, "period": c.period, "time_tick": tick,
+            "sampled_radius": controller.radius.value,
             "margins": {"axes": [asdict(axis) for axis in margins.axes], "distance": margins.distance}}  # fmt: skip
 
 

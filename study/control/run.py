@@ -14,12 +14,12 @@ from rich.progress import Progress, TaskProgressColumn
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.bounds import bases_with_bounds
-from softgrasp.lqr.design.controller import NoController, certified_controller
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
 from softgrasp.lqr.design.orders import BasisGains, orders
 from softgrasp.lqr.design.scene import with_control
-from softgrasp.study.control.loop import run_loops, save_controllers, tick_seconds
+from softgrasp.study.control.gain import run_gain, small_controller
+from softgrasp.study.control.loop import run_loops, save_controllers
 from softgrasp.study.control.page import sections
 from softgrasp.study.control.result import ControlStudy, Note, Retuned, a_priori, control_result
 from softgrasp.study.control.sweep import retune, sweep
@@ -41,6 +41,7 @@ def run_control(
     quiet: bool = False,
     pictures: bool = True,
     empty: bool = False,
+    gain_only: bool = False,
 ) -> dict[str, Any]:
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
@@ -55,6 +56,7 @@ def run_control(
         quiet: no progress bars.
         pictures: draw figures and the animation.
         empty: remove what an earlier run has left in the folder.
+        gain_only: solve the Riccati equation and write the controllers; no closed loop, no pictures.
 
     Returns:
         What result.json holds.
@@ -73,6 +75,8 @@ def run_control(
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         notes = [Note("table", sentence)] if sentence else []
+        if gain_only:
+            return run_gain(session, model, watch, solver_bar(bar, model), notes, restart)
         study, frames = control_model(session, model, watch, bar, notes, restart)
     fields = frames.close()
     with watch.stage("controllers"):
@@ -147,12 +151,8 @@ def control_model(
             retuned, why = retune(feedback, bases, duration, counted(bar, "re-tuning"))
         notes += [Note("orders", few)] if few else []
         notes += [Note("retune", f"no re-tuning: {why}")] if why else []
-    controller, tick = None, float("nan")
-    try:
-        controller = certified_controller(feedback, a_priori(bases))
-        tick = model.system.layout.comm.bcast(tick_seconds(controller.controller))
-    except NoController as error:
-        notes.append(Note("controller", f"no small controller: {error}"))
+    controller, tick, refused = small_controller(feedback, a_priori(bases))
+    notes += refused
     sampled = feedback.quality.sampled
     if sampled is not None and sampled.reason:
         notes.append(Note("sampling", f"the loop from tick to tick is not certified: {sampled.reason}"))

@@ -9,6 +9,8 @@ import numpy as np
 
 from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.petsc import Array
+from softgrasp.lqr.design.controller import CertifiedController
+from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation
 from softgrasp.lqr.reduced.retune import BoxPoint
@@ -30,28 +32,17 @@ BEST_HEADER = (
 
 def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[str, str]]:
     """The short table as label and text."""
-    design, full, loops = study.design, study.loops.full, study.loops
-    solution, away = design.solution, study.distance(full)
-    counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
+    full, loops, away = study.loops.full, study.loops, study.distance(study.loops.full)
     arrived = settled(full.times, away)
     rows = [
-        ("method", solution.summary),
-        ("rank, Newton steps, solves", ", ".join(counts)),
-        ("true relative residual", f"{solution.residual:.1e}"),
-        ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
-        *_spectrum(study),
-        ("gain, body displaced", _matrix(gain_translation(design.problem, solution))),
-        ("gain, body moving", _matrix(gain_rigid_velocity(design.problem, solution))),
+        *gain_rows(study.design),
         ("distance to the target", f"{away[0]:.3g} m at first, {away[-1]:.3g} m at the end"),
-        ("within 1 % for good after", "not within the run" if arrived is None else f"{arrived:.4g} s"),
+        ("stays within 1 % of the way from", "not within the run" if arrived is None else f"{arrived:.4g} s on"),
         ("cost of the run + still to come", f"{full.cost[-1]:.6g} + {loops.to_come:.3g}"),
     ]
     if full.saturated:
         rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
-    if study.controller is not None:
-        c = study.controller.controller
-        text = f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms"
-        rows.append(("small controller", text))
+    rows += controller_rows(study.controller, study.tick)
     if study.margins is not None:
         low, high, phase = study.margins.together
         text = (
@@ -65,16 +56,39 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
     return [*rows, ("time: ARE, reduced, loop", stages)]
 
 
-def _spectrum(study: ControlStudy) -> list[tuple[str, str]]:
+def gain_rows(design: Design) -> list[tuple[str, str]]:
+    """The solution of the Riccati equation and its closed loop as label and text."""
+    solution = design.solution
+    counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
+    return [
+        ("method", solution.summary),
+        ("rank, Newton steps, solves", ", ".join(counts)),
+        ("true relative residual", f"{solution.residual:.1e}"),
+        ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
+        *_spectrum(design),
+        ("gain, body displaced", _matrix(gain_translation(design.problem, solution))),
+        ("gain, body moving", _matrix(gain_rigid_velocity(design.problem, solution))),
+    ]
+
+
+def controller_rows(controller: CertifiedController | None, tick: float) -> list[tuple[str, str]]:
+    """The small controller as label and text, if there is one."""
+    if controller is None:
+        return []
+    c = controller.controller
+    return [("small controller", f"N = {c.plant.N}, {1e6 * tick:.2g} us a tick of {1e3 * c.period:g} ms")]
+
+
+def _spectrum(design: Design) -> list[tuple[str, str]]:
     """Abscissa and radius of the closed loop, with what is certain of them."""
-    quality, left_out = study.design.quality, ", not certified for the modes left out"
+    quality, left_out = design.quality, ", not certified for the modes left out"
     if not quality.certified:
         remark = left_out
     elif not quality.abscissa < 0:
         remark = ": not stable"
     else:
         remark = "" if quality.exact else ", a lower bound; stable for certain"
-    if remark and study.design.modal and not study.design.problem.system.damping.active:
+    if remark and design.modal and not design.problem.system.damping.active:
         remark = ": that of the modes left out, zero to rounding"
     rows = [("closed-loop spectral abscissa", f"{quality.abscissa:.4g} 1/s{remark}")]
     if quality.sampled is not None:

@@ -26,7 +26,7 @@ Tried = tuple[Finding, Change, Cost]
 
 def figure_effects(
     findings: Sequence[Finding], tolerance: float, noise: tuple[float, float], out_png: Path
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """Each effect in a row: what it changes on the left, what it costs on the right; PNG and PDF."""
     marks = [(f, f.change, f.cost) for f in findings if f.change is not None and f.cost is not None]
     with paper_style():

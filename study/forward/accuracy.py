@@ -111,7 +111,7 @@ def percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
-def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, Path]:
+def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, ...]:
     """Outputs against the hand, y and y + delta y, with the band of the bound; PNG and PDF."""
     import matplotlib.pyplot as plt
 

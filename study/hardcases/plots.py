@@ -22,7 +22,7 @@ WORDS = 42  # [letters] of a failure that fit beside the frame
 SIZE = 4.5  # of a mark
 
 
-def figure_family(family: Family, rows: Sequence[HardCase], out_png: Path) -> tuple[Path, Path]:
+def figure_family(family: Family, rows: Sequence[HardCase], out_png: Path) -> tuple[Path, ...]:
     """Numbers against what is varied, with lanes above for refusals and for what has no number; PNG and PDF."""
     with paper_style():
         draw = _listed if family.axis == "listed" else _curves

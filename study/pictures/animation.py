@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -97,30 +98,69 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
         draw_scene(ax, shot, frames[:1], None, shot.hands[:1])
-        box = frame_box(figure)
+        film = Film(figure, axes, [stamp])
         for i in range(len(frames)):
-            for artist in [*ax.collections, *ax.lines, *ax.texts]:
-                artist.remove()
+            film.clear()
             draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
             name_layers(ax, shot, frames[i], inside=True)  # beside the body they would change sides
             stamp.set_text(f"$t$ = {times[i]:.{digits}f} s{note}")
-            images.append(frame_image(figure, box))
+            images.append(film.frame())
         plt.close(figure)
     return images
 
 
-def frame_box(figure: Any) -> Any:
-    """The part of a figure that every frame shows."""
-    figure.set_dpi(DPI)
-    figure.canvas.draw()
-    return figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08)
+class Film:
+    """Frames of one figure: axes, colour bar and legend are drawn once, what moves over them in every frame.
+
+    Args:
+        figure: with its first frame, whose size all frames get.
+        axes: whose collections, lines and texts move.
+        others: further artists that change.
+    """
+
+    def __init__(self, figure: Any, axes: list[Any], others: Sequence[Any] = ()) -> None:
+        self.figure, self.axes, self.others = figure, axes, others
+        figure.set_dpi(DPI)
+        figure.canvas.draw()
+        _fit(figure, figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08))
+        self.clear()
+        for artist in others:
+            artist.set_animated(True)  # no part of the background
+        figure.canvas.draw()
+        self.background = figure.canvas.copy_from_bbox(figure.bbox)
+
+    def clear(self) -> None:
+        """Remove what moves."""
+        for ax in self.axes:
+            for artist in [*ax.collections, *ax.lines, *ax.texts]:
+                artist.remove()
+
+    def frame(self) -> Any:
+        """The figure as it is now, as a picture."""
+        canvas = self.figure.canvas
+        canvas.restore_region(self.background)
+        for ax in self.axes:
+            for artist in sorted([*ax.collections, *ax.lines, *ax.texts], key=lambda a: float(a.get_zorder())):
+                ax.draw_artist(artist)
+        for artist in self.others:
+            artist.draw(canvas.get_renderer())
+        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
 
-def frame_image(figure: Any, box: Any) -> Any:
-    """The figure as it is now, as a picture."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box, pil_kwargs={"compress_level": 1})
-    return Image.open(buffer).convert("RGB")
+def _fit(figure: Any, box: Any) -> None:
+    """Give a figure the size of a box [inch], everything in it where it is."""
+    figure.set_layout_engine("none")
+    size = figure.get_size_inches()
+    scale, corner = size / box.size, box.min / box.size
+    places = [(ax, ax.get_position().get_points() * scale - corner) for ax in figure.axes]
+    anchors = [(placed, placed.get_bbox_to_anchor().min / figure.dpi / box.size - corner) for placed in figure.legends]
+    for text in figure.texts:
+        text.set_position(np.array(text.get_position()) * scale - corner)
+    figure.set_size_inches(*box.size)
+    for ax, (low, high) in places:
+        ax.set_position((*low, *(high - low)))
+    for placed, anchor in anchors:
+        placed.set_bbox_to_anchor(tuple(anchor), transform=figure.transFigure)
 
 
 def write_gif(images: list[Any], durations: list[int], out_gif: Path, palette: Any = None) -> Path:

@@ -118,7 +118,7 @@ def figure_move(
     table: Array,
     target: npt.ArrayLike | None,
     out_png: Path,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """The deformed body at a few instants with hand, path and target; PNG and PDF.
 
     Bodies that would hide each other get a panel each.
@@ -137,7 +137,7 @@ def figure_move(
     states, times = np.asarray(states, dtype=np.float64), np.asarray(times, dtype=np.float64)
     shot = make_shot(picture, states, times, np.asarray(table, dtype=np.float64), target)
     with paper_style():
-        apart = len(states) > 1 and overlap(picture, states)
+        apart = len(states) > 1 and (picture.dimension == 3 or overlap(picture, states))  # in 3D captions meet bodies
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
         figure, axes = make_axes(shot, len(groups), captions=True)
         for ax, group in zip(axes, groups, strict=True):

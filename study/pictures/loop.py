@@ -18,7 +18,18 @@ from softgrasp.fem.columns import AXES, Array, Columns, farthest
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.shapes import pick_instants
-from softgrasp.study.pictures.style import CYCLE, OUTLINE, SKY, TARGET, WIDTH, length_unit, paper_style, save
+from softgrasp.study.pictures.style import (
+    COLUMN,
+    CYCLE,
+    OUTLINE,
+    SKY,
+    TARGET,
+    WIDTH,
+    few_ticks,
+    length_unit,
+    paper_style,
+    save,
+)
 
 Poles = npt.NDArray[np.complex128]
 
@@ -41,7 +52,7 @@ def figure_histories(
     others: Mapping[str, tuple[Array, Array]] | None = None,
     settle: float | None = None,
     dimension: int | None = None,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """Outputs, their distance to the target, and inputs against time; PNG and PDF.
 
     Args:
@@ -71,7 +82,11 @@ def figure_histories(
     with paper_style():
         figure, axes = plt.subplots(rows, 1, figsize=(WIDTH * 0.8, 1.15 + 1.5 * rows), layout="constrained")
         for number, (y, u) in enumerate(runs.values()):
-            look: dict[str, Any] = {"ls": STYLES[number % len(STYLES)], "lw": 1.4 if number == 0 else 1.0}
+            look: dict[str, Any] = {
+                "ls": STYLES[number % len(STYLES)],
+                "lw": 2.6 if number == 0 else 1.0,
+                "alpha": 0.45 if number == 0 else 1.0,
+            }
             for ax, part in zip(axes, panels, strict=False):
                 _lines(ax, times, (unit[0] if part is lengths else 1.0) * y[:, part], look)
             _steps(axes[first], times, u[:, :d], look)
@@ -100,6 +115,8 @@ def figure_histories(
         for ax in axes:
             ax.set_xlim(0.0, float(times[-1]) if settle is None or ax in whole else min(settle, float(times[-1])))
         axes[-1].set_xlabel("time [s]")
+        if aim is not None:
+            axes[-2].set_xlabel("time [s], the move only")
         labels = [[columns[j].formula for j in part] for part in panels]
         _legends(axes, labels, inputs.shape[1], d, list(runs), aim is not None)
         return save(figure, out_png)
@@ -172,7 +189,7 @@ def figure_loop_move(
     table: Array,
     target: npt.ArrayLike | None,
     out_png: Path,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """The body at a few instants of the move to the target, at equal steps along the path of the hand; PNG and PDF.
 
     Args and return value as in :func:`softgrasp.study.pictures.body.figure_move`, with as many states as there are.
@@ -186,7 +203,7 @@ def figure_decay(
     out_png: Path,
     *,
     noise: float = 0.0,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """Decay rate -Re p of every pole against its frequency |Im p|, one mark a plant or gain; PNG and PDF.
 
     Poles on the real axis stand in a strip at the left; poles that do not decay are drawn as crosses on the lower edge
@@ -210,7 +227,7 @@ def figure_decay(
     left, right = (frequencies.min(), frequencies.max()) if len(frequencies) else (1.0, 10.0)
     axis_strip = left / 2.5
     with paper_style():
-        figure, ax = plt.subplots(figsize=(WIDTH * 0.8, 3.3), layout="constrained")
+        figure, ax = plt.subplots(figsize=(COLUMN + 1, 3.3), layout="constrained")
         for i, (name, p) in enumerate(sets.items()):
             x = np.where(np.abs(p.imag) > 1e-9 * np.abs(p), np.abs(p.imag), axis_strip)
             fine = -p.real > noise
@@ -226,6 +243,7 @@ def figure_decay(
             ax.text(axis_strip, high, "real", ha="center", va="bottom", fontsize=8, color=OUTLINE)
         ax.set_xlabel(r"frequency $|\mathrm{Im}\,p|$ [1/s]")
         ax.set_ylabel(r"decay rate $-\mathrm{Re}\,p$ [1/s]")
-        row = {"ncols": min(3, max(1, len(sets))), "columnspacing": 1.2, "handletextpad": 0.2, "borderaxespad": 0.0}
-        ax.legend(loc="lower left", bbox_to_anchor=(0.1 if not swings.all() else 0.0, 1.02), **row)
+        few_ticks(ax.xaxis)
+        few_ticks(ax.yaxis)
+        figure.legend(loc="outside upper center", ncols=2, columnspacing=1.2, handletextpad=0.2)
         return save(figure, out_png)

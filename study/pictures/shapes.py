@@ -67,7 +67,8 @@ def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Arra
     single = [(a, (0, i, last)) for a, i in inner(1 / 2, 0.25)]
     for choice in (pairs, single):
         for _, chosen in sorted(choice, reverse=True):
-            if not _boxes_overlap(low[list(chosen)], high[list(chosen)]):
+            telling = bent[list(chosen)].max() >= 0.9  # near the largest deformation of the move
+            if telling and not _boxes_overlap(low[list(chosen)], high[list(chosen)]):
                 return list(chosen)
     halves = (np.flatnonzero((done > 0.02) & (done <= 0.5)), np.flatnonzero((done > 0.5) & (done < 0.98)))
     return sorted({0, last, *(int(h[np.argmax(bent[h])]) for h in halves if len(h))})

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from cycler import cycler
+
+from softgrasp.study.pictures import PDF
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -22,7 +25,7 @@ OUTLINE = "#555555"
 TARGET = ORANGE
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
 COLUMN, WIDTH = 3.4, 7.0  # [inch], one column and both of a two-column page
-DPI = 300
+DPI = 150
 STEPS = [1, 2, 5, 10]  # between ticks
 
 
@@ -66,13 +69,41 @@ def few_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def save(figure: Any, out_png: Path) -> tuple[Path, Path]:
-    """Write the figure as PNG and, beside it, as PDF; close it and return both names."""
-    out_pdf = out_png.with_suffix(".pdf")
-    figure.savefig(out_png, bbox_inches="tight", pad_inches=0.04)
-    figure.savefig(out_pdf, bbox_inches="tight", pad_inches=0.04)
+def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: float = 7.0) -> None:
+    """Names of curves right of the axes, each beside the end of its own, moved apart where they would touch.
+
+    Args:
+        ax: axes with their final limits and scales.
+        ends: x and y of the last point, name and colour of each curve.
+        size: of the font [pt].
+    """
+    inverse, inch = ax.transAxes.inverted(), ax.get_position().height * ax.figure.get_figheight()
+    gap = 1.25 * size / 72 / inch
+    heights = [float(np.clip(inverse.transform(ax.transData.transform((x, y)))[1], 0, 1)) for x, y, _, _ in ends]
+    order = sorted(range(len(ends)), key=heights.__getitem__)
+    places = list(np.array(heights)[order])
+    for i in range(1, len(places)):
+        places[i] = max(places[i], places[i - 1] + gap)
+    excess = max(0.0, places[-1] - 1.0) if places else 0.0
+    for i in reversed(range(len(places))):  # back below the upper edge
+        places[i] = min(places[i], 1.0 if i == len(places) - 1 else places[i + 1] - gap) if excess else places[i]
+    for place, i in zip(places, order, strict=True):
+        x, y, name, colour = ends[i]
+        ax.annotate(
+            name, (x, y), (1.04, place), xycoords="data", textcoords="axes fraction", va="center", color=colour,
+            fontsize=size, annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "alpha": 0.6, "shrinkA": 1, "shrinkB": 2,
+                "relpos": (0, 0.5)},
+        )  # fmt: skip
+
+
+def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
+    """Write the figure as PNG and, where :data:`PDF` is set, beside it as PDF; close it and return the names."""
+    files = (out_png, out_png.with_suffix(".pdf")) if PDF.get() else (out_png,)
+    for file in files:
+        figure.savefig(file, bbox_inches="tight", pad_inches=0.04)
     plt.close(figure)
-    return out_png, out_pdf
+    return files
 
 
 def length_unit(largest: float) -> tuple[float, str]:

@@ -22,7 +22,7 @@ def figure_traces(
     *,
     rigid: Array | None = None,
     dimension: int | None = None,
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """Hand and outputs against time, and below what the outputs move relative to the hand; PNG and PDF.
 
     An output that is the hand again is drawn once, as the hand, and has no share in what moves relative to it.

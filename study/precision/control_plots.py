@@ -41,9 +41,7 @@ def _band(ax: Any, error: float | None) -> bool:
     return True
 
 
-def figure_riccati(
-    points: Sequence[RiccatiPoint], error: float | None, paper: bool, out_png: Path
-) -> tuple[Path, Path]:
+def figure_riccati(points: Sequence[RiccatiPoint], error: float | None, paper: bool, out_png: Path) -> tuple[Path, ...]:
     """Error of the gain and true residual against time, one line a method along its tolerances; PNG and PDF.
 
     Args:
@@ -81,7 +79,7 @@ def figure_riccati(
         return save(figure, out_png)
 
 
-def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, out_png: Path) -> tuple[Path, Path]:
+def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, out_png: Path) -> tuple[Path, ...]:
     """Error of the gain and excess cost, each against N and against the time of the equation; PNG and PDF.
 
     Args:
@@ -157,7 +155,7 @@ def _reduced_handles(points: Sequence[ReducedRiccatiPoint], paper: bool) -> list
     return handles
 
 
-def figure_loop(points: Sequence[LoopPoint], error: float | None, out_png: Path) -> tuple[Path, Path]:
+def figure_loop(points: Sequence[LoopPoint], error: float | None, out_png: Path) -> tuple[Path, ...]:
     """Error of the trajectory against time, error in time against the steps, time of a step; PNG and PDF.
 
     Args:

@@ -73,7 +73,7 @@ def band_handle() -> Line2D:
 
 def figure_forward(
     points: Sequence[ForwardPoint], slopes: Sequence[Slope], truth_error: float, paper: bool, out_png: Path
-) -> tuple[Path, Path]:
+) -> tuple[Path, ...]:
     """Error of the deformation against the time of a whole run; beside it orders in space and time; PNG and PDF.
 
     Args:
@@ -142,7 +142,7 @@ def _orders(space: Any, time: Any, points: Sequence[ForwardPoint], slopes: Seque
         time.legend(loc="best", fontsize=6.5, handlelength=1.4)
 
 
-def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out_png: Path) -> tuple[Path, Path]:
+def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out_png: Path) -> tuple[Path, ...]:
     """Error of the deformation against the online time, and against that from nothing; PNG and PDF.
 
     Args:
@@ -194,7 +194,7 @@ def _title(name: str) -> str:
     return METHODS[name].title.replace(", fixed solid modes", ", fixed") if name in METHODS else name
 
 
-def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) -> tuple[Path, Path]:
+def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) -> tuple[Path, ...]:
     """One line a series, error against time; PNG and PDF."""
     with paper_style():
         figure, ax = plt.subplots(figsize=(0.62 * WIDTH, 2.9), layout="constrained")
@@ -212,7 +212,7 @@ def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) ->
         return save(figure, out_png)
 
 
-def figure_budget(points: Sequence[WorkPoint], budget: float, out_png: Path) -> tuple[Path, Path]:
+def figure_budget(points: Sequence[WorkPoint], budget: float, out_png: Path) -> tuple[Path, ...]:
     """Time of a step, median to 99 % and the largest, against the error of the deformation; PNG and PDF."""
     with paper_style():
         figure, ax = plt.subplots(figsize=(0.75 * WIDTH, 3.3), layout="constrained")

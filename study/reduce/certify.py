@@ -81,7 +81,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
                 bar.update(task, completed=float(min(share, 0.99)))
             r, (lam, mu) = state.rounds[-1], trainer.points[state.rounds[-1].worst]
             bar.console.print(
-                f"round {len(state.rounds)}: k = {r.k}, largest bound {r.bound:.1e} at ({lam:.3g}, {mu:.3g}), "
+                f"round {len(state.rounds)}: k = {r.k}, largest bound {_shown(r.bound)} at ({lam:.3g}, {mu:.3g}), "
                 f"{r.evaluations} evaluations, {r.seconds:.1f} s",
                 markup=False,
             )
@@ -95,7 +95,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     finally:
         trainer.destroy()
     with watch.stage("mesh"):
-        mesh = _mesh(model, certified)
+        mesh = _mesh(model, trainer, certified)
     tested = {} if validation is None else {"validation": asdict(validation)}
     certified = replace(certified, mesh=mesh, training={**certified.training, **tested})
     save_certified(certified, file)
@@ -122,6 +122,10 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     return result
 
 
+def _shown(bound: float) -> str:
+    return f"{bound:.1e}" if np.isfinite(bound) else "above 1"
+
+
 def _range(pair: tuple[float, float]) -> str:
     return f"{pair[0]:.4g} to {pair[1]:.4g} Pa"
 
@@ -140,9 +144,9 @@ def _earlier(model: Model, file: Path) -> tuple[Greedy | None, Array | None]:
     return state_of(old), old.fine.lift.L_q[:, hand : hand + old.k2]
 
 
-def _mesh(model: Model, certified: CertifiedModel) -> MeshNumber | None:
+def _mesh(model: Model, trainer: Trainer, certified: CertifiedModel) -> MeshNumber | None:
     """What is known of the mesh at some of the trained parameters; None where it has no estimate."""
-    places = list(dict.fromkeys(tuple(place) for place in certified.training["chosen"]))[:PLACES]
+    places = list(dict.fromkeys(trainer.parameters[r["at"]] for r in certified.training["rounds"]))[:PLACES]
     try:
         return mesh_number(model, places)
     except SoftgraspError:
@@ -211,7 +215,7 @@ def greedy_table(certified: CertifiedModel) -> Table:
     hand, points = 2 * len(certified.fine.parts["M_hand"]), certified.training["points"]
     rows = [
         (
-            i + 1, *(f"{x:.4g}" for x in points[r["at"]]), r["k"], hand + 2 * r["k"], f"{r['bound']:.1e}",
+            i + 1, *(f"{x:.4g}" for x in points[r["at"]]), r["k"], hand + 2 * r["k"], _shown(r["bound"]),
             *(f"{x:.4g}" for x in points[r["worst"]]), r["evaluations"], f"{r['seconds']:.1f}",
         )
         for i, r in enumerate(certified.training["rounds"])

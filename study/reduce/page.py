@@ -22,19 +22,20 @@ from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section
 
 CAPTIONS = {
-    "errors.png": "Relative errors of the paper's six methods against N, all columns of V counted. First the "
-    "deformation, after removing the rigid motion of the hand; then the state [q_s, v_s, q_e, v_e], the paper's error; "
-    "then [q_s, p_s, q_e, p_e]; then the energy of the tissue; each the same for every method. Thin dotted: projection "
-    "error, which no model of the basis can fall below. Red crosses: unstable models. Errors above 1 are drawn at 1.",
+    "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
+    "is broken where its model is unstable (crosses). Errors above 1 are drawn at 1.",
     "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
-    "times.png": "Errors of all models against the time of a run, and against offline plus online time. Open marks: "
-    "global bases. Red crosses: unstable models. Errors above 1 are drawn at 1. Dashed: the full run with its matrix "
-    "factored beforehand.",
+    "errors_state.png": "Further errors of the paper's six methods: of the state [q_s, v_s, q_e, v_e], which is the "
+    "paper's, of [q_s, p_s, q_e, p_e], and of the energy of the tissue.",
+    "times.png": "Error of the deformation of all stable models against the time of a run, and against offline plus "
+    "online time. Bold: the models that no other beats in both. Dashed: the full run with its matrix factored "
+    "beforehand.",
     "sigma.png": "Singular values over the first of each decomposition; thin lines are its further parts. Those of "
     "PSD are symplectic or of complex snapshots, each a pair of columns.",
     "modes.png": "First modes of the best method of the paper that keeps the hand apart, and of Craig-Bampton or the "
-    "best beyond the paper, scaled to the same largest displacement. Colour: displacement. Modes in absolute "
-    "coordinates hold the motion that the hand gives, so that the body leaves its contact.",
+    "best beyond the paper, scaled to the same largest displacement. Colour: displacement relative to the hand. The "
+    "paper's modes hold absolute displacements of the tissue alone, and columns of their own move the hand: here the "
+    "hand stands where the tissue beside it goes.",
     "compare.png": "Reduced bodies under the outline of the full one, at instants of large deformation or error.",
     "compare.gif": "The same in motion.",
 }

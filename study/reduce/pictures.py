@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,18 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.registry import PAPER_METHODS
 from softgrasp.reduction.replay import FullRun, replay
-from softgrasp.study.pictures.animation import frame_box, frame_image, speed_up, write_gif
+from softgrasp.study.pictures.animation import Film, speed_up, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
-from softgrasp.study.reduce.plots import figure_errors, figure_sigma, figure_times, further_methods, of_paper
+from softgrasp.study.reduce.plots import (
+    figure_errors,
+    figure_further_errors,
+    figure_sigma,
+    figure_times,
+    further_methods,
+    of_paper,
+)
 from softgrasp.study.reduce.result import ReductionStudy, Sweep, nearest
 
 MODES = 4  # a method
@@ -61,7 +68,8 @@ class Views:
         table: the hand, columns time and q_s, (steps + 1, 1 + n_s) [s, m, rad].
         full: vertex displacements of the full run at the frames, (k, n, d) [m].
         reduced: models to compare.
-        modes: title and vertex displacements (k, n, d) of the first modes of some methods, largest entry 1.
+        modes: title and vertex displacements (k, n, d) of the first modes of some methods, largest entry 1; whether
+            they are absolute displacements, that take the hand along.
     """
 
     picture: PictureMesh
@@ -69,7 +77,7 @@ class Views:
     table: Array
     full: Array
     reduced: tuple[View, ...]
-    modes: tuple[tuple[str, Array], ...]
+    modes: tuple[tuple[str, Array, bool], ...]
 
 
 def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
@@ -78,6 +86,7 @@ def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
     shown = [s for s in study.sweeps if s.points]
     if of_paper(shown):
         files += figure_errors(of_paper(shown), out / "errors.png")
+        files += figure_further_errors(of_paper(shown), out / "errors_state.png")
     if any(s not in of_paper(shown) for s in shown):
         files += figure_errors(further_methods(shown), out / "errors_beyond.png")
     if shown:
@@ -122,11 +131,11 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views |
         states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
         if states is not None:
             views.append(View(f"{s.method.title}, $N$ = {point.N}", point.stable, point.error_deformation, states))
-    modes = [(s.method.title, _modes(model, s, i)) for s, i in modes_of(sweeps)]
+    modes = [(s.method.title, _modes(model, s, i), s.method.frame == "absolute") for s, i in modes_of(sweeps)]
     if picture is None or full is None:
         return None
     table = np.column_stack([run.trajectory.times, run.trajectory.q_s])
-    shown = tuple((title, shapes) for title, shapes in modes if shapes is not None and len(shapes))
+    shown = tuple((title, shapes, free) for title, shapes, free in modes if shapes is not None and len(shapes))
     return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
 
 
@@ -152,19 +161,26 @@ def _modes(model: Model, s: Sweep, i: int) -> Array | None:
     return None if shapes is None else np.asarray(shapes)
 
 
-def figure_modes(views: Views, out_png: Path) -> tuple[Path, Path]:
+def figure_modes(views: Views, out_png: Path) -> tuple[Path, ...]:
     """First modes of the best methods drawn on the body, scaled to one largest displacement; PNG and PDF."""
     picture = views.picture
     size = float(np.ptp(picture.points, axis=0).max())
     titles = [
         f"{title.replace(', fixed solid modes', ', fixed')}, {k + 1}"
-        for title, shapes in views.modes
+        for title, shapes, _ in views.modes
         for k in range(len(shapes))
     ]
-    shapes = np.concatenate([_scaled(shapes, STRETCH * size) for _, shapes in views.modes])
+    shapes = np.concatenate([_scaled(shapes, STRETCH * size) for _, shapes, _ in views.modes])
+    free = np.concatenate([np.full(len(shapes), absolute) for _, shapes, absolute in views.modes])
     times = np.arange(len(shapes), dtype=float)
-    still = np.column_stack([times, np.zeros((len(shapes), picture.n_s))])
-    shot = make_shot(picture, shapes, times, still, None)
+    hands = np.zeros((len(shapes), picture.n_s))
+    held = np.unique(picture.contact)
+    near = np.setdiff1d(picture.cells[np.isin(picture.cells, held).any(axis=1)], held)
+    if len(near):  # the hand moves by columns of its own: shown where the tissue beside it goes
+        hands[free, : picture.dimension] = shapes[free][:, near].mean(axis=1)
+        shapes[:, held] = np.stack([picture.rigid(q)[held] for q in hands])
+    shot = make_shot(picture, shapes, times, np.column_stack([times, hands]), None)
+    shot = replace(shot, path=shot.path[:1])
     with paper_style():
         figure, axes = make_axes(shot, len(shapes), captions=True, width=WIDTH, tallest=5.0)
         for ax, shape, title, hand in zip(axes, shapes, titles, shot.hands, strict=True):
@@ -231,7 +247,7 @@ def instants(views: Views) -> list[int]:
     return sorted(chosen)
 
 
-def figure_compare(views: Views, out_png: Path) -> tuple[Path, Path]:
+def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
     """Full outline over reduced bodies at some instants; PNG and PDF."""
     shown = instants(views)
     note = f"; shown: $t$ = {', '.join(f'{views.times[k]:.2g}' for k in shown)} s"
@@ -248,13 +264,12 @@ def gif_compare(views: Views, out_gif: Path) -> Path:
     images = []
     with paper_style():
         figure, axes, shot = _figure(views, WIDTH if len(views.reduced) > 1 else COLUMN + 1)
-        box = frame_box(figure)
+        film = Film(figure, axes)
         for k in range(len(views.times)):
+            film.clear()
             for ax, view in zip(axes, views.reduced, strict=True):
-                for artist in [*ax.collections, *ax.lines]:
-                    artist.remove()
                 _draw(ax, shot, views, view, k)
-            images.append(frame_image(figure, box))
+            images.append(film.frame())
         plt.close(figure)
     span = float(views.times[-1] - views.times[0]) / speed_up(views.times)
     wait = max(20, round(100 * span / max(1, len(images) - 1)) * 10)  # [ms], GIF counts in hundredths of a second

@@ -9,26 +9,28 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from softgrasp.reduction.registry import PAPER_METHODS
 from softgrasp.study.pictures.style import (
     BLUE,
+    COLUMN,
     GREEN,
     HAND,
     ORANGE,
+    OUTLINE,
     PURPLE,
     SKY,
     STEPS,
-    UNSTABLE,
     WIDTH,
+    direct_labels,
+    few_ticks,
     paper_style,
     save,
 )
 from softgrasp.study.reduce.result import Point, Sweep, nearest
 
 TOP = 1.0  # errors above are drawn at the upper edge
-NARROW = 16.0  # largest over least time below which an axis has numbers between the powers of ten
 LOWEST = 1e-17  # of a singular value over the first
 SHOWN_VALUES = 100
 OLIVE, BROWN = "#8a8a00", "#8c510a"
@@ -46,13 +48,13 @@ LOOKS: dict[str, tuple[str, str, str]] = {  # colour by decomposition, dashes fo
     "craig_bampton": (HAND, "-", "P"),
 }
 SPARE = ((BROWN, "-", ">"), (BROWN, "--", "h"), (BROWN, ":", "X"), (BROWN, "-.", "p"))
-CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.1, "color": UNSTABLE}
+CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 4.0, "mew": 0.8, "alpha": 0.6}
 FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
 QUANTITIES = (
-    ("error_deformation", "projection_error_deformation", "error of the deformation"),
-    ("error", "projection_error", r"error of $[q_s, v_s, q_e, v_e]$"),
-    ("error_canonical", "", r"error of $[q_s, p_s, q_e, p_e]$"),
-    ("error_energy", "", "error of the energy"),
+    ("error_deformation", "error of the deformation"),
+    ("error", r"error of $[q_s, v_s, q_e, v_e]$"),
+    ("error_canonical", r"error of $[q_s, p_s, q_e, p_e]$"),
+    ("error_energy", "error of the energy"),
 )
 
 
@@ -74,69 +76,104 @@ def further_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
     return ([] if first is None else [first[1]]) + [s for s in sweeps if s.method.key not in PAPER_METHODS and s.points]
 
 
-def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, Path]:
-    """Four errors against N with the floor of the projection and the unstable points; PNG and PDF."""
+def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...]:
+    """Error of the deformation against N; a curve is broken where its model is unstable."""
     look = looks(sweeps)
     with paper_style():
-        figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.4), sharex=True)
-        clipped = False
-        for ax, (key, floor, label) in zip(grid.flat, QUANTITIES, strict=True):
-            for s in sweeps:
-                N = [p.N for p in s.points]
-                if floor:
-                    ax.plot(N, _values(s.points, floor), color=look[s.method.key][0], ls=":", lw=0.7, zorder=1)
-                clipped |= _curve(ax, s, N, key, look[s.method.key])
-            ax.set_ylabel(label)
-            _log_axis(ax)
-            ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=STEPS))
-        for ax in grid[1]:
-            ax.set_xlabel("$N$")
-        _legend(figure, _entries(sweeps, look, clipped))
+        figure, ax = plt.subplots(figsize=(COLUMN + 1.6, 3.4))
+        figure.subplots_adjust(left=0.13, right=0.66, bottom=0.13, top=0.9)
+        ends = _errors_axis(ax, sweeps, look, *QUANTITIES[0])
+        ax.set_xlabel("$N$, columns of the basis")
+        direct_labels(ax, ends)
+        if handles := _remarks(sweeps):
+            ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.2, ncols=2)
         return save(figure, out_png)
 
 
-def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[Path, Path]:
-    """Errors against online time, and against offline plus online time, with the unstable points; PNG and PDF.
+def figure_further_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...]:
+    """State, canonical state and energy, one below the other, as the deformation in :func:`figure_errors`."""
+    look = looks(sweeps)
+    with paper_style():
+        figure, axes = plt.subplots(3, 1, figsize=(COLUMN + 1.6, 6.4), sharex=True)
+        figure.subplots_adjust(left=0.13, right=0.66, bottom=0.07, top=0.97, hspace=0.1)
+        for ax, quantity in zip(axes, QUANTITIES[1:], strict=True):
+            ends = _errors_axis(ax, sweeps, look, *quantity)
+            direct_labels(ax, ends)
+        axes[-1].set_xlabel("$N$, columns of the basis")
+        return save(figure, out_png)
+
+
+def _errors_axis(
+    ax: Any, sweeps: Sequence[Sweep], look: dict[str, tuple[str, str, str]], key: str, label: str
+) -> list[tuple[float, float, str, str]]:
+    """Curves of one error; the end of each with its name and colour."""
+    ends = []
+    for s in sweeps:
+        colour, dashes, marker = look[s.method.key]
+        N, values = [p.N for p in s.points], _values(s.points, key)
+        held = np.where([p.stable for p in s.points], values, np.nan)
+        ax.plot(N, held, color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, zorder=2)
+        ax.plot(N, values, color=colour, ls=(0, (1, 2.5)), lw=0.6, zorder=1)
+        _crosses(ax, s, N, key, colour)
+        ends.append((float(N[-1]), float(values[-1]), s.method.short_title, colour))
+    ax.set_ylabel(label)
+    _log_axis(ax)
+    ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=STEPS))
+    return ends
+
+
+def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[Path, ...]:
+    """Error of the deformation against online time, and against offline plus online time, with the Pareto front.
 
     Args:
         sweeps: methods.
         full: seconds of the steps of a full run.
-        out_png: name of the picture; the PDF gets its stem.
+        out_png: name of the picture.
     """
-    look = looks(sweeps)
+    look, key = looks(sweeps), QUANTITIES[0][0]
     with paper_style():
-        figure, grid = plt.subplots(2, 2, figsize=(WIDTH, 5.4), sharex="col")
-        clipped = False
-        for row, (key, _, label) in zip(grid, QUANTITIES[:2], strict=True):
-            row[0].set_ylabel(label)
-            for ax, offline in zip(row, (False, True), strict=True):
-                unit = 1.0 if offline else 1e3
-                for s in sweeps:
-                    times = [unit * (p.time_online + offline * p.time_offline) for p in s.points]
-                    ax.plot(times, _values(s.points, key), **_marks(look[s.method.key]))
-                    _crosses(ax, s, times, key)
-                    clipped |= _clipped(s, key)
-                ax.axvline(full * unit, **FULL)
-                ax.set_xscale("log")
-                _log_axis(ax)
-        for ax in grid[1]:
-            _time_axis(ax)
-        grid[1, 0].set_xlabel("online time of a run [ms]")
-        grid[1, 1].set_xlabel("offline + online time [s]")
-        entries = [Line2D([], [], label=s.method.short_title, **_marks(look[s.method.key])) for s in sweeps if s.points]
-        entries.append(Line2D([], [], label="full run, prefactored", **FULL))
-        _legend(figure, [*entries, *_remarks(sweeps, clipped)])
+        figure, axes = plt.subplots(2, 1, figsize=(COLUMN + 0.9, 5.6), layout="constrained")
+        named: dict[str, Line2D] = {}
+        for ax, offline in zip(axes, (False, True), strict=True):
+            unit = 1.0 if offline else 1e3
+            points = [
+                (unit * (p.time_online + offline * p.time_offline), min(getattr(p, key), TOP), s)
+                for s in sweeps for p in s.points if p.stable and np.isfinite(getattr(p, key))
+            ]  # fmt: skip
+            ax.plot([t for t, _, _ in points], [e for _, e, _ in points], ls="", marker=".", ms=4, color="#c4c4c4")
+            front = pareto(points)
+            ax.plot([t for t, _, _ in front], [e for _, e, _ in front], color=OUTLINE, lw=1.6, zorder=2)
+            for t, e, s in front:
+                colour, _, marker = look[s.method.key]
+                mark: dict[str, Any] = {"ls": "", "marker": marker, "ms": 5.0, "color": colour}
+                ax.plot(t, e, **mark, zorder=3)
+                named[s.method.key] = Line2D([], [], label=s.method.short_title, **mark)
+            ax.axvline(full * unit, **FULL)
+            ax.set_xscale("log")
+            _log_axis(ax)
+            ax.set_ylabel(QUANTITIES[0][1])
+            few_ticks(ax.xaxis)
+        axes[0].set_xlabel("online time of a run [ms]")
+        axes[1].set_xlabel("offline + online time [s]")
+        rest = [
+            Line2D([], [], ls="", marker=".", ms=4, color="#c4c4c4", label="other stable models"),
+            Line2D([], [], color=OUTLINE, lw=1.6, label="Pareto front"),
+            Line2D([], [], label="full run, prefactored", **FULL),
+        ]
+        figure.legend(handles=[*named.values(), *rest], loc="outside upper center", ncols=2)
         return save(figure, out_png)
 
 
-def _marks(look: tuple[str, str, str]) -> dict[str, Any]:
-    """Filled marks for bases that keep the hand apart, open ones for global bases."""
-    colour, dashes, marker = look
-    fill = "full" if dashes == "-" else "none"
-    return {"ls": "", "marker": marker, "ms": 3.6, "mew": 0.8, "color": colour, "fillstyle": fill}
+def pareto(points: Sequence[tuple[float, float, Sweep]]) -> list[tuple[float, float, Sweep]]:
+    """Those of (time, error, method) that no other beats in both, by time."""
+    front: list[tuple[float, float, Sweep]] = []
+    for point in sorted(points, key=lambda p: p[:2]):
+        if not front or point[1] < front[-1][1]:
+            front.append(point)
+    return front
 
 
-def figure_sigma(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, Path] | None:
+def figure_sigma(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...] | None:
     """Singular values over the first, a line for each part of a decomposition; PNG and PDF, None without any."""
     look = looks(sweeps)
     groups = [
@@ -172,26 +209,6 @@ def _values(points: Sequence[Point], key: str) -> np.ndarray:
     return np.where(np.isfinite(values), np.minimum(values, TOP), TOP)
 
 
-def _curve(ax: Any, s: Sweep, N: list[int], key: str, look: tuple[str, str, str]) -> bool:
-    """One method; whether a value had to be drawn at the edge."""
-    colour, dashes, marker = look
-    shown = _values(s.points, key)
-    ax.plot(N, shown, color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, zorder=2)
-    _crosses(ax, s, N, key)
-    return _clipped(s, key)
-
-
-def _crosses(ax: Any, s: Sweep, at: Sequence[float], key: str) -> None:
-    """Marks of the unstable models among the points at these abscissae."""
-    bad = [i for i, p in enumerate(s.points) if not p.stable]
-    ax.plot([at[i] for i in bad], _values(s.points, key)[bad], **CROSS, zorder=4, clip_on=False)
-
-
-def _clipped(s: Sweep, key: str) -> bool:
-    """Whether a value has to be drawn at the edge."""
-    return not all(getattr(p, key) <= TOP for p in s.points)
-
-
 def _log_axis(ax: Any) -> None:
     ax.set_yscale("log")
     ax.set_ylim(top=1.6 * TOP)
@@ -201,44 +218,17 @@ def _log_axis(ax: Any) -> None:
     ax.set_axisbelow(True)
 
 
-def _time_axis(ax: Any) -> None:
-    """Plain numbers at the powers of ten, and between them where the axis spans hardly more than one."""
-    low, high = ax.get_xlim()
-    shown = "235" if high < NARROW * low else ""
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    ax.xaxis.set_minor_locator(LogLocator(subs=tuple(range(2, 10))))
-    ax.xaxis.set_minor_formatter(FuncFormatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in shown else ""))
+def _crosses(ax: Any, s: Sweep, at: Sequence[float], key: str, colour: str) -> None:
+    """Faint marks of the unstable models, where the curve is broken."""
+    bad = [i for i, p in enumerate(s.points) if not p.stable]
+    ax.plot([at[i] for i in bad], _values(s.points, key)[bad], **CROSS, color=colour, zorder=1)
 
 
-def _entries(sweeps: Sequence[Sweep], look: dict[str, tuple[str, str, str]], clipped: bool) -> list[Line2D]:
-    """Legend of the errors against N."""
-    entries = []
-    for s in sweeps:
-        colour, dashes, marker = look[s.method.key]
-        entries.append(
-            Line2D([], [], color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, label=s.method.short_title)
-        )
-    entries.append(Line2D([], [], color="#777777", ls=":", lw=0.9, label="projection error, the floor"))
-    return [*entries, *_remarks(sweeps, clipped)]
-
-
-def _remarks(sweeps: Sequence[Sweep], clipped: bool) -> list[Line2D]:
+def _remarks(sweeps: Sequence[Sweep]) -> list[Line2D]:
     """What a legend says of unstable models and of errors beyond the frame, where there are any."""
     entries = []
     if any(not p.stable for s in sweeps for p in s.points):
-        entries.append(Line2D([], [], **CROSS, label="unstable model"))
-    if clipped:
-        entries.append(Line2D([], [], ls="", label=f"errors above {TOP:g} are drawn at {TOP:g}"))
+        entries.append(Line2D([], [], **CROSS, color=OUTLINE, label="unstable, the curve is broken"))
+    if any(not p.error_deformation <= TOP for s in sweeps for p in s.points):
+        entries.append(Line2D([], [], ls="", label=f"above {TOP:g} is drawn at {TOP:g}"))
     return entries
-
-
-def _legend(figure: Any, entries: list[Line2D]) -> None:
-    """Three columns above the axes, which take the rest of the figure."""
-    height = float(figure.get_figheight())
-    rows = -(-len(entries) // 3)
-    top = 1 - (0.12 + 0.165 * rows) / height
-    figure.subplots_adjust(left=0.085, right=0.99, bottom=0.45 / height, top=top, wspace=0.24, hspace=0.1)
-    figure.legend(
-        handles=entries, loc="upper center", bbox_to_anchor=(0.5, 1.0), ncols=3, columnspacing=1.4, handlelength=2.4,
-        borderaxespad=0.0, fontsize=7,
-    )  # fmt: skip

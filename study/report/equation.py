@@ -73,9 +73,10 @@ def _motion(scene: Scene) -> str:
 
 def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
     effects, layers = scene.effects, "sum over layers of " if scene.tissue.layers else ""
-    law = [] if effects.finite_strain is None else [f"f(z) = dW/dz, W(F) {effects.finite_strain.law}, F = I + grad z"]
+    finite = effects.finite_strain
+    strain = [] if finite is None else [f"f(z) = dW/dz, W(F) {finite.law}, F = I + grad z"]
     result = [
-        *law,
+        *strain,
         "q_s: translations" + (" and small angles" if effects.rotation else "") + " of the hand",
         "z = q_e - T q_s: displacement of the tissue against the rigid motion T q_s",
         "G = M_es + M_ee T; K_es = -K_ee T",
@@ -87,9 +88,10 @@ def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
         result.append("one-way: the hand does not feel the tissue, M_ss = M_hand, M_se = 0, K_ss = K_se = 0")
     if effects.damping is not None:
         beta = "beta K_ee" if not layered(scene) else "sum over layers of beta K"
-        law = f"alpha M_ee + {beta}" if effects.damping.alpha else beta
+        damping = f"alpha M_ee + {beta}" if effects.damping.alpha else beta
         result.append(
-            f"D_ee = {law}, D_es = -D_ee T" + (" + alpha G: dragged in space" if dragged else ": a rigid move is free")
+            f"D_ee = {damping}, D_es = -D_ee T"
+            + (" + alpha G: dragged in space" if dragged else ": a rigid move is free")
         )
         if effects.reaction:
             result.append("D_se = D_es', D_ss = T' D_ee T" + (" + alpha (R' M R - T' M_ee T)" if dragged else ""))

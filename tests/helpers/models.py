@@ -368,7 +368,7 @@ def run_from(model: Model, z: Array, v: Array, v_s: Array | None = None, force: 
     return run
 
 
-def rough_save(figure: Any, out_png: Path) -> tuple[Path, Path]:
+def rough_save(figure: Any, out_png: Path) -> tuple[Path, ...]:
     """In place of `study.pictures.style.save`, for tests that look at no more than the existence of a picture."""
     import matplotlib.pyplot as plt
 

@@ -24,8 +24,9 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
+from softgrasp.reduction.parameters import materials_at
 from tests.helpers.certified import KELVIN_VOIGT, error_to, full_at
-from tests.helpers.models import close, make_scene
+from tests.helpers.models import LAYERS, close, make_scene
 
 BOX: dict[str, Any] = {"reduction": {"lambda_range": [30.0, 500.0], "mu_range": [20.0, 500.0], "grid": 5}}
 SMALL: dict[str, Any] = {"time": {"steps": 40}}
@@ -160,9 +161,28 @@ def test_unit_motions_train_for_every_direction(comm: MPI.Intracomm) -> None:
 
 
 @pytest.mark.serial
+def test_layers_apart(comm: MPI.Intracomm) -> None:
+    """Every layer has factors of its own; materials with other ratios are inside, and certified."""
+    layers: dict[str, Any] = {"tissue": {"layers": {"low": {**LAYERS["low"], "beta": 0.002}}}}
+    apart: dict[str, Any] = {"reduction": {**BOX["reduction"], "layers": "apart", "grid": 4}}
+    model, trainer, certified = trained(comm, 0.3, layers, apart)
+    ratios = {round(m[0].lam / m[1].lam, 6) for m in trainer.parameters}
+    assert len(ratios) > 10
+    first, second = certified.fine.materials
+    mixed = (replace(first, lam=400.0, mu=30.0), replace(second, lam=second.lam, mu=2 * second.mu))
+    run = certified.run(mixed, allow=True)
+    assert run.certificate.inside
+    assert not replace(certified, box=replace(certified.box, apart=False)).inside(mixed)
+    system, full = full_at(model, mixed)
+    error, size = error_to(system, full, certified, run)
+    assert (run.certificate.energy.values >= error - 1e-9 * size).all()
+    trainer.destroy()
+
+
+@pytest.mark.serial
 def test_the_mesh_has_a_number(comm: MPI.Intracomm) -> None:
     model = build(make_scene(KELVIN_VOIGT, SMALL), comm=comm)
-    number = mesh_number(model, [(50.0, 50.0), (500.0, 50.0)])
+    number = mesh_number(model, [materials_at(model, 50.0, 50.0), materials_at(model, 500.0, 50.0)])
     assert len(number.estimates) == 2
     assert 0.01 < number.largest < 1
 
@@ -172,3 +192,14 @@ def test_scenes_that_cannot_be_trained(comm: MPI.Intracomm) -> None:
     outside: dict[str, Any] = {"reduction": {"lambda_range": [100.0, 500.0]}}
     with pytest.raises(SceneError, match=r"lies outside reduction\.lambda_range"):
         Trainer(build(make_scene(outside), comm=comm))
+
+
+@pytest.mark.serial
+def test_rounding_adds_no_modes() -> None:
+    """A tolerance that no double reaches ends with a reason, not with modes of rounding that are dependent."""
+    scene = make_scene(KELVIN_VOIGT, SMALL, {"reduction": {**BOX["reduction"], "grid": 2, "add": 20}})
+    trainer = Trainer(build(scene, comm=MPI.COMM_SELF))
+    certified = build_certified(trainer, 1e-14)
+    trainer.destroy()
+    assert certified.training["reason"] == "exhausted"
+    assert certified.run(allow=True).certificate.reduction < 1e-9  # the bound at rounding

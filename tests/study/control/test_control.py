@@ -206,6 +206,17 @@ def test_files_can_be_used(result: dict[str, Any], out: Path) -> None:
     assert target.q_s.tolist() == [5.0, 3.0]
 
 
+def test_the_gain_alone_is_that_of_the_whole_command(result: dict[str, Any], tmp_path: Path) -> None:
+    out, same = common(tmp_path) / "alone", [*SMALL, "control.method='newton-adi'"]
+    alone = run_control(SCENES / "paper_lqr.toml", out, same, Console(quiet=True), quiet=True, gain_only=True)
+    assert "loop" not in alone
+    for key in ("residual", "optimal_cost", "gain_translation", "gain_rigid_velocity", "closed_loop_abscissa"):
+        assert alone[key] == result[key], key  # the same computation on the same ranks
+    assert alone["controller"]["N"] == result["controller"]["N"]
+    assert not list(out.glob("*.png"))
+    assert (out / "controller.npz").exists()
+
+
 def test_other_methods_find_the_same(result: dict[str, Any], tmp_path: Path) -> None:
     other = ran(common(tmp_path), "dense")[0]
     assert other["method"].startswith("dense")
@@ -376,9 +387,8 @@ def test_large_errors_break_the_line_and_unstable_gains_are_marked() -> None:
 @pytest.mark.serial
 def test_figure_of_the_errors(tmp_path: Path) -> None:
     bases = (points("pod", (4, 0.5, -1.0), (6, 30.0, 0.1)), points("structured", (4, 1e-3, -1.0), (6, 1e-5, -1.0)))
-    png, pdf = figure_reduced(bases, tmp_path / "errors.png")
+    (png,) = figure_reduced(bases, tmp_path / "errors.png")
     assert png.stat().st_size > 10_000
-    assert pdf.stat().st_size > 5_000
 
 
 def test_small_helpers() -> None:

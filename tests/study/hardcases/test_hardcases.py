@@ -89,8 +89,7 @@ def test_pictures(tmp_path: Path, name: str) -> None:
     """One of each kind of axis."""
     assert run_hardcases(tmp_path, quiet_console(), quick=True, family=name, quiet=True)["ok"]
     assert (tmp_path / "report.html").read_text().count("<img") == 1
-    for suffix in ("png", "pdf"):
-        assert (tmp_path / f"hard_{name}.{suffix}").stat().st_size > 5000
+    assert (tmp_path / f"hard_{name}.png").stat().st_size > 5000
 
 
 def number(value: float | None, bound: float | None, **more: Any) -> HardCase:

@@ -48,7 +48,7 @@ def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> Non
     assert result["ranks"] == ranks
     assert {"assembly", "factor", "steps", "per_step"} <= result["time"].keys()
     assert result["memory_peak_mb"] > 50  # MiB; Python with PETSc alone needs more
-    for name in ("trajectory.csv", "scene.toml", "move.png", "move.pdf", "move.gif", "traces.png", "report.html"):
+    for name in ("trajectory.csv", "scene.toml", "move.png", "move.gif", "traces.png", "report.html"):
         assert (out / name).stat().st_size > 500, name
     page = (out / "report.html").read_text()
     assert "data:image/png;base64" in page
