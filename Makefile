@@ -18,8 +18,9 @@ $(STAMP): pyproject.toml tools/make-env
 	@sh tools/make-env .venv
 	@touch $@
 
-demo: $(STAMP) ## run the paper's forward scene into out/paper_forward-simulate
+demo: $(STAMP) ## run the paper's forward scene, and the same on an accurate mesh, into out/
 	@$(BIN)/softgrasp simulate paper_forward
+	@$(BIN)/softgrasp simulate paper_accurate
 
 lint: $(STAMP) ## ruff, mypy and the import contracts
 	$(BIN)/ruff check
