@@ -20,7 +20,7 @@ from softgrasp.fem.scene.file import load_scene
 
 comm = MPI.COMM_WORLD
 scenes = Path(__file__).parent / "scenes"
-scene = load_scene(scenes / "pillow_3d.toml", ["tissue.order=1", "time.steps=200"])
+scene = load_scene(scenes / "pillow_3d.toml", ["tissue.refine=false", "tissue.order=1", "time.steps=200"])
 model = build(scene, comm=comm)
 run = simulate(model)
 
@@ -59,7 +59,7 @@ with agree(comm):
             marked = meshio.Mesh(mesh.points, blocks, cell_data=data)
             meshio.write(folder / f"pillow{suffix}", marked, **({"file_format": "gmsh22"} if suffix == ".msh" else {}))
 
-changes = ["tissue.order=1", "time.steps=200", "contact={facet_tag=3}"]
+changes = ["tissue.refine=false", "tissue.order=1", "time.steps=200", "contact={facet_tag=3}"]
 changes += ["tissue.layers.core={tag=1, material={young=2e5, poisson=0.4, rho=200.0}}"]
 marked = {}
 for suffix in (".msh", ".vtu"):

@@ -28,7 +28,19 @@ assert abs(run.q_s[-1] - [5, 3]).max() < 1e-12  # a prescribed motion ends where
 assert run.energy_drift < 1e-12  # the midpoint rule conserves quadratic invariants: rounding only
 
 # %% [markdown]
-# New material: $K = \mu K_\mu + \lambda K_\lambda$ is combined again. A stiffer body follows the hand more closely.
+# What the mesh costs: the same scene on a graded mesh, cells shrinking towards the ends of the contact zone. The
+# deformation, the tip against the hand, is 40 % off on the paper's mesh, and a tenth of a percent on the graded one.
+
+# %%
+accurate = sg.simulate(sg.build("paper_accurate"))
+coarse, fine = (r.outputs - r.outputs_rigid for r in (run, accurate))
+off = abs(coarse - fine).max() / abs(fine).max()
+if MPI.COMM_WORLD.rank == 0:
+    print(f"the paper's mesh leaves {100 * off:.0f} % of the deformation")
+assert 0.35 < off < 0.45
+
+# %% [markdown]
+# New material: `K = mu K_mu + lambda K_lambda` is combined again. A stiffer body follows the hand more closely.
 
 # %%
 lag = {}

@@ -18,7 +18,7 @@ from softgrasp.fem.strain.laws import LAWS, LawName, Start
 from softgrasp.fem.system import LayerMaterial
 
 BLOCK = 1 << 20  # entries of H at a time
-PADDING = 8  # points: doubles of one vector register
+LANES = 8  # points that `stepper.c` takes at a time
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class Packed:
-    """What `stepper.c` takes: B (d d, k, p), weight, lam and mu (p,), points padded to p with weight 0."""
+    """What `stepper.c` takes: B (p / LANES, k, d d, LANES), weight, lam, mu (p,); what fills up p weighs nothing."""
 
     law: int
     d: int
@@ -154,11 +154,12 @@ class Potential:
     def packed(self) -> Packed:
         """Arrays for the compiled stepper."""
         q = len(self.cells.weight)
-        p = -(-q // PADDING) * PADDING
+        p = -(-q // LANES) * LANES
 
         def padded(x: Array) -> Array:
             return np.ascontiguousarray(np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, p - q)]))
 
-        B = self.cells.B.reshape(self.k, self.d**2, q).transpose(1, 0, 2)
-        arrays = (padded(B), padded(self.cells.weight), padded(self.lam), padded(self.mu))
+        B = padded(self.cells.B.reshape(self.k, self.d**2, q)).reshape(self.k, self.d**2, -1, LANES)
+        B = np.ascontiguousarray(B.transpose(2, 0, 1, 3))
+        arrays = (B, padded(self.cells.weight), padded(self.lam), padded(self.mu))
         return Packed(list(LAWS).index(self.cells.law), self.d, p, arrays)

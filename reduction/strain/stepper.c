@@ -2,165 +2,161 @@
 
    S w + f_alg(a, w) = h,  h = s v + l,  S = s^2 I + s D,  s = 2/dt,   a_1 = a + 2 w,  v_1 = 2 s w - v
    f_alg = sum_q weight_q B_q' P_alg(H_0, H_0 + 2 B_q w): the discrete gradient of W(F) = mu/2 |F|^2 + g(J), or of
-   St. Venant-Kirchhoff. Points lie next to each other in every array, p of them with the padding: B[component][i][p]. */
+   St. Venant-Kirchhoff, by the formulas of fem/strain/laws.py. LANES points at a time stay in registers and their B in the
+   nearest cache: B[chunk][i][component][lane], and of p points in all those that fill up the last chunk weigh nothing. */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
 enum { NEO_HOOKE, NEO_HOOKE_QUADRATIC, STVK };
+enum { LANES = 8 };
+#define EACH for (int l = 0; l < LANES; l++)
+#define INLINE static inline __attribute__((always_inline)) /* so that d is a constant in all loops */
 
+typedef double Lane[LANES];
 typedef struct {
   int law, d, k, p;
   const double *B, *weight, *lam, *mu;
-  double *H0, *h, *P, *E0, *j0, *l0;
+  Lane *H0, *E0, *j0, *l0, *f; /* by chunk: d d components, or one; f by coordinate */
   long evaluations, bad;
 } Body;
 
-static void gradient(const Body *b, const double *a, double *H) {
-  const int p = b->p;
-  for (int c = 0; c < b->d * b->d; c++) {
-    double *restrict out = H + c * p;
-    for (int e = 0; e < p; e++) out[e] = 0;
-    for (int i = 0; i < b->k; i++) {
-      const double t = a[i], *restrict in = b->B + (c * b->k + i) * p;
-      for (int e = 0; e < p; e++) out[e] += t * in[e];
-    }
-  }
+/* Component by component, row by row: H[i * d + j] = dz_i / dX_j. */
+INLINE void gradient(const Body *b, int n, int chunk, const double *a, Lane *H) {
+  const double *B = b->B + (size_t)chunk * b->k * n * LANES;
+  Lane sum[9] = {{0}};
+  for (int i = 0; i < b->k; i++)
+    for (int c = 0; c < n; c++) EACH sum[c][l] += a[i] * B[(i * n + c) * LANES + l];
+  for (int c = 0; c < n; c++) EACH H[c][l] = sum[c][l];
 }
 
-static void back(const Body *b, double *restrict f) {
-  const int p = b->p, k = b->k;
-  for (int i = 0; i < k; i++) {
-    double sum = 0;
-    for (int c = 0; c < b->d * b->d; c++) {
-      const double *restrict in = b->B + (c * k + i) * p, *restrict P = b->P + c * p;
-#pragma omp simd reduction(+ : sum)
-      for (int e = 0; e < p; e++) sum += in[e] * P[e];
-    }
-    f[i] = sum;
-  }
-}
-
-static inline void cofactor(int d, const double *F, double *C) {
+INLINE void cofactor(int d, const Lane *F, Lane *C) {
   if (d == 2) {
-    C[0] = F[3], C[1] = -F[2], C[2] = -F[1], C[3] = F[0];
+    EACH C[0][l] = F[3][l], C[1][l] = -F[2][l], C[2][l] = -F[1][l], C[3][l] = F[0][l];
     return;
   }
   for (int i = 0; i < 3; i++)
     for (int k = 0; k < 3; k++) {
       const int a = 3 * ((i + 1) % 3), m = 3 * ((i + 2) % 3), n = (k + 1) % 3, o = (k + 2) % 3;
-      C[3 * i + k] = F[a + n] * F[m + o] - F[a + o] * F[m + n];
+      EACH C[3 * i + k][l] = F[a + n][l] * F[m + o][l] - F[a + o][l] * F[m + n][l];
     }
 }
 
 /* J - 1 of I + H: trace, principal minors and determinant of H lose no digit. */
-static inline double volume(int d, const double *H) {
-  double C[9];
-  if (d == 2) return H[0] + H[3] + (H[0] * H[3] - H[1] * H[2]);
+INLINE void volume(int d, const Lane *H, double *j) {
+  Lane C[9];
+  if (d == 2) {
+    EACH j[l] = H[0][l] + H[3][l] + (H[0][l] * H[3][l] - H[1][l] * H[2][l]);
+    return;
+  }
   cofactor(3, H, C);
-  return H[0] + H[4] + H[8] + (C[0] + C[4] + C[8] + (H[0] * C[0] + H[1] * C[1] + H[2] * C[2]));
+  EACH j[l] = H[0][l] + H[4][l] + H[8][l] +
+              (C[0][l] + C[4][l] + C[8][l] + (H[0][l] * C[0][l] + H[1][l] * C[1][l] + H[2][l] * C[2][l]));
 }
 
-static inline void strain(int d, const double *H, double *E) {
+INLINE void strain(int d, const Lane *H, Lane *E) {
   for (int i = 0; i < d; i++)
     for (int k = 0; k < d; k++) {
-      double e = H[i * d + k] + H[k * d + i];
-      for (int m = 0; m < d; m++) e += H[m * d + i] * H[m * d + k];
-      E[i * d + k] = e / 2;
+      Lane e;
+      EACH e[l] = H[i * d + k][l] + H[k * d + i][l];
+      for (int m = 0; m < d; m++) EACH e[l] += H[m * d + i][l] * H[m * d + k][l];
+      EACH E[i * d + k][l] = e[l] / 2;
     }
 }
 
 /* log1p(x) / x without 0/0: 2 artanh(u) / x with u = x / (2 + x). */
-static inline double log_quotient(double x) {
-  if (fabs(x) > 0.25) return log1p(x) / x;
-  const double u = x / (2 + x), t = u * u;
-  return 2 / (2 + x) * (1 + t * (1. / 3 + t * (1. / 5 + t * (1. / 7 + t * (1. / 9 + t * (1. / 11 + t * (1. / 13 +
-         t * (1. / 15 + t / 17))))))));
-}
-
-/* J - 1 and ln J, or the strain, at the start of a step. */
-static inline void begin_as(const Body *b, int d) {
-  const int p = b->p, n = d * d;
-  for (int e = 0; e < p; e++) {
-    double H[9], E[9];
-    for (int c = 0; c < n; c++) H[c] = b->H0[c * p + e];
-    if (b->law == STVK) {
-      strain(d, H, E);
-      for (int c = 0; c < n; c++) b->E0[c * p + e] = E[c];
-    } else
-      b->j0[e] = volume(d, H), b->l0[e] = log1p(b->j0[e]);
+INLINE void log_quotient(const double *x, double *q) {
+  EACH {
+    const double u = x[l] / (2 + x[l]), t = u * u;
+    q[l] = 2 / (2 + x[l]) * (1 + t * (1. / 3 + t * (1. / 5 + t * (1. / 7 + t * (1. / 9 + t * (1. / 11 + t * (1. / 13 +
+           t * (1. / 15 + t / 17))))))));
   }
+  EACH if (!(fabs(x[l]) < 0.25)) q[l] = log1p(x[l]) / x[l];
 }
 
-static inline void stress_stvk(const Body *b, int d) {
-  const int p = b->p, n = d * d;
-  for (int e = 0; e < p; e++) {
-    double H1[9], F[9], S[9], trace = 0;
-    for (int c = 0; c < n; c++) {
-      const double h = b->h[c * p + e];
-      F[c] = b->H0[c * p + e] + h + (c % (d + 1) == 0);
-      H1[c] = b->H0[c * p + e] + 2 * h;
+/* Gradient, J - 1 and ln J, or the strain, at the start of a step. */
+INLINE void begin_as(Body *b, int d, const double *a) {
+  const int n = d * d;
+  for (int e = 0; e < b->p / LANES; e++) {
+    gradient(b, n, e, a, b->H0 + e * n);
+    if (b->law == STVK) strain(d, b->H0 + e * n, b->E0 + e * n);
+    else {
+      volume(d, b->H0 + e * n, b->j0[e]);
+      EACH b->l0[e][l] = log1p(b->j0[e][l]);
     }
-    strain(d, H1, S);
-    for (int c = 0; c < n; c++) S[c] = (S[c] + b->E0[c * p + e]) / 2;
-    for (int i = 0; i < d; i++) trace += S[i * (d + 1)];
-    for (int c = 0; c < n; c++) S[c] = 2 * b->mu[e] * S[c] + (c % (d + 1) == 0) * b->lam[e] * trace;
-    for (int i = 0; i < d; i++)
-      for (int k = 0; k < d; k++) {
-        double t = 0;
-        for (int m = 0; m < d; m++) t += F[i * d + m] * S[m * d + k];
-        b->P[(i * d + k) * p + e] = b->weight[e] * t;
-      }
   }
 }
 
-/* P_alg = mu F_m + (g(J_1) - g(J_0)) / (J_1 - J_0) C with C : (F_1 - F_0) = J_1 - J_0; the laws are those of
-   fem/strain/laws.py. Returns the first point with J_1 <= 0, or -1. */
-static inline long stress_j(const Body *b, int d) {
-  const int p = b->p, n = d * d;
-  long bad = -1;
-  for (int e = 0; e < p; e++) {
-    double F[9], h[9], C[9], dj = 0, slope;
-    for (int c = 0; c < n; c++) h[c] = b->h[c * p + e], F[c] = b->H0[c * p + e] + h[c] + (c % (d + 1) == 0);
-    cofactor(d, F, C);
-    if (d == 3) {
-      double more[9];
-      cofactor(3, h, more);
-      for (int c = 0; c < n; c++) C[c] += more[c] / 3;
+INLINE void stress_stvk(const Body *b, int d, int e, const Lane *h, Lane *P) {
+  const int n = d * d;
+  const double *lam = b->lam + e * LANES, *mu = b->mu + e * LANES;
+  Lane H1[9], F[9], S[9], trace = {0};
+  for (int c = 0; c < n; c++)
+    EACH F[c][l] = b->H0[e * n + c][l] + h[c][l] + (c % (d + 1) == 0), H1[c][l] = b->H0[e * n + c][l] + 2 * h[c][l];
+  strain(d, H1, S);
+  for (int c = 0; c < n; c++) EACH S[c][l] = (S[c][l] + b->E0[e * n + c][l]) / 2;
+  for (int i = 0; i < d; i++) EACH trace[l] += S[i * (d + 1)][l];
+  for (int c = 0; c < n; c++) EACH S[c][l] = 2 * mu[l] * S[c][l] + (c % (d + 1) == 0) * lam[l] * trace[l];
+  for (int i = 0; i < d; i++)
+    for (int k = 0; k < d; k++) {
+      EACH P[i * d + k][l] = 0;
+      for (int m = 0; m < d; m++) EACH P[i * d + k][l] += F[i * d + m][l] * S[m * d + k][l];
     }
-    for (int c = 0; c < n; c++) dj += 2 * C[c] * h[c];
-    const double j0 = b->j0[e], x = dj / (1 + j0), q = log_quotient(x);
-    if (!(x > -1) && bad < 0) bad = e;
-    if (b->law == NEO_HOOKE) slope = q / (1 + j0) * (b->lam[e] * (b->l0[e] + q * x / 2) - b->mu[e]);
-    else slope = b->lam[e] * (j0 + dj / 2) - b->mu[e] * q / (1 + j0);
-    for (int c = 0; c < n; c++) b->P[c * p + e] = b->weight[e] * (b->mu[e] * F[c] + slope * C[c]);
-  }
-  return bad;
 }
 
-static void begin(Body *b, const double *a) {
-  gradient(b, a, b->H0);
-  if (b->d == 2) begin_as(b, 2);
-  else begin_as(b, 3);
+/* P_alg = mu F_m + (g(J_1) - g(J_0)) / (J_1 - J_0) C with C : (F_1 - F_0) = J_1 - J_0; 0 where some J_1 <= 0. */
+INLINE int stress_j(Body *b, int d, int e, const Lane *h, Lane *P) {
+  const int n = d * d;
+  const double *lam = b->lam + e * LANES, *mu = b->mu + e * LANES, *j0 = b->j0[e], *l0 = b->l0[e];
+  Lane F[9], C[9], dj = {0}, x, q, slope;
+  for (int c = 0; c < n; c++) EACH F[c][l] = b->H0[e * n + c][l] + h[c][l] + (c % (d + 1) == 0);
+  cofactor(d, F, C);
+  if (d == 3) {
+    Lane more[9];
+    cofactor(3, h, more);
+    for (int c = 0; c < n; c++) EACH C[c][l] += more[c][l] / 3;
+  }
+  for (int c = 0; c < n; c++) EACH dj[l] += 2 * C[c][l] * h[c][l];
+  EACH x[l] = dj[l] / (1 + j0[l]);
+  EACH if (!(x[l] > -1)) {
+    b->bad = e * LANES + l;
+    return 0;
+  }
+  log_quotient(x, q);
+  if (b->law == NEO_HOOKE) EACH slope[l] = q[l] / (1 + j0[l]) * (lam[l] * (l0[l] + q[l] * x[l] / 2) - mu[l]);
+  else EACH slope[l] = lam[l] * (j0[l] + dj[l] / 2) - mu[l] * q[l] / (1 + j0[l]);
+  for (int c = 0; c < n; c++) EACH P[c][l] = mu[l] * F[c][l] + slope[l] * C[c][l];
+  return 1;
+}
+
+/* f = f_alg(w) by lanes; 0 where a point would have J <= 0. */
+INLINE int force_as(Body *b, int d, const double *w) {
+  const int n = d * d, k = b->k;
+  for (int i = 0; i < k; i++) EACH b->f[i][l] = 0;
+  for (int e = 0; e < b->p / LANES; e++) {
+    const double *B = b->B + (size_t)e * k * n * LANES, *weight = b->weight + e * LANES;
+    Lane h[9], P[9];
+    gradient(b, n, e, w, h);
+    if (b->law == STVK) stress_stvk(b, d, e, h, P);
+    else if (!stress_j(b, d, e, h, P)) return 0;
+    for (int c = 0; c < n; c++) EACH P[c][l] *= weight[l];
+    for (int i = 0; i < k; i++) {
+      Lane sum = {0};
+      for (int c = 0; c < n; c++) EACH sum[l] += B[(i * n + c) * LANES + l] * P[c][l];
+      EACH b->f[i][l] += sum[l];
+    }
+  }
+  return 1;
 }
 
 /* R = S w + f_alg(w) - h; 0 where a point would have J <= 0. */
 static int residual(Body *b, const double *S, const double *h, const double *w, double *R) {
   const int k = b->k;
-  long bad = -1;
   b->evaluations++;
-  gradient(b, w, b->h);
-  if (b->law == STVK) {
-    if (b->d == 2) stress_stvk(b, 2);
-    else stress_stvk(b, 3);
-  } else bad = b->d == 2 ? stress_j(b, 2) : stress_j(b, 3);
-  if (bad >= 0) {
-    b->bad = bad;
-    return 0;
-  }
-  back(b, R);
+  if (!(b->d == 2 ? force_as(b, 2, w) : force_as(b, 3, w))) return 0;
   for (int i = 0; i < k; i++) {
-    double t = R[i] - h[i];
+    double t = -h[i];
+    EACH t += b->f[i][l];
     for (int j = 0; j < k; j++) t += S[i * k + j] * w[j];
     R[i] = t;
   }
@@ -267,17 +263,19 @@ static int solve(Body *b, const double *S, const double *h, double tol, double f
 int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight, const double *lam,
                     const double *mu, const double *S, double s, const double *load, int steps, double tol, double floor,
                     double *J, double *A, double *V, long *counts) {
-  const int n = d * d;
-  double *room = calloc((size_t)(4 * n + 2) * p + (size_t)(11 * k + k * k), sizeof(double));
-  if (!room) return -1;
-  Body b = {law, d, k, p, B, weight, lam, mu, room, room + n * p, room + 2 * n * p, room + 3 * n * p,
-            room + 4 * n * p, room + (4 * n + 1) * p, 0, -1};
-  double *h = room + (4 * n + 2) * p, *w = h + k, *older = w + k, *old = older + k, *at = old + k, scale = 0;
+  const int n = d * d, chunks = p / LANES;
+  Lane *lanes = calloc((size_t)((2 * n + 2) * chunks + k), sizeof(Lane));
+  double *room = calloc((size_t)(11 * k + k * k), sizeof(double));
+  if (!room || !lanes) return free(room), free(lanes), -1;
+  Body b = {law, d, k, p, B, weight, lam, mu, lanes, lanes + n * chunks, lanes + 2 * n * chunks,
+            lanes + (2 * n + 1) * chunks, lanes + (2 * n + 2) * chunks, 0, -1};
+  double *h = room, *w = h + k, *older = w + k, *old = older + k, *at = old + k, scale = 0;
   int failed = 0;
   for (int t = 0; t < steps && !failed; t++) {
     const double *a = A + t * k, *v = V + t * k;
     double *a1 = A + (t + 1) * k, *v1 = V + (t + 1) * k;
-    begin(&b, a);
+    if (d == 2) begin_as(&b, 2, a);
+    else begin_as(&b, 3, a);
     for (int i = 0; i < k; i++) h[i] = s * v[i] + load[t * k + i], w[i] = 2 * old[i] - older[i];
     if (!solve(&b, S, h, tol, floor, &scale, J, w, at, counts + 1)) failed = t + 1;
     for (int i = 0; i < k; i++) {
@@ -286,6 +284,6 @@ int softgrasp_march(int law, int d, int k, int p, const double *B, const double 
     }
   }
   counts[0] = b.evaluations, counts[2] = b.bad;
-  free(room);
+  free(room), free(lanes);
   return failed;
 }

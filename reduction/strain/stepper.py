@@ -31,7 +31,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.reduction.strain.cells import Potential
 
 SOURCE = Path(__file__).with_name("stepper.c")
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fopenmp-simd", "-shared", "-fPIC")
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 DECLARATION = """int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight,
   const double *lam, const double *mu, const double *S, double s, const double *load, int steps, double tol,
   double floor, double *J, double *A, double *V, long *counts);"""

@@ -19,7 +19,7 @@ CAPTIONS = {
     "move.png": "The move to the target at some instants, full plant under the optimal gain.",
     "move.gif": "The move in motion{speed}.",
     "histories.png": "Outputs, force on the hand, and the distance of the farthest output to the target, on the "
-    "full plant; dashed and dash-dotted under the a-priori gain and the dearest of the paper's.",
+    "full plant; dashed and dash-dotted under the a-priori gain and the paper's reduced gain of largest cost.",
     "errors.png": "Reduced Riccati equations: relative error of P, relative error of the gain and excess cost against "
     "N. Errors above 100 % are not drawn, excess cost below 1e-12 at 1e-12. Red crosses: gains that leave the full "
     "plant unstable or without certificate; on the upper edge those with an error above 100 %.",

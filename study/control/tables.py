@@ -40,6 +40,8 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
         ("stays within 1 % of the way from", "not within the run" if arrived is None else f"{arrived:.4g} s on"),
         ("cost of the run + still to come", f"{full.cost[-1]:.6g} + {loops.to_come:.3g}"),
     ]
+    if study.finite is not None:
+        rows.append((f"on the plant of finite strain ({study.finite.law})", study.finite.text))
     if full.saturated:
         rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
     rows += controller_rows(study.controller, study.tick)

@@ -127,11 +127,7 @@ class Simulation:
         }
 
     def _newton(self) -> dict[str, Any]:
-        newton = self.run.newton
-        if newton is None:
-            return {}
-        keys = {"mean": newton.mean, "max": newton.max, "factors": newton.factors, "min_J": newton.min_det}
-        return {"newton": {**keys, "divided": newton.divided}}
+        return {} if self.run.newton is None else {"newton": newton_keys(self.run.newton)}
 
     def rows(self) -> list[tuple[str, str]]:
         """The short table of a run as label and text."""
@@ -180,6 +176,12 @@ class Simulation:
             header += [f"{c.label} [{c.load_unit}]" for c in self.hand("force")]
             parts.append(np.vstack([np.full(n_s, np.nan), run.force]))
         return Table(tuple(header), np.column_stack(parts).tolist())
+
+
+def newton_keys(newton: NewtonFigures) -> dict[str, float]:
+    """How the steps of finite strain converged, for result.json."""
+    keys = {"mean": newton.mean, "max": newton.max, "factors": newton.factors, "min_J": newton.min_det}
+    return {**keys, "divided": newton.divided}
 
 
 def newton_text(newton: NewtonFigures) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
+from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.equation import Equation, Rows, equation
 from softgrasp.study.report.origin import versions
@@ -78,13 +78,9 @@ def _lines(rows: Rows) -> list[str]:
     return [f"  {row[0] + ':':<{wide + 1}} {left} = {right}" for row, (left, right) in zip(rows, sides, strict=True)]
 
 
-def of_scene(scene: str) -> Section:
-    """The section with the equation of a resolved scene.
-
-    Raises:
-        pydantic.ValidationError: the text is no scene.
-    """
-    return Section(EQUATION, code=equation_text(equation(Scene.model_validate(tomllib.loads(scene)))))
+def of_scene(scene: Scene) -> Section:
+    """The section with the equation of a scene."""
+    return Section(EQUATION, code=equation_text(equation(scene)))
 
 
 def outside(page: str) -> list[str]:
@@ -105,7 +101,7 @@ def write_report(
     title: str,
     subtitle: str = "",
     sections: Sequence[Section] = (),
-    scene: str = "",
+    scene: Scene | None = None,
     reproduce: str = "",
     numbers: str = "result.json",
     summary: Sequence[str] = (),
@@ -119,7 +115,7 @@ def write_report(
         path: the HTML file.
         title, subtitle: first lines.
         sections: what follows, in this order.
-        scene: resolved scene text.
+        scene: what was run.
         reproduce: the commands that made this page.
         numbers: the files beside it that hold its numbers.
         summary: sentences that say what came out.
@@ -146,7 +142,7 @@ def write_report(
         sections=prepared,
         words=words_of(told),
         files=[file.relative_to(path.parent).as_posix() for file in files if file.is_relative_to(path.parent)],
-        scene=scene.strip(),
+        scene="" if scene is None else resolved_toml(scene).strip(),
         reproduce=reproduce.strip(),
         how=HOW.format(numbers=numbers),
     )

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.scene.file import load_scene_collective, resolved_toml
+from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import write_json, write_scene
 from softgrasp.study.report.origin import command_line
@@ -158,7 +158,7 @@ class Session:
                         sections=content.sections,
                         summary=content.summary,
                         files=files,
-                        scene=resolved_toml(scene),
+                        scene=scene,
                         reproduce=command_line(
                             self.command, self.path, self.overrides, self.comm.size, content.options
                         ),

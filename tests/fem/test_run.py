@@ -75,7 +75,12 @@ def test_restart_with_layered_damping_is_bitwise(
     comm: MPI.Intracomm, mpi_tmp_path: Path, extra: tuple[str, ...]
 ) -> None:
     def model() -> Model:
-        return build(load_scene(SCENES / "layers_2d.toml", ["tissue.cells=[8,5]", "time.steps=40", *extra]), comm=comm)
+        return build(
+            load_scene(
+                SCENES / "layers_2d.toml", ["tissue.refine=false", "tissue.cells=[8,5]", "time.steps=40", *extra]
+            ),
+            comm=comm,
+        )
 
     assert model().system.damping.matrix is not None
     whole = simulate(model())
@@ -236,7 +241,7 @@ def test_two_way_force_restart_is_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Pat
 
 
 def test_mumps_restarts_bitwise(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
-    extra = ("tissue.cells=[5,5,10]", "time.steps=10", 'time.solver="mumps"')
+    extra = ("tissue.cells=[5,5,10]", "tissue.order=1", "time.steps=10", 'time.solver="mumps"')
     whole = simulate(small(comm, *extra, scene="block_3d"))
     with pytest.raises(Interrupted):
         simulate(small(comm, *extra, scene="block_3d"), RunOptions(directory=mpi_tmp_path, until=4))

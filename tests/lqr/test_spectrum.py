@@ -51,14 +51,17 @@ def poles(problem: RiccatiProblem, K: Block) -> np.ndarray:
     return ModalLoop(problem, DENSE_LIMIT).poles(K)
 
 
+LINEAR = ("tissue.refine=false", "tissue.order=1")  # all poles are few then
+
+
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
         ("paper_lqr.toml", ("tissue.cells=[4,8]",)),
-        ("franka_muscle.toml", ("tissue.cells=[4,8]",)),
-        ("franka_muscle.toml", ("tissue.cells=[4,8]", "control.Q=1e6")),
-        ("franka_muscle.toml", ("tissue.cells=[4,8]", "control.Q=1e5", "effects.damping.beta=0.1")),
-        ("block_3d.toml", ("tissue.cells=[2,2,4]",)),
+        ("franka_muscle.toml", (*LINEAR, "tissue.cells=[4,8]")),
+        ("franka_muscle.toml", (*LINEAR, "tissue.cells=[4,8]", "control.Q=1e6")),
+        ("franka_muscle.toml", (*LINEAR, "tissue.cells=[4,8]", "control.Q=1e5", "effects.damping.beta=0.1")),
+        ("block_3d.toml", (*LINEAR, "tissue.cells=[2,2,4]")),
     ],
     ids=["paper", "muscle", "muscle-stiff-gain", "muscle-overdamped", "block"],
 )

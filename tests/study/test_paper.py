@@ -31,7 +31,15 @@ def results() -> dict[str, dict[str, Any]]:
     titles = {"global_pod": about("global POD", False), "psd": about("PSD", True), "psd_fixed": about("PSD, f", True)}
     run = {"method": "pod", "N": 16, "distance_final": 2e-4, "cost": 11.0, "reason": ""}
     return {
-        "forward": {"states": 1916, "time": {"factor": 0.002, "steps": 0.04}},
+        "forward": {
+            "states": 1916,
+            "time": {"factor": 0.002, "steps": 0.04},
+            "mesh_error": {"estimate": 0.4, "bound": 0.6, "n_e": 956},
+        },
+        "accurate": {
+            "time": {"factor": 0.02, "steps": 0.3},
+            "mesh_error": {"estimate": 4e-4, "bound": 8.8e-4, "n_e": 4704},
+        },
         "reduce": {
             "methods": methods,
             "about": titles,
@@ -52,6 +60,9 @@ def test_page_has_every_row(tmp_path: Path, results: dict[str, dict[str, Any]]) 
     found = json.loads(data.read_text())
     forward = {row["quantity"]: row["here"] for row in found["forward"]}
     assert forward["stable at every N tried"] == "PSD, f"
+    mesh = "error of the deformation through the mesh"
+    assert forward[mesh] == "about 40 % (bound 60 %) at n_e = 956 in 0.042 s"
+    assert forward["the same, scene paper_accurate"] == "about 0.04 % (bound 0.088 %) at n_e = 4704 in 0.32 s"
     assert forward["reduced runs, all six methods and N"] == "0.0002 to 0.0003 s"
     assert forward["errors of methods that the paper calls structure-preserving, N = 14"] == (
         "preserving: 0.001, 0.002; not preserving: 0.5 unstable"

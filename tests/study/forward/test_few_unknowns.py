@@ -36,7 +36,8 @@ SMALL = ["--set", "tissue.cells=[2,4]", "--set", "output.frames=2", "--quiet"]
 COMMANDS = {
     "simulate": ["paper_forward", *SMALL, "--set", "time.steps=40"],
     "control": ["paper_lqr", *SMALL, "--set", "time.steps=40", "--set", "time.end=4.0", "--set", "control.N=[12]"],
-    "effects": ["franka_muscle", *SMALL, "--set", "time.steps=40", "--set", "contact.box=[[0.0,0.06],[0.06,0.12]]"],
+    "effects": ["franka_muscle", *SMALL, "--set", "time.steps=40", "--set", "contact.box=[[0.0,0.06],[0.06,0.12]]",
+                "--set", "study.repeats=1"],
 }  # fmt: skip
 # what the machine, the clock and the number of ranks say, and polishing steps, which rounding decides
 OWN = {

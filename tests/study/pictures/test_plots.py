@@ -20,6 +20,7 @@ from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.shapes import hand_polygons, overlap, pick_instants, seen, shadow, view_direction
 from softgrasp.study.pictures.traces import figure_traces
 from softgrasp.study.report.page import Section, write_report
+from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.serial  # no communication here
 
@@ -230,15 +231,6 @@ def test_long_moves_are_shown_faster_and_short_ones_slower() -> None:
     assert speed_up(np.array([0.0, 0.03])) == pytest.approx(0.02, rel=1e-12)  # rounding
 
 
-SCENE = """name = "s"
-tissue = { size = [1.0, 2.0], cells = [2, 4], material = { lambda = 50.0, mu = 50.0, rho = 1.0 } }
-contact = { sides = ["left"] }
-hand = { mass = 1.0 }
-motion = { target = [5.0, 3.0] }
-time = { steps = 5 }
-"""
-
-
 class Page(HTMLParser):
     """Checks that tags are balanced and collects texts and addresses."""
 
@@ -270,7 +262,7 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
         "Errors", "First.\n\nSecond <b>.", header=("N", "error", "ok"), rows=[(4, 1.25e-7, True), (6, None, False)]
     )
     path = write_report(
-        tmp_path / "r.html", title="A & B", subtitle="s", scene=SCENE, reproduce="softgrasp reduce x.toml",
+        tmp_path / "r.html", title="A & B", subtitle="s", scene=make_scene(), reproduce="softgrasp reduce x.toml",
         sections=[Section("", figures=[(png, "caption")]), Section("Short", rows=[("a", 1)]), table],
     )  # fmt: skip
     page = Page(path.read_text())

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from softgrasp.fem.scene.file import load_scene, resolved_toml, shipped_scenes
+from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.equation_control import control_text
@@ -89,7 +89,7 @@ def test_versions_name_what_the_numbers_come_from() -> None:
 
 
 def test_the_equation_comes_from_the_scene(tmp_path: Path) -> None:
-    scene = resolved_toml(load_scene(shipped_scenes()["paper_forward"]))
+    scene = load_scene(shipped_scenes()["paper_forward"])
     page = write_report(tmp_path / "r.html", title="t", scene=scene, reproduce="softgrasp").read_text()
     assert str(equation_html(of_scene(scene).code)) in page
     assert "<h2>Versions</h2>" in page
