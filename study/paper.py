@@ -167,6 +167,12 @@ def forward_rows(forward: dict[str, Any], reduced: dict[str, Any]) -> list[Row]:
             verdict(any(3e-4 < (psd[key] or 0) < 3e-3 for key in ("error", "error_canonical"))),
             "hand mass and motion are not in the paper; in (q, p) the rigid motion hides the deformation",
         ),
+        *_method_rows(points, about, paper),
+    ]
+
+
+def _method_rows(points: dict[str, Any], about: dict[str, Any], paper: list[str]) -> list[Row]:
+    return [
         (
             "N for 99.9 % of the energy",
             "used, not told",
