@@ -32,6 +32,7 @@ CACHED = 3e8  # entries of full runs that are kept, in case a point comes again:
 SHARE = 0.5  # of the tolerance that the larger basis may use, so that the smaller one has the rest
 RANDOM = 100  # parameters beside the grid where the finished model is looked at
 PLACES = 4  # trained parameters at which the mesh is estimated
+ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
 CHUNK = 50  # parameters that are looked at together
 SEED = 20
 
@@ -165,12 +166,16 @@ class Trainer:
     def _leading(self, Z: Array, count: int) -> Array:
         """Leading POD modes of what Phi does not hold of a run, orthonormal in K_r with Phi. Collective."""
         n = len(Z) // 2
-        z, v = self._less(Z[:n]), self._less(Z[n:])
         K = self.space.system.K_ee
-        lengths = [float(np.sqrt(total(self.comm, (x * times_columns(K, x)).sum(axis=0)).sum())) for x in (z, v)]
-        if lengths[0] == 0 and lengths[1] == 0:
+
+        def length(x: Array) -> float:
+            return float(np.sqrt(total(self.comm, (x * times_columns(K, x)).sum(axis=0)).sum()))
+
+        left = [(x, length(x), length(Z_x)) for Z_x in (Z[:n], Z[n:]) for x in (self._less(Z_x),)]
+        parts = [(x, own) for x, own, whole in left if own > ROUNDING * whole]  # the rest is rounding, not motion
+        if not parts:
             return np.zeros((n, 0))
-        X = np.hstack([z, v * (lengths[0] / lengths[1] if lengths[0] > 0 and lengths[1] > 0 else 1.0)])
+        X = np.hstack([x * (parts[0][1] / own) for x, own in parts])
         gram = total(self.comm, X.T @ times_columns(K, X))
         squares, V = on_root(self.comm, lambda: np.linalg.eigh((gram + gram.T) / 2))
         pick = [j for j in range(len(squares) - 1, -1, -1) if squares[j] > 1e-14 * squares[-1]][:count]

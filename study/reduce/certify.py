@@ -81,7 +81,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
                 bar.update(task, completed=float(min(share, 0.99)))
             r, (lam, mu) = state.rounds[-1], trainer.points[state.rounds[-1].worst]
             bar.console.print(
-                f"round {len(state.rounds)}: k = {r.k}, largest bound {r.bound:.1e} at ({lam:.3g}, {mu:.3g}), "
+                f"round {len(state.rounds)}: k = {r.k}, largest bound {_shown(r.bound)} at ({lam:.3g}, {mu:.3g}), "
                 f"{r.evaluations} evaluations, {r.seconds:.1f} s",
                 markup=False,
             )
@@ -120,6 +120,10 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         console.print(sentence, markup=False)
     list_files(console, files)
     return result
+
+
+def _shown(bound: float) -> str:
+    return f"{bound:.1e}" if np.isfinite(bound) else "above 1"
 
 
 def _range(pair: tuple[float, float]) -> str:
@@ -211,7 +215,7 @@ def greedy_table(certified: CertifiedModel) -> Table:
     hand, points = 2 * len(certified.fine.parts["M_hand"]), certified.training["points"]
     rows = [
         (
-            i + 1, *(f"{x:.4g}" for x in points[r["at"]]), r["k"], hand + 2 * r["k"], f"{r['bound']:.1e}",
+            i + 1, *(f"{x:.4g}" for x in points[r["at"]]), r["k"], hand + 2 * r["k"], _shown(r["bound"]),
             *(f"{x:.4g}" for x in points[r["worst"]]), r["evaluations"], f"{r['seconds']:.1f}",
         )
         for i, r in enumerate(certified.training["rounds"])

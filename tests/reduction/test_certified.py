@@ -23,7 +23,7 @@ from softgrasp.reduction.certified.model import Box
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.oscillators import march
 from softgrasp.reduction.certified.residual import ResidualSpace
-from softgrasp.reduction.certified.training import certified_any
+from softgrasp.reduction.certified.training import certified_any, certified_model
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.reduce import project_scene
 from softgrasp.reduction.registry import make_basis
@@ -40,6 +40,7 @@ from tests.helpers.certified import (
     ritz,
 )
 from tests.helpers.models import CUBE, LAYERS, close, make_scene
+from tests.helpers.reduced import waves
 
 RAYLEIGH = {"effects": {"damping": {"kind": "rayleigh", "beta": 0.01, "alpha": 0.3, "drag": "space"}}}
 ROUNDING = 1e-9  # of the solution: what the bound, exact in exact arithmetic, may fall short by
@@ -196,6 +197,19 @@ def test_the_bound_holds_at_every_step(comm: MPI.Intracomm, name: str) -> None:
             if run.certificate.effectivity_at_most < np.inf:
                 top = run.certificate.energy.values.max() / error.max()
                 assert top <= run.certificate.effectivity_at_most * (1 + 1e-6)
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("force", [{}, {"motion": {"drive": "force"}, **TURNING}], ids=["motion", "two-way"])
+def test_one_rank_and_all_say_the_same(comm: MPI.Intracomm, force: dict[str, Any]) -> None:
+    """The same smooth modes on one rank and on all: bounds equal to 1e-10, not only to the residual's own rounding."""
+    values = []
+    for ranks in (MPI.COMM_SELF, comm):
+        model = build(make_scene(KELVIN_VOIGT, force), comm=ranks)
+        certified = certified_model(model, waves(model.system.layout, 8, 1), k=3)
+        runs = certified.run_batch([certified.materials(*place) for place in ((50.0, 50.0), (30.0, 400.0))])
+        values.append(np.array([run.certificate.energy.values for run in runs]))
+    assert np.abs(values[0] - values[1]).max() <= 1e-10 * np.abs(values[0]).max()
 
 
 def _lifted(part: Any, whole: Any) -> Any:

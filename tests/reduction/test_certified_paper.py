@@ -10,16 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.trainer import Trainer, build_certified
-from softgrasp.reduction.certified.training import certified_model, scene_drive
+from softgrasp.reduction.certified.training import scene_drive
 from tests.helpers.certified import error_to, full_at
 from tests.helpers.models import Array
-from tests.helpers.reduced import waves
 
 PAPER = Path(__file__).parents[2] / "demos" / "scenes" / "paper_forward.toml"
 BOX = ["reduction.lambda_range=[30.0,500.0]", "reduction.mu_range=[20.0,500.0]"]
@@ -156,16 +154,3 @@ def test_what_was_not_trained(damping: tuple[str, ...]) -> None:
             assert (run.certificate.energy.values >= error - ROUNDING * scale).all(), (name, size)
             top = float(run.certificate.energy.values.max())
             show(name, {size: np.array([[error.max() / scale, top / scale, top / error.max()]])})
-
-
-@pytest.mark.slow
-@pytest.mark.ranks(2)
-def test_ranks_agree(comm: MPI.Intracomm) -> None:
-    """The same modes on one rank and on all: equal bounds."""
-    bounds = []
-    for ranks in (MPI.COMM_SELF, comm):
-        model = build(load_scene(PAPER, [*BOX, *KV]), comm=ranks)
-        certified = certified_model(model, waves(model.system.layout, 12, 1), k=5)
-        runs = certified.run_batch([certified.materials(*place) for place in parameters(0)[::6]])
-        bounds.append(np.array([run.certificate.energy.values for run in runs]))
-    assert np.abs(bounds[0] - bounds[1]).max() <= 1e-10 * np.abs(bounds[0]).max()

@@ -192,3 +192,14 @@ def test_scenes_that_cannot_be_trained(comm: MPI.Intracomm) -> None:
     outside: dict[str, Any] = {"reduction": {"lambda_range": [100.0, 500.0]}}
     with pytest.raises(SceneError, match=r"lies outside reduction\.lambda_range"):
         Trainer(build(make_scene(outside), comm=comm))
+
+
+@pytest.mark.serial
+def test_rounding_adds_no_modes() -> None:
+    """A tolerance that no double reaches ends with a reason, not with modes of rounding that are dependent."""
+    scene = make_scene(KELVIN_VOIGT, SMALL, {"reduction": {**BOX["reduction"], "grid": 2, "add": 20}})
+    trainer = Trainer(build(scene, comm=MPI.COMM_SELF))
+    certified = build_certified(trainer, 1e-14)
+    trainer.destroy()
+    assert certified.training["reason"] == "exhausted"
+    assert certified.run(allow=True).certificate.reduction < 1e-9  # the bound at rounding
