@@ -19,7 +19,7 @@ plain = build(load_scene(file), comm=comm)
 heavy = build(load_scene(file, ["effects.gravity.g=[0.0,-1.0]"]), comm=comm)
 
 # %% [markdown]
-# Gravity reuses the coupling $G$ of the moving hand, so it adds no form and no operator; it still changes the motion.
+# Gravity reuses the coupling `G` of the moving hand, so it adds no form and no operator; it still changes the motion.
 
 # %%
 assert heavy.inventory.forms == plain.inventory.forms
@@ -30,7 +30,7 @@ if comm.rank == 0:
 assert np.abs(a.outputs - b.outputs).max() > 1e-3
 
 # %% [markdown]
-# Kelvin-Voigt damping $D = \beta K$ needs no matrix of its own either; it takes the vibration out of the tissue.
+# Kelvin-Voigt damping `D = beta K` needs no matrix of its own either; it takes the vibration out of the tissue.
 
 # %%
 longer = ["time.end=6.0", "time.steps=1200"]  # the hand rests from t = 3 s on

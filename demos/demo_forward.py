@@ -40,7 +40,7 @@ if MPI.COMM_WORLD.rank == 0:
 assert 0.35 < off < 0.45
 
 # %% [markdown]
-# New material: $K = \mu K_\mu + \lambda K_\lambda$ is combined again. A stiffer body follows the hand more closely.
+# New material: `K = mu K_mu + lambda K_lambda` is combined again. A stiffer body follows the hand more closely.
 
 # %%
 lag = {}

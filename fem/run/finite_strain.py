@@ -111,7 +111,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     parts: int  # into which the step in work is divided
     jump: Array | None  # of the velocity over a divided step
-    C: Array | None  # load that the hand adds per G'w
+    C: Array | None  # load added per N'w
+    N: Array
+    felt: Array
 
     def _price(self) -> float:
         if self.solver.name == "cg":
@@ -120,7 +122,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         return float(np.clip(nz / (4 * self.system.layout.n_e), 8, 100))
 
     def _pulled(self, w: Array) -> Array:
-        pull = self.G.T @ w
+        pull = self.N.T @ w
         return pull if self.held.whole else total(self.comm, pull)
 
     # ---- the state
@@ -192,17 +194,22 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     # ---- a step
 
-    def solve_midpoint(self, c: Array, C: Array | None = None) -> None:
-        """Solve R(w) = 0 under the load G (c + C G'w), once a step; ``self.c`` is c + C G'w then. Collective.
+    def hold(self, N: Array) -> Array:
+        """Columns on the owned rows, (n_local, m), as they are held. Collective."""
+        return np.asfortranarray(self.held.gather(N))
+
+    def solve_midpoint(self, c: Array, C: Array | None = None, N: Array | None = None) -> None:
+        """Solve R(w) = 0 under the load G (c + C N'w); ``self.c`` is c + C N'w then, ``felt`` is N'w. Collective.
 
         Args:
             c: load, (n_s,).
-            C: what the hand adds as it yields, (n_s, n_s), symmetric positive definite; None for a hand that does not.
+            C: what hand and feedback add as the tissue moves, (n_s, m); None where they do not feel it.
+            N: from :meth:`hold`, (rows held, m); None is G.
 
         Raises:
             SolverError: no convergence, not even in parts of the step; the message names the cell with the smallest J.
         """
-        self.C, self.jump, counts = C, None, self.counts
+        self.C, self.N, self.jump, counts = C, self.G if N is None else N, None, self.counts
         self.load = self.G @ c
         self.right = self.r_array + self.load
         counts.scale = max(counts.scale, float(np.sqrt(self.dot(self.right, self.right))))
@@ -217,8 +224,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
         counts.spent += max(root.spent - counts.first, 0)
         counts.iterations, counts.steps = counts.iterations + root.spent, counts.steps + 1
         counts.most = max(counts.most, root.spent)
-        self.past.appendleft(root.x.copy())
-        self.c = c if C is None else c + C @ self._pulled(root.x)
+        self.c = c
+        if C is not None:
+            self.felt = self._pulled(root.x)
+            self.c = c + C @ self.felt
 
     def _guess(self) -> Array:
         past = self.past
@@ -256,13 +265,14 @@ class FiniteStrainMidpoint(TissueMidpoint):
         return R, float(np.sqrt(self.dot(R, R)))
 
     def _apply(self, q: Array) -> Array:
-        """(S - G C G')^-1 q for the tangent factored last. Collective."""
+        """(S - G C N')^-1 q for the tangent factored last. Collective."""
         self.trial_array[:] = q
         self.trial.stateIncrease()
         self._solve(self.trial, self.solved)
         x: Array = self.solved.array_r.copy()
         if self.C is not None:
-            x += self.Y @ np.linalg.solve(np.linalg.inv(self.C) - self._pulled(self.Y), self._pulled(x))
+            seen = self.C @ self._pulled(self.Y)
+            x += self.Y @ np.linalg.solve(np.eye(len(seen)) - seen, self.C @ self._pulled(x))
         return x
 
     def _renew_from(self, w: Array) -> bool:
@@ -344,6 +354,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def _carry_on(self, z: PETSc.Vec) -> None:
         if self.jump is None:
             self._add_momentum()
+            self.past.appendleft(self.w_array.copy())
         self._arrive(z)
 
     def _add_momentum(self) -> None:

@@ -201,12 +201,12 @@ class TissueMidpoint:
     def _held_z(self, state: TissueState) -> PETSc.Vec:
         return self.z if self.held.whole else state.z
 
-    def solve_midpoint(self, c: Array, C: Array | None = None) -> None:
+    def solve_midpoint(self, c: Array, C: Array | None = None, N: Array | None = None) -> None:
         """Solve S w = h + G c, once a step. Collective.
 
         Args:
             c: load, (n_s,); kept, not copied: leave it as it is until the next solve.
-            C: of finite strain only.
+            C, N: of finite strain only.
         """
         np.add(self.pending, c, out=self.added_array)
         self.coupling.multAdd(self.added, self.r_here, self.r_here)

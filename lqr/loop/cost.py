@@ -37,6 +37,19 @@ def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: floa
     return np.concatenate([[0.0], dt * np.cumsum(rate)])
 
 
+def overshoot(outputs: Array, target: Array) -> float:
+    """Farthest that an output runs past its target, over the way that it had to go; 0 where none does [1].
+
+    Args:
+        outputs: y at the grid points [m], (steps + 1, p).
+        target: y_bar [m], (p,).
+    """
+    way = target - outputs[0]
+    going = np.abs(way) > 1e-9 * np.abs(way).max(initial=0.0)
+    past = (outputs - target)[:, going] / way[going]
+    return max(float(past.max(initial=0.0)), 0.0)
+
+
 def predicted_cost(problem: RiccatiProblem, solution: RiccatiSolution, error: PlantState) -> float:
     """V = e'E'XE e = |Z'E e|^2 for e = x - x_bar: the cost from here to infinity. Collective."""
     moved = descriptor(problem, error.block)

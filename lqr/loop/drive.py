@@ -10,6 +10,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
+from softgrasp.lqr.loop.finite import FiniteDrive
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
 
@@ -47,6 +48,7 @@ class PlantStep:
             self.GY = (GY + GY.T) / 2
             self.L = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
         self.inverse = np.linalg.inv(self.L)
+        self.finite: FiniteDrive | None = None  # of a pushed hand that feels a tissue of finite strain
 
 
 class Drive(Protocol):
@@ -173,6 +175,11 @@ class OpenDrive:
 def push(plant: PlantStep, drive: Drive, n: int, u: Array, state: TissueState) -> None:
     """One step of hand and tissue under an input that is known before it. Collective."""
     midpoint, system, c_0 = plant.midpoint, plant.system, plant.alpha * drive.v[n] - plant.g
+    if system.two_way and system.points is not None:
+        plant.finite = plant.finite or FiniteDrive(plant, None, None, None, 0)
+        plant.finite.v = drive.v
+        move(drive, n, u, plant.finite.push(n, u, np.zeros(len(u), dtype=bool), state)[0], plant.dt)
+        return
     if not system.two_way:
         a = plant.inverse @ (u + plant.weight)
         midpoint.solve_midpoint(-(plant.kappa * a + c_0))

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from mpi4py import MPI
@@ -14,17 +14,21 @@ from mpi4py import MPI
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import TissueMidpoint
+from softgrasp.fem.run.midpoint import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.solve.solvers import Reproducible, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
 from softgrasp.lqr.loop.drive import Drive, HeldDrive, ImplicitDrive, PlantStep
+from softgrasp.lqr.loop.finite import FiniteDrive
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import Target, hand_target, rest
+
+if TYPE_CHECKING:
+    from softgrasp.fem.run.finite_strain import NewtonFigures
 
 CHUNKS = 50  # segments of a run without frames: progress, and the check that the numbers are finite
 
@@ -71,6 +75,7 @@ class LoopTrajectory:
         residuals: relative residual of the first and the last solve.
         solver: name and reason.
         seconds: factor (with the responses) and steps; the slowest rank.
+        newton: how the steps of finite strain converged, or None.
     """
 
     times: Array
@@ -87,6 +92,7 @@ class LoopTrajectory:
     residuals: tuple[float, float]
     solver: tuple[str, str]
     seconds: dict[str, float] = field(default_factory=dict)
+    newton: NewtonFigures | None = None
 
     @property
     def output_names(self) -> tuple[str, ...]:
@@ -130,7 +136,7 @@ class ClosedLoop:
         self.problem, self.dt = problem, dt
         self.solver = choose_solver(problem.layout, solver)
         begin = time.perf_counter()
-        self.midpoint = TissueMidpoint(problem.system, dt, self.solver[0], rtol, reproducible)
+        self.midpoint = make_midpoint(problem.system, dt, self.solver[0], rtol, reproducible)
         self.solver = self.solver[0], self.solver[1] + self.midpoint.solver.remark
         try:
             self.plant = PlantStep(problem.system, self.midpoint)
@@ -172,6 +178,8 @@ class ClosedLoop:
         drive: Drive = (
             HeldDrive(self.plant, gain, target, actuation, steps)
             if held
+            else FiniteDrive(self.plant, gain, target, bound, steps)
+            if self.problem.system.points is not None
             else ImplicitDrive(self.plant, gain, target, bound, steps)
         )
         run = LoopRun(self, drive, start, steps, options, target)
@@ -318,5 +326,6 @@ class LoopRun(Stepped):
             saturated=saturated,
             residuals=(self.residual_first, self.residual_last),
             solver=self.solver,
+            newton=self.midpoint.figures(),
             seconds={"factor": self.loop.factor_seconds, "steps": comm.allreduce(self.seconds, MPI.MAX)},
         )

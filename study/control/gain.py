@@ -10,6 +10,7 @@ from typing import Any
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
 from softgrasp.lqr.design.feedback import Design, design
+from softgrasp.lqr.design.linearise import finite_problem, linearised
 from softgrasp.lqr.design.orders import BasisGains, orders, reduce_gains
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.loop import save_controllers, tick_seconds
@@ -44,14 +45,17 @@ def run_gain(
     Raises:
         SoftgraspError: with one sentence.
     """
-    feedback = design(model, watch, progress, restart)
+    feedback = design(linearised(model), watch, progress, restart)
     bases: tuple[BasisGains, ...] = ()
     if not feedback.modal:
         with watch.stage("reduced"):
             bases = reduce_gains(feedback, orders(feedback)[0], names=(A_PRIORI,))
     controller, tick, refused = small_controller(feedback, a_priori(bases))
     session.out.mkdir(parents=True, exist_ok=True)
-    saved = save_controllers(feedback, controller, session.out)
+    target = feedback.target
+    if model.system.points is not None:
+        _, target = finite_problem(feedback.problem, model.system, target)
+    saved = save_controllers(feedback, controller, session.out, target.state)
     result = gain_result(feedback, controller, tick, [*notes, *refused], {**model.watch.seconds, **watch.seconds})
     rows = [*gain_rows(feedback), *controller_rows(controller, tick)]
     page = Page(

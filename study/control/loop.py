@@ -11,17 +11,22 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Model
 from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
 from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.linearise import finite_problem
 from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains
 from softgrasp.lqr.loop.controller import Controller, save_gain
-from softgrasp.lqr.loop.cost import predicted_cost
-from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
-from softgrasp.study.control.result import LoopRuns, ReducedLoopRun
+from softgrasp.lqr.loop.cost import overshoot, predicted_cost
+from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
+from softgrasp.lqr.plant.gain import PlantState
+from softgrasp.lqr.plant.target import rest
+from softgrasp.study.control.result import FiniteLoop, LoopRuns, ReducedLoopRun
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import move_steps
 
+NEAR = 0.01  # of the way, which a loop that settles comes to
 TICKS = 1000  # behind the time of one tick of the controller
 
 
@@ -38,15 +43,51 @@ def tick_seconds(controller: Controller) -> float:
     return float(np.median(times))
 
 
-def save_controllers(design: Design, controller: CertifiedController | None, out: Path) -> list[Path]:
-    """controller.npz for the robot, gain.npz of full order. Collective."""
+def save_controllers(
+    design: Design, controller: CertifiedController | None, out: Path, target: PlantState
+) -> list[Path]:
+    """controller.npz for the robot, gain.npz of full order with x_bar. Collective."""
     files, layout = list[Path](), design.problem.layout
     if controller is not None and layout.comm.rank == 0:
         files.append(controller.controller.save(out / "controller.npz"))
     return [
         *files,
-        save_gain(out / "gain.npz", design.gain, design.target.state, layout, scene_hash(design.model.scene)),
+        save_gain(out / "gain.npz", design.gain, target, layout, scene_hash(design.model.scene)),
     ]
+
+
+def run_finite(design: Design, model: Model, linear: LoopTrajectory, plan: LoopPlan, notify: Notify) -> FiniteLoop:
+    """The optimal gain of the linear plant on that of finite strain, from the same start. Collective.
+
+    Args:
+        design: of the linearised model.
+        model: with finite strain.
+        linear: the run of the linear plant under the same gain.
+        plan: times.
+        notify: called with steps done and in all.
+
+    Raises:
+        SolverError: there is no equilibrium under gravity.
+    """
+    scene, points = model.scene, model.system.points
+    assert points is not None
+    problem, target = finite_problem(design.problem, model.system, design.target)
+    start = rest(model.system, deformed=scene.time.start == "equilibrium")
+    options = LoopOptions(progress=lambda run: notify(run.reached, plan.steps), most=largest_cost(design, plan))
+    loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible)
+    try:
+        run = loop.run(design.gain, target, plan.steps, design.actuation, start, options)
+    except SolverError as error:  # it diverges, or leaves what the law describes
+        return FiniteLoop(points.law, None, target, str(error))
+    finally:
+        loop.destroy()
+    away, expected = (np.linalg.norm(r.outputs - t.y, axis=1) for r, t in ((run, target), (linear, design.target)))
+    reason = ""
+    if away[-1] > max(NEAR * away[0], 2 * expected[-1]):
+        reason = f"the outputs end {away[-1]:.3g} m from their target, on the linear plant {expected[-1]:.3g} m"
+    excess = float(run.cost[-1] / linear.cost[-1] - 1) if linear.cost[-1] > 0 else 0.0
+    past = overshoot(run.outputs, target.y), overshoot(linear.outputs, design.target.y)
+    return FiniteLoop(points.law, run, target, reason, excess, *past)
 
 
 def run_loops(

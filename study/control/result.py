@@ -18,9 +18,11 @@ from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
+from softgrasp.lqr.plant.target import Target
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.reduced.retune import BoxPoint
 from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
 TITLES = {
@@ -103,6 +105,36 @@ class LoopRuns:
 
 
 @dataclass(frozen=True)
+class FiniteLoop:
+    """The linear gain on the plant of finite strain.
+
+    Attributes:
+        law: of the material.
+        run: None when it failed.
+        target: where the loop goes; its shape is the equilibrium of finite strain.
+        reason: why the gain does not stabilise this plant; else empty.
+        cost_excess: cost over that of the linear plant, less one [1].
+        overshoot, overshoot_linear: farthest past the target over the way, here and on the linear plant [1].
+    """
+
+    law: str
+    run: LoopTrajectory | None
+    target: Target
+    reason: str = ""
+    cost_excess: float = float("nan")
+    overshoot: float = float("nan")
+    overshoot_linear: float = float("nan")
+
+    @property
+    def text(self) -> str:
+        """The finding in words."""
+        if self.reason:
+            return f"the linear gain does not stabilise it: {self.reason}"
+        past = f"overshoot {self.overshoot:.3g} instead of {self.overshoot_linear:.3g}"
+        return f"the cost changes by {self.cost_excess:+.2g} of the linear prediction, {past}"
+
+
+@dataclass(frozen=True)
 class ControlStudy:
     """All that ``softgrasp control`` finds.
 
@@ -114,6 +146,7 @@ class ControlStudy:
         tick: seconds of one tick of it, median.
         loops: closed loops.
         notes: what was chosen for the user, and why parts are missing.
+        finite: the loop on the plant of finite strain; None where the effect is off.
     """
 
     design: Design
@@ -123,6 +156,7 @@ class ControlStudy:
     tick: float
     loops: LoopRuns
     notes: tuple[Note, ...]
+    finite: FiniteLoop | None = None
 
     @cached_property
     def margins(self) -> LoopMargins | None:
@@ -151,6 +185,7 @@ def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, 
         "refused": {b.name: b.refused for b in study.bases if b.refused},
         "retune": [_retuned(r) for r in study.retuned],
         "loop": _loop(study),
+        **_finite(study.finite),
     }
 
 
@@ -253,6 +288,16 @@ def _loop(study: ControlStudy) -> dict[str, Any]:
         "time": dict(full.seconds),
         "reduced": [_reduced_run(study, r) for r in loops.reduced],
     }
+
+
+def _finite(finite: FiniteLoop | None) -> dict[str, Any]:
+    if finite is None:
+        return {}
+    keys = ("law", "cost_excess", "overshoot", "overshoot_linear", "reason")
+    result = {key: getattr(finite, key) for key in keys} | {"stable": not finite.reason}
+    if finite.run is not None and finite.run.newton is not None:
+        result |= {"cost": float(finite.run.cost[-1]), "newton": newton_keys(finite.run.newton)}
+    return {"finite_strain": result}
 
 
 def _reduced_run(study: ControlStudy, r: ReducedLoopRun) -> dict[str, Any]:

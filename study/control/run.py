@@ -16,14 +16,15 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.bounds import bases_with_bounds
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
+from softgrasp.lqr.design.linearise import linearised
 from softgrasp.lqr.design.orders import BasisGains, orders
 from softgrasp.lqr.design.scene import with_control
 from softgrasp.study.control.gain import run_gain, small_controller
-from softgrasp.study.control.loop import run_loops, save_controllers
+from softgrasp.study.control.loop import run_finite, run_loops, save_controllers
 from softgrasp.study.control.page import sections
 from softgrasp.study.control.result import ControlStudy, Note, Retuned, a_priori, control_result
 from softgrasp.study.control.sweep import retune, sweep
-from softgrasp.study.control.tables import best_table, summary_rows, tables
+from softgrasp.study.control.tables import best_table, summary, summary_rows, tables
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -81,7 +82,8 @@ def run_control(
     fields = frames.close()
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
-        saved = save_controllers(study.design, study.controller, out)
+        target = study.design.target if study.finite is None else study.finite.target
+        saved = save_controllers(study.design, study.controller, out, target.state)
     poles = {}
     if pictures:
         from softgrasp.study.control.plots import pole_sets  # brings Matplotlib
@@ -97,7 +99,8 @@ def run_control(
 
             drawn = draw_all(out, study, poles, frames)
         title = f"{model.scene.name}: optimal feedback"
-        return Page(title, sections(study, seconds, drawn), tables(study), [*drawn, *fields, *saved])
+        parts, files = sections(study, seconds, drawn), [*drawn, *fields, *saved]
+        return Page(title, parts, tables(study), files, summary=summary(study))
 
     files = session.write(model.scene, result, page)
     if session.comm.rank == 0:
@@ -134,7 +137,9 @@ def control_model(
         SoftgraspError: with one sentence.
     """
     own_end = not notes  # a scene made for control says how long its loop runs
-    feedback = design(model, watch, solver_bar(bar, model), restart)
+    finite_strain = model.system.points is not None
+    linear = linearised(model)
+    feedback = design(linear, watch, solver_bar(bar, model), restart)
     bases: tuple[BasisGains, ...] = ()
     retuned: tuple[Retuned, ...] = ()
     notes, duration = list(notes), plan(feedback, own_end)
@@ -148,7 +153,10 @@ def control_model(
         with watch.stage("bounds"):
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
         with watch.stage("retune"):
-            retuned, why = retune(feedback, bases, duration, counted(bar, "re-tuning"))
+            if finite_strain and model.system.gravity is not None:
+                retuned, why = (), "the stiffness is that of the equilibrium, which moves with the material"
+            else:
+                retuned, why = retune(feedback, bases, duration, counted(bar, "re-tuning"))
         notes += [Note("orders", few)] if few else []
         notes += [Note("retune", f"no re-tuning: {why}")] if why else []
     controller, tick, refused = small_controller(feedback, a_priori(bases))
@@ -160,7 +168,11 @@ def control_model(
     frames = Frames(model, session.out, session.pictures)
     with watch.stage("loop"):
         loops = run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
-    return ControlStudy(feedback, bases, retuned, controller, tick, loops, tuple(notes)), frames
+    finite = None
+    if finite_strain:
+        with watch.stage("finite strain"):
+            finite = run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
+    return ControlStudy(feedback, bases, retuned, controller, tick, loops, tuple(notes), finite), frames
 
 
 def solver_bar(bar: Progress, model: Model) -> Callable[[dict[str, float]], None]:

@@ -40,6 +40,8 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
         ("stays within 1 % of the way from", "not within the run" if arrived is None else f"{arrived:.4g} s on"),
         ("cost of the run + still to come", f"{full.cost[-1]:.6g} + {loops.to_come:.3g}"),
     ]
+    if study.finite is not None:
+        rows.append((f"on the plant of finite strain ({study.finite.law})", study.finite.text))
     if full.saturated:
         rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
     rows += controller_rows(study.controller, study.tick)
@@ -54,6 +56,28 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
     rows += [("re-tuned", _fast(r)) for r in study.retuned]
     stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
     return [*rows, ("time: ARE, reduced, loop", stages)]
+
+
+def summary(study: ControlStudy) -> list[str]:
+    """What came out, in three sentences."""
+    full, loops, optimal = study.loops.full, study.loops, study.design.judge.optimal
+    arrived = settled(full.times, study.distance(full))
+    reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
+        f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
+    )  # fmt: skip
+    excess, told = (full.cost[-1] + loops.to_come) / optimal - 1, [f"The optimal gain {reaches}."]
+    if full.saturated:
+        told.append(f"With the limits of the loads the move costs {excess:.2%} more than without them.")
+    else:
+        told.append(f"The move costs {full.cost[-1]:.4g}; the Riccati equation predicts {optimal:.4g}.")
+    if study.controller is None:
+        return [*told, "No small controller is certified, see the notes."]
+    c = study.controller.controller
+    return [
+        *told,
+        f"The small controller has {c.plant.N} states and takes {1e6 * study.tick:.2g} us of each tick of "
+        f"{1e3 * c.period:g} ms.",
+    ]
 
 
 def gain_rows(design: Design) -> list[tuple[str, str]]:

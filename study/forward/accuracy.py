@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgrasp.fem.accuracy.adapt import judged
-from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.errors import SceneError, SoftgraspError
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
@@ -35,6 +35,11 @@ def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | N
     Raises:
         SoftgraspError: the estimate fails and ``certify`` asks for it.
     """
+    if model.system.points is not None:  # the small models are of linear elasticity
+        reason = "The error of mesh and time step is estimated for linear elasticity only"
+        if certify:
+            raise SceneError(f"{reason}: leave out --certify, or set effects.finite_strain to false")
+        return None, [f"{reason}; with effects.finite_strain compare with a finer mesh and more steps."]
     if model.accuracy is not None:
         return model.accuracy, []
     d, n_e = model.system.layout.dimension, model.system.layout.n_e
@@ -83,6 +88,16 @@ def rows(result: MeshEstimate | None) -> list[tuple[str, str]]:
     return [
         ("deformation", f"about {percent(result.estimate)} off on this mesh (bound {percent(result.bound)}){better}"),
         ("", f"about {percent(result.time_error)} off by the time step"),
+    ]
+
+
+def summary(result: MeshEstimate | None) -> list[str]:
+    """The same in one sentence."""
+    if result is None:
+        return []
+    return [
+        f"The deformation is about {percent(result.estimate)} off by the mesh and {percent(result.time_error)} by the "
+        "time step."
     ]
 
 

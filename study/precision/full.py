@@ -40,6 +40,7 @@ class FullRuns:
         self.reference = reference.tolist() if scene.effects.rotation else None
         self.repeats, self.dimension = scene.study.repeats, places.dimension
         self._mesh: tuple[Setting, Model, Probe, dict[str, float]] | None = None
+        self._compiled: set[tuple[int, object]] = set()  # forms by order and maker; the first build makes them
 
     def variant(self, setting: Setting, snapshots: str = "none") -> Scene:
         """The scene under a setting."""
@@ -64,7 +65,10 @@ class FullRuns:
         if setting.refine == "scene":  # one mesh whatever the steps, which its passes depend on a little
             scene = self.variant(own_setting(self.scene))
         make = build_to_tolerance if setting.refine == "scene" else build
-        make(scene, comm=comm)
+        forms = setting.order, make
+        if forms not in self._compiled:
+            make(scene, comm=comm)
+            self._compiled.add(forms)
         for _ in range(repeats):
             gc.collect()
             model = make(scene, comm=comm)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -132,7 +131,7 @@ def _inside(model: Model) -> list[list[float]]:
 def _family(
     key: str, model: Model, runs: Sequence[FullRun], held: Sequence[Held], sizes: Sequence[int], say: Say
 ) -> Family:
-    comm, refused = model.system.layout.comm, {}
+    refused: dict[int, str] = {}
     training = None
     for N in sorted(sizes, reverse=True):
         try:
@@ -155,8 +154,7 @@ def _family(
                 points.append(point)
                 models[N] = rom
     tests = tuple(_test(h, reference, models.values()) for h, reference in zip(held, references, strict=True))
-    size = comm.allreduce(len(training.cells.weight)) if comm.size > 1 else len(training.cells.weight)
-    return Family(key, training.whole.box, len(runs), tuple(points), tuple(curves), tests, models, refused, size)
+    return Family(key, training.whole.box, len(runs), tuple(points), tuple(curves), tests, models, refused)
 
 
 def _measure(
@@ -201,8 +199,3 @@ def _test(held: Held, reference: Reference, models: Iterable[StrainModel]) -> Te
     first = held.full.model.system.materials[0]
     target = tuple(held.full.trajectory.q_s[-1].tolist())
     return Test(held.kind, first.lam, first.mu, target, {m.N: _error(m, held, reference) for m in models})
-
-
-def median_of(values: Sequence[float]) -> float | None:
-    """Median, None of nothing."""
-    return statistics.median(values) if values else None

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from softgrasp.study.reduce.strain_measure import CELLS_AT, median_of
+from softgrasp.study.reduce.strain_measure import CELLS_AT
 from softgrasp.study.reduce.strain_result import Family, StrainStudy, speed_up
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import Table
@@ -18,7 +19,8 @@ CAPTIONS = {
     "strain_errors.png": "Error of the deformation z against N, and against the number of sampled cells at some N. "
     "Filled: over the runs that trained the models; open: largest of the held-out runs. Dotted: the same models on all "
     "cells. Grey: linear elasticity on the same scene.",
-    "cells.png": "Cells that the models evaluate, and their weights: for how many cells of the body each of them is.",
+    "cells.png": "Cells that the models evaluate, and their weights: for how many cells of the body each of them is. "
+    "In 3D a dot stands for a cell.",
 }
 NOTE = (
     "N counts the hand's 2 n_s, as for linear models. cells: those with a weight. own: error of z on the scene's own "
@@ -109,12 +111,10 @@ def sentences(study: StrainStudy) -> list[str]:
             f"Models {TITLES[f.key]} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
             f"accelerations of the hand up to {reach} by degree of freedom; they refuse what lies outside."
         )
-        middle = [(N, median_of([e for t in f.tests if (e := t.errors.get(N)) is not None])) for N in f.models]
-        best = min(((e, N) for N, e in middle if e is not None), default=None)
+        errors = {N: [e for t in f.tests if (e := t.errors.get(N)) is not None] for N in f.models}
+        best = min(((statistics.median(e), N) for N, e in errors.items() if e), default=None)
         if best is not None:
-            lines.append(
-                f"Median error over their {len(f.tests)} held-out runs: least at N = {best[1]}, {best[0]:.1e}."
-            )
+            lines.append(f"Median error over {len(f.tests)} held-out runs: least at N = {best[1]}, {best[0]:.1e}.")
         lines += [f"N = {N} refused: {reason}." for N, reason in f.refused.items()]
     if {p.engine for f in study.families for p in f.points} == {"NumPy"}:
         lines.append("No C compiler was found, so the reduced runs stepped in NumPy, about thirty times slower.")

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import LogNorm
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from softgrasp.fem.fields.picture import PictureMesh
@@ -84,7 +84,8 @@ def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: P
     size = np.ptp(flat, axis=0)
     height = min(4.0, 1.1 + (WIDTH / 2 if len(models) > 1 else COLUMN) * float(size[1] / size[0]) * 0.8)
     weights = [_weights(m) for m in models]
-    norm = Normalize(0.0, max(float(x.max()) for _, x in weights))
+    together = np.concatenate([x for _, x in weights])
+    norm = LogNorm(float(together.min()), float(together.max()))
     with paper_style():
         figure, axes = plt.subplots(
             1, len(models), figsize=(WIDTH if len(models) > 1 else COLUMN, height), squeeze=False, layout="constrained"

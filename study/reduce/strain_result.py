@@ -82,7 +82,6 @@ class Family:
         tests: held-out runs.
         models: those of ``points`` by N.
         refused: reason by N.
-        points_full: quadrature points of the body.
     """
 
     key: str
@@ -93,7 +92,6 @@ class Family:
     tests: tuple[Test, ...]
     models: dict[int, StrainModel]
     refused: dict[int, str]
-    points_full: int
 
 
 @dataclass(frozen=True)

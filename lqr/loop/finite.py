@@ -1,0 +1,84 @@
+"""Feedback on a plant of finite strain: the law becomes part of the equation of the tissue's step.
+
+With w = z_mid - z_n, p = [N'w; G'w], N = K_z + s K_v and F = dt^2/4 K_q + dt/2 K_v the law at the midpoint is
+
+    u = u_bar + K_q (q + dt/2 v - q_bar) + K_v v + K_z'(z - z_bar) + F a + N'w,
+
+and the hand's equation (M_hand [+ kappa M_rigid] - F) a = .. + N'w [- theta G'w] turns the load -G c of the tissue, c =
+kappa a + c_0, into G (c_1 + C p). Inputs beyond their limits are fixed there, and the step is solved once more.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.midpoint import TissueState
+from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.plant.target import Target
+
+
+class FiniteDrive:
+    """u = clip(u_bar + K (x_mid - x_bar)) on a plant of finite strain.
+
+    Args:
+        plant: :class:`softgrasp.lqr.loop.drive.PlantStep`.
+        gain: K.
+        target: x_bar and u_bar.
+        bound: limits of the input, or None.
+        steps: number of steps.
+    """
+
+    def __init__(self, plant: Any, gain: Gain | None, target: Target | None, bound: Array | None, steps: int) -> None:
+        system, dt = plant.system, plant.dt
+        n_s = system.layout.n_s
+        self.plant, self.gain, self.bound = plant, gain, bound
+        self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
+        self.inertia = system.M_hand + (plant.kappa * system.M_rigid if system.two_way else 0.0)
+        N = np.zeros_like(system.G)
+        self.offset, self.F = np.zeros(n_s), np.zeros((n_s, n_s))
+        if gain is not None and target is not None:
+            self.K_q, self.K_v, N = gain.K_s[:, :n_s], gain.K_s[:, n_s:], gain.K_z + plant.s * gain.K_v
+            self.F = dt**2 / 4 * self.K_q + dt / 2 * self.K_v
+            self.offset = target.u - self.K_q @ target.state.q_s - total(plant.comm, gain.K_z.T @ target.state.z)
+        self.N = plant.midpoint.hold(np.hstack([N, system.G]))
+
+    def solve(self, n: int, state: TissueState) -> None:
+        """One step under the law. Collective."""
+        assert self.gain is not None
+        layout = self.plant.system.layout
+        tissue = total(self.plant.comm, self.gain.K_z.T @ state.array[: layout.n_local])
+        known = self.offset + self.K_q @ (self.q[n] + self.plant.dt / 2 * self.v[n]) + self.K_v @ self.v[n] + tissue
+        free = np.ones(layout.n_s, dtype=bool)
+        while True:
+            a, law = self.push(n, known, free, state)
+            beyond = free & (np.abs(law) > (np.inf if self.bound is None else self.bound))
+            if not beyond.any():
+                break
+            assert self.bound is not None
+            free &= ~beyond
+            known[beyond] = (np.sign(law) * self.bound)[beyond]
+        self.move(n, np.where(free, law, known), a)
+
+    def push(self, n: int, known: Array, free: Array, state: TissueState) -> tuple[Array, Array]:
+        """The step with u = known, where ``free`` with the part F a + N'w of the law; a and the law. Collective."""
+        plant, system, n_s = self.plant, self.plant.system, len(known)
+        c_0 = plant.alpha * self.v[n] - plant.g
+        right, C = known + plant.weight, np.zeros((n_s, 2 * n_s))
+        C[:, :n_s] = np.diag(free)
+        if system.two_way:
+            right = right - system.M_rigid @ c_0
+            right += plant.s * total(plant.comm, system.G.T @ state.array[system.layout.n_local :])
+            C[:, n_s:] = -plant.theta * np.eye(n_s)
+        inverse = np.linalg.inv(self.inertia - free[:, None] * self.F)
+        plant.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), -plant.kappa * inverse @ C, self.N)
+        a = -(plant.midpoint.c + c_0) / plant.kappa
+        return a, known + self.F @ a + plant.midpoint.felt[:n_s]
+
+    def move(self, n: int, u: Array, a: Array) -> None:
+        """Midpoint rule of the hand."""
+        dt = self.plant.dt
+        self.u[n], self.v[n + 1] = u, self.v[n] + dt * a
+        self.q[n + 1] = self.q[n] + dt * (self.v[n] + self.v[n + 1]) / 2
