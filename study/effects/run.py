@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,15 @@ def study_effects(
     runs = Experiments(scene, scales, {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried})
     changes: Changes = {}
     for s in tried:
-        changes[s.name] = runs.alone(s.name)
+        why = runs.fails(on ^ {s.name})
+        if why:
+            effects = [replace(e, other=None, reason=f"its run fails: {why}") if e is s else e for e in effects]
+            cases.pop(s.name)
+        else:
+            changes[s.name] = runs.alone(s.name)
         tick()
+    tried = [s for s in tried if s.name in changes]
+    scenes = {name: scenes[name] for name in cases}
     needed = frozenset(s.name for s in tried if shows(s, changes[s.name], explanation.effects[s.name], scene))
     together = judge_together(runs, tuple(changes), needed, scene.study.tolerance)
     elements = judge_elements(runs.models[on], runs.first, scene.study.tolerance)
