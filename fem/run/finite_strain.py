@@ -52,7 +52,7 @@ class NewtonFigures:
 
 @dataclass
 class Counts:
-    """What a restart needs of the figures, of the rule for a new tangent, and the largest |s pi + G c| so far."""
+    """What a restart needs: figures, the rule for a new tangent, the largest of |f(z_0)| and |s pi + G c| so far."""
 
     iterations: int = 0
     steps: int = 0
@@ -139,7 +139,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
         z = self.at.array_r.copy()
         if self.dot(z, z) > 0 or self.tangent_at is not None:
             self._renew(z)
-        self.counts = Counts(min_det=self.counts.min_det)
+        self.trial_array[:] = z
+        self.trial.stateIncrease()
+        self.body.force(self.trial, self.f)
+        self.counts = Counts(min_det=self.counts.min_det, scale=float(np.sqrt(self.dot(self.f_array, self.f_array))))
 
     def join(self, state: TissueState) -> None:
         """Take a state over whose r is set. Collective."""
