@@ -19,7 +19,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("fem", "reduction", "lqr", "study")
 COLOURS = {"fem": "#dcebf7", "reduction": "#e2f2e4", "lqr": "#fdeeda", "study": "#efe6f5"}
-WIDTH, HEIGHT, GAP = 1.7, 0.75, 0.5
+WIDTH, HEIGHT, GAP, BESIDE = 1.7, 0.95, 0.4, 0.25
 
 
 def lines_of(package: str) -> list[list[str]]:
@@ -48,21 +48,25 @@ def arrows(graph: grimp.ImportGraph) -> Counter[tuple[tuple[str, str], tuple[str
     return count
 
 
-def place(axes: Axes, package: str, top: float) -> tuple[dict[tuple[str, str], tuple[float, float]], float]:
+def place(
+    axes: Axes, package: str, top: float, wide: float
+) -> tuple[dict[tuple[str, str], tuple[float, float]], float]:
     """Boxes of one package; where they are, and its lower edge."""
     lines, at = lines_of(package), {}
     height = len(lines) * (HEIGHT + GAP) + 0.5
     axes.add_patch(
-        FancyBboxPatch((0.05, top - height), 8.6, height, "round,pad=0.02", fc=COLOURS[package], ec="none", zorder=0)
+        FancyBboxPatch(
+            (0.05, top - height), wide - 0.1, height, "round,pad=0.02", fc=COLOURS[package], ec="none", zorder=0
+        )
     )
     axes.text(0.2, top - 0.12, package + "/", va="top", weight="bold", size=10)
     for i, line in enumerate(lines):
         y = top - 0.5 - i * (HEIGHT + GAP) - HEIGHT / 2
         for j, room in enumerate(line):
-            x = 4.6 + (j - (len(line) - 1) / 2) * (WIDTH + 0.25)
+            x = wide / 2 + (j - (len(line) - 1) / 2) * (WIDTH + BESIDE)
             at[package, room] = x, y
             files = list((ROOT / package / room).glob("*.py")) if (ROOT / package / room).is_dir() else []
-            files = files or (list((ROOT / package).glob("*.py")) if room == "all modules" else [])
+            files = files or (list((ROOT / package).rglob("*.py")) if room == "all modules" else [])
             axes.add_patch(
                 FancyBboxPatch(
                     (x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT, "round,pad=0.02", fc="white", ec="#555", lw=0.8
@@ -75,11 +79,12 @@ def place(axes: Axes, package: str, top: float) -> tuple[dict[tuple[str, str], t
 
 def main(file: Path) -> None:
     """Draw and save."""
-    figure, axes = plt.subplots(figsize=(7.5, 15))
+    figure, axes = plt.subplots(figsize=(9, 15))
+    wide = max(len(line) for package in PACKAGES for line in lines_of(package)) * (WIDTH + BESIDE) + BESIDE
     at: dict[tuple[str, str], tuple[float, float]] = {}
     top = 0.0
     for package in reversed(PACKAGES):
-        boxes, top = place(axes, package, top)
+        boxes, top = place(axes, package, top, wide)
         at |= boxes
     for (source, target), count in sorted(arrows(grimp.build_graph("softgrasp")).items()):
         if source[0] != target[0] or source not in at or target not in at:
@@ -92,7 +97,7 @@ def main(file: Path) -> None:
                 color="#c0392b" if v > y else "#7a8a99", alpha=0.75, zorder=0.5,
             )
         )  # fmt: skip
-    axes.set_xlim(0, 8.7)
+    axes.set_xlim(0, wide)
     axes.set_ylim(top, 0.1)
     axes.set_axis_off()
     figure.savefig(file, dpi=90, bbox_inches="tight")

@@ -88,7 +88,7 @@ class Reduction(Section):
         "at as many points, spread evenly",
     )
     add: Annotated[int, Field(ge=1)] = Field(4, description="modes that each full run of the greedy adds [1]")
-    max_N: Annotated[int, Field(ge=1)] = Field(200, description="largest N of the greedy's basis [1]")
+    max_N: Annotated[int, Field(ge=1)] = Field(320, description="largest N of the greedy's basis [1]")
     validation: Annotated[int, Field(ge=0)] = Field(
         0, description="random parameters where full runs test the certified model afterwards [1]"
     )

@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -225,7 +226,7 @@ def compiled() -> Any:
         ffi = FFI()
         ffi.cdef(DECLARATION)
         return ffi, ffi.dlopen(str(path))
-    except (ImportError, OSError, subprocess.SubprocessError) as error:
+    except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
         reason = (str(getattr(error, "stderr", "") or "") or str(error)).strip().splitlines()[:1]
         warnings.warn(
             f"reduced runs at finite strain step in NumPy, about thirty times slower, for want of a compiled stepper "
@@ -243,9 +244,9 @@ def _library() -> Path:
         raise OSError("there is no C compiler")
     key = hashlib.sha256("\0".join((SOURCE.read_text(), compiler, *FLAGS, _processor())).encode()).hexdigest()[:20]
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "softgrasp"
-    try:
+    with suppress(OSError):
         root.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    if not os.access(root, os.W_OK):
         root = Path(tempfile.mkdtemp(prefix="softgrasp-"))  # of this process alone
     path = root / f"stepper-{key}.so"
     if not path.exists():

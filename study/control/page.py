@@ -55,7 +55,8 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     scene, layout = study.design.model.scene, study.design.problem.layout
     notes = "\n\n".join((*study.findings, *(note.text for note in study.notes)))
     parts = [
-        Section("", text=notes, figures=pick("move.png", "move.gif")),
+        Section("", figures=pick("move.png", "move.gif")),
+        *([Section("Notes", text=notes)] if notes else []),
         Section("Result", rows=summary_rows(study, dict(seconds)), figures=pick("histories.png", "decay.png")),
         Section("Equation", code=control_text(scene)),
     ]
@@ -88,7 +89,9 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
         f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with room for what is to come after it."
     )
     table = reduced_table(study.bases)
-    parts = [Section(table.title, text, header=table.header, rows=table.rows, figures=figures)]
+    best = [i for i, (b, r) in enumerate((b, r) for b in study.bases for r in b.reports) if r is b.best()]
+    shown = best if len(table.rows) == sum(len(b.reports) for b in study.bases) else []
+    parts = [Section(table.title, text, header=table.header, rows=table.rows, figures=figures, best=shown)]
     refused = [(TITLES[b.name], b.refused) for b in study.bases if b.refused]
     refused += [(f"{TITLES[b.name]}, N = {r.N}", r.reason) for b in study.bases for r in b.reports if r.reason]
     if refused:

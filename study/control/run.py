@@ -24,7 +24,7 @@ from softgrasp.study.control.loop import run_finite, run_loops, save_controllers
 from softgrasp.study.control.page import sections
 from softgrasp.study.control.result import ControlStudy, Note, Retuned, a_priori, control_result
 from softgrasp.study.control.sweep import retune, sweep
-from softgrasp.study.control.tables import best_table, summary_rows, tables
+from softgrasp.study.control.tables import best_table, summary, summary_rows, tables
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -99,7 +99,8 @@ def run_control(
 
             drawn = draw_all(out, study, poles, frames)
         title = f"{model.scene.name}: optimal feedback"
-        return Page(title, sections(study, seconds, drawn), tables(study), [*drawn, *fields, *saved])
+        parts, files = sections(study, seconds, drawn), [*drawn, *fields, *saved]
+        return Page(title, parts, tables(study), files, summary=summary(study))
 
     files = session.write(model.scene, result, page)
     if session.comm.rank == 0:

@@ -58,6 +58,28 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
     return [*rows, ("time: ARE, reduced, loop", stages)]
 
 
+def summary(study: ControlStudy) -> list[str]:
+    """What came out, in three sentences."""
+    full, loops, optimal = study.loops.full, study.loops, study.design.judge.optimal
+    arrived = settled(full.times, study.distance(full))
+    reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
+        f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
+    )  # fmt: skip
+    excess, told = (full.cost[-1] + loops.to_come) / optimal - 1, [f"The optimal gain {reaches}."]
+    if full.saturated:
+        told.append(f"With the limits of the loads the move costs {excess:.2%} more than without them.")
+    else:
+        told.append(f"The move costs {full.cost[-1]:.4g}; the Riccati equation predicts {optimal:.4g}.")
+    if study.controller is None:
+        return [*told, "No small controller is certified, see the notes."]
+    c = study.controller.controller
+    return [
+        *told,
+        f"The small controller has {c.plant.N} states and takes {1e6 * study.tick:.2g} us of each tick of "
+        f"{1e3 * c.period:g} ms.",
+    ]
+
+
 def gain_rows(design: Design) -> list[tuple[str, str]]:
     """The solution of the Riccati equation and its closed loop as label and text."""
     solution = design.solution

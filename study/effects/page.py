@@ -43,7 +43,7 @@ def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: 
         (f"{f.name}: {f.value}" if f.on else f"{f.name}, tried: {f.value}" if f.value else f.name, f.advice)
         for f in study.findings
     ]
-    advice += [("all together", in_company(study)), *(("look at", text) for text in study.warnings)]
+    advice += [("all together", in_company(study)), *(("warning", text) for text in study.warnings)]
     how = [
         ("tolerance", f"{study.tolerance:g}: relative change of the outputs that counts"),
         ("needed", "changes the outputs of the run by more than the tolerance, alone or with others that are advised"),

@@ -91,6 +91,16 @@ def rows(result: MeshEstimate | None) -> list[tuple[str, str]]:
     ]
 
 
+def summary(result: MeshEstimate | None) -> list[str]:
+    """The same in one sentence."""
+    if result is None:
+        return []
+    return [
+        f"The deformation is about {percent(result.estimate)} off by the mesh and {percent(result.time_error)} by the "
+        "time step."
+    ]
+
+
 def warnings(result: MeshEstimate | None) -> list[str]:
     """What the estimate warns of."""
     if result is None:

@@ -96,7 +96,7 @@ def sections(result: Explanation) -> list[Section]:
     modes = ("mode", "omega [1/s]", "period [s]", "dt / period")
     no_modes = "" if periods else "Not computed: the factor would not fit."
     return [
-        Section("Look at", text="\n\n".join(remarks(result)) or "Nothing stands out."),
+        Section("Warnings", text="\n\n".join(remarks(result)) or "Nothing stands out."),
         Section(EQUATION, code=equation_text(result.equation)),
         Section("Sizes", rows=sizes),
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),

@@ -149,6 +149,24 @@ class Simulation:
             ("peak memory, all ranks", f"{self.memory_peak_mb:.0f} MiB"),
         ]
 
+    def summary(self) -> list[str]:
+        """What came out, in three sentences."""
+        run, sizes = self.run, self.sizes
+        place = ", ".join(f"{x:.4g}" for x in run.q_s[-1])
+        lag = np.abs(run.outputs - run.outputs_rigid).max(axis=0, initial=0.0)
+        texts = [f"At t = {run.times[-1]:.4g} s the hand stands at ({place})."]
+        if len(lag):
+            i = int(lag.argmax())
+            texts.append(
+                f"The output {run.columns[i].label} leaves the rigid motion of the hand by up to {lag[i]:.3g} "
+                f"{run.columns[i].unit} and by {abs(run.outputs[-1, i] - run.outputs_rigid[-1, i]):.3g} at the end."
+            )
+        texts.append(
+            f"The {run.steps_timed} steps of {sizes.n_e} unknowns took {run.seconds['steps']:.3g} s; the energy "
+            f"drifted by {run.energy_drift:.1e} of its largest value."
+        )
+        return texts
+
     def trajectory(self) -> Table:
         """State at each time, and the force in the step that ends there, nan in the first row."""
         run, n_s = self.run, self.sizes.n_s

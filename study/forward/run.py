@@ -90,7 +90,9 @@ def run_simulate(
         if pictures and judged is not None:
             drawn += accuracy.draw(out / "mesh_error.png", run, judged)
         sections = _sections(result, rows, drawn)
-        return Page(scene.name, sections, {"trajectory.csv": result.trajectory()}, [*fields, *drawn])
+        told = [*result.summary(), *accuracy.summary(judged)]
+        tables = {"trajectory.csv": result.trajectory()}
+        return Page(scene.name, sections, tables, [*fields, *drawn], summary=told)
 
     numbers = result.to_json() | accuracy.keys(judged, run)
     files = session.write(scene, numbers, page)
@@ -134,7 +136,7 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
     return [
         Section("", figures=figures),
         Section("Result", rows=numbers),
-        *([Section("Look at", text="\n\n".join(result.warnings))] if result.warnings else []),
+        *([Section("Warnings", text="\n\n".join(result.warnings))] if result.warnings else []),
         Section("Equation", code=equation_text(equation(scene))),
         Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
         Section("Size", rows=rows),

@@ -131,8 +131,8 @@ class Answers:
             if first is None or runs == TRIES or (best is not None and best[1].seconds <= first.seconds):
                 return best
             point = self.measure(first.setting)
-            if self.meets(point, tolerance):
-                return first, point
+            if self.meets(point, tolerance):  # cheap as predicted, or a prediction that told too little
+                return (first, point) if best is None or point.seconds <= best[1].seconds else best
         return None
 
     def too_large(self, tolerance: float) -> Prediction | None:

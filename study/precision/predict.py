@@ -96,9 +96,14 @@ class Predictor:
                 return value(known)
             return interpolate(float(setting.refine), list(line), [value(p) for p in line.values()])
 
+        def cost(value: Callable[[ForwardPoint], float]) -> float:
+            """No less beyond the finest mesh that was run, whatever noise its times have."""
+            finer = known is None and float(setting.refine) < min(line)
+            return max(at(value), value(line[min(line)])) if finer else at(value)
+
         error = at(self.space_of) + self.time_error(setting.steps)
-        seconds = at(lambda p: p.mesh + p.assembly + p.factor) + setting.steps * at(lambda p: p.per_step)
-        return Prediction(setting, at(lambda p: p.n_e), error, seconds, self.runs.get(setting))
+        seconds = cost(lambda p: p.mesh + p.assembly + p.factor) + setting.steps * cost(lambda p: p.per_step)
+        return Prediction(setting, cost(lambda p: p.n_e), error, seconds, self.runs.get(setting))
 
     def candidates(self) -> list[Prediction]:
         """Settings of the diagram, other steps on their meshes, and graded meshes of other tolerances."""

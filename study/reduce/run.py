@@ -31,6 +31,7 @@ from softgrasp.study.reduce.tables import (
     inner_note,
     point_table,
     refused_table,
+    summary,
     time_table,
 )
 from softgrasp.study.reduce.times import full_times, speed_notes, speed_of
@@ -105,7 +106,8 @@ def run_reduce(
     def page() -> Page:
         files = draw(out, study, views) if pictures else []
         parts = sections(study, result["time"], files)
-        return Page(f"{scene.name}: reduced models", parts, {"points.csv": point_table(study)}, [*files, *models])
+        tables = {"points.csv": point_table(study)}
+        return Page(f"{scene.name}: reduced models", parts, tables, [*files, *models], summary=summary(study))
 
     files = session.write(scene, result, page)
     show(console, study)

@@ -91,6 +91,26 @@ def refused_table(sweeps: Sequence[Sweep], narrow: bool = False) -> Table:
     return Table(("N", "method", "reason"), rows, "Refused")
 
 
+def summary(study: ReductionStudy) -> list[str]:
+    """What came out, in three sentences."""
+    chosen = [(s.points[i], s) for s in study.sweeps if (i := nearest(s.points)) is not None]
+    if not chosen:
+        return ["No method has a stable model."]
+    point, s = min(chosen, key=lambda pair: pair[0].error_deformation)
+    told = [
+        f"At N = {point.N} the most accurate stable model is {s.method.title}: its deformation is "
+        f"{point.error_deformation:.2%} off the full run."
+    ]
+    speed = next((v for v in study.speeds if v.method == s.method.key), None)
+    if speed is not None:
+        told.append(
+            f"It runs {speed.speedup_same_model:.3g} times as fast as the full model, and "
+            f"{speed.speedup_new_parameter:.3g} times at a new parameter."
+        )
+    held = [s for s in study.sweeps if s.points and all(p.stable for p in s.points)]
+    return [*told, f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried."]
+
+
 def time_table(speeds: Sequence[Speed], narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
     header = ("method", "N", "run [ms]", "new [ms]", "offline [s]", "x again", "x new", "break-even")

@@ -19,6 +19,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.equation import Equation, Rows, equation
 from softgrasp.study.report.origin import versions
 from softgrasp.study.report.typeset import equation_html
+from softgrasp.study.report.words import words_of
 
 TEMPLATE = Path(__file__).with_name("page.html")
 KINDS = {".png": "image/png", ".gif": "image/gif", ".svg": "image/svg+xml", ".jpg": "image/jpeg"}
@@ -30,12 +31,14 @@ HOW = (
     "machine and on what else it does."
 )
 ADDRESS = re.compile(
-    r"""<(?:script|link|iframe|object|embed|base|form)\b[^>]*|\b(?:src|href|srcset|action|data)\s*=\s*["']?(?!data:)[^"'>\s]+"""
+    r"""<(?:script|link|iframe|object|embed|base|form)\b[^>]*|\b(?:src|srcset|action|data)\s*=\s*["']?(?!data:)[^"'>\s]+"""
+    r"""|\bhref\s*=\s*["']?(?!#|[\w-][\w./-]*["'\s>])[^"'>\s]+"""
     r"""|@import[^;]*|url\(\s*["']?(?!data:)[^)]*""",
     re.IGNORECASE,
 )
 NUMBERS = (int, float, np.integer, np.floating)
 LONG = 24  # [letters]
+SHOWN, MOST_ROWS = 8, 14  # rows of a longer table that stand unfolded
 SVG_WIDTH = 800  # [pixel]
 
 
@@ -50,6 +53,7 @@ class Section:
         header: names of the columns; without it two columns are label and value.
         rows: a table; every row as long as the header. Numbers are shown with four digits.
         figures: (picture file, caption); the files are embedded.
+        best: rows of a long table that stand unfolded; the first ones if there are none.
     """
 
     title: str
@@ -58,6 +62,7 @@ class Section:
     header: Sequence[str] = ()
     rows: Sequence[Sequence[Any]] = ()
     figures: Sequence[tuple[Path, str]] = ()
+    best: Sequence[int] = ()
 
 
 def equation_text(rows: Equation) -> str:
@@ -99,6 +104,8 @@ def write_report(
     scene: Scene | None = None,
     reproduce: str = "",
     numbers: str = "result.json",
+    summary: Sequence[str] = (),
+    files: Sequence[Path] = (),
 ) -> Path:
     """Write the page; what is empty is left out. Not collective: call on one rank.
 
@@ -111,6 +118,8 @@ def write_report(
         scene: what was run.
         reproduce: the commands that made this page.
         numbers: the files beside it that hold its numbers.
+        summary: sentences that say what came out.
+        files: what lies beside the page; the page links to it.
 
     Raises:
         ValueError: a row is not as long as its table's header or first row, or the page would load anything.
@@ -123,10 +132,16 @@ def write_report(
     page = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(
         TEMPLATE.read_text(encoding="utf-8")
     )
+    prepared = [_prepared(section) for section in given]
+    told = " ".join((*summary, *(part for s in prepared for part in (s["title"], *s["paragraphs"], *s["header"]))))
+    told += " ".join(str(row[0]) for s in prepared for row in s["rows"])
     html = page.render(
         title=title,
         subtitle=subtitle,
-        sections=[_prepared(section) for section in given],
+        summary=summary,
+        sections=prepared,
+        words=words_of(told),
+        files=[file.relative_to(path.parent).as_posix() for file in files if file.is_relative_to(path.parent)],
         scene="" if scene is None else resolved_toml(scene).strip(),
         reproduce=reproduce.strip(),
         how=HOW.format(numbers=numbers),
@@ -147,13 +162,15 @@ def _prepared(section: Section) -> dict[str, Any]:
         {"data": embed(file), "caption": caption, "moving": file.suffix == ".gif", "width": _width(file)}
         for file, caption in section.figures
     ]
+    rows = [[shown(cell) for cell in row] for row in section.rows]
     return {
         "title": section.title,
         "paragraphs": [part.strip() for part in section.text.split("\n\n") if part.strip()],
         "code": section.code,
         "equation": equation_html(section.code) if section.title.startswith(EQUATION) and section.code else "",
         "header": section.header,
-        "rows": [[shown(cell) for cell in row] for row in section.rows],
+        "rows": rows,
+        "unfolded": [rows[i] for i in section.best or range(SHOWN)] if section.header and len(rows) > MOST_ROWS else [],
         "align": [Markup(f' class="{kind}"') if kind else "" for kind in kinds],
         "kind": "wider" if section.header else "pairs",
         "figures": figures,

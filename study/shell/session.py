@@ -36,6 +36,7 @@ class Page:
         tables: CSV file name -> table.
         files: what is written already, pictures and fields.
         options: of the command line, for the page's last line: " --tolerance 1e-2".
+        summary: three sentences that say what came out.
     """
 
     title: str
@@ -43,6 +44,7 @@ class Page:
     tables: Mapping[str, Table] = field(default_factory=dict)
     files: Sequence[Path] = ()
     options: str = ""
+    summary: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,8 @@ class Session:
                         title=content.title,
                         subtitle=scene.description,
                         sections=content.sections,
+                        summary=content.summary,
+                        files=files,
                         scene=scene,
                         reproduce=command_line(
                             self.command, self.path, self.overrides, self.comm.size, content.options

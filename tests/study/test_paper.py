@@ -77,6 +77,12 @@ def test_page_has_every_row(tmp_path: Path, results: dict[str, dict[str, Any]]) 
     assert control["speed-up, POD of P, N = 8"] == "500"
     assert control["target reached, POD of P, N = 16"] in ("0.0002 m off, excess cost 0.1", "not stable")
     assert control["smallest error of P at N = 8"] == "inf without, 0.25 with"
+    verdicts = {row["quantity"]: row["verdict"] for rows in found.values() for row in rows}
+    assert verdicts["full run, 600 steps"] == "better"
+    assert verdicts["speed-up, PSD, N = 14"] == "better"
+    assert verdicts["speed-up, POD of P, N = 8"] == "differs"  # 500 against 1600
+    assert verdicts["best of the six methods, stable, N = 14"] == "reproduced"
+    assert verdicts["smallest error of P at N = 8"] == "differs"
     text = page.read_text()
     # every number that the paper states on its results
     for words in (

@@ -77,8 +77,8 @@ def move(picture: PictureMesh, reach: float, k: int = 9) -> tuple[np.ndarray, np
 def colours(path: Path) -> np.ndarray:
     """Distinct colours of a picture, counted on a coarse grid of values."""
     pixels = np.asarray(Image.open(path).convert("RGB"))
-    assert pixels.shape[0] > 200
-    assert pixels.shape[1] > 200
+    assert pixels.shape[0] > 100  # 150 dots an inch
+    assert pixels.shape[1] > 100
     return np.unique(pixels.reshape(-1, 3) // 16, axis=0)
 
 
@@ -244,7 +244,8 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         if tag not in ("meta", "img"):
             self.open.append(tag)
-        self.sources += [value or "" for key, value in attrs if key in ("src", "href")]
+        addresses = [value or "" for key, value in attrs if key in ("src", "href")]
+        self.sources += [a for a in addresses if not a.startswith("#")]  # the contents link within the page
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
