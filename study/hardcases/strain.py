@@ -121,6 +121,7 @@ def sag_error(model: Model) -> float:
     """|f(z) - G g| / |G g| of the equilibrium, and that it sags by more than its length."""
     system = model.system
     assert system.points is not None
+    assert system.gravity is not None
     z, f = system.K_ee.createVecs()
     z.array_w[:] = equilibrium(system)
     Body(system.points, system.materials).force(z, f)
@@ -132,6 +133,7 @@ def newton_sag(model: Model) -> float:
     """The same by Newton's method from rest under the whole load."""
     system = model.system
     assert system.points is not None
+    assert system.gravity is not None
     body, load = Body(system.points, system.materials), system.G @ system.gravity
     z, f = system.K_ee.createVecs()
     for _ in range(12):
