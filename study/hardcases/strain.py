@@ -81,7 +81,7 @@ def newton_midpoint(system: BlockSystem, z: Array, dt: float) -> float:
             if np.linalg.norm(R) <= 1e-9 * np.linalg.norm(s * (M @ v) + at(z)[0]):
                 break
         z, v = z + 2 * w, 2 * s * w - v
-    return abs(at(z)[1] + v @ (M @ v) / 2 - first) / first
+    return float(abs(at(z)[1] + v @ (M @ v) / 2 - first) / first)
 
 
 def released(case: str, x: float, model: Model, z: Array, dt: float, group: str) -> HardCase:
