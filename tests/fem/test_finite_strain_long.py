@@ -20,7 +20,8 @@ from softgrasp.fem.run.trajectory import Trajectory
 pytestmark = [pytest.mark.slow, pytest.mark.serial]
 MATERIALS = [(50, 50), (30, 30), (200, 30), (60, 120), (40, 40), (120, 45), (50, 80)]
 BLOCK = [
-    "tissue.cells=[3,3,6]", "tissue.order=1", "tissue.refine=false", "effects.rotation=false", "effects.reaction=false", "effects.gravity=false",
+    "tissue.cells=[3,3,6]", "tissue.order=1", "tissue.refine=false", "effects.rotation=false",
+    "effects.reaction=false", "effects.gravity=false",
     "effects.damping=false", "time.start='rest'", "control=false",
 ]  # fmt: skip
 
