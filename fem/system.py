@@ -94,6 +94,7 @@ class BlockSystem:
         gravity: acceleration of free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None.
         hand_weight: gravity acts on the hand's own mass too.
         two_way: the hand feels the tissue.
+        graded: nodes crowd where cells shrink, so that Euclidean norms of node values mean little.
         points: where finite strain evaluates its law; None while the effect is off, and K_ee z is the whole force.
     """
 
@@ -110,6 +111,7 @@ class BlockSystem:
     gravity: Array | None = None
     hand_weight: bool = False
     two_way: bool = False
+    graded: bool = False
     points: Points | None = None
 
     @property

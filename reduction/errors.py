@@ -70,21 +70,34 @@ def full_energy(system: BlockSystem, snapshots: Snapshots) -> Array:
 def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array, v_s: Array) -> Array:
     """Columns of a view from relative tissue states and the hand: local rows, those of the hand on rank 0. Collective.
 
+    On graded meshes rows count by the diagonal d of the mass, over its mean m: sqrt(d / m) of displacements and
+    velocities, sqrt(m / d) of momenta, which makes |X|_F a norm that does not see where nodes crowd [W87].
+
     Args:
         view: which state.
         system: gives T, G and the mass.
         z, v_z: local rows (n_local, m).
         q_s, v_s: (n_s, m), the same on every rank.
     """
+    tissue, hand = row_weights(system)
     if view == "deformation":
-        return np.vstack([z, v_z])
+        return np.vstack([tissue * z, tissue * v_z])
     T, top = system.T, 1 if system.layout.comm.rank == 0 else 0  # the hand counts once
     if view == "velocities":
         second, p_s = v_z + T @ v_s, v_s
     else:
         second, p_s = times_columns(system.M_ee, v_z) + system.G @ v_s, system.M_hand @ v_s
-    count = top * len(q_s)
-    return np.vstack([q_s[:count], p_s[:count], z + T @ q_s, second])
+    count, low = top * len(q_s), hand**2 / tissue if view == "momenta" else tissue
+    return np.vstack([hand * q_s[:count], hand * p_s[:count], tissue * (z + T @ q_s), low * second])
+
+
+def row_weights(system: BlockSystem) -> tuple[Array, float]:
+    """Square roots of the diagonal d of the tissue mass (n_local, 1), and of its mean m; 1 on even meshes."""
+    if not system.graded:
+        return np.ones((1, 1)), 1.0
+    diagonal = system.M_ee.getDiagonal().array_r
+    whole = total(system.layout.comm, np.array([diagonal.sum(), len(diagonal)]))
+    return np.sqrt(diagonal)[:, None], float(np.sqrt(whole[0] / whole[1]))
 
 
 def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: BlockSystem) -> Array:

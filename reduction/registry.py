@@ -142,8 +142,9 @@ def make_basis(
         states: system and snapshots: z and v_z (2 n_local, m) [m, m/s] with the hand (n_s, m) of every run.
         size: N of the whole basis, the hand's columns included, or a rule; None keeps 99.9 % of the energy, as the
             paper does.
-        inner: inner product; None takes that of the method: Euclidean for the paper's six and all in (q, v), energy for
-            canonical bases beyond them, where it is ten times better. SVD-like pairs depend on it little.
+        inner: inner product; None takes energy on graded meshes, else that of the method: Euclidean for the paper's six
+            and all in (q, v), energy for canonical bases beyond them, where it is ten times better. SVD-like pairs
+            depend on it little.
         engine: engine of the tall factorisation.
 
     Raises:
@@ -165,7 +166,7 @@ def make_bases(
     Args and errors as in :func:`make_basis`; one basis for each of ``sizes``.
     """
     method = find_method(name)
-    metric = _inner_of(method, inner)
+    metric = _inner_of(method, inner, states.system.graded)
     rules = [Truncation(N=size) if isinstance(size, int | np.integer) else size for size in sizes]
     clock = [time.perf_counter()]
     n_s = states.layout.n_s
@@ -197,12 +198,12 @@ def make_bases(
     return tuple(_cut(whole, columns, c) for c in counts)
 
 
-def _inner_of(method: Method, inner: InnerName | None) -> InnerName:
+def _inner_of(method: Method, inner: InnerName | None, graded: bool) -> InnerName:
     if inner is not None and inner not in INNERS:
         raise BasisError(f"inner product '{inner}' is unknown; choose one of {', '.join(INNERS)}")
     if not method.snapshots and inner not in (None, method.inner):
         raise BasisError(f"{method.key} is orthonormal in the mass product by definition; leave inner out")
-    return inner or method.inner
+    return inner or ("energy" if graded and method.snapshots else method.inner)
 
 
 def _no_blocks(states: States) -> Blocks:

@@ -43,7 +43,10 @@ class Damping:
 
     name = "damping"
     term = "D_ee z' with D_ee = alpha M_ee + beta K_ee; with drag = 'space' also alpha G q_s'"
-    cost = "Uniform: no matrix, S is scaled, a few vector operations a step; layers that differ: D_ee, two products."
+    cost = (
+        "Equal damping in all layers takes no matrix and a few vector operations a step; layers that differ take D_ee "
+        "and two products."
+    )
 
     def active(self, scene: Scene) -> bool:
         """Whether the scene has it on."""

@@ -24,7 +24,7 @@ class Gravity:
 
     name = "gravity"
     term = "f_e = G g, as the load -G (q_s'' - g)"
-    cost = "No operator and no work in a step: n_s numbers shift the hand's acceleration in a product that is there."
+    cost = "Gravity takes no operator and no work in a step: G multiplies q_s'' - g instead of q_s''."
 
     def active(self, scene: Scene) -> bool:
         """Whether the scene has it on."""

@@ -14,7 +14,7 @@ class Layers:
 
     name = "layers"
     term = "sums over the layers in M and K"
-    cost = "3 tissue matrices a layer, kept so that new materials need no assembly; nothing in a step."
+    cost = "Each layer takes 3 tissue matrices, which new materials need no assembly for; a step costs nothing more."
 
     def active(self, scene: Scene) -> bool:
         """Whether the scene has layers."""

@@ -34,7 +34,7 @@ class Rotation:
 
     name = "rotation"
     term = "d (d-1)/2 small angles in q_s: as many columns more in R, T and G, the hand's inertia in M_ss"
-    cost = "1 column more of R, T and G in 2D, 3 in 3D; a step multiplies with those columns of G too."
+    cost = "R, T and G have 1 column more in 2D and 3 more in 3D; a step multiplies with those columns of G too."
 
     def active(self, scene: Scene) -> bool:
         """Whether the scene has it on."""

@@ -204,6 +204,7 @@ def build(
             gravity=acceleration(scene, layout.n_s),
             hand_weight=bool(scene.effects.gravity is not None and scene.effects.gravity.hand_weight),
             two_way=scene.effects.reaction,
+            graded=scene.tissue.refine is not None and scene.tissue.refine.grading != "off",
             points=_points(space, scene, inventory),
         )
     return Model(scene, space, system, inventory, watch)

@@ -35,6 +35,18 @@ _EXPECTED = {
     "string_pattern_mismatch": "in one line without $ and \\",
 }
 
+_FORMS = {
+    "effects.gravity": "gravity = { g = [0, -9.81] }",
+    "effects.damping": 'damping = { kind = "kelvin-voigt", beta = 0.01 }',
+    "tissue.material": 'material = "muscle" or material = { young = 2e4, poisson = 0.45, rho = 1060 }',
+    "tissue.size": "size = [0.06, 0.12]",
+    "tissue.cells": "cells = [12, 24]",
+    "tissue.refine": "refine = { tolerance = 1e-2 }",
+    "contact.box": "box = [[0, 0.09], [0.06, 0.12]]",
+    "motion.target": "target = [0.3, 0.2]",
+    "control.outputs": 'outputs = [{ kind = "node", point = [0.03, 0] }]',
+}
+
 
 def shipped_scenes() -> dict[str, Path]:
     """Name and path of the scenes that ship with the project.
@@ -192,7 +204,13 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
             text = text.replace("greater than", ">").replace("> or equal to", ">=").replace("less than", "<")
             text = text.replace(" after validation", "")
             earlier = problems.get(dotted, (False, []))[1]
-            text = f"{earlier[0]} or {text}" if earlier else f"{dotted} is {_show(value)}; it must {verb} {text}"
+            text = (
+                f"{earlier[0].partition('; write ')[0]} or {text}"
+                if earlier
+                else f"{dotted} is {_show(value)}; it must {verb} {text}"
+            )
+        if kind == "missing" or kind.endswith("_type"):
+            text += next((f"; write {form}" for key, form in _FORMS.items() if f"{dotted}.".startswith(f"{key}.")), "")
         problems[dotted] = (kind == "extra_forbidden", [text])
     ordered = sorted(problems.values(), key=lambda problem: not problem[0])
     more = f"; and {len(ordered) - 1} more" if len(ordered) > 1 else ""

@@ -1,7 +1,7 @@
 """Training of reduced models at finite strain from full runs: basis, Galerkin's model on all cells, sampled cells.
 
-Basis: cotangent lift (Phi, M Phi) with z = Phi a and Phi' M Phi = I [PM16]. Cells by energy-conserving
-sampling and weighting [FCA15]: xi >= 0, most of them zero, with
+Basis: cotangent lift (Phi, M Phi) with z = Phi a and Phi' M Phi = I [PM16]. Cells by energy-conserving sampling and
+weighting [FCA15]: xi >= 0, most of them zero, with
 
     |sum_e xi_e g_e - sum_e g_e| <= tau |sum_e g_e|,   g_e = the cell's part of dW_r/da, stacked over training states.
 
@@ -54,12 +54,12 @@ class Training:
 
     Attributes:
         model: the scene.
-        runs: full runs; the model must be asked for nothing outside of them.
+        runs: full runs to train on.
         Phi: largest basis, local rows (n_local, k).
         cells: all cells of this rank.
         offset: number of this rank's first cell.
         references: the runs in terms of the basis.
-        seconds: spent, by stage.
+        seconds: spent on the basis.
     """
 
     model: Model
@@ -68,8 +68,9 @@ class Training:
     cells: Cells
     offset: int
     references: tuple[Reference, ...]
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: float = 0.0
     _galerkin: dict[int, tuple[StrainRun, ...]] = field(default_factory=dict)
+    _spent: dict[int, dict[str, float]] = field(default_factory=dict)
 
     @cached_property
     def whole(self) -> StrainModel:
@@ -122,12 +123,12 @@ class Training:
             SolverError: a run did not converge.
         """
         if k not in self._galerkin:
-            with self._stage("galerkin"):
+            with self._stage(k, "galerkin"):
                 model = self.leading(k)
-                self._galerkin[k] = tuple(self._run_all(model, run) for run in self.runs)
+                self._galerkin[k] = tuple(self._run(model, run) for run in self.runs)
         return self._galerkin[k]
 
-    def _run_all(self, model: StrainModel, run: FullRun) -> StrainRun:
+    def _run(self, model: StrainModel, run: FullRun) -> StrainRun:
         comm, materials = self.model.system.layout.comm, run.model.system.materials
         small = model.at(run.dt, materials, outside=True)
         if comm.size > 1:
@@ -158,18 +159,18 @@ class Training:
         """Models of one dimension at several tau; the forces are gathered once. Collective."""
         comm, k = self.model.system.layout.comm, displacements(self.model.system, N)
         error, all_cells = self.galerkin_error(k), self.leading(k)
-        with self._stage("forces"):
+        with self._stage(k, "forces"):
             G = self._forces(k)
             C, c = on_one_rank(comm, G)
         models, counts = [], comm.allgather(G.shape[1])
         for tau in taus:
             goal = float(np.clip(error / 2, *TAUS)) if tau is None else tau
-            with self._stage("weights"):
+            with self._stage(k, "weights"):
                 weights = on_root(comm, partial(nnls, C, c, goal))
                 xi = weights.x[sum(counts[: comm.rank]) :][: counts[comm.rank]]
                 cells = gathered(comm, all_cells.cells.sampled(xi), self.offset)
             found = replace(all_cells, cells=cells, tau=goal, residual=weights.residual, error_galerkin=error)
-            models.append(replace(found, seconds=dict(self.seconds)))
+            models.append(replace(found, seconds={"basis": self.seconds, **self._spent[k]}))
         return models
 
     def _forces(self, k: int) -> Array:
@@ -186,11 +187,11 @@ class Training:
         return np.concatenate(rows)
 
     @contextmanager
-    def _stage(self, key: str) -> Iterator[None]:
+    def _stage(self, k: int, key: str) -> Iterator[None]:
         begin = time.perf_counter()
         yield
         spent = self.model.system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)
-        self.seconds[key] = self.seconds.get(key, 0.0) + spent
+        self._spent.setdefault(k, {})[key] = spent
 
 
 def displacements(system: BlockSystem, N: int) -> int:
@@ -253,7 +254,7 @@ def train(model: Model, runs: Sequence[Trajectory | FullRun], N: int) -> Trainin
         raise ReductionError("there is no full run to train on; give at least one")
     begin = time.perf_counter()
     Phi = basis_of(system, [run.snapshots for run in fulls], displacements(system, N))
-    seconds = {"basis": system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX)}
+    seconds = float(system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX))
     d = points.d
     B = times_columns(points.B, Phi).reshape(d, d, -1, Phi.shape[1]).transpose(3, 0, 1, 2)
     mesh = model.space.mesh.mesh

@@ -1,4 +1,4 @@
-"""``python -m softgrasp.study.bench forward | riccati | bases | switches | meshes``."""
+"""``python -m softgrasp.study.bench forward | riccati | bases | switches | meshes | accuracy``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from softgrasp.study.bench import bases, forward, forward_rows, meshes, riccati, riccati_rows, switches
+from softgrasp.study.bench import accuracy, bases, forward, forward_rows, meshes, riccati, riccati_rows, switches
 from softgrasp.study.shell.ending import run_command
 from softgrasp.study.shell.jobs import leave_result
 
@@ -32,6 +32,7 @@ for _name, _module in (
     ("bases", bases),
     ("switches", switches),
     ("meshes", meshes),
+    ("accuracy", accuracy),
 ):
     app.command(name=_name, help=_module.HELP)(_module.main)
 

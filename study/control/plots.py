@@ -91,7 +91,12 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ..
             ax.set_ylabel(label)
             ends = [(drawn(s, key), s) for s in ran]
             direct_labels(
-                ax, [(N[-1], v[-1], TITLES[s.name], LOOKS[s.name][0]) for (N, v), s in ends if len(N) and v[-1] > 0]
+                ax,
+                [
+                    (*[(n, x) for n, x in zip(N, v, strict=True) if x > 0][-1], TITLES[s.name], LOOKS[s.name][0])
+                    for (N, v), s in ends
+                    if any(x > 0 for x in v)
+                ],
             )
         axes[-1].set_xlabel("$N$, order of the reduced equation")
         if bad:

@@ -130,7 +130,7 @@ def needed_for_control(s: Switch, control: float | None, gate: EffectReport, sce
 
 def _advice(s: Switch, verdict: str, change: float, why: str, cost: Cost, tolerance: float) -> str:
     if verdict == "needed":
-        text = "Keep it: it changes" if s.on else "Switch it on if it acts: it would change"
+        text = "Keep it: it changes" if s.on else "Switch it on if it acts on your robot: it would change"
         text += f" the outputs by {change:.2g}, tolerance {tolerance:g}"
         if s.strength is not None and change < 0.1:  # where the change still grows with the strength
             text += f"; below about {s.strength * tolerance / change:.2g} {s.unit} it would not show"
@@ -139,9 +139,9 @@ def _advice(s: Switch, verdict: str, change: float, why: str, cost: Cost, tolera
     if why:
         return f"{'Keep' if s.on else 'Switch'} it{'' if s.on else ' on'} for control alone: it {little}, but {why}."
     if verdict == "wasted":
-        text = "Switch it off: it" if s.on else "Rightly off: it would cost and not show: it"
-        return f"{text} {little} and adds {_cost_in_words(cost)}."
-    return f"{'Keep or drop it' if s.on else 'Rightly off'}: it {little} and costs nothing in this run."
+        text = "Switch it off" if s.on else "It is right to leave it off"
+        return f"{text}: it {little} and adds {_cost_in_words(cost)}."
+    return f"{'Keep or drop it' if s.on else 'It is right to leave it off'}: it {little} and costs nothing in this run."
 
 
 def _advice_together(s: Switch, change: float, company: Company, scene: Scene) -> str:

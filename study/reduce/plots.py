@@ -144,8 +144,9 @@ def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[P
             front = pareto(points)
             ax.plot([t for t, _, _ in front], [e for _, e, _ in front], color=OUTLINE, lw=1.6, zorder=2)
             for t, e, s in front:
-                colour, _, marker = look[s.method.key]
+                colour, dashes, marker = look[s.method.key]
                 mark: dict[str, Any] = {"ls": "", "marker": marker, "ms": 5.0, "color": colour}
+                mark["mfc"] = colour if dashes == "-" else "white"
                 ax.plot(t, e, **mark, zorder=3)
                 named[s.method.key] = Line2D([], [], label=s.method.short_title, **mark)
             ax.axvline(full * unit, **FULL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.basis import ReductionError
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
-from softgrasp.reduction.replay import FullRun
+from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.compare import Reference, errors_of, reference_of
 from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.reduction.strain.training import Training, replay_strain, train
@@ -76,9 +77,8 @@ def linear_error(model: Model, own: FullRun) -> float:
     scene = model.scene.model_copy(update={"effects": effects})
     comm, n = model.system.layout.comm, model.system.layout.n_local
     system = replace(model.system, points=None)
-    run = simulate(replace(model, scene=scene, system=system, watch=Stopwatch(comm)))
-    assert run.snapshots is not None
-    Z, other = own.snapshots.Z[:n], run.snapshots.Z[:n]
+    linear = replace(model, scene=scene, system=system, watch=Stopwatch(comm))
+    Z, other = own.snapshots.Z[:n], full_run(linear, simulate(linear)).snapshots.Z[:n]
     missed, whole = comm.allreduce(np.array([np.sum((Z - other) ** 2), np.sum(Z**2)]))
     return float(np.sqrt(missed / whole))
 
@@ -146,13 +146,19 @@ def _family(
     points, curves, models = [], [], {}
     for i, N in enumerate(fitting):
         say(f"models trained on {len(runs)} run(s)", i, len(fitting))
-        taus = [None, *TAUS] if N in CELLS_AT else [None]
-        for tau, rom in zip(taus, training.family(N, taus), strict=True):
-            point = _measure(training, rom, held, references)
-            curves.append(point)
-            if tau is None:
-                points.append(point)
-                models[N] = rom
+        try:
+            roms = training.family(N, [None, *TAUS] if N in CELLS_AT else [None])
+            points.append(_measure(training, roms[0], held, references))
+        except SolverError as error:  # on all cells, or on those sampled by default
+            refused[N] = str(error)
+            continue
+        models[N] = roms[0]
+        for rom in roms[1:]:
+            with suppress(SolverError):  # a model of few cells may fail, and has no error then
+                curves.append(_measure(training, rom, held, references))
+    if not points:
+        raise ReductionError(f"no N of {list(sizes)} gives a model: {'; '.join(refused.values())}")
+    curves += points
     tests = tuple(_test(h, reference, models.values()) for h, reference in zip(held, references, strict=True))
     return Family(key, training.whole.box, len(runs), tuple(points), tuple(curves), tests, models, refused)
 
@@ -187,10 +193,10 @@ def _worst(rom: StrainModel, kind: str, held: Sequence[Held], references: Sequen
 
 
 def _error(rom: StrainModel, held: Held, reference: Reference) -> float | None:
-    """Error in z on a held-out run; None where the model refuses it."""
+    """Error in z on a held-out run; None where the model refuses it or fails."""
     try:
         run = replay_strain(rom, held.full.model, held.full)
-    except ReductionError:
+    except (ReductionError, SolverError):
         return None
     return reference.errors(run.a, run.v).z
 

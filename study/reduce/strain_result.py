@@ -59,7 +59,7 @@ class Test:
         kind: "material" or "motion", whichever is new.
         lam, mu: of the first layer [Pa].
         target: where the hand ends [m].
-        errors: in z by N; None where the model refuses the run.
+        errors: in z by N; None where the model refuses the run or fails.
     """
 
     kind: str

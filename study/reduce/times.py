@@ -74,7 +74,8 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
     mesh, model = n_e * chosen.time_online / full.steps, f"{chosen.title}, N = {chosen.N}"
     if mesh < LEAST_MESH:
         pays = (
-            f"none, the reduced run ({model}) is faster on every mesh (by its time per unknown from n_e = {mesh:.0f})"
+            f"the reduced run ({model}) is faster on every mesh; at this mesh's time per unknown it already pays from "
+            f"n_e = {mesh:.0f} on"
         )
     else:
         pays = (

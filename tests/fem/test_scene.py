@@ -408,3 +408,24 @@ def test_library_and_conversions(name: str) -> None:
 def test_later_sections_are_checked_too(change: str, words: str) -> None:
     with pytest.raises(SceneError, match=words):
         load_scene(PAPER.parent / "paper_lqr.toml", [change])
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("override", "form"),
+    [
+        ("effects.gravity=true", "write gravity = { g = [0, -9.81] }"),
+        ("effects.damping={}", 'write damping = { kind = "kelvin-voigt", beta = 0.01 }'),
+        ("contact.box=[0,1]", "write box = [[0, 0.09], [0.06, 0.12]]"),
+        ('control.outputs="tip"', "write outputs = [{ kind"),
+    ],
+)
+def test_a_wrong_key_says_how_to_write_it(override: str, form: str) -> None:
+    """The form that the message gives is itself accepted."""
+    with pytest.raises(SceneError) as error:
+        load_scene("paper_forward", [override])
+    assert form in str(error.value)
+    section = override.partition("=")[0].rpartition(".")[0]
+    line = str(error.value).partition("write ")[2].partition(";")[0]
+    key, _, value = line.partition(" = ")
+    load_scene("paper_forward", [f"{section}.{key}={value}"])

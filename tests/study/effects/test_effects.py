@@ -94,7 +94,7 @@ def test_gravity_that_matters_but_is_off_is_needed(comm: MPI.Intracomm) -> None:
     # heavy only because it is soft: of steel it would not show
     _, hard = found(comm, tissue={"material": {"young": 2e11, "poisson": 0.3, "rho": 7850.0}}, time={"steps": 5})
     assert hard["gravity"].verdict == "optional"
-    assert hard["gravity"].advice.startswith("Rightly off")
+    assert hard["gravity"].advice.startswith("It is right to leave it off")
 
 
 def test_p1_near_incompressibility_is_repeated_in_the_report(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
