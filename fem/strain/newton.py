@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
@@ -54,7 +55,7 @@ class QuasiNewton:
     def find(self, x: Array, target: float) -> Root:
         """From x until |R| <= target: a correction is halved while R is none or grows fourfold."""
         R, norm = self.residual(x)
-        if not np.isfinite(norm):
+        if not math.isfinite(norm):
             x = np.zeros_like(x)
             R, norm = self.residual(x)
         for count in range(MOST + 1):
