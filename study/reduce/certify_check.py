@@ -17,6 +17,7 @@ from softgrasp.study.shell.timing import median_seconds, timed
 TESTS, FEWER, LARGE = 5, 3, 20_000  # tests of each constant, and from so many unknowns on
 SHARES = (1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 3, 1 / 2)  # of the modes: sizes that are shown
 SECOND = 3  # times as many modes in the basis that certifies, as far as there are
+NEAR = 0.2  # of the model's own k: sizes that would hide it
 REPEATS = 5  # behind the median time of a query
 
 
@@ -124,5 +125,5 @@ def sizes_of(certified: CertifiedModel) -> list[tuple[int, int]]:
     """Pairs k, k2 that are shown: the model's own, and leading parts of its basis."""
     K = certified.k2
     pairs = {max(1, round(share * K)) for share in SHARES}
-    own = {(k, min(SECOND * k, K)) for k in pairs if k < K and k != certified.k}
+    own = {(k, min(SECOND * k, K)) for k in pairs if k < K and abs(k / certified.k - 1) > NEAR}
     return sorted({*own, (certified.k, certified.k2)})
