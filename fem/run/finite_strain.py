@@ -25,7 +25,7 @@ from softgrasp.fem.petsc import SAME, Array, PETSc, total
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.solve.solvers import Reproducible, SolverName
 from softgrasp.fem.strain.body import Body
-from softgrasp.fem.strain.newton import QuasiNewton, Root
+from softgrasp.fem.strain.newton import Counts, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
 from softgrasp.fem.system import BlockSystem
 
@@ -49,21 +49,6 @@ class NewtonFigures:
     factors: int
     min_det: float
     divided: int
-
-
-@dataclass
-class Counts:
-    """What a restart needs: figures, the rule for a new tangent, the largest of |f(z_0)| and |s pi + G c| so far."""
-
-    iterations: int = 0
-    steps: int = 0
-    most: int = 0
-    factors: int = 0
-    divided: int = 0
-    first: int = -1  # iterations of the first step with this tangent
-    spent: int = 0  # iterations above these since then
-    min_det: float = np.inf
-    scale: float = 0.0
 
 
 class FiniteStrainMidpoint(TissueMidpoint):

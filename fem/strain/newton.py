@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,21 @@ class Root(NamedTuple):
     R: Array
     norm: float
     spent: int
+
+
+@dataclass
+class Counts:
+    """What a restart needs: figures, the rule for a new tangent, the largest of |f(z_0)| and |s pi + G c| so far."""
+
+    iterations: int = 0
+    steps: int = 0
+    most: int = 0
+    factors: int = 0
+    divided: int = 0
+    first: int = -1  # iterations of the first step with this tangent
+    spent: int = 0  # iterations above these since then
+    min_det: float = np.inf
+    scale: float = 0.0
 
 
 class QuasiNewton:
