@@ -54,6 +54,7 @@ pictures: demo ## make the README's pictures again
 	$(BIN)/softgrasp effects franka_muscle
 	cp out/franka_muscle-effects/effects.png docs/effects.png
 	$(BIN)/python tools/draw_rooms.py docs/rooms.png
+	$(BIN)/python tools/draw_finite_strain.py docs/finite_strain.png
 
 docs: $(STAMP) ## build the documentation into out/site, with all links checked
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -12,6 +12,7 @@ A step that does not converge is taken in 2, 4, .. 16 parts under the same load.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from softgrasp.fem.petsc import SAME, Array, PETSc, total
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.solve.solvers import Reproducible, SolverName
 from softgrasp.fem.strain.body import Body
-from softgrasp.fem.strain.newton import QuasiNewton, Root
+from softgrasp.fem.strain.newton import Counts, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
 from softgrasp.fem.system import BlockSystem
 
@@ -48,21 +49,6 @@ class NewtonFigures:
     factors: int
     min_det: float
     divided: int
-
-
-@dataclass
-class Counts:
-    """What a restart needs of the figures, of the rule for a new tangent, and the largest |s pi + G c| so far."""
-
-    iterations: int = 0
-    steps: int = 0
-    most: int = 0
-    factors: int = 0
-    divided: int = 0
-    first: int = -1  # iterations of the first step with this tangent
-    spent: int = 0  # iterations above these since then
-    min_det: float = np.inf
-    scale: float = 0.0
 
 
 class FiniteStrainMidpoint(TissueMidpoint):
@@ -99,7 +85,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         for part in self.held.parts:
             part.convert("aij")
         self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
-        self.trial_array, self.f_array, self.y_array = (x.array_w for x in (self.trial, self.f, self.y))
+        vectors = (self.trial, self.f, self.y, self.solved)
+        self.trial_array, self.f_array, self.y_array, self.solved_array = (x.array_w for x in vectors)
         self.newton = QuasiNewton(self._residual, self._apply, self._renew_from, self.dot)
         self.past: deque[Array] = deque(maxlen=KEPT)
         self.tangent_at: Array | None = None
@@ -139,7 +126,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
         z = self.at.array_r.copy()
         if self.dot(z, z) > 0 or self.tangent_at is not None:
             self._renew(z)
-        self.counts = Counts(min_det=self.counts.min_det)
+        self.trial_array[:] = z
+        self.trial.stateIncrease()
+        self.body.force(self.trial, self.f)
+        self.counts = Counts(min_det=self.counts.min_det, scale=float(np.sqrt(self.dot(self.f_array, self.f_array))))
 
     def join(self, state: TissueState) -> None:
         """Take a state over whose r is set. Collective."""
@@ -212,7 +202,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.C, self.N, self.jump, counts = C, self.G if N is None else N, None, self.counts
         self.load = self.G @ c
         self.right = self.r_array + self.load
-        counts.scale = max(counts.scale, float(np.sqrt(self.dot(self.right, self.right))))
+        counts.scale = max(counts.scale, math.sqrt(self.dot(self.right, self.right)))
         guess = self._guess()
         if counts.first >= 0 and counts.spent >= self.price:
             self._renew(self.at.array_r + guess) or self._renew(self.at.array_r)
@@ -262,14 +252,14 @@ class FiniteStrainMidpoint(TissueMidpoint):
             R += n * self.y_array
         if self.C is not None:
             R -= self.G @ (self.C @ self._pulled(w))
-        return R, float(np.sqrt(self.dot(R, R)))
+        return R, math.sqrt(self.dot(R, R))
 
     def _apply(self, q: Array) -> Array:
         """(S - G C N')^-1 q for the tangent factored last. Collective."""
         self.trial_array[:] = q
         self.trial.stateIncrease()
         self._solve(self.trial, self.solved)
-        x: Array = self.solved.array_r.copy()
+        x: Array = np.array(self.solved_array)
         if self.C is not None:
             seen = self.C @ self._pulled(self.Y)
             x += self.Y @ np.linalg.solve(np.eye(len(seen)) - seen, self.C @ self._pulled(x))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])[:, :, None]
 
 
 def identity(H: Array) -> Array:
@@ -23,12 +24,9 @@ def double_dot(A: Array, B: Array) -> Array:
 
 def cofactor(A: Array) -> Array:
     """Cof A = det(A) A^-T, (d, d, Q)."""
-    C = np.empty_like(A)
     if len(A) == 2:
-        C[0, 0], C[1, 1] = A[1, 1], A[0, 0]
-        np.negative(A[1, 0], out=C[0, 1])
-        np.negative(A[0, 1], out=C[1, 0])
-        return C
+        return np.asarray(SIGNS * A[::-1, ::-1])
+    C = np.empty_like(A)
     for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
         for j in range(3):

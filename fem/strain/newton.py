@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +33,21 @@ class Root(NamedTuple):
     spent: int
 
 
+@dataclass
+class Counts:
+    """What a restart needs: figures, the rule for a new tangent, the largest of |f(z_0)| and |s pi + G c| so far."""
+
+    iterations: int = 0
+    steps: int = 0
+    most: int = 0
+    factors: int = 0
+    divided: int = 0
+    first: int = -1  # iterations of the first step with this tangent
+    spent: int = 0  # iterations above these since then
+    min_det: float = np.inf
+    scale: float = 0.0
+
+
 class QuasiNewton:
     """Iterations that share their pairs (dx, dr, 1/dx'dr), as the steps of a run do.
 
@@ -54,7 +71,7 @@ class QuasiNewton:
     def find(self, x: Array, target: float) -> Root:
         """From x until |R| <= target: a correction is halved while R is none or grows fourfold."""
         R, norm = self.residual(x)
-        if not np.isfinite(norm):
+        if not math.isfinite(norm):
             x = np.zeros_like(x)
             R, norm = self.residual(x)
         for count in range(MOST + 1):

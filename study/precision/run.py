@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import TaskProgressColumn
 
 from softgrasp.fem.accuracy.adapt import build_to_tolerance
-from softgrasp.fem.errors import ResourceError, SolverError
+from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.refined import scene_ends
 from softgrasp.fem.run.interrupt import interruptible
@@ -73,6 +73,11 @@ def run_study(
     session = Session("study", path, overrides, out, console, quiet, empty=empty)
     request = Request(tolerance, budget, tuple(questions or ()))
     scene = session.scene()
+    if scene.effects.finite_strain is not None:
+        raise SceneError(
+            f"{path}: study compares methods of linear elasticity; set effects.finite_strain to false, or run reduce, "
+            "which knows models of finite strain"
+        )
     with session.progress(TaskProgressColumn()) as bar:
         task = bar.add_task("study", total=1.0)
 
