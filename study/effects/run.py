@@ -70,7 +70,8 @@ def study_effects(
     for s in tried:
         why = runs.fails(on ^ {s.name})
         if why:
-            effects = [replace(e, other=None, reason=f"its run fails: {why}") if e is s else e for e in effects]
+            failed = replace(s, other=None, reason=f"its run fails: {why}")
+            effects = tuple(failed if e is s else e for e in effects)
             cases.pop(s.name)
         else:
             changes[s.name] = runs.alone(s.name)

@@ -191,7 +191,7 @@ class Table(Experiments):
     """Experiments whose outputs are a formula of the effects that are on."""
 
     def __init__(self, on: set[str], output: Callable[[Names], float], forced: Callable[[Names], float] | None) -> None:
-        self.on = frozenset(on)
+        self.on, self.failures = frozenset(on), {}
         self.force = None if forced is None else lambda n, t, q, v: q
         self.formulas = {False: output, True: forced or output}
 
