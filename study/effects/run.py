@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
-from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
+from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import Changes, Experiments, judge_together
 from softgrasp.study.effects.elements import judge_elements
@@ -22,7 +24,7 @@ from softgrasp.study.effects.judge import find, quartiles, shows
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, count_objects, measure_builds, measure_steps
 from softgrasp.study.effects.page import compose, show
 from softgrasp.study.effects.result import EffectsStudy
-from softgrasp.study.effects.switch import scales_of, switches
+from softgrasp.study.effects.switch import Switch, scales_of, switches
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.session import Session, list_files
@@ -49,7 +51,7 @@ def study_effects(
     model = build(scene, comm=comm)  # also compiles the forms
     explanation = explain_model(model)
     scales = scales_of(model.system.layout, rigid_inertia(model), explanation.time.omega)
-    effects = switches(scene, scales)
+    effects = tuple(_runnable(s, comm) for s in switches(scene, scales))
     tried = [s for s in effects if s.other is not None]
     scenes = {SCENE: scene} | {s.name: s.other for s in tried if s.other is not None} | {AGAIN: scene}
     check_memory(comm, explanation, len(scenes))
@@ -94,6 +96,17 @@ def study_effects(
         | {"steps": scene.time.steps, "cells": explanation.sizes.cells},
         elements=elements,
     )
+
+
+def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
+    """Finite strain on trial may leave what its law describes: then there is nothing to compare. Collective."""
+    if s.on or s.other is None or s.name != "finite_strain":
+        return s
+    try:
+        simulate(build(s.other, comm=comm))
+    except SolverError as error:
+        return replace(s, other=None, reason=f"the run with it fails ({error})")
+    return s
 
 
 def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
