@@ -23,7 +23,7 @@ from softgrasp.study.effects.elements import judge_elements
 from softgrasp.study.effects.judge import find, quartiles, shows
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, count_objects, measure_builds, measure_steps
 from softgrasp.study.effects.page import compose, show
-from softgrasp.study.effects.result import EffectsStudy
+from softgrasp.study.effects.result import Company, EffectsStudy
 from softgrasp.study.effects.switch import Switch, scales_of, switches
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
@@ -72,7 +72,12 @@ def study_effects(
         changes[s.name] = runs.alone(s.name)
         tick()
     needed = frozenset(s.name for s in tried if shows(s, changes[s.name], explanation.effects[s.name], scene))
-    together = judge_together(runs, tuple(changes), needed, scene.study.tolerance)
+    # with other effects on trial a run of finite strain may leave its law: it is judged in the scene as it is
+    apart = {s.name for s in tried if s.name == "finite_strain" and not s.on}
+    joint = tuple(name for name in changes if name not in apart)
+    together = judge_together(runs, joint, needed - apart, scene.study.tolerance)
+    together.company.update({name: Company(*changes[name], (), False, 0.0, False) for name in apart})
+    together = replace(together, on=(*together.on, *sorted(apart & needed)))
     elements = judge_elements(runs.models[on], runs.first, scene.study.tolerance)
     done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
