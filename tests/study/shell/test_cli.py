@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import locale
 import os
@@ -59,7 +60,7 @@ def test_simulate_writes_what_design_promises(tmp_path: Path, ranks: int) -> Non
         0.40, abs=0.02
     )  # against finer runs: tests of fem.accuracy
     assert result["time_error"] < 1e-3
-    assert result["warnings"][0] in page
+    assert result["warnings"][0] in html.unescape(page)
     assert run.stdout.count("warning:") == 2
 
 
