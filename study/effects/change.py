@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.drive import Force
@@ -99,7 +98,6 @@ class Experiments:
         later = scene.control is not None and scene.motion.drive == "motion"
         self.force = force_of_motion(scene, own) if later else None
         self.runs: dict[tuple[Names, bool], Shown] = {}
-        self.failures: dict[Names, str] = {}
         self.first: Trajectory = simulate(own, RunOptions())
         self.runs[self.on, False] = shown(own, self.first)
 
@@ -126,28 +124,13 @@ class Experiments:
             self.runs[on, forced] = shown(model, simulate(model, RunOptions(), self.force if forced else None))
         return self.runs[on, forced]
 
-    def fails(self, on: Names) -> str:
-        """Why the run with exactly these effects on fails; empty where it does not. Collective."""
-        if on not in self.failures:
-            try:
-                self.of(on)
-                self.failures[on] = ""
-            except SolverError as error:
-                self.failures[on] = str(error)
-        return self.failures[on]
-
     def change(self, a: Names, b: Names) -> Change:
         """Change between two sets of effects. Collective."""
         return compare(self.of(a), self.of(b))
 
     def control(self, a: Names, b: Names) -> float | None:
         """Change of the outputs when a force moves the hand; None where that is no question. Collective."""
-        if self.force is None:
-            return None
-        try:
-            return compare(self.of(a, True), self.of(b, True)).outputs
-        except SolverError:  # of finite strain; the motion itself may well be possible
-            return None
+        return None if self.force is None else compare(self.of(a, True), self.of(b, True)).outputs
 
     def alone(self, name: str) -> tuple[Change, float | None]:
         """Change by one effect switched in the scene; under a force too where the run does not show it. Collective."""
@@ -157,12 +140,7 @@ class Experiments:
         return change, self.control(self.on, other) if hidden else None
 
     def shows(self, a: Names, b: Names, tolerance: float) -> tuple[float, bool] | None:
-        """A change of the outputs above the tolerance, and whether only a force brings it out. Collective.
-
-        A set of effects whose run fails, as finite strain may beside others, shows nothing.
-        """
-        if self.fails(a) or self.fails(b):
-            return None
+        """A change of the outputs above the tolerance, and whether only a force brings it out. Collective."""
         change = self.change(a, b).outputs
         if change > tolerance:
             return change, False
@@ -177,15 +155,12 @@ class Together:
     Attributes:
         on: effects that are advised, those that cannot be tried as they are.
         company: of each effect that was tried.
-        failures: why an effect cannot run beside those that are advised; its company is then the scene as it is.
     """
 
     on: tuple[str, ...]
     company: dict[str, Company]
-    failures: dict[str, str]
 
 
-FINITE_STRAIN = "finite_strain"
 Joined = dict[str, tuple[tuple[str, ...], bool, float, bool]]
 
 
@@ -205,19 +180,17 @@ def judge_together(runs: Experiments, tried: tuple[str, ...], needed: Names, tol
         SolverError: a solve failed.
     """
     on = needed | (runs.on - frozenset(tried))
-    if runs.fails(on) and FINITE_STRAIN not in runs.on:  # of the effects, only its steps may fail to converge
-        on -= {FINITE_STRAIN}
     joined: Joined = {}
     while new := _singles(runs, tried, on, tolerance) or _pair(runs, tried, on, tolerance):
         on |= frozenset(new)
         joined |= new
-    failures = {name: why for name in tried if (why := runs.fails(on ^ {name}))}
-    company = {}
-    for name in tried:
-        beside = runs.on if name in failures else on
-        pair = beside, beside ^ {name}
-        company[name] = Company(runs.change(*pair), runs.control(*pair), *joined.get(name, ((), False, 0.0, False)))
-    return Together(tuple(name for name in EFFECTS if name in on), company, failures)
+    company = {
+        name: Company(
+            runs.change(on, on ^ {name}), runs.control(on, on ^ {name}), *joined.get(name, ((), False, 0.0, False))
+        )
+        for name in tried
+    }
+    return Together(tuple(name for name in EFFECTS if name in on), company)
 
 
 def _singles(runs: Experiments, tried: tuple[str, ...], on: Names, tolerance: float) -> Joined:

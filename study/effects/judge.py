@@ -110,8 +110,6 @@ def find(
         advice = _advice(s, verdict, change.outputs, why, cost, tolerance)
         if verdict == "needed" and company.change.outputs <= tolerance:
             advice += f" Beside the other advised effects it changes them by {company.change.outputs:.1e} only."
-    if s.name in together.failures:
-        advice += f" Beside the other advised effects its run fails: {together.failures[s.name]}."
     return Finding(s.name, s.on, s.value, gate, verdict, advice, change, control, company, cost, proof)
 
 

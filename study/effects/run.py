@@ -13,17 +13,18 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
-from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
+from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import Changes, Experiments, judge_together
 from softgrasp.study.effects.elements import judge_elements
 from softgrasp.study.effects.judge import find, quartiles, shows
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, count_objects, measure_builds, measure_steps
 from softgrasp.study.effects.page import compose, show
-from softgrasp.study.effects.result import EffectsStudy
-from softgrasp.study.effects.switch import scales_of, switches
+from softgrasp.study.effects.result import Company, EffectsStudy
+from softgrasp.study.effects.switch import Switch, scales_of, switches
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.session import Session, list_files
@@ -50,7 +51,7 @@ def study_effects(
     model = build(scene, comm=comm)  # also compiles the forms
     explanation = explain_model(model)
     scales = scales_of(model.system.layout, rigid_inertia(model), explanation.time.omega)
-    effects = switches(scene, scales)
+    effects = tuple(_runnable(s, comm) for s in switches(scene, scales))
     tried = [s for s in effects if s.other is not None]
     scenes = {SCENE: scene} | {s.name: s.other for s in tried if s.other is not None} | {AGAIN: scene}
     check_memory(comm, explanation, len(scenes))
@@ -68,18 +69,15 @@ def study_effects(
     runs = Experiments(scene, scales, {on: cases[SCENE].model} | {on ^ {s.name}: cases[s.name].model for s in tried})
     changes: Changes = {}
     for s in tried:
-        why = runs.fails(on ^ {s.name})
-        if why:
-            failed = replace(s, other=None, reason=f"its run fails: {why}")
-            effects = tuple(failed if e is s else e for e in effects)
-            cases.pop(s.name)
-        else:
-            changes[s.name] = runs.alone(s.name)
+        changes[s.name] = runs.alone(s.name)
         tick()
-    tried = [s for s in tried if s.name in changes]
-    scenes = {name: scenes[name] for name in cases}
     needed = frozenset(s.name for s in tried if shows(s, changes[s.name], explanation.effects[s.name], scene))
-    together = judge_together(runs, tuple(changes), needed, scene.study.tolerance)
+    # with other effects on trial a run of finite strain may leave its law: it is judged in the scene as it is
+    apart = {s.name for s in tried if s.name == "finite_strain" and not s.on}
+    joint = tuple(name for name in changes if name not in apart)
+    together = judge_together(runs, joint, needed - apart, scene.study.tolerance)
+    together.company.update({name: Company(*changes[name], (), False, 0.0, False) for name in apart})
+    together = replace(together, on=(*together.on, *sorted(apart & needed)))
     elements = judge_elements(runs.models[on], runs.first, scene.study.tolerance)
     done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
@@ -103,6 +101,17 @@ def study_effects(
         | {"steps": scene.time.steps, "cells": explanation.sizes.cells},
         elements=elements,
     )
+
+
+def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
+    """Finite strain on trial may leave what its law describes: then there is nothing to compare. Collective."""
+    if s.on or s.other is None or s.name != "finite_strain":
+        return s
+    try:
+        simulate(build(s.other, comm=comm))
+    except SolverError as error:
+        return replace(s, other=None, reason=f"the run with it fails ({error})")
+    return s
 
 
 def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
