@@ -66,7 +66,7 @@ def main(out: Path) -> None:
                 u = vertex_displacement(model, snapshots.Z[:n, k], np.zeros(2))
                 drawn = body(axes, picture, u)
                 if row == 0:
-                    axes.set_title(f"t = {times[k]:.2g} s")
+                    axes.set_title(f"t = {times[k]:.3g} s")
                 if column == 0:
                     axes.text(-0.62, 0.95, TITLES[law], rotation=90, va="center", ha="right", size=8, weight="bold")
         bar = figure.colorbar(drawn, cax=figure.add_subplot(grid[:2, SHOWN]), ticks=[0.5, 0.75, 1, 1.25, 1.5])
