@@ -97,7 +97,8 @@ def load_certified(path: str | Path, layout: BlockLayout | None = None) -> Certi
         ModelError: the file is missing, damaged, without a certificate, or of another mesh.
     """
     path = Path(path)
-    fields = _read(path, layout is not None)  # before the model itself, which trusts what it reads
+    with agree(MPI.COMM_SELF if layout is None else layout.comm):  # before the model itself, which trusts what it reads
+        fields = _read(path, layout is not None)
     if layout is not None and fields.pop("mesh_key") != mesh_key(layout):
         raise ModelError(f"{path} belongs to another mesh; load it with its own scene")
     fields.pop("mesh_key", None)
@@ -123,18 +124,23 @@ def _read(path: Path, lift: bool) -> dict[str, Any]:
                     drive = _read_drive(group[name], drive)
             shape = (group["shape/0"][()], group["shape/1"][()]) if "shape" in group else None
             static, mass, compliance = (group[name][()] for name in ("static", "mass", "compliance"))
-    except (OSError, KeyError, ValueError) as error:
-        raise ModelError(f"{path} cannot be read as a certified model ({error}); reduce the scene again") from error
+        return {**_about(about, static, mass, shape), "compliance": compliance, "drive": drive}
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise ModelError(f"{path} cannot be read as a certified model ({reason}); reduce the scene again") from error
+
+
+def _about(about: dict[str, Any], static: Array, mass: Array, shape: tuple[Array, Array] | None) -> dict[str, Any]:
     reference = tuple(LayerMaterial(**m) for m in about["reference"])
     low, high = about["omega"]
     norms = ResidualNorms(static, mass, reference, about["n_s"], about["dimension"], (low, high), shape)
     mesh, box = about["mesh"], about["box"]
     if mesh is not None:
         mesh = MeshNumber(tuple((a, b) for a, b in mesh["places"]), tuple(mesh["estimates"]))
-    kept = {key: about[key] for key in ("k", "certify", "tolerance", "norm", "training", "mesh_key")}
     if box is not None:
         box = Box(tuple(box["lam"]), tuple(box["mu"]), box["apart"])
-    return {**kept, "norms": norms, "compliance": compliance, "box": box, "mesh": mesh, "drive": drive}
+    kept = {key: about[key] for key in ("k", "certify", "tolerance", "norm", "training", "mesh_key")}
+    return {**kept, "norms": norms, "box": box, "mesh": mesh}
 
 
 def _read_drive(part: h5py.Group, finer: Drive | None) -> Drive:

@@ -93,18 +93,20 @@ def _read(path: Path, layout: BlockLayout | None, scene_hash: str | None) -> Str
             read = {group: {key: file[f"{group}/{key}"][()] for key in keys} for group, keys in ARRAYS.items()}
             gravity = file["gravity"][()] if "gravity" in file else None
             lift = None if layout is None else read_lift(file, layout, path)
-    except (OSError, KeyError, ValueError) as error:
-        raise ModelError(f"{path} cannot be read as a reduced model ({error}); reduce the scene again") from error
-    if scene_hash is not None and data["scene_hash"] != scene_hash:
-        raise ModelError(f"{path} was made for another scene (hash {data['scene_hash'][:12]}); reduce the scene again")
-    return StrainModel(
-        cells=Cells(law=data.pop("law"), **read["cells"]),
-        materials=tuple(LayerMaterial(**m) for m in data.pop("materials")),
-        outputs=Outputs(**read["outputs"], names=tuple(data.pop("names"))),
-        box=Box(**read["box"]),
-        gravity=gravity,
-        layout=layout,
-        Phi=None if lift is None else np.asarray(lift.L_q),
-        **read["parts"],
-        **data,
-    )
+        if scene_hash is not None and data["scene_hash"] != scene_hash:
+            found = data["scene_hash"][:12]
+            raise ModelError(f"{path} was made for another scene (hash {found}); reduce the scene again")
+        return StrainModel(
+            cells=Cells(law=data.pop("law"), **read["cells"]),
+            materials=tuple(LayerMaterial(**m) for m in data.pop("materials")),
+            outputs=Outputs(**read["outputs"], names=tuple(data.pop("names"))),
+            box=Box(**read["box"]),
+            gravity=gravity,
+            layout=layout,
+            Phi=None if lift is None else np.asarray(lift.L_q),
+            **read["parts"],
+            **data,
+        )
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error

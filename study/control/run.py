@@ -13,6 +13,7 @@ from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.scene.control import Loop
 from softgrasp.lqr.design.bounds import bases_with_bounds
 from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import design
@@ -164,6 +165,7 @@ def control_model(
     sampled = feedback.quality.sampled
     if sampled is not None and sampled.reason:
         notes.append(Note("sampling", f"the loop from tick to tick is not certified: {sampled.reason}"))
+    notes += unused_rate(model)
     notes += [Note("end", duration.note)] if duration.note else []
     frames = Frames(model, session.out, session.pictures)
     with watch.stage("loop"):
@@ -173,6 +175,15 @@ def control_model(
         with watch.stage("finite strain"):
             finite = run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
     return ControlStudy(feedback, bases, retuned, controller, tick, loops, tuple(notes), finite), frames
+
+
+def unused_rate(model: Model) -> list[Note]:
+    """Says that a rate other than the default does nothing, where the loop is not sampled."""
+    loop = Loop() if model.scene.control is None else model.scene.control.loop
+    if loop.sampling == "held" or loop.rate == Loop().rate:
+        return []
+    text = f"control.loop.rate = {loop.rate:g} Hz has no effect: set control.loop.sampling = 'held' to sample the loop"
+    return [Note("sampling", text)]
 
 
 def solver_bar(bar: Progress, model: Model) -> Callable[[dict[str, float]], None]:

@@ -23,6 +23,7 @@ from softgrasp.reduction.certified.motion import Drive, Materials
 
 KEYS = ("lambda", "mu", "rho")
 FINER = 8  # steps for one, of the runs that tell the error of the step
+MOST = 1_000_000  # steps of a run, which stands in memory as a whole
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, float]:
@@ -109,7 +110,7 @@ def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None
         dt: step [s]; None takes the model's own. It is adjusted so that steps fill the time of the motion.
 
     Raises:
-        SceneError: the file does not fit, dt is not positive, or the model holds no motion.
+        SceneError: the file does not fit, dt is not positive or too small, or the model holds no motion.
     """
     own = model.drive
     if dt is not None and not (math.isfinite(dt) and dt > 0):
@@ -119,6 +120,8 @@ def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None
     if motion is None and dt is None:
         return own
     times, columns, rates, end = _table(model, own, motion)
+    if dt is not None and end > MOST * dt:
+        raise SceneError(f"--dt {dt:g}: a run of {end:g} s takes at most {MOST} steps; give {end / MOST:.3g} s or more")
     steps = max(1, round(end / (dt or own.dt)))
 
     def at(count: int) -> Drive:

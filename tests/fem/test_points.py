@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.points import make_points
 from softgrasp.fem.petsc import PETSc, to_scipy, total
 from softgrasp.fem.strain.arrays import volume_change
 from softgrasp.fem.strain.body import Body
@@ -190,3 +191,55 @@ def test_off_has_no_points_and_rotation_is_refused() -> None:
         make_scene(effects={"rotation": True, "finite_strain": {}})
     with pytest.raises(SceneError, match="nonsense"):
         build("paper_forward", ["effects.finite_strain.law='nonsense'"])
+
+
+def closed_form(law: str, F: Array, lam: float, mu: float) -> Array:
+    """P of one gradient of deformation, from the textbook's inverse."""
+    J, turned, E = np.linalg.det(F), np.linalg.inv(F).T, (F.T @ F - np.eye(len(F))) / 2
+    if law == "stvk":
+        return np.asarray(F @ (2 * mu * E + lam * np.trace(E) * np.eye(len(F))))
+    return np.asarray(mu * (F - turned) + lam * (np.log(J) if law == "neo-hooke" else J * (J - 1)) * turned)
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("changes", "side"), [(FLAT, "y+"), (CUBE, "z+")], ids=["2d", "3d"])
+def test_patch_of_an_irregular_mesh_has_one_stress(changes: dict[str, Any], side: str, order: int, law: str) -> None:
+    """z = a (X - top) of the last axis is 0 at the hand and affine: one P in every point, no force on inner nodes."""
+    model = model_of(changes, order, law, contact={"sides": [side], "box": None})
+    space, comm, d = model.space, model.system.layout.comm, model.system.layout.dimension
+    size = np.array(model.scene.tissue.size)
+    x = space.mesh.mesh.geometry.x
+    inside = np.prod(np.sin(np.pi * x[:, :d] / size), axis=1)
+    x[:, :d] += 0.08 * (inside * np.sin(7.0 * x[:, :d] @ np.arange(2.0, d + 2)))[:, None] * np.cos(np.arange(d))
+    points = make_points(space, model.scene, model.scene.effects.finite_strain)  # type: ignore[arg-type]
+    assert points.vol.max(initial=0.0) > 1.2 * points.vol.min(initial=np.inf)  # irregular indeed
+    nodes = space.V.tabulate_dof_coordinates()[space.free][:, :d]
+    a = np.array([0.3, -0.2, -0.25])[-d:]  # shear, and pressed by a quarter
+    z = vector(model, np.outer(nodes[:, -1] - size[-1], a).ravel())
+    H, normal = np.zeros((d, d)), np.eye(d)[-1]
+    H += np.outer(a, normal)
+    materials = model.scene.tissue.material
+    P = closed_form(law, np.eye(d) + H, materials.lam, materials.mu)
+    body, f = Body(points, model.system.materials), z.duplicate()
+    h = body.gradient(z).copy()
+    assert np.abs(h - H[:, :, None]).max(initial=0.0) < 1e-13
+    assert np.abs(points.laws.stress(h, body.lam, body.mu) - P[:, :, None]).max(initial=0.0) < 1e-12 * np.abs(P).max()
+    volume = np.prod(size) * model.scene.tissue.thickness
+    inner = np.all((nodes > 1e-9) & (nodes < size - 1e-9), axis=1)
+    assert comm.allreduce(int(inner.sum())) > 0
+    start, half = body.start(zeros := z.duplicate()), z.copy()
+    half.scale(0.5)
+    assert zeros.norm() == 0.0
+
+    def check(work: float) -> None:
+        forces = f.array_r.reshape(-1, d)
+        assert np.abs(forces[inner]).max(initial=0.0) < 1e-12 * f.norm()
+        assert z.dot(f) == pytest.approx(work, rel=1e-12)
+
+    body.force(z, f)
+    check(volume * float(np.sum(P * H)))
+    # the force of a step from rest is that of one stress too, and does the work W
+    assert body.step(start, half, f)
+    check(comm.allreduce(body.energy(z)))

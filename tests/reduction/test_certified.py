@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction import online
-from softgrasp.reduction.certified import bounds
+from softgrasp.reduction.certified import archive, bounds
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.certificate import Bound, ToleranceError
 from softgrasp.reduction.certified.model import Box
@@ -396,6 +397,31 @@ def test_archive(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
                 data[name][...] = kept
         comm.Barrier()
     assert load_certified(file).k2 == 9
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("whole", [False, True], ids=["online", "lift"])
+@pytest.mark.parametrize(
+    ("part", "changed", "word"),
+    [("box", {"lam": [30, 500], "mu": [20, 500]}, "'apart' is missing"), ("reference", [{"nu": 0.3}], "nu")],
+)
+def test_a_file_of_other_keys_is_refused(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, part: str, changed: object, word: str, whole: bool
+) -> None:
+    """As another version of the same format would write it, with right hashes."""
+    model = build(make_scene(KELVIN_VOIGT), comm=comm)
+    file = mpi_tmp_path / "certified.h5"
+    save_certified(ritz(model, 4, 9), file)
+    if comm.rank == 0:
+        with h5py.File(file, "r+") as data:
+            about = json.loads(data["certificate/about"][()].tobytes()) | {part: changed}
+            del data["certificate/about"]
+            data["certificate/about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
+            for name, lift in (("sha256", False), ("sha256_lift", True)):
+                data["certificate"].attrs[name] = archive._digest(data, lift)
+    comm.Barrier()
+    with pytest.raises(ModelError, match=rf"cannot be read .*{word}"):
+        load_certified(file, model.system.layout if whole else None)
 
 
 @pytest.mark.serial

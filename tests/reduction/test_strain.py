@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import scipy.optimize
@@ -287,3 +289,10 @@ def test_a_file_gives_the_same_model(tmp_path: Path) -> None:
         load_strain(tmp_path / "strain.h5", scene_hash="other")
     with pytest.raises(ModelError, match="load_strain reads it"):
         load(tmp_path / "strain.h5")
+    for key, value in (("cells_full", None), ("beta", 0.1)):  # as other versions would write it
+        save(model, tmp_path / "strain.h5")
+        with h5py.File(tmp_path / "strain.h5", "r+") as file:
+            data = json.loads(file.attrs["model"])
+            file.attrs["model"] = json.dumps({k: v for k, v in {**data, key: value}.items() if v is not None})
+        with pytest.raises(ModelError, match=f"cannot be read .*{key}"):
+            load_strain(tmp_path / "strain.h5")

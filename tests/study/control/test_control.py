@@ -25,7 +25,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.study.control.plots import drawn, figure_reduced, unstable
 from softgrasp.study.control.result import settled
-from softgrasp.study.control.run import run_control
+from softgrasp.study.control.run import run_control, unused_rate
 from softgrasp.study.report.files import to_json
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene
@@ -401,3 +401,11 @@ def test_small_helpers() -> None:
     }
     assert issubclass(ControlError, SoftgraspError)
     assert issubclass(SceneError, SoftgraspError)
+
+
+def test_a_rate_without_sampling_is_said_to_do_nothing() -> None:
+    base = {"outputs": [{"kind": "hand"}]}
+    for loop, said in (({}, False), ({"rate": 2.0}, True), ({"rate": 2.0, "sampling": "held"}, False)):
+        notes = unused_rate(build(make_scene({"control": {**base, "loop": loop}})))
+        assert [note.topic for note in notes] == ["sampling"] * said
+        assert not said or "control.loop.rate = 2 Hz has no effect" in notes[0].text

@@ -273,6 +273,12 @@ def test_files_that_make_no_sense(file: Path, tmp_path: Path) -> None:
         ask(file, tolerance=1e-9, fallback="full", scene=SCENES / "paper_forward.toml")
 
 
+def test_a_step_that_no_memory_holds_is_refused() -> None:
+    for dt in (1e-300, 1e-7):
+        with pytest.raises(SceneError, match=r"at most 1000000 steps; give 3e-06 s or more"):
+            drive_of(made()[1], dt=dt)
+
+
 def test_the_command_line(file: Path) -> None:
     runner = CliRunner()
     assert runner.invoke(app, ["query", str(file), "--set", "lambda=300", "--set", "mu=200"]).exit_code == 0
