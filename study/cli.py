@@ -230,8 +230,11 @@ def view(
 ) -> None:
     """Show the move of a run with PyVista: a window with a time slider, or a picture."""
     from softgrasp.study.pictures.view import view as show
+    from softgrasp.study.shell.session import list_files
 
     show(folder, field, save)
+    if save is not None:
+        list_files(console(), [save])
 
 
 @app.command()

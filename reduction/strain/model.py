@@ -175,6 +175,8 @@ class SmallStrainModel:
         n_s = model.G.shape[1]
         if q.shape != v.shape or q.ndim != 2 or q.shape[1] != n_s or len(q) < 2:
             raise ModelError(f"the hand's tables have shapes {q.shape} and {v.shape}; both must be (steps + 1, {n_s})")
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
+            raise ModelError("the hand's tables hold numbers that are not finite")
         c = np.diff(v, axis=0) / dt - self.gravity
         self._check(model.box.refuse_load(c))
         if model.in_space:
@@ -262,8 +264,10 @@ class StrainModel:
             outside: allow what the model was not trained on.
 
         Raises:
-            ModelError: materials outside the training box, of another density, or too many.
+            ModelError: dt is no positive number, or materials outside the training box, of another density, too many.
         """
+        if not (np.isfinite(dt) and dt > 0):
+            raise ModelError(f"dt = {dt:g} s must be a positive number")
         materials = self.materials if materials is None else materials
         if len(materials) != len(self.materials):
             raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")

@@ -262,6 +262,11 @@ def test_a_model_answers_inside_its_box_only() -> None:
     assert small.run(hand_of(1.0)).energy_drift < 1e-8
     with pytest.raises(ModelError, match="acceleration in degree of freedom 1"):
         small.run(hand_of(3.0))
+    for dt in (0.0, -0.01, np.nan):
+        with pytest.raises(ModelError, match="must be a positive number"):
+            model.at(dt)
+    with pytest.raises(ModelError, match="not finite"):
+        small.run((hand_of(1.0)[0], np.full_like(hand_of(1.0)[1], np.nan)))
     narrow = replace(model, box=replace(model.box, reach=model.box.reach * 1e-4))
     with pytest.raises(ModelError, match="times what the training runs reached"):
         narrow.at(0.01).run(hand_of(1.0))

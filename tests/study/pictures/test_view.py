@@ -52,6 +52,7 @@ def test_picture_shows_four_bodies(two_legs: Path, tmp_path: Path) -> None:
     if done.returncode < 0:
         pytest.skip("no OpenGL here, not even in memory")
     assert done.returncode == 0, done.stderr
+    assert str(picture) in done.stdout
     pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
     coloured = np.ptp(pixels, axis=2)[100:500] > 30  # without titles and colour bar
     quarters = [part.sum() for part in np.array_split(coloured, 4, axis=1)]
