@@ -26,7 +26,7 @@ from softgrasp.fem.solve.solvers import TissueSolver
 
 pytestmark = pytest.mark.ranks
 
-SCENES = Path(__file__).parents[2] / "demos" / "scenes"
+SCENES = Path(__file__).parents[3] / "demos" / "scenes"
 
 
 def small(comm: MPI.Intracomm, *overrides: str, scene: str = "paper_forward") -> Model:

@@ -22,7 +22,7 @@ from softgrasp.fem.run.simulate import Trajectory, simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
-from tests.fem.test_refined import fingerprint, l_scene
+from tests.fem.mesh.test_refined import fingerprint, l_scene
 from tests.helpers.models import CUBE, LAYERS, _k_lambda, _k_mu, _mass, held_by_paper, make_scene
 
 pytestmark = pytest.mark.ranks

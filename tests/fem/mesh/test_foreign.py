@@ -14,7 +14,7 @@ import softgrasp.fem.mesh.foreign
 from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh.file import read_mesh
 from softgrasp.fem.mesh.foreign import read_foreign
-from tests.fem.test_mesh import COMM, WIDE, grid, volume
+from tests.fem.mesh.test_mesh import COMM, WIDE, grid, volume
 
 pytestmark = pytest.mark.ranks
 

@@ -24,7 +24,7 @@ from softgrasp.fem.scene.tissue import Contact
 pytestmark = pytest.mark.ranks
 
 COMM = MPI.COMM_WORLD
-PILLOW = Path(__file__).parents[2] / "demos" / "scenes" / "meshes" / "pillow_small.msh"
+PILLOW = Path(__file__).parents[3] / "demos" / "scenes" / "meshes" / "pillow_small.msh"
 WIDE = 1e-12  # sums of a few hundred positive terms of order one: round-off is below 1e-13
 
 

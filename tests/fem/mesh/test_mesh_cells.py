@@ -24,7 +24,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.model.contact import cells_in, check_parts, contact_facets, held_check
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.tissue import Contact, Layer
-from tests.fem.test_mesh import COMM, WIDE, area, grid, volume, zone
+from tests.fem.mesh.test_mesh import COMM, WIDE, area, grid, volume, zone
 from tests.helpers.models import gather_matrix, node_order
 
 pytestmark = pytest.mark.ranks

@@ -18,7 +18,7 @@ from mpi4py import MPI
 from softgrasp.fem.fields.series import SeriesWriter
 from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import note_of
-from tests.fem.test_fields import EXACT, hand_of, make_model, turned
+from tests.fem.fields.test_fields import EXACT, hand_of, make_model, turned
 
 pytestmark = pytest.mark.ranks
 
