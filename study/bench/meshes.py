@@ -41,30 +41,22 @@ machine quiet."""
 
 @dataclass(frozen=True)
 class MeshRow:
-    """One mesh; times in seconds.
+    """One mesh; times in seconds."""
 
-    Attributes:
-        cells: of the short side.
-        n_e: tissue unknowns.
-        time_factor, time_full: factorisation and all steps of the full run.
-        time_offline: basis and projection.
-        time_setup, time_online: of the reduced model.
-        N: its dimension.
-        error, error_deformation: see :class:`softgrasp.study.reduce.result.Point`.
-        stable: of the reduced model.
-    """
-
-    cells: int
-    n_e: int
+    cells: int  # of the short side
+    n_e: int  # tissue unknowns
+    # time_factor, time_full: factorisation and all steps of the full run
     time_factor: float
     time_full: float
-    time_offline: float
+    time_offline: float  # basis and projection
+    # time_setup, time_online: of the reduced model
     time_setup: float
     time_online: float
-    N: int
+    N: int  # its dimension
+    # error, error_deformation: see softgrasp.study.reduce.result.Point
     error: float
     error_deformation: float
-    stable: bool
+    stable: bool  # of the reduced model
 
 
 def block(n_e: int, steps: int, method: str, N: int) -> Scene:

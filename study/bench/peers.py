@@ -22,7 +22,6 @@ class TextbookLoop:
     """S w = l - K z + s M v, z += 2 w, v = 2 s w - v in a bare Python loop: one solve, two products. Collective.
 
     Args:
-        system: operators.
         dt: step [s].
         solve: S w = r with S = K + s^2 M and s = 2/dt, as a function of r and w.
         loads: c_n, shape (steps, n_s).

@@ -61,16 +61,11 @@ def launch(spec: dict[str, Any], ranks: int) -> Row:
 
 @dataclass
 class Record:
-    """Rows as they come, in a file that outlives whatever goes wrong with the next one.
+    """Rows as they come, in a file that outlives whatever goes wrong with the next one."""
 
-    Attributes:
-        file: bench_riccati.json.
-        beta: Kelvin-Voigt time of all rows [s].
-        rows, peers: what is measured.
-    """
-
-    file: Path
-    beta: float
+    file: Path  # bench_riccati.json
+    beta: float  # Kelvin-Voigt time of all rows [s]
+    # rows, peers: what is measured
     rows: list[Row] = field(default_factory=list)
     peers: list[Row] = field(default_factory=list)
 
