@@ -80,7 +80,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
             self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
         if self.held.whole:
             points = whole_points(points, self.comm, self.held.enter(np.arange(system.layout.n_e)))
-        self.body, self.tol = Body(points, system.materials), points.tol
+        self.body, self.tol = Body(points, system.materials, None if self.held.whole else system.K_ee), points.tol
+        if not self.comm.allreduce(self.body.kernel is not None, MPI.LAND):
+            self.body.kernel = None  # ranks that hold all rows compute the same bits
         self.inertia, self.drag = (*self.held.parts, None)[:2]
         for part in self.held.parts:
             part.convert("aij")
