@@ -12,7 +12,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import driven_table
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction import online
-from softgrasp.reduction.certified.bounds import lengths, remainder
+from softgrasp.reduction.certified.bounds import lengths, nodal
 from softgrasp.reduction.certified.oscillators import Modes, SecondOrder, march
 from softgrasp.reduction.certified.residual import ResidualNorms
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
@@ -57,14 +57,12 @@ class Residual:
     """What the static bound takes of a run, see :func:`softgrasp.reduction.certified.bounds.static_bound`.
 
     Attributes:
-        static: T r in K^-1 at the middles, (w, steps).
-        first: the same at a start in equilibrium, (w,), or None.
+        nodes: T r^ in K^-1 at the steps, (w, steps + 1).
         rest: |r - mean r^|_{M^-1}, (steps,).
         inexact: drift (steps,), gap (steps + 1,) and start, where the kinematics are not exact.
     """
 
-    static: Array
-    first: Array | None
+    nodes: Array
     rest: Array
     inexact: tuple[Array, Array, float] | None = None
 
@@ -200,7 +198,7 @@ def modal_residual(
     """Residual of a run in modes: what the modes are not modes of, (K - omega^2 M) Phi X y + (G - M Phi X g) c.
 
     It uses b' + alpha b = -omega^2 y - g c of the reduced equations, y = eta + beta eta', so that it has k + n_s
-    coefficients a step instead of 2 k + n_s; the triangles are brought to that size once a parameter.
+    coefficients a step instead of 2 k + n_s; the triangle is brought to that size once a parameter.
 
     Args:
         norms: of the basis.
@@ -210,23 +208,14 @@ def modal_residual(
         c: (n_s, steps).
         c_0: at a start in equilibrium, (n_s,); else None.
     """
-    rows = np.vstack([c, (y[:, 1:] + y[:, :-1]) / 2])
-    first = None if c_0 is None else np.concatenate([c_0, y[:, 0]])
-    static, mass = (
-        _combined(norms, T, materials, m) * factor
-        for T, factor in (
-            (norms.static, norms.static_factor(materials)),
-            (norms.mass, norms.mass_factor(materials)),
-        )
-    )
-    rest = lengths(mass @ remainder(rows, first))
-    return Residual(static @ rows, None if first is None else static @ first, rest)
-
-
-def _combined(norms: ResidualNorms, T: Array, materials: Materials, m: Modes) -> Array:
-    G, M, K, _ = norms.columns(T, materials)
+    nodes, left = nodal(c, c_0)
+    G, M, K, _ = norms.columns(norms.static, materials)
     inertia = M @ m.X
-    return np.linalg.qr(np.hstack([G - inertia @ m.g, K @ m.X - inertia * m.omega**2]), mode="r")
+    columns = np.hstack([G - inertia @ m.g, K @ m.X - inertia * m.omega**2])
+    static = norms.static_factor(materials) * np.linalg.qr(columns, mode="r")
+    G, M, _, _ = norms.columns(norms.mass, materials)
+    mass = norms.mass_factor(materials) * np.linalg.qr(G - M @ (m.X @ m.g), mode="r")
+    return Residual(static @ np.vstack([nodes, y]), lengths(mass @ left))
 
 
 def stepped_motion(
@@ -265,17 +254,18 @@ def stepped_residual(
     exact = model.structure == "second_order"
     a, b = np.split(x, 2) if exact else (x, np.gradient(x, dt, axis=1))
     middle = (b[:, 1:] + b[:, :-1]) / 2
-    c = load_rows(model, run.v_s, dt, g)
-    rows = np.vstack([c, np.diff(b, axis=1) / dt + model.alpha * middle, (a[:, 1:] + a[:, :-1]) / 2, middle])
-    first = None
-    if drive.start == "equilibrium":
-        first = np.concatenate([-g, np.zeros(len(b)), a[:, 0], np.zeros(len(b))])
+    still = drive.start == "equilibrium"
+    rows = np.vstack([load_rows(model, run.v_s, dt, g), np.diff(b, axis=1) / dt + model.alpha * middle])
+    nodes, left = nodal(rows, np.concatenate([-g, np.zeros(len(b))]) if still else None)
+    nodes = np.vstack([nodes, a, b])
+    if still:
+        nodes[-len(b) :, 0] = 0.0
     static = norms.static_factor(materials) * np.linalg.qr(np.hstack(norms.columns(norms.static, materials)), mode="r")
-    mass = norms.mass_factor(materials) * np.hstack(norms.columns(norms.mass, materials))
+    M_1, factor = np.hstack(norms.columns(norms.mass, materials)[:2]), norms.mass_factor(materials)
+    mass = factor * M_1
     if model.two_way and drive.hand is None:
         G, root = hand_inertia(model, norms)
-        pulled = root.T @ G.T @ np.hstack(norms.columns(norms.mass, materials))
-        mass = np.vstack([mass, pulled * max(1.0, norms.mass_factor(materials))])
+        mass = np.vstack([mass, root.T @ G.T @ M_1 * max(1.0, factor)])
     inexact = None
     if not exact and norms.shape is not None:
         K, M = norms.shape
@@ -283,8 +273,7 @@ def stepped_residual(
         both = norms.inertia_factor(materials) * M
         gap, begin = lengths(both @ np.vstack([b, -x / scale])), lengths(both[:, : len(b)] @ b[:, :1])
         inexact = drift, gap, float(begin[0])
-    rest = lengths(np.linalg.qr(mass, mode="r") @ remainder(rows, first))
-    return Residual(static @ rows, None if first is None else static @ first, rest, inexact)
+    return Residual(static @ nodes, lengths(np.linalg.qr(mass, mode="r") @ left), inexact)
 
 
 def hand_inertia(model: ReducedModel, norms: ResidualNorms) -> tuple[Array, Array]:

@@ -66,14 +66,13 @@ class ResidualNorms:
     def columns(self, T: Array, materials: tuple[LayerMaterial, ...]) -> tuple[Array, Array, Array, Array]:
         """A triangle at a parameter: what multiplies c, (rows, n_s), b' + alpha b, a, and b by viscosity, (rows, k)."""
         layers, n_s, rows = len(materials), self.n_s, len(T)
-        weights = np.zeros((layers, 3, 3))
-        for i, m in enumerate(materials):
-            weights[i, :, 0] = m.rho, 0.0, 0.0
-            weights[i, :, 1] = 0.0, m.mu, m.lam
-            weights[i, :, 2] = 0.0, m.beta * m.mu, m.beta * m.lam
-        G = np.tensordot(T[:, : layers * n_s].reshape(rows, layers, n_s), weights[:, 0, 0], (1, 0))
-        parts = T[:, layers * n_s :].reshape(-1, 3 * layers) @ weights.reshape(3 * layers, 3)
-        M, K, D = np.moveaxis(parts.reshape(rows, -1, 3), 2, 0)
+        rho, mu, lam, beta = np.array([(m.rho, m.mu, m.lam, m.beta) for m in materials]).T
+        weights = np.zeros((3, layers, 3))  # of M_1, K_mu, K_lambda
+        weights[0, :, 0], weights[1, :, 1], weights[1, :, 2] = rho, mu, lam
+        weights[2] = beta[:, None] * weights[1]
+        G = np.tensordot(T[:, : layers * n_s].reshape(rows, layers, n_s), rho, (1, 0))
+        parts = T[:, layers * n_s :].reshape(rows, -1, 3 * layers).transpose(2, 0, 1).reshape(3 * layers, -1)
+        M, K, D = (weights.reshape(3, -1) @ parts).reshape(3, rows, -1)
         return G, M, K, D
 
     def static_factor(self, materials: tuple[LayerMaterial, ...]) -> float:

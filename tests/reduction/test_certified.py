@@ -287,7 +287,7 @@ def test_decay_of_a_damped_run(comm: MPI.Intracomm) -> None:
     error, size = error_to(system, full, certified, run)
     assert holds(run.certificate.energy.values, error, size)
     motion = certified._motions(4, [certified.fine.materials], certified.drive, np.zeros(2), True)[0].residual
-    plain = bounds.static_bound(motion.static, motion.rest, certified.drive.dt)
+    plain = bounds.static_bound(motion.nodes, motion.rest, certified.drive.dt)
     assert run.certificate.energy.values[-1] < 0.7 * plain[-1]
 
 
