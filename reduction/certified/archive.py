@@ -27,7 +27,7 @@ from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.residual import ResidualNorms
 from softgrasp.reduction.model import ModelError
 
-FORMAT = "softgrasp certified model 2"
+FORMAT = "softgrasp certified model 3"
 GROUP = "certificate"
 
 

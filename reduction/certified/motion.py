@@ -198,7 +198,7 @@ def modal_residual(
     """Residual of a run in modes: what the modes are not modes of, (K - omega^2 M) Phi X y + (G - M Phi X g) c.
 
     It uses b' + alpha b = -omega^2 y - g c of the reduced equations, y = eta + beta eta', so that it has k + n_s
-    coefficients a step instead of 2 k + n_s; the triangle is brought to that size once a parameter.
+    coefficients a step instead of 2 k + n_s; the triangles are brought to that size once a parameter.
 
     Args:
         norms: of the basis.
@@ -208,14 +208,16 @@ def modal_residual(
         c: (n_s, steps).
         c_0: at a start in equilibrium, (n_s,); else None.
     """
-    nodes, left = nodal(c, c_0)
-    G, M, K, _ = norms.columns(norms.static, materials)
-    inertia = M @ m.X
-    columns = np.hstack([G - inertia @ m.g, K @ m.X - inertia * m.omega**2])
-    static = norms.static_factor(materials) * np.linalg.qr(columns, mode="r")
-    G, M, _, _ = norms.columns(norms.mass, materials)
-    mass = norms.mass_factor(materials) * np.linalg.qr(G - M @ (m.X @ m.g), mode="r")
-    return Residual(static @ np.vstack([nodes, y]), lengths(mass @ left))
+    middles = np.vstack([c, 0.5 * (y[:, 1:] + y[:, :-1])])
+    nodes, left = nodal(middles, None if c_0 is None else np.concatenate([c_0, y[:, 0]]))
+    static, mass = (
+        factor * np.linalg.qr(np.hstack([G - M @ (m.X @ m.g), K @ m.X - (M @ m.X) * m.omega**2]), mode="r")
+        for (G, M, K, _), factor in (
+            (norms.columns(norms.static, materials), norms.static_factor(materials)),
+            (norms.columns(norms.mass, materials), norms.mass_factor(materials)),
+        )
+    )
+    return Residual(static @ nodes, lengths(mass @ left))
 
 
 def stepped_motion(
@@ -254,18 +256,18 @@ def stepped_residual(
     exact = model.structure == "second_order"
     a, b = np.split(x, 2) if exact else (x, np.gradient(x, dt, axis=1))
     middle = (b[:, 1:] + b[:, :-1]) / 2
-    still = drive.start == "equilibrium"
-    rows = np.vstack([load_rows(model, run.v_s, dt, g), np.diff(b, axis=1) / dt + model.alpha * middle])
-    nodes, left = nodal(rows, np.concatenate([-g, np.zeros(len(b))]) if still else None)
-    nodes = np.vstack([nodes, a, b])
-    if still:
-        nodes[-len(b) :, 0] = 0.0
+    c = load_rows(model, run.v_s, dt, g)
+    rows = np.vstack([c, np.diff(b, axis=1) / dt + model.alpha * middle, (a[:, 1:] + a[:, :-1]) / 2, middle])
+    first = None
+    if drive.start == "equilibrium":
+        first = np.concatenate([-g, np.zeros(len(b)), a[:, 0], np.zeros(len(b))])
+    nodes, left = nodal(rows, first)
     static = norms.static_factor(materials) * np.linalg.qr(np.hstack(norms.columns(norms.static, materials)), mode="r")
-    M_1, factor = np.hstack(norms.columns(norms.mass, materials)[:2]), norms.mass_factor(materials)
-    mass = factor * M_1
+    mass = norms.mass_factor(materials) * np.hstack(norms.columns(norms.mass, materials))
     if model.two_way and drive.hand is None:
         G, root = hand_inertia(model, norms)
-        mass = np.vstack([mass, root.T @ G.T @ M_1 * max(1.0, factor)])
+        pulled = root.T @ G.T @ np.hstack(norms.columns(norms.mass, materials))
+        mass = np.vstack([mass, pulled * max(1.0, norms.mass_factor(materials))])
     inexact = None
     if not exact and norms.shape is not None:
         K, M = norms.shape
