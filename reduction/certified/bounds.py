@@ -6,8 +6,8 @@ forces K^-1 (r^+ - r^) / dt and r - mean r^: in the energy norm |e|^2 = e_z'K e_
     |e'_0| = |r^_0|_{K^-1},   |e'_+| <= |e'| + dt sqrt(|(r^+ - r^) / dt|_{K^-1}^2 + |r - mean r^|_{M^-1}^2),
     |e| <= |e'| + |r^|_{K^-1}.
 
-Here r^ is the mean of its neighbours, which takes the ringing of steps out of it. Damping only helps. The textbook bound
-|e| <= dt sum |r|_{M^-1} charges what the basis lacks at every step anew.
+Here r^ is the mean of its neighbours, which takes the ringing of steps out of it. Damping only helps. The textbook
+bound |e| <= dt sum |r|_{M^-1} charges what the basis lacks at every step anew.
 """
 
 from __future__ import annotations
