@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,42 +19,37 @@ from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive, Materials, modal_motions
 from softgrasp.reduction.certified.oscillators import SecondOrder
 from softgrasp.reduction.certified.trainer import Trainer, build_certified
-from softgrasp.study.bench.driver import Goal, goal_rows, list_bench, open_console, parse_list, show_goals, write_bench
-from softgrasp.study.report.tables import Table
+from softgrasp.study.bench.driver import (
+    Goal,
+    Row,
+    goal_rows,
+    list_bench,
+    open_console,
+    parse_numbers,
+    show_goals,
+    table_of,
+    write_bench,
+)
 from softgrasp.study.shell.timing import interleave, medians
 
 K, K2 = 16, 48  # modes of the answer, and of the basis that certifies it
 BOX = ((30.0, 500.0), (20.0, 500.0))  # lambda and mu [Pa]
 SHARE = 0.3  # of an answer that its proof may cost
 OF_FULL = {15: 1 / 3, 60: 1 / 50}  # of a full run that an answer may cost, by cells of the short side
-FULL = "full run with its factor"
-HEADER = ("cells", "answer", "CPU ms", "without the proof", "share of the proof", "of a full run")
+FULL, STEP = "full run with its factor", ", with the time step's error"
+COLUMNS = {
+    "cells": "cells",
+    "answer": "answer",
+    "CPU ms": "ms 3",
+    "without the proof": "plain 3",
+    "share of the proof": "share .0%",
+    "of a full run": "of_full 3",
+}
 HELP = f"""Certified answers of the paper's scene with Kelvin-Voigt damping, {K} modes certified by {K2}.
 
 Each repeat draws a new material, for which every answer and the full run are made from the start, in turn; medians of
 CPU time on one rank. The proof's share is that of an answer less the same answer without it: with two bases the
 estimate alone, with one basis the reduced run alone. A fast look: --cells 15."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One kind of answer: median CPU seconds, the same without its proof, and of the full run."""
-
-    cells: int
-    answer: str
-    seconds: float
-    plain: float
-    full: float
-
-    @property
-    def share(self) -> float:
-        """Of the proof in the answer."""
-        return 1 - self.plain / self.seconds
-
-    @property
-    def of_full(self) -> float:
-        """Answer over full run."""
-        return self.seconds / self.full
 
 
 def trained(nx: int) -> tuple[Model, CertifiedModel]:
@@ -90,7 +85,7 @@ def measure(nx: int, repeats: int) -> Iterator[Row]:
     assert two.drive is not None
     step, short = two.drive, replace(two.drive, finer=None)
     answers: dict[str, tuple[Callable[[Materials], Any], Callable[[Materials], Any]]] = {}
-    for drive, what in ((step, ", with the time step's error"), (short, "")):
+    for drive, what in ((step, STEP), (short, "")):
         answers[f"{K} + {K2}{what}"] = (
             lambda m, drive=drive: two.run(m, drive, allow=True),  # type: ignore[misc]
             lambda m, drive=drive: estimate.run(m, drive, allow=True),  # type: ignore[misc]
@@ -118,19 +113,24 @@ def measure(nx: int, repeats: int) -> Iterator[Row]:
     for call in calls.values():
         call()
     found = medians(interleave(calls, repeats))
+    full = found[FULL]
+    yield {"cells": nx, "answer": FULL, "ms": 1e3 * full}
     for name in answers:
-        yield Row(nx, name, found[name], found[f"{name} plain"], found[FULL])
+        proved, less = found[name], found[f"{name} plain"]
+        about = {"ms": 1e3 * proved, "plain": 1e3 * less, "share": 1 - less / proved, "of_full": proved / full}
+        yield {"cells": nx, "answer": name, **about}
 
 
 def goals_of(rows: list[Row]) -> list[Goal]:
-    """What was asked for."""
-    shares = [Goal(f"nx = {r.cells}, {r.answer}: share of the proof", r.share, SHARE) for r in rows]
-    first = {r.cells: r for r in reversed(rows)}  # with all three numbers
-    return shares + [
-        Goal(f"nx = {nx}, {r.answer}: of a full run", r.of_full, OF_FULL[nx])
-        for nx, r in first.items()
-        if nx in OF_FULL
-    ]
+    """What was asked for: of every answer, and of those with all three numbers."""
+    goals = []
+    for r in rows:
+        name = f"nx = {r['cells']}, {r['answer']}"
+        if "share" in r:
+            goals.append(Goal(f"{name}: share of the proof", r["share"], SHARE))
+        if r["answer"] == f"{K} + {K2}{STEP}" and r["cells"] in OF_FULL:
+            goals.append(Goal(f"{name}: of a full run", r["of_full"], OF_FULL[r["cells"]]))
+    return goals
 
 
 def main(
@@ -139,32 +139,15 @@ def main(
     out: Annotated[Path, typer.Option(help="folder for bench_certified.json and bench_certified.csv")] = Path("out"),
 ) -> None:
     """See HELP."""
-    sizes = [int(n) for n in parse_list(cells, r"([1-9]\d*)", "number of cells; write 15,60")]
+    sizes = parse_numbers(cells, r"([1-9]\d*)", "number of cells; write 15,60")
     console = open_console(130)
     rows: list[Row] = []
     for nx in sizes:
         with console.status(f"{nx} x {2 * nx} cells"):
             rows += measure(nx, repeats)
-    full = [(r.cells, FULL, f"{1e3 * r.full:.3g}", "", "", "") for r in {r.cells: r for r in rows}.values()]
-    lines = [
-        (
-            r.cells,
-            r.answer,
-            f"{1e3 * r.seconds:.3g}",
-            f"{1e3 * r.plain:.3g}",
-            f"{r.share:.0%}",
-            f"1/{1 / r.of_full:.3g}",
-        )
-        for r in rows
-    ]
-    table = Table(HEADER, [*full, *lines], f"certified answers, median CPU time of {repeats} new materials")
+    table = table_of(rows, COLUMNS, f"certified answers, median CPU time of {repeats} new materials")
     console.print(table.terminal())
     goals = goals_of(rows)
     show_goals(console, goals)
-    list_bench(
-        console,
-        write_bench(
-            out, "bench_certified", {"command": "bench_certified", "repeats": repeats, "goals": goal_rows(goals)}, table
-        ),
-        False,
-    )
+    content = {"command": "bench_certified", "repeats": repeats, "rows": rows, "goals": goal_rows(goals)}
+    list_bench(console, write_bench(out, "bench_certified", content, table), False)

@@ -166,6 +166,7 @@ def test_random_parameters_above_the_grid_are_trained_too(comm: MPI.Intracomm) -
     one: dict[str, Any] = {"reduction": {**BOX["reduction"], "grid": 1, "certify": "proof"}}
     _, trainer, certified = trained(comm, 0.3, one)
     count = len(certified.training["added"])
+    assert certified.training["reason"] == "tolerance"
     assert 0 < count < ADDED
     assert len(trainer.points) == 1 + count
     assert certified.training["proved"] <= 0.3

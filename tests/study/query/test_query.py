@@ -272,7 +272,7 @@ def test_files_that_make_no_sense(file: Path, tmp_path: Path) -> None:
     alone.write_bytes(file.read_bytes())
     with pytest.raises(SceneError, match=r"no scene\.toml"):
         ask(alone, tolerance=1e-9, fallback="full")
-    with pytest.raises(SoftgraspError, match="another mesh"):
+    with pytest.raises(SoftgraspError, match="belongs to a mesh of"):
         ask(file, tolerance=1e-9, fallback="full", scene=SCENES / "paper_forward.toml")
 
 
