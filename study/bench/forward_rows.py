@@ -206,8 +206,6 @@ def measure(
     """One row of the table. Collective.
 
     Args:
-        comm: ranks.
-        dimension: 2 or 3.
         size: about so many tissue unknowns.
         repeats: how often each number is taken.
         repeat_seconds: aimed length of one repeat [s].

@@ -43,7 +43,6 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     """Parts of the page.
 
     Args:
-        study: what was found.
         seconds: of the stages.
         drawn: picture files.
     """

@@ -25,15 +25,10 @@ Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a 
 
 @dataclass(frozen=True)
 class Shown:
-    """Where a run takes its outputs, angles of the hand left out.
+    """Where a run takes its outputs, angles of the hand left out."""
 
-    Attributes:
-        places: displacements, (steps + 1, outputs, d) [m].
-        rigid: their share of the hand's rigid motion [m].
-    """
-
-    places: Array
-    rigid: Array
+    places: Array  # displacements, (steps + 1, outputs, d) [m]
+    rigid: Array  # their share of the hand's rigid motion [m]
 
 
 def shown(model: Model, run: Trajectory) -> Shown:
@@ -85,7 +80,6 @@ class Experiments:
     the force that would make that motion.
 
     Args:
-        scene: the scene.
         scales: what trial values rest on.
         models: already built, by the set of effects that are on; the scene's own among them.
     """
@@ -114,11 +108,7 @@ class Experiments:
         return build(scene, comm=self.comm)
 
     def of(self, on: Names, forced: bool = False) -> Shown:
-        """Outputs with exactly these effects on. Collective.
-
-        Raises:
-            SolverError: a solve failed.
-        """
+        """Outputs with exactly these effects on. Collective. Raises SolverError: a solve failed."""
         if (on, forced) not in self.runs:
             model = self.model(on)
             self.runs[on, forced] = shown(model, simulate(model, RunOptions(), self.force if forced else None))
@@ -150,15 +140,10 @@ class Experiments:
 
 @dataclass(frozen=True)
 class Together:
-    """All effects judged again.
+    """All effects judged again."""
 
-    Attributes:
-        on: effects that are advised, those that cannot be tried as they are.
-        company: of each effect that was tried.
-    """
-
-    on: tuple[str, ...]
-    company: dict[str, Company]
+    on: tuple[str, ...]  # effects that are advised, those that cannot be tried as they are
+    company: dict[str, Company]  # of each effect that was tried
 
 
 Joined = dict[str, tuple[tuple[str, ...], bool, float, bool]]

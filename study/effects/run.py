@@ -39,7 +39,6 @@ def study_effects(
 
     Args:
         scene: the scene; tolerance and repeats are those of its section study.
-        comm: ranks.
         progress: called with steps of work done and in all.
 
     Raises:

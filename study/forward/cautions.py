@@ -92,8 +92,6 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     that of :func:`slowest`, which needs snapshots in memory.
 
     Args:
-        model: the model.
-        run: its run.
         most: time [s] and local rows (n_local,) [m] of a large displacement that was seen on the way.
     """
     scene, system, d = model.scene, model.system, model.space.mesh.dimension

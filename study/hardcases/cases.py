@@ -26,19 +26,12 @@ LENGTH = 400  # characters of a message that are kept
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one way: a number, or the sentence with which it ended.
+    """Result of one way: a number, or the sentence with which it ended."""
 
-    Attributes:
-        value: the measured number; None when there is none.
-        text: the refusal or failure in words, or a remark on the number.
-        refused: it ended by one of our own errors.
-        error: name of the exception that ended the textbook way.
-    """
-
-    value: float | None
-    text: str = ""
-    refused: bool = False
-    error: str = ""
+    value: float | None  # the measured number; None when there is none
+    text: str = ""  # the refusal or failure in words, or a remark on the number
+    refused: bool = False  # it ended by one of our own errors
+    error: str = ""  # name of the exception that ended the textbook way
 
     def __str__(self) -> str:
         """Number and remark as a table shows them."""
@@ -48,26 +41,17 @@ class Outcome:
 
 @dataclass(frozen=True)
 class HardCase:
-    """One case.
+    """One case."""
 
-    Attributes:
-        case: what is special, in words.
-        x: the varied number, the position in the picture.
-        here, textbook: what softgrasp and the textbook way gave.
-        bound: the number from here must not exceed it; None when the case has to be refused.
-        reason: where the bound comes from.
-        may_refuse: a refusal is as good as a number within the bound.
-        group: curve of the picture it belongs to.
-    """
-
-    case: str
-    x: float
+    case: str  # what is special, in words
+    x: float  # the varied number, the position in the picture
+    # here, textbook: what softgrasp and the textbook way gave
     here: Outcome
     textbook: Outcome
-    bound: float | None
-    reason: str
-    may_refuse: bool = False
-    group: str = ""
+    bound: float | None  # the number from here must not exceed it; None when the case has to be refused
+    reason: str  # where the bound comes from
+    may_refuse: bool = False  # a refusal is as good as a number within the bound
+    group: str = ""  # curve of the picture it belongs to
 
     @property
     def verdict(self) -> Verdict:
@@ -118,26 +102,16 @@ class HardCase:
 
 @dataclass(frozen=True)
 class Family:
-    """Cases that vary one thing.
+    """Cases that vary one thing."""
 
-    Attributes:
-        name: short name, as `--family` takes it.
-        title: what is hard, in words.
-        varied: label of the varied number with its unit.
-        quantity: label of the measured number with its unit.
-        textbook: the textbook way in a few words.
-        lesson: what the comparison shows, one or two sentences.
-        cases: runs them; True for the quick half.
-        axis: of the varied number in the picture: a logarithm, linear, or the cases one below the other.
-    """
-
-    name: str
-    title: str
-    varied: str
-    quantity: str
-    textbook: str
-    lesson: str
-    cases: Callable[[bool], Iterable[HardCase]]
+    name: str  # short name, as `--family` takes it
+    title: str  # what is hard, in words
+    varied: str  # label of the varied number with its unit
+    quantity: str  # label of the measured number with its unit
+    textbook: str  # the textbook way in a few words
+    lesson: str  # what the comparison shows, one or two sentences
+    cases: Callable[[bool], Iterable[HardCase]]  # runs them; True for the quick half
+    # of the varied number in the picture: a logarithm, linear, or the cases one below the other
     axis: Literal["log", "linear", "listed"] = "log"
 
 

@@ -23,11 +23,7 @@ FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for fam
 
 
 def choose(family: str | None) -> list[Family]:
-    """The families to run.
-
-    Raises:
-        SoftgraspError: there is no family of this name.
-    """
+    """The families to run. Raises SoftgraspError: there is no family of this name."""
     if family is None:
         return list(FAMILIES.values())
     if family not in FAMILIES:
