@@ -162,11 +162,7 @@ def draw(path: Path, rows: Sequence[MeshRow], trends: dict[str, Any]) -> tuple[P
 def run_mesh_study(
     sizes: Sequence[int], steps: int, method: str, N: int, out: Path, console: Console, comm: MPI.Intracomm
 ) -> dict[str, Any]:
-    """Measure all meshes and write mesh_study.json, mesh_study.png and .pdf. Collective.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Measure all meshes and write mesh_study.json, mesh_study.png and .pdf. Collective."""
     find_method(method)
     rows = []
     for size in sizes:
