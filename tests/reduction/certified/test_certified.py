@@ -17,6 +17,8 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction import online
+from softgrasp.reduction.bases.registry import make_basis
+from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.certified import bounds
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.certificate import Bound, ToleranceError
@@ -28,8 +30,6 @@ from softgrasp.reduction.certified.training import certified_any, certified_mode
 from softgrasp.reduction.files import seal
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.reduce import project_scene
-from softgrasp.reduction.registry import make_basis
-from softgrasp.reduction.states import states_of
 from tests.helpers.certified import (
     EQUILIBRIUM,
     KELVIN_VOIGT,

@@ -26,7 +26,7 @@ from softgrasp.reduction.certified.training import certified_model, scene_drive
 from tests.helpers.certified import error_to, full_at
 from tests.helpers.models import Array, close
 
-PAPER = Path(__file__).parents[2] / "demos" / "scenes" / "paper_forward.toml"
+PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
 BOX = ["reduction.lambda_range=[30.0,500.0]", "reduction.mu_range=[20.0,500.0]"]
 KV = ["effects.damping.kind='kelvin-voigt'", "effects.damping.beta=0.002"]
 ROUNDING = 1e-9  # of the solution
