@@ -129,11 +129,7 @@ class ControlStudy:
 
 
 def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, Any]:
-    """The keys of ``result.json``. Collective.
-
-    Args:
-        seconds: of the stages.
-    """
+    """The keys of ``result.json``. Collective."""
     return gain_result(study.design, study.controller, study.tick, study.notes, seconds) | {
         "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
         "refused": {b.name: b.refused for b in study.bases if b.refused},

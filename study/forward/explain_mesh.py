@@ -39,11 +39,7 @@ class MeshReport:
 
 
 def mesh_report(model: Model) -> MeshReport:
-    """Look for singular ends and estimate the error. Collective.
-
-    Raises:
-        MeshError: the mesh file changed since the model was built.
-    """
+    """Look for singular ends and estimate the error. Collective."""
     comm, scene, tissue = model.system.layout.comm, model.scene, model.space.mesh
     refine = scene.tissue.refine
     small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE
