@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.strain.arrays import double_dot
+from softgrasp.fem.strain.arrays import double_dot, volume_change
 from softgrasp.fem.strain.force import Kernel, compiled
 from softgrasp.fem.strain.laws import Start, green, stretches
 from softgrasp.fem.strain.points import Points
@@ -26,9 +26,7 @@ class Body:
         rounding: what rounding in the stress mu F leaves of a force [N], in the norm of all rows.
     """
 
-    def __init__(
-        self, points: Points, materials: tuple[LayerMaterial, ...], pattern: PETSc.Mat | None = None
-    ) -> None:
+    def __init__(self, points: Points, materials: tuple[LayerMaterial, ...], pattern: PETSc.Mat | None = None) -> None:
         self.points, self.law = points, points.laws
         self.lam, self.mu = points.lame(materials)
         d, Q = points.d, len(points.vol)
@@ -65,6 +63,10 @@ class Body:
     def force(self, z: PETSc.Vec, f: PETSc.Vec) -> None:
         """F = B' (vol P(B z)) [N]. Collective."""
         self._collect(self.law.stress(self.gradient(z), self.lam, self.mu), f)
+
+    def sound(self, z: PETSc.Vec) -> bool:
+        """Whether the law has a tangent at z in the points of this rank. Collective."""
+        return not self.law.barrier or bool(volume_change(self.gradient(z)).min(initial=0.0) > -1)
 
     def start(self, z: PETSc.Vec) -> Start:
         """The law at the start of a step; valid until the next call. Collective."""

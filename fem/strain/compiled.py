@@ -32,8 +32,8 @@ def library(source: Path, declaration: str, otherwise: str) -> Any:
     except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
         reason = (str(getattr(error, "stderr", "") or "") or str(error)).strip().splitlines()[:1]
         warnings.warn(
-            f"{otherwise}, for want of compiled code ({''.join(reason)}); install cffi and a C compiler, or name one in "
-            "CC",
+            f"{otherwise}, for want of compiled code ({''.join(reason)}); install cffi and a C compiler, or name one "
+            "in CC",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -16,9 +16,9 @@ LANES = 8  # points that `law.h` takes at a time
 DECLARATION = """
 void softgrasp_start(int d, int k, int p, const int *node, const double *G, const double *z, double *H0, double *j0,
                      double *l0);
-int softgrasp_force(int law, int d, int k, int p, const int *node, const double *G, const double *vol, const double *lam,
-                    const double *mu, const double *H0, const double *j0, const double *l0, const double *w, int n,
-                    double *f, double *J);"""
+int softgrasp_force(int law, int d, int k, int p, const int *node, const double *G, const double *vol,
+                    const double *lam, const double *mu, const double *H0, const double *j0, const double *l0,
+                    const double *w, int n, double *f, double *J);"""
 
 
 def compiled() -> Any:

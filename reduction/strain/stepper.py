@@ -5,7 +5,8 @@
 
 solved by Broyden's method [Broyden65] on a k x k inverse, with the discrete gradient f_alg, 2 w' f_alg =
 W_r(a_{n+1}) - W_r(a_n), so that |v|^2 / 2 + W_r changes by the work 2 w'l less the loss 2 s w'D w, to the tolerance of
-the solve. `stepper.c` takes whole runs; without a compiler NumPy takes the same steps, about thirty times slower, and says so.
+the solve. `stepper.c` takes whole runs; without a compiler NumPy takes the same steps, about thirty times slower, and
+says so.
 """
 
 from __future__ import annotations
