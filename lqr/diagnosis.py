@@ -28,17 +28,11 @@ Kind = Literal["error", "warning"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about the control problem; an error means that no solver should be started.
+    """One sentence about the control problem; an error means that no solver should be started."""
 
-    Attributes:
-        kind: error or warning.
-        topic: weights, data, outputs, inputs, damping.
-        sentence: what is wrong and what would be right.
-    """
-
-    kind: Kind
-    topic: str
-    sentence: str
+    kind: Kind  # error or warning
+    topic: str  # weights, data, outputs, inputs, damping
+    sentence: str  # what is wrong and what would be right
 
 
 @dataclass(frozen=True)
@@ -81,7 +75,6 @@ def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
     """Check weights and data, outputs and inputs, and the damping of the closed loop. Collective.
 
     Args:
-        problem: the plant.
         modes: lowest modes to look at.
     """
     unusable = _data(problem)

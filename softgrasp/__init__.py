@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from softgrasp.reduction.reduce import reduce as reduce
     from softgrasp.reduction.replay import errors as errors
     from softgrasp.reduction.replay import replay as replay
-    from softgrasp.reduction.strain.archive import load_strain as load_strain
     from softgrasp.reduction.strain.training import errors_strain as errors_strain
     from softgrasp.reduction.strain.training import reduce_strain as reduce_strain
     from softgrasp.reduction.strain.training import replay_strain as replay_strain
@@ -62,7 +61,6 @@ _FACE = {
     "errors_strain": "reduction.strain.training",
     "save": "reduction.archive",
     "load": "reduction.archive",
-    "load_strain": "reduction.strain.archive",
     "problem": "lqr.design",
     "design": "lqr.design",
     "solve": "lqr.riccati",
@@ -75,7 +73,7 @@ _FACE = {
 
 __all__ = [
     "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors",
-    "errors_strain", "load", "load_scene", "load_strain", "make_controller", "problem", "reduce", "reduce_strain",
+    "errors_strain", "load", "load_scene", "make_controller", "problem", "reduce", "reduce_strain",
     "replay", "replay_strain", "save", "shipped_scenes", "simulate", "solve",
 ]  # fmt: skip
 

@@ -21,27 +21,16 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class PictureMesh:
-    """The whole body in arrays.
+    """The whole body in arrays."""
 
-    Attributes:
-        points: vertices [m], shape (n, d).
-        cells: vertices of the cells, shape (m, d + 1).
-        facets: vertices of the boundary facets, shape (k, d), the body to their left or below.
-        contact: vertices of those that the hand holds, shape (c, d).
-        layers: number of the layer of each cell, shape (m,).
-        names: names of the layers.
-        reference: point the hand turns about [m], shape (d,).
-        n_s: hand degrees of freedom.
-    """
-
-    points: Array
-    cells: Integers
-    facets: Integers
-    contact: Integers
-    layers: Integers
+    points: Array  # vertices [m], shape (n, d)
+    cells: Integers  # vertices of the cells, shape (m, d + 1)
+    facets: Integers  # vertices of the boundary facets, shape (k, d), the body to their left or below
+    contact: Integers  # vertices of those that the hand holds, shape (c, d)
+    layers: Integers  # number of the layer of each cell, shape (m,)
     names: tuple[str, ...]
-    reference: Array
-    n_s: int
+    reference: Array  # point the hand turns about [m], shape (d,)
+    n_s: int  # hand degrees of freedom
 
     @property
     def dimension(self) -> int:
@@ -89,7 +78,6 @@ def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
     Collective.
 
     Args:
-        model: the model.
         z: relative displacement on the owned free dofs [m], shape (n_local,), or (n_local, k) for k instants.
         q_s: hand [m, rad], shape (n_s,) or (n_s, k).
 

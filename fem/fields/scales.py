@@ -19,7 +19,6 @@ def measure(model: Model, omega: Array, Phi: Array, a: Array) -> Problem:
     """Length, masses, damping ratios, sag and static response of a model. Collective.
 
     Args:
-        model: the model.
         omega: lowest angular frequencies [1/s], (k,), may be empty.
         Phi: their M-orthonormal modes, local rows (n_local, k).
         a: largest acceleration of the hand, (n_s,).

@@ -31,24 +31,14 @@ class Inventory:
 
 @dataclass(frozen=True)
 class Discretisation:
-    """Function space and the split of its nodes into contact and free ones.
-
-    Attributes:
-        mesh: the tissue mesh.
-        V: displacement space (Lagrange P1 or P2, blocked).
-        contact: owned local node indices that follow the hand.
-        free: owned local node indices of the tissue unknowns.
-        is_e: PETSc index set of the free dofs (blocked).
-        R: rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s).
-        layout: sizes and ownership.
-    """
+    """Function space and the split of its nodes into contact and free ones."""
 
     mesh: TissueMesh
-    V: Any
-    contact: np.ndarray
-    free: np.ndarray
-    is_e: PETSc.IS
-    R: Array
+    V: Any  # displacement space (Lagrange P1 or P2, blocked)
+    contact: np.ndarray  # owned local node indices that follow the hand
+    free: np.ndarray  # owned local node indices of the tissue unknowns
+    is_e: PETSc.IS  # PETSc index set of the free dofs (blocked)
+    R: Array  # rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s)
     layout: BlockLayout
 
 

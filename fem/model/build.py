@@ -151,7 +151,6 @@ def build(
     Args:
         scene: a scene, the path of its file, or the name of one that ships.
         overrides: "section.key=value" each, as after ``--set``; for a file or a name.
-        comm: ranks.
         mesh: on which; None makes that of the scene.
         run: its steps will be taken, so their tables must fit too.
 

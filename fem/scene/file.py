@@ -97,11 +97,7 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
 
 
 def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequence[str] = ()) -> Scene:
-    """`load_scene` on rank 0, broadcast to all. Collective.
-
-    Raises:
-        SceneError: on every rank, as rank 0 met it.
-    """
+    """`load_scene` on rank 0, broadcast to all. Collective. Raises SceneError: on every rank, as rank 0 met it."""
     result: Scene | Exception | None = None
     if comm.rank == 0:
         try:

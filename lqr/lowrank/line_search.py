@@ -18,7 +18,6 @@ def best_step(comm: MPI.Intracomm, old: tuple[Block, Array], W: Block, change: B
     Residual of X_j + t (X_new - X_j), exactly. Collective.
 
     Args:
-        comm: ranks.
         old: (U, signs) with R_j = U diag(signs) U'.
         W: residual factor of the Lyapunov equation.
         change: dK' = K_new' - K_j'.

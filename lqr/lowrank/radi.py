@@ -25,17 +25,11 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 @dataclass
 class RadiState:
-    """W with Res(X_k) = W W', K_k' and Z.
+    """W with Res(X_k) = W W', K_k' and Z."""
 
-    Attributes:
-        both: [K', W], (B'X_k E)' and the residual factor with p columns.
-        Z: X_k = Z Z'.
-        solves: tissue solves done.
-    """
-
-    both: Right
-    Z: Columns
-    solves: int = 0
+    both: Right  # [K', W], (B'X_k E)' and the residual factor with p columns
+    Z: Columns  # X_k = Z Z'
+    solves: int = 0  # tissue solves done
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
 

@@ -30,8 +30,6 @@ def optimal_cost(problem: RiccatiProblem, solution: RiccatiSolution, displacemen
     """Cost x' E'XE x for the whole body at rest, displaced by hand coordinates from its target.
 
     Args:
-        problem: sizes.
-        solution: the Riccati solution.
         displacement: start minus target of the hand [m, rad], (n_s,).
     """
     return float(np.sum((solution.factor.hand[: problem.layout.n_s].T @ displacement) ** 2))

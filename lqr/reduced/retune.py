@@ -26,17 +26,11 @@ Materials = tuple[LayerMaterial, ...]
 
 @dataclass(frozen=True)
 class Tuned:
-    """Gain for one setting of the materials.
+    """Gain for one setting of the materials."""
 
-    Attributes:
-        P_N: (N, N), in the retuner's scaled basis.
-        K_N: gain on reduced states, u = K_N x_N, (n_s, N).
-        seconds: to combine the components and solve the equation.
-    """
-
-    P_N: Array
-    K_N: Array
-    seconds: float
+    P_N: Array  # (N, N), in the retuner's scaled basis
+    K_N: Array  # gain on reduced states, u = K_N x_N, (n_s, N)
+    seconds: float  # to combine the components and solve the equation
 
 
 class Retuner:

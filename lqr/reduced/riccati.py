@@ -25,19 +25,12 @@ from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radiu
 
 @dataclass(frozen=True)
 class ReducedRiccati:
-    """P_hat = V P_N V' and its gain.
+    """P_hat = V P_N V' and its gain."""
 
-    Attributes:
-        basis: the basis, scaled to energy.
-        matrices: E_N, A_N, B_N, C_N with the weights.
-        P_N: (N, N).
-        gain: K_hat on the full plant.
-    """
-
-    basis: RiccatiBasis
-    matrices: ReducedMatrices
-    P_N: Array
-    gain: Gain
+    basis: RiccatiBasis  # the basis, scaled to energy
+    matrices: ReducedMatrices  # E_N, A_N, B_N, C_N with the weights
+    P_N: Array  # (N, N)
+    gain: Gain  # K_hat on the full plant
 
 
 @dataclass(frozen=True)
@@ -144,7 +137,6 @@ class GainJudge:
     """Compares reduced gains with the optimal one on the full plant.
 
     Args:
-        problem: the plant.
         solution: the Riccati solution of the full plant.
         start: start minus target of hand and tissue, hand-relative, one column.
         loop: the full closed loop; made here when None.

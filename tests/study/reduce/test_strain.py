@@ -35,7 +35,7 @@ def test_numbers_are_those_of_the_saved_models(out: Path) -> None:
         family = result["finite_strain"][key]
         assert family["runs"] == runs
         assert [p["N"] for p in family["points"]] == [8, 14]
-        rom = sg.load_strain(out / "models" / f"{key}_N14.h5", model.system.layout)
+        rom = sg.load(out / "models" / f"{key}_N14.h5", model.system.layout)
         held = family["held_out"]
         for test in held[:1] + held[-1:]:
             full = run_at(moved_to(model, test["target"]), test["lam"], test["mu"])

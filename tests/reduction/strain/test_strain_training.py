@@ -15,14 +15,13 @@ from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.strain.body import Body
-from softgrasp.reduction.archive import save
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.archive import load, save
+from softgrasp.reduction.bases.basis import ReductionError
+from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import moved_to, run_at
 from softgrasp.reduction.reduce import reduce
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import BasisError
-from softgrasp.reduction.strain.archive import load_strain
 from softgrasp.reduction.strain.cells import Potential
 from softgrasp.reduction.strain.training import Training, errors_strain, reduce_strain, replay_strain, train
 
@@ -163,11 +162,11 @@ def test_a_file_brings_the_lift_back_on_any_rank_count(trained: Training, tmp_pa
     path = Path(comm.bcast(str(tmp_path))) / "rom.h5"
     rom = trained.reduce(14)
     save(rom, path)
-    read = load_strain(path, trained.model.system.layout, rom.scene_hash)
+    read = load(path, trained.model.system.layout, rom.scene_hash)
     assert rom.Phi is not None
     assert read.Phi is not None
     np.testing.assert_array_equal(read.Phi, rom.Phi)
-    online = load_strain(path)
+    online = load(path)
     with pytest.raises(ModelError, match="no lift"):
         online.displacement(np.zeros((1, 5)))
 
