@@ -6,15 +6,15 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.reduction.basis import Basis, ReductionError
-from softgrasp.reduction.engines import EngineName
-from softgrasp.reduction.inner import InnerName
+from softgrasp.reduction.bases.basis import Basis, ReductionError
+from softgrasp.reduction.bases.engines import EngineName
+from softgrasp.reduction.bases.inner import InnerName
+from softgrasp.reduction.bases.registry import make_basis
+from softgrasp.reduction.bases.states import States
+from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import make_basis
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import States
-from softgrasp.reduction.truncation import Truncation
 
 
 def reduce(
@@ -44,10 +44,10 @@ def reduce(
         run: a run of it with the snapshots in memory.
         method: "global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed",
             "psd_cotangent_lift", "psd_svd_like" and their "_fixed" and "_relative" forms, or "craig_bampton"; all keys
-            in :data:`softgrasp.reduction.registry.METHODS`. "psd_fixed" is the paper's PSD with fixed solid modes
+            in :data:`softgrasp.reduction.bases.registry.METHODS`. "psd_fixed" is the paper's PSD with fixed solid modes
             [SBRH21].
         N: columns of V, the hand's included; or a rule; None keeps 99.9 % of the energy, as the paper does.
-        inner, engine: see :func:`softgrasp.reduction.registry.make_basis`.
+        inner, engine: see :func:`softgrasp.reduction.bases.registry.make_basis`.
 
     Returns:
         A :class:`softgrasp.reduction.model.ReducedModel` with V, the N x N blocks and the hand's coupling; ``at`` gives

@@ -16,7 +16,7 @@ from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction import online
-from softgrasp.reduction.engines import factor
+from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.errors import Comparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory

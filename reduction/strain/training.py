@@ -28,19 +28,19 @@ from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import ReductionError
-from softgrasp.reduction.inner import Rows, Weight
+from softgrasp.reduction.bases.basis import ReductionError
+from softgrasp.reduction.bases.inner import Rows, Weight
+from softgrasp.reduction.bases.pod import pod_part
+from softgrasp.reduction.bases.states import BasisError
+from softgrasp.reduction.bases.truncation import Columns
 from softgrasp.reduction.model import Lift, ModelError
 from softgrasp.reduction.parameters import thinned
-from softgrasp.reduction.pod import pod_part
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import BasisError
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.compare import Reference, StrainErrors, errors_of, reference_of
 from softgrasp.reduction.strain.model import Box, SmallStrainModel, StrainModel, StrainRun
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
-from softgrasp.reduction.truncation import Columns
 
 SNAPSHOTS = 400  # behind a basis, of all runs together
 STATES = 80  # of each run behind the weights

@@ -19,7 +19,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.registry import METHODS, find_method
+from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
 from softgrasp.study.bench.driver import Curve, growth, loglog, parse_list
 from softgrasp.study.reduce.sweep import sweep

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, comparison_of, replay
-from softgrasp.reduction.states import States
 from softgrasp.study.reduce.result import COMPARED, LARGER, Box, BoxErrors, BoxPoint, Sweep, TestedModel, nearest
 from softgrasp.study.reduce.sweep import bases_of
 

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.registry import PAPER_METHODS
+from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.reduction.replay import FullRun, replay
 from softgrasp.study.pictures.animation import Film, speed_up, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot

@@ -12,7 +12,7 @@ from scipy.stats import qmc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.compare import Reference, errors_of, reference_of

@@ -26,7 +26,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import hand_target, rest
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.bases.basis import ReductionError
 from tests.helpers.models import close, gather_rows, make_scene, same_everywhere
 
 Array = np.ndarray

@@ -10,7 +10,7 @@ import typer
 from mpi4py import MPI
 from typer.testing import CliRunner
 
-from softgrasp.reduction.engines import ENGINES, EngineName, factor, small_svd
+from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, small_svd
 from softgrasp.study.bench import bases as bench_bases
 from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.bases import known_matrix, parse_shapes, right_down_to, spectrum_of

@@ -19,11 +19,11 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.archive import load
+from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_bases
+from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.parameters import grid_of, outside, training_of, training_states
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import METHODS, PAPER_METHODS, make_bases
 from softgrasp.reduction.replay import FullRun, full_run, replay
-from softgrasp.reduction.states import BasisError, States
 from softgrasp.study.reduce.box import box_models, measure_box
 from softgrasp.study.reduce.pictures import gather_views, instants
 from softgrasp.study.reduce.result import FullTimes

@@ -16,12 +16,12 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.strain.body import Body
 from softgrasp.reduction.archive import load, save
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.bases.basis import ReductionError
+from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import moved_to, run_at
 from softgrasp.reduction.reduce import reduce
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import BasisError
 from softgrasp.reduction.strain.cells import Potential
 from softgrasp.reduction.strain.training import Training, errors_strain, reduce_strain, replay_strain, train
 
