@@ -47,18 +47,31 @@ def write_files(out: Path, result: HardCaseResult, family: str | None, pictures:
         if pictures and f.cases
     }
     options = (" --quick" if result.quick else "") + (f" --family {family}" if family else "")
-    return [
+    files = [
         write_json(out / "result.json", result.to_dict()),
         csv_table(result).write_csv(out / "hardcases.csv"),
         *(file for pair in figures.values() for file in pair),
-        write_report(
-            out / "report.html",
-            title="Hard cases",
-            subtitle=result.summary,
-            sections=sections(result, {name: pair[0] for name, pair in figures.items()}),
-            reproduce=f"softgrasp hardcases{options}",
-            numbers="result.json and hardcases.csv",
-        ),
+    ]
+    page = write_report(
+        out / "report.html",
+        title="Hard cases",
+        summary=summary(result),
+        sections=sections(result, {name: pair[0] for name, pair in figures.items()}),
+        reproduce=f"softgrasp hardcases{options}",
+        numbers="result.json and hardcases.csv",
+        files=files,
+    )
+    return [*files, page]
+
+
+def summary(result: HardCaseResult) -> list[str]:
+    """What came out, in three sentences."""
+    cases = [case for f in result.families for case in f.cases]
+    broken = [c for c in cases if c.textbook.value is None or (c.bound is not None and not c.textbook.value <= c.bound)]
+    return [
+        f"{result.summary}.",
+        f"The textbook way keeps the same bound in {len(cases) - len(broken)} of them.",
+        f"All took {sum(f.seconds for f in result.families):.3g} s.",
     ]
 
 
@@ -87,11 +100,10 @@ def sections(result: HardCaseResult, pictures: Mapping[str, Path]) -> list[Secti
         text = f"{family.lesson}\n\nMeasured: {bare_label(family.quantity)}. Textbook way: {family.textbook}."
         text += f" Why these bounds: {reasons}." if reasons else ""
         figures = [(pictures[family.name], caption(family))] if family.name in pictures else []
-        rows = [brief(case) for case in f.cases]
-        columns = ("case", "bound", "here", "textbook", "verdict") if rows else ()
-        parts.append(Section(family.title, text, header=columns, rows=rows, figures=figures))
+        table = Table(("case", "bound", "here", "textbook", "verdict"), [brief(case) for case in f.cases])
+        parts.append(table.section(text, family.title, figures))
         if texts := sentences(f):
-            parts.append(Section("", "In their own words:", rows=texts))
+            parts.append(Section("", "Refusals and remarks in full:", rows=texts))
     return parts
 
 
