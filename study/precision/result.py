@@ -9,7 +9,7 @@ from typing import Any
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
-from softgrasp.study.precision.series import Series, TimedRun
+from softgrasp.study.precision.probe import Series, TimedRun
 from softgrasp.study.precision.settings import Setting
 from softgrasp.study.report.files import to_json
 
@@ -170,7 +170,7 @@ class Choice:
     def to_dict(self, command: str) -> dict[str, Any]:
         """For JSON, with the whole command that runs it again."""
         row, names = self.point.to_row(), (
-            "error_deformation", "error_displacement", "error_range", "p50", "p99", "max", "scratch", "per_step",
+            "error_displacement", "error_range", "p50", "p99", "max", "scratch", "per_step",
             "error_outputs_full", "error_full",
         )  # fmt: skip
         return {

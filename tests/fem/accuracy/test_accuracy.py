@@ -25,8 +25,6 @@ from softgrasp.fem.solve.modes import lowest_modes
 from tests.fem.mesh.test_refined import fingerprint, l_scene
 from tests.helpers.models import CUBE, LAYERS, _k_lambda, _k_mu, _mass, held_by_paper, make_scene
 
-pytestmark = pytest.mark.ranks
-
 TIP = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]}}
 DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
 WEIGHT = {"effects": {"gravity": {"g": [0.0, -9.81]}}, "time": {"start": "equilibrium"}}
@@ -163,6 +161,7 @@ def test_time_error_is_that_of_the_steps(comm: MPI.Intracomm) -> None:
     assert estimate(coarse).time_error == pytest.approx(true, rel=0.15)
 
 
+@pytest.mark.ranks
 def test_cells_share_the_difference_of_the_energies(comm: MPI.Intracomm) -> None:
     """sum_T k_T(e_i, e_j) = x'_i K' x'_j - x_i K x_j for static solutions on nested spaces."""
     model = build(make_scene(LAYERED, TIP), comm=comm)
@@ -202,6 +201,7 @@ def test_orders_of_graded_and_even_meshes(comm: MPI.Intracomm, order: int, least
     assert order_of(graded) >= least, graded
 
 
+@pytest.mark.ranks
 def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
     scene = with_refine(make_scene(TIP, {"time": {"steps": 300}}), 1, 5e-2)
     model, alone = (build_to_tolerance(scene, c) for c in (comm, MPI.COMM_SELF))
@@ -210,6 +210,7 @@ def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
     assert fingerprint(model.space.mesh) == fingerprint(alone.space.mesh)
 
 
+@pytest.mark.serial
 def test_cubic_elements_are_those_of_scikit_fem() -> None:
     """Frequencies on one mesh: the same space, whatever its nodes."""
     scene = make_scene({"tissue": {"order": 3, "cells": [2, 4]}})
