@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.study.reduce.result import FullTimes, Speed, Sweep, nearest
 
 FULL_REPEATS = 3  # behind the median of the full run
@@ -17,15 +18,15 @@ PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 
 LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 
 
-def full_times(model: Model, first: Trajectory) -> FullTimes:
-    """Median seconds of the full run, of several when it is short. Collective."""
+def measured_run(model: Model, progress: Callable[[Run], None]) -> tuple[FullRun, FullTimes]:
+    """The full run, and its seconds in the median of several when it is short. Collective."""
+    first = simulate(model, RunOptions(progress=progress))
     comm, runs = model.system.layout.comm, [first]
     repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
     runs += [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
-    return FullTimes(
-        statistics.median(steps_seconds(run) for run in runs),
-        statistics.median(run.seconds["factor"] for run in runs),
-    )
+    factors = [run.seconds["factor"] for run in runs]
+    times = FullTimes(statistics.median(map(steps_seconds, runs)), statistics.median(factors))
+    return full_run(model, first), times
 
 
 def steps_seconds(run: Trajectory) -> float:
@@ -41,7 +42,7 @@ def speed_of(sweep: Sweep, full: FullTimes) -> Speed | None:
     if i is None:
         return None
     p = sweep.points[i]
-    whole, new = full.factor + full.steps, p.time_setup + p.time_online
+    again, new, runs = full.against(p.time_offline, p.time_setup, p.time_online)
     return Speed(
         method=sweep.method.key,
         title=sweep.method.title,
@@ -51,9 +52,9 @@ def speed_of(sweep: Sweep, full: FullTimes) -> Speed | None:
         time_offline=p.time_offline,
         time_setup=p.time_setup,
         time_online=p.time_online,
-        speedup_same_model=full.steps / p.time_online,
-        speedup_new_parameter=whole / new,
-        break_even_runs=p.time_offline / (whole - new) if whole > new else None,
+        speedup_same_model=again,
+        speedup_new_parameter=new,
+        break_even_runs=runs,
     )
 
 
@@ -73,17 +74,12 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
     # tissue unknowns at which a full run would take as long as a reduced one, at this mesh's time per unknown
     mesh, model = n_e * chosen.time_online / full.steps, f"{chosen.title}, N = {chosen.N}"
     if mesh < LEAST_MESH:
-        pays = (
-            f"the reduced run ({model}) is faster on every mesh; at this mesh's time per unknown it already pays from "
-            f"n_e = {mesh:.0f} on"
-        )
+        pays = f"the reduced run ({model}) is faster than a full run on every mesh"
     else:
-        pays = (
-            f"at this mesh's time per unknown a full run of n_e = {mesh:.0f} takes as long as the reduced one ({model})"
-        )
+        pays = f"a full run of n_e = {mesh:.0f} would take as long as the reduced one ({model})"
     return (
         against,
-        f"Break-even mesh: {pays}. The reduced time does not grow with the mesh, see "
+        f"Break-even mesh: {pays}, at this mesh's time per unknown. The reduced time does not grow with the mesh, see "
         "python -m softgrasp.study.bench meshes.",
         f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
         f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
