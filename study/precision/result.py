@@ -223,7 +223,7 @@ class Part:
         name: of the source.
         error: that it leaves [1].
         share: of the sum of all parts [1].
-        wasted: whole digits below a tenth of the largest part, which nobody sees.
+        wasted: whole digits below a tenth of the largest part, which the largest part hides.
         halved_by: setting that halves it; empty where none that was tried does.
         cost: time of that setting over the time now [1]; None without one.
     """
