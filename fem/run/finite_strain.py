@@ -22,11 +22,10 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, total
-from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState
+from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState, viscosity
 from softgrasp.fem.strain.body import Body
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
-from softgrasp.fem.system import BlockSystem
 
 PARTS = 16  # most of a step
 KEPT = 2  # steps that the first guess is extrapolated from
@@ -214,15 +213,23 @@ class FiniteStrainMidpoint(TissueMidpoint):
         """The root, moved to w'R = 0 by a small part of a correction made before. Collective."""
         target = max(self.tol * self.parts * self.counts.scale, 4 * self.body.rounding)
         root = self.newton.find(guess, target)
+        if root.spent > 0 and (moved := self._balance(root)) is None:  # what is left of R does work: iterate on
+            finer = self.newton.find(root.x, max(target / 30, 4 * self.body.rounding))
+            root = root if finer.spent < 0 else finer._replace(spent=root.spent + finer.spent)
+            moved = self._balance(root)
         self.last = root.norm / (self.parts * self.counts.scale) if self.counts.scale > 0 else 0.0
+        return root if root.spent < 1 or moved is None else root._replace(x=moved)
+
+    def _balance(self, root: Root) -> Array | None:
+        """W moved to w'R = 0 by a small part of a correction made before; None where none is large enough."""
         pairs = self.newton.pairs
-        if root.spent < 1 or not pairs.order:
-            return root
+        if not pairs.order:
+            return None
         slopes, work = self._dots(pairs.dr, root.x), self.dot(root.x, root.R)
         i = int(np.argmax(np.abs(slopes)))  # zero in an empty slot
-        if abs(work) > 0.1 * abs(slopes[i]):
-            return root
-        return root._replace(x=root.x - work / slopes[i] * pairs.dx[i])
+        if abs(work) >= 0.1 * abs(slopes[i]):
+            return None
+        return np.asarray(root.x - work / slopes[i] * pairs.dx[i])
 
     def _residual(self, w: Array) -> tuple[Array, float]:
         """R(w) and its norm, infinite where the law has no stress. Collective."""
@@ -384,15 +391,3 @@ class FiniteStrainMidpoint(TissueMidpoint):
         for item in (*mine, *([self.body.points.B] if self.held.whole else [])):
             item.destroy()
         super().destroy()
-
-
-def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:
-    """S D with D = alpha M + beta K [+ layers], with the pattern of M. Collective."""
-    damping = system.damping
-    result = system.M_ee.copy()
-    result.scale(s * damping.alpha)
-    if damping.beta:
-        result.axpy(s * damping.beta, system.K_ee, SAME)
-    if damping.matrix is not None:
-        result.axpy(s, damping.matrix, SAME)
-    return result

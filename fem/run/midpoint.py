@@ -56,6 +56,18 @@ def midpoint_matrix(system: BlockSystem, dt: float) -> PETSc.Mat:
     return S
 
 
+def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:
+    """S D with D = alpha M + beta K [+ layers], with the pattern of M. Collective."""
+    damping = system.damping
+    result = system.M_ee.copy()
+    result.scale(s * damping.alpha)
+    if damping.beta:
+        result.axpy(s * damping.beta, system.K_ee, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    if damping.matrix is not None:
+        result.axpy(s, damping.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+    return result
+
+
 @dataclass
 class TissueState:
     """Relative displacement and velocity of the tissue as PETSc vectors that share one local array [z; v]."""

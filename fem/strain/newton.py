@@ -11,7 +11,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array
 
-PAIRS = 6  # on 60 x 120 cells 2 cost a sixth more iterations, 12 save none
+PAIRS = 4  # on 60 x 120 cells 2 cost more iterations, 12 save none
 MOST, RENEW = 40, 8  # iterations, and after how many of them the tangent is made anew
 SMALLEST = 2.0**-10  # part of a correction
 GROWTH = 4.0  # of |R|, beyond which a correction is halved
