@@ -178,8 +178,8 @@ def gain_result(
 def report_dict(report: GainReport) -> dict[str, Any]:
     """One point of result.json."""
     keys = (
-        "N", "error_P", "error_K", "cost_excess", "cost_excess_at_most", "abscissa_full", "time_are", "stable",
-        "certified", "reason",
+        "N", "error_P", "error_K", "cost_excess", "cost_excess_proved", "cost_excess_at_most", "unbounded",
+        "abscissa_full", "time_are", "stable", "certified", "reason",
     )  # fmt: skip
     return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
 
@@ -196,7 +196,9 @@ def _retuned(r: Retuned) -> dict[str, Any]:
             "mu": p.materials[0].mu,
             "error_K": p.error_K,
             "cost_excess": p.cost_excess,
+            "cost_excess_proved": p.cost_excess_proved,
             "cost_excess_at_most": p.cost_excess_at_most,
+            "unbounded": p.unbounded,
             "abscissa_full": p.abscissa_full,
             "sampled_radius": radius_of(p),
             "time": p.seconds,

@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, UNSTABLE, WIDTH, few_ticks, paper_style, save
@@ -116,6 +116,7 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
             left.plot(size.k, np.median(values), "_", color=colour, ms=11, mew=1.8)
         left.set(yscale="log", xlabel="modes $k$ of the answer", ylabel="bound / true error")
         left.set_ylim(bottom=0.9)
+        left.xaxis.set_major_locator(MaxNLocator(integer=True))
         left.axhline(1.0, color="#888888", lw=0.9)
         left.set_title(f"green: the model as built, $k = {check.own.k}$, $k_2 = {check.own.k2}$")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
