@@ -190,21 +190,13 @@ def radius_of(report: GainReport | BoxPoint) -> float:
 
 
 def _retuned(r: Retuned) -> dict[str, Any]:
+    keys = (
+        "error_K", "cost_excess", "cost_excess_proved", "cost_excess_at_most", "unbounded", "abscissa_full", "stable",
+        "reason",
+    )  # fmt: skip
     points = [
-        {
-            "lambda": p.materials[0].lam,
-            "mu": p.materials[0].mu,
-            "error_K": p.error_K,
-            "cost_excess": p.cost_excess,
-            "cost_excess_proved": p.cost_excess_proved,
-            "cost_excess_at_most": p.cost_excess_at_most,
-            "unbounded": p.unbounded,
-            "abscissa_full": p.abscissa_full,
-            "sampled_radius": radius_of(p),
-            "time": p.seconds,
-            "stable": p.stable,
-            "reason": p.reason,
-        }
+        {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "sampled_radius": radius_of(p), "time": p.seconds}
+        | {key: getattr(p, key) for key in keys}
         for p in r.points
     ]
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}

@@ -129,9 +129,9 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
                        label=label)  # fmt: skip
         right.axvline(1e3 * check.full, color="#888888", lw=1.0, ls="-.", label="full run")
         right.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
-        for time, size in zip(times, check.sizes, strict=True):
-            place = (time, size.largest("bound"))
-            right.annotate(f"$k = {size.k}$", place, xytext=(5, 2), textcoords="offset points", fontsize=6.5)
+        for i, (time, size) in enumerate(zip(times, check.sizes, strict=True)):
+            place, beside = (time, size.largest("bound")), (5, -8 if i % 2 else 2)  # neighbours may stand close
+            right.annotate(f"$k = {size.k}$", place, xytext=beside, textcoords="offset points", fontsize=6.5)
         right.set(xscale="log", yscale="log", xlabel="time of an answer [ms]", ylabel="largest relative error")
         right.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(right.xaxis)
