@@ -52,19 +52,14 @@ class ModelErrors:
     error_energy: float
 
 
-def full_energy(system: BlockSystem, snapshots: Snapshots) -> Array:
-    """(z' K_ee z + v_z' M_ee v_z) / 2 of every snapshot [J], (m,), on every rank. Collective."""
-    n, m = system.layout.n_local, snapshots.Z.shape[1]
-    x, y = system.K_ee.createVecs()
-    local = np.zeros(m)
-    for rows, A in ((slice(0, n), system.K_ee), (slice(n, 2 * n), system.M_ee)):
-        for j in range(m):
-            x.array_w[:] = snapshots.Z[rows, j]
-            A.mult(x, y)
-            local[j] += np.dot(snapshots.Z[rows, j], y.array_r) / 2
-    x.destroy()
-    y.destroy()
-    return total(system.layout.comm, local)
+def full_energy(system: BlockSystem, Z: Array) -> Array:
+    """(z' K_ee z + v_z' M_ee v_z) / 2 of columns [z; v_z], local rows [J], (m,), on every rank. Collective."""
+    halves = ((slice(0, system.layout.n_local), system.K_ee), (slice(system.layout.n_local, None), system.M_ee))
+    parts = [
+        sum((Z[rows, b] * times_columns(A, Z[rows, b])).sum(axis=0) for rows, A in halves)
+        for b in column_blocks(Z.shape[1])
+    ]
+    return total(system.layout.comm, np.concatenate(parts) / 2)
 
 
 def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array, v_s: Array) -> Array:
@@ -74,7 +69,6 @@ def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array
     velocities, sqrt(m / d) of momenta, which makes |X|_F a norm that does not see where nodes crowd [W87].
 
     Args:
-        view: which state.
         system: gives T, G and the mass.
         z, v_z: local rows (n_local, m).
         q_s, v_s: (n_s, m), the same on every rank.
@@ -104,7 +98,7 @@ def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: Block
     """V with V Y = what the model shows for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
 
     Raises:
-        ModelError: the model holds no lift.
+        ModelError: the model holds no basis on the mesh.
     """
     N, n_s = model.N, small.n_s
     width = N + 2 * n_s
@@ -114,21 +108,13 @@ def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: Block
 
 @dataclass(frozen=True)
 class Span:
-    """Snapshots in the columns of one orthonormal basis, X = Q C + rest.
+    """Snapshots in the columns of one orthonormal basis, X = Q C + rest."""
 
-    Attributes:
-        comm: ranks that share the rows.
-        Q: local rows (rows, k).
-        C: (k, m), on every rank.
-        rest: |X - Q C|_F^2.
-        square: |X|_F^2.
-    """
-
-    comm: MPI.Intracomm
-    Q: Array
-    C: Array
-    rest: float
-    square: float
+    comm: MPI.Intracomm  # ranks that share the rows
+    Q: Array  # local rows (rows, k)
+    C: Array  # (k, m), on every rank
+    rest: float  # |X - Q C|_F^2
+    square: float  # |X|_F^2
 
     def inside(self, V: Array) -> Array:
         """R = Q'V for columns V, local rows, that lie in the span. Collective.
@@ -185,27 +171,20 @@ def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of one model, or of a whole family of nested ones, against one full run.
+    """Errors of one model, or of a whole family of nested ones, against one full run."""
 
-    Attributes:
-        model, small: the largest model of the family, at the parameter of the snapshots.
-        system: of the full run.
-        snapshots: of the full run.
-        energy: :func:`full_energy` of the snapshots.
-    """
-
-    model: ReducedModel
+    model: ReducedModel  # model, small: the largest model of the family, at the parameter of the snapshots
     small: SmallModel
-    system: BlockSystem
-    snapshots: Snapshots
-    energy: Array
+    system: BlockSystem  # of the full run
+    snapshots: Snapshots  # of the full run
+    energy: Array  # :func:`full_energy` of the snapshots
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
 
     def span(self, view: View) -> Span:
         """Snapshots in what the largest model shows; factored at the first call. Collective.
 
         Raises:
-            ModelError: the model holds no lift.
+            ModelError: the model holds no basis on the mesh.
         """
         if view not in self._spans:
             V = shown_rows(view, self.model, self.small, self.system)

@@ -52,7 +52,7 @@ class FullRun:
     @cached_property
     def energy(self) -> Array:
         """Tissue energy (z' K z + v_z' M v_z) / 2 of every snapshot, (m,) [J]. Collective at the first use."""
-        return full_energy(self.model.system, self.snapshots)
+        return full_energy(self.model.system, self.snapshots.Z)
 
     @cached_property
     def force(self) -> Array:
@@ -144,9 +144,7 @@ def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[
     """Propagator, and keywords of :func:`softgrasp.reduction.online.run`, that repeat a full run. Collective.
 
     Args:
-        rom: reduced model.
         small: the same at the materials of the run that is to be made.
-        full: run to repeat.
 
     Raises:
         ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.

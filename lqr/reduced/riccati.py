@@ -60,39 +60,23 @@ class Verdict:
 
 @dataclass(frozen=True)
 class GainReport(Verdict):
-    """A reduced gain against the optimal one, on the full plant.
+    """A reduced gain against the optimal one, on the full plant."""
 
-    Attributes:
-        method: key of the basis.
-        N: order of the reduced equation.
-        error_P: ||P - P_hat||_F / ||P||_F in the paper's coordinates.
-        error_K: ||K - K_hat||_F / ||K||_F in the paper's coordinates.
-        cost_excess: J(K_hat) / J(K) - 1 from the scene's start on the full plant.
-        abscissa_full: largest real part of the full closed loop [1/s].
-        time_are: seconds of one solution of the reduced equation, for who measures it; else nan.
-        reason: why there is no gain; empty when there is one.
-        certified: the sign of the abscissa is certain, see :class:`softgrasp.lqr.spectrum.modal_loop.LoopQuality`.
-        sampled: the loop from tick to tick, where its instants are known.
-        gain: K_hat; None where there is none.
-        cost_excess_at_most: bound on the excess; nan where it was not asked for.
-        cost_excess_proved: the part of it that is proved, see :func:`softgrasp.lqr.design.bounds.with_bounds`.
-        matrices: of the reduced equation; None where they are not kept.
-    """
-
-    method: str
-    N: int
+    method: str  # key of the basis
+    N: int  # order of the reduced equation
+    # ||P - P_hat||_F / ||P||_F and ||K - K_hat||_F / ||K||_F in the paper's coordinates
     error_P: float  # noqa: N815
     error_K: float  # noqa: N815
-    cost_excess: float
-    abscissa_full: float
-    time_are: float = float("nan")
-    reason: str = ""
-    certified: bool = True
-    sampled: SampledRadius | None = None
-    gain: Gain | None = None
-    cost_excess_at_most: float = float("nan")
-    cost_excess_proved: float = float("nan")
-    matrices: ReducedMatrices | None = None
+    cost_excess: float  # J(K_hat) / J(K) - 1 from the scene's start on the full plant
+    abscissa_full: float  # largest real part of the full closed loop [1/s]
+    time_are: float = float("nan")  # seconds of one solution of the reduced equation, for who measures it
+    reason: str = ""  # why there is no gain; empty when there is one
+    certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
+    sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
+    gain: Gain | None = None  # K_hat; None where there is none
+    cost_excess_at_most: float = float("nan")  # bound on the excess; nan where not asked for
+    cost_excess_proved: float = float("nan")  # the part that is proved, see softgrasp.lqr.design.bounds.with_bounds
+    matrices: ReducedMatrices | None = None  # of the reduced equation; None where they are not kept
 
 
 def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:

@@ -5,22 +5,12 @@
 
 solved by Broyden's method [Broyden65] on a k x k inverse, with the discrete gradient f_alg, 2 w' f_alg =
 W_r(a_{n+1}) - W_r(a_n), so that |v|^2 / 2 + W_r changes by the work 2 w'l less the loss 2 s w'D w, to the tolerance of
-the solve. `stepper.c` takes whole runs; it is compiled when it is first needed, once for a machine, into a cache folder
-(`$XDG_CACHE_HOME/softgrasp`). Without a compiler NumPy takes the same steps, about thirty times slower, and says so.
+the solve. `stepper.c` takes whole runs; without a compiler NumPy takes the same steps, about thirty times slower, and
+says so.
 """
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import os
-import platform
-import shutil
-import subprocess
-import sys
-import tempfile
-import warnings
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,10 +19,10 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.strain.compiled import library
 from softgrasp.reduction.strain.cells import Potential
 
 SOURCE = Path(__file__).with_name("stepper.c")
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 DECLARATION = """int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight,
   const double *lam, const double *mu, const double *S, double s, const double *load, int steps, double tol,
   double floor, double *J, double *A, double *V, long *counts);"""
@@ -41,20 +31,13 @@ GROWTH = 4.0  # of the residual, above which a correction is refused
 
 
 @dataclass(frozen=True)
-class Problem:
-    """One reduced model at one parameter and one step.
+class StrainProblem:
+    """One reduced model at one parameter and one step."""
 
-    Attributes:
-        potential: W_r and its discrete gradient.
-        D: damping, (k, k) [1/s].
-        K: tangent at rest, (k, k) [1/s^2]: the first inverse is (S + K)^-1.
-        dt: step [s].
-    """
-
-    potential: Potential
-    D: Array
-    K: Array
-    dt: float
+    potential: Potential  # W_r and its discrete gradient
+    D: Array  # damping, (k, k) [1/s]
+    K: Array  # tangent at rest, (k, k) [1/s^2]: the first inverse is (S + K)^-1
+    dt: float  # step [s]
 
     @property
     def S(self) -> Array:
@@ -65,27 +48,19 @@ class Problem:
 
 @dataclass(frozen=True)
 class March:
-    """What a run of the stepper returns.
+    """What a run of the stepper returns."""
 
-    Attributes:
-        a, v: coordinates and rates, (steps + 1, k).
-        evaluations: of the force, in the mean of a step.
-        restarts: fresh tangents.
-        engine: "C" or "NumPy".
-    """
-
-    a: Array
+    a: Array  # a, v: coordinates and rates, (steps + 1, k)
     v: Array
-    evaluations: float
-    restarts: int
-    engine: str
+    evaluations: float  # of the force, in the mean of a step
+    restarts: int  # fresh tangents
+    engine: str  # "C" or "NumPy"
 
 
-def march(problem: Problem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
+def march(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
     """All steps under loads l (steps, k). Not collective but where the potential is distributed.
 
     Args:
-        problem: what is stepped.
         load: l_n at the step midpoints.
         a0, v0: start, (k,).
         tol: |residual| over the largest |h| seen; rounding of the force is enough in any case.
@@ -110,7 +85,7 @@ def march(problem: Problem, load: Array, a0: Array, v0: Array, tol: float, engin
     return March(A, V, counts[0] / max(steps, 1), counts[1], "NumPy" if library is None else "C")
 
 
-def _sentence(problem: Problem, step: int, point: int) -> str:
+def _sentence(problem: StrainProblem, step: int, point: int) -> str:
     cells = problem.potential.cells
     where = ""
     if 0 <= point < len(cells.weight):
@@ -122,7 +97,7 @@ def _sentence(problem: Problem, step: int, point: int) -> str:
     )
 
 
-def _march_c(library: Any, problem: Problem, load: Array, tol: float, J: Array, A: Array, V: Array) -> Any:
+def _march_c(library: Any, problem: StrainProblem, load: Array, tol: float, J: Array, A: Array, V: Array) -> Any:
     ffi, lib = library
     packed = problem.potential.packed
     counts = ffi.new("long[3]")
@@ -144,7 +119,7 @@ def _march_c(library: Any, problem: Problem, load: Array, tol: float, J: Array, 
 class _March:
     """The steps of `stepper.c` in NumPy, line by line."""
 
-    def __init__(self, problem: Problem, tol: float, J: Array) -> None:
+    def __init__(self, problem: StrainProblem, tol: float, J: Array) -> None:
         self.potential, self.S, self.s, self.tol, self.J = problem.potential, problem.S, 2 / problem.dt, tol, J
         self.h = np.zeros(len(J))
         self.scale, self.floor, self.counts = 0.0, problem.potential.rounding, [0, 0, -1]
@@ -216,56 +191,6 @@ class _March:
         return True
 
 
-@functools.cache
 def compiled() -> Any:
     """(ffi, library) of `stepper.c`, or None with a warning where it cannot be compiled."""
-    try:
-        from cffi import FFI  # it comes with FFCx, not with every online machine
-
-        path = _library()
-        ffi = FFI()
-        ffi.cdef(DECLARATION)
-        return ffi, ffi.dlopen(str(path))
-    except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
-        reason = (str(getattr(error, "stderr", "") or "") or str(error)).strip().splitlines()[:1]
-        warnings.warn(
-            f"reduced runs at finite strain step in NumPy, about thirty times slower, for want of a compiled stepper "
-            f"({''.join(reason)}); install cffi and a C compiler, or name one in CC",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-        return None
-
-
-def _library() -> Path:
-    """The shared library in the cache folder, made there unless it is there; its name says source and machine."""
-    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
-        raise OSError("there is no C compiler")
-    key = hashlib.sha256("\0".join((SOURCE.read_text(), compiler, *FLAGS, _processor())).encode()).hexdigest()[:20]
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "softgrasp"
-    with suppress(OSError):
-        root.mkdir(parents=True, exist_ok=True)
-    if not os.access(root, os.W_OK):
-        root = Path(tempfile.mkdtemp(prefix="softgrasp-"))  # of this process alone
-    path = root / f"stepper-{key}.so"
-    if not path.exists():
-        # several ranks may compile at once: each its own file, and the last one stays
-        handle, name = tempfile.mkstemp(dir=root, suffix=".so")
-        os.close(handle)
-        command = [*compiler.split(), *FLAGS, str(SOURCE), "-o", name, "-lm"]
-        try:
-            subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
-            os.replace(name, path)
-        finally:
-            Path(name).unlink(missing_ok=True)
-    return path
-
-
-def _processor() -> str:
-    """What -march=native depends on: a home folder may serve several kinds of machine."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line for line in lines if line.startswith(("flags", "Features")))
-    except (OSError, StopIteration):
-        return f"{sys.platform} {platform.machine()} {platform.processor()}"
+    return library(SOURCE, DECLARATION, "reduced runs at finite strain step in NumPy, about thirty times slower")

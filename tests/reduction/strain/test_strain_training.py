@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import timeit
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +46,6 @@ def trained(own: FullRun) -> Training:
     return train(own.model, [own], 24)
 
 
-@pytest.mark.ranks
 def test_all_weights_one_is_the_projected_body(trained: Training) -> None:
     """Phi' f(Phi a) and W(Phi a) of the full model, which shares the laws and nothing else."""
     system, comm = trained.model.system, trained.model.system.layout.comm
@@ -64,7 +64,6 @@ def test_all_weights_one_is_the_projected_body(trained: Training) -> None:
     assert np.abs(potential.tangent(np.zeros(potential.k)) - tangent).max() < 1e-12 * np.abs(tangent).max()
 
 
-@pytest.mark.ranks
 def test_models_of_one_run(trained: Training) -> None:
     system, full = trained.model.system, trained.runs[0]
     gram = total(system.layout.comm, trained.Phi.T @ times_columns(system.M_ee, trained.Phi))
@@ -165,7 +164,7 @@ def test_a_file_brings_the_lift_back_on_any_rank_count(trained: Training, tmp_pa
     assert read.Phi is not None
     np.testing.assert_array_equal(read.Phi, rom.Phi)
     online = load(path)
-    with pytest.raises(ModelError, match="no lift"):
+    with pytest.raises(ModelError, match="no basis on the mesh"):
         online.displacement(np.zeros((1, 5)))
 
 
@@ -186,6 +185,11 @@ def test_what_does_not_fit_is_refused(own: FullRun, trained: Training) -> None:
         reduce(own.model, replace(own.trajectory, snapshots=None))
 
 
+def said(what: str, value: float) -> float:
+    print(f"{what}: {value:.2e}")  # noqa: T201  (pytest -s -m slow shows it)
+    return value
+
+
 @pytest.mark.slow
 @pytest.mark.serial
 def test_the_paper_scene_meets_what_was_asked_for() -> None:
@@ -196,15 +200,22 @@ def test_the_paper_scene_meets_what_was_asked_for() -> None:
     for N, most, cells in ((14, 1e-2, 25), (24, 2e-3, 75)):
         rom = single.reduce(N)
         run = replay_strain(rom, own)
-        assert errors_strain(rom, run, model, own).z <= most
+        assert said(f"own run, N = {N}, {rom.cells.count} cells", errors_strain(rom, run, own).z) <= most
         assert rom.cells.count <= cells
-        assert run.energy_drift <= 1e-8
+        assert said("drift of its energy", run.energy_drift) <= 1e-8
+        if N == 14 and run.engine == "C":
+            small = rom.at(own.dt)
+            seconds = min(timeit.repeat(lambda small=small: small.run(own.hand), number=1, repeat=31))
+            said("seconds of 600 steps (goal on a quiet machine: 3e-3)", seconds)
+            assert said("times faster than the full run", own.trajectory.seconds["steps"] / seconds) >= 80
     corners = train(model, [run_at(model, lam, mu) for lam in (40.0, 120.0) for mu in (40.0, 120.0)], 24).reduce(24)
     for place in ((50.0, 50.0), (70.0, 45.0), (45.0, 70.0), (110.0, 50.0), (100.0, 100.0)):
         test = run_at(model, *place)
-        assert errors_strain(corners, replay_strain(corners, test), test).z <= 2.5e-2
+        error = errors_strain(corners, replay_strain(corners, test), test).z
+        assert said(f"four materials, N = 24, unseen {place}", error) <= 2.5e-2
     moves = [run_at(moved_to(model, target), 50.0, 50.0) for target in ([5.0, -3.0], [-5.0, 3.0], [-5.0, -3.0])]
     moving = train(model, [own, *moves], 24).reduce(24)
     for target in ([4.0, 3.0], [5.0, 0.0], [0.0, 3.0], [-4.0, 2.0], [3.0, 2.0]):
         test = run_at(moved_to(model, target), 50.0, 50.0)
-        assert errors_strain(moving, replay_strain(moving, test), test).z <= 1.5e-2
+        error = errors_strain(moving, replay_strain(moving, test), test).z
+        assert said(f"four moves, N = 24, unseen {target}", error) <= 1.5e-2
