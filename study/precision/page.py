@@ -209,8 +209,8 @@ def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
     if study.truth is not None:
         rows += [
-            ("error", "max over the run of |y - y*|, over max |y*|; y the outputs against the hand, the deformation"),
-            ("displacement", "the same of the whole displacements, in which the motion of the hand hides the tissue"),
+            ("deformation error", "max over the run of |y - y*|, over max |y*|; y the outputs against the hand"),
+            ("displacement error", "the same of the whole displacements, where the hand's motion hides the tissue"),
             ("places", "the same points of the body on every mesh, not the nearest nodes"),
             ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
         ]

@@ -18,7 +18,7 @@ from softgrasp.study.shell.session import Page, Session, list_files, show_warnin
 COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of
 LAG = "lag: largest distance of an output from where it would be if the tissue moved rigidly with the hand."
 REDUCED = (
-    f"The model is reduced ({METHOD}) at the scene's own material; error: of the deformation against a full run, "
+    f"The model is reduced ({METHOD}) at the scene's own material; error_deformation: against a full run, "
     "measured at the first and the last point."
 )
 
@@ -63,7 +63,7 @@ def run_sweep(
         raise SceneError(f"no point of the sweep could be run; the first: {failed[0]['reason']}")
     table = sweep_table(rows)
     notes = [f"{len(failed)} of {len(rows)} points failed: {failed[0]['reason']}"] if failed else []
-    if (worst := max((row.get("error") or 0.0 for row in rows), default=0.0)) > COARSE:
+    if (worst := max((row.get("error_deformation") or 0.0 for row in rows), default=0.0)) > COARSE:
         notes.append(f"The reduced model is off by {worst:.0%} at an end of the sweep; take more columns, --reduced.")
     result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced, "points": rows, "warnings": notes}
 

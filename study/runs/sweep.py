@@ -136,10 +136,9 @@ class Runner:
             raise SceneError(f"--reduced {N}: the reduced model is affine in tissue.material only; sweep its keys")
         begin = MPI.Wtime()
         small = replay(self.rom, model, self.base)
-        row = {**values, **_outputs(self.base, small.outputs), "seconds": MPI.Wtime() - begin, "error": None}
-        if judged:
-            row["error"] = float(errors(self.rom, small, model, simulate(model)).error_deformation)
-        return row
+        seconds = MPI.Wtime() - begin
+        off = float(errors(self.rom, small, model, simulate(model)).error_deformation) if judged else None
+        return {**values, **_outputs(self.base, small.outputs), "seconds": seconds, "error_deformation": off}
 
 
 def _outputs(run: Trajectory, outputs: np.ndarray) -> Row:

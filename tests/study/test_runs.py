@@ -64,10 +64,10 @@ def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path:
     axes = ["tissue.material.mu=40:60:3"]
     result = run_sweep(SCENE, axes, tmp_path, SMALL, QUIET, quiet=True, reduced=20)
     first, middle, last = result["points"]
-    assert middle["error"] is None
+    assert middle["error_deformation"] is None
     for row in (first, last):
         full = sg.simulate(sg.build("paper_forward", [*SMALL, f"tissue.material.mu={row['tissue.material.mu']}"]))
-        assert 0 < row["error"] < 0.05
+        assert 0 < row["error_deformation"] < 0.05
         assert row["tip_x end [m]"] == pytest.approx(full.outputs[-1, 0], abs=0.05 * np.abs(full.outputs[:, 0]).max())
     assert (tmp_path / "sweep.png").stat().st_size > 5000
     failed = run_sweep(SCENE, ["output.memory=1e3,1e-9"], tmp_path / "b", SMALL, QUIET, quiet=True, pictures=False)
