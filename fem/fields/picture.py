@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.petsc import Array, rows_on_root
@@ -55,13 +55,7 @@ def gather_picture(model: Model) -> PictureMesh | None:
         return _numbered(nodes, _outward(mesh, d, facets))
 
     cells = np.asarray(cell_nodes(mesh)[: mesh.topology.index_map(d).size_local])
-    layers = np.zeros(len(cells), dtype=np.int64)
-    names: tuple[str, ...] = ("tissue",)
-    if model.scene.tissue.layers:
-        groups = cells_of_layers(tissue, model.scene)
-        names = tuple(groups)
-        for i, members in enumerate(groups.values()):
-            layers[members] = i
+    names, layers = layer_numbers(tissue, model.scene)
     outer = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     held = contact_facets(tissue, model.scene.contact)
     points = np.ascontiguousarray(mesh.geometry.x[: nodes.size_local, :d])

@@ -199,3 +199,12 @@ def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
     if counts[0]:
         cells["tissue"] = np.flatnonzero(label == -1).astype(np.int32)
     return cells
+
+
+def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names of the layers in the order of their blocks, and the number of the layer of each owned cell. Collective."""
+    cells = cells_of_layers(mesh, scene)
+    numbers = np.zeros(mesh.mesh.topology.index_map(mesh.dimension).size_local, dtype=np.intp)
+    for i, members in enumerate(cells.values()):
+        numbers[members] = i
+    return tuple(cells), numbers

@@ -23,13 +23,7 @@ from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.system import (
-    BlockSystem,
-    LayerBlocks,
-    LayerMaterial,
-    coupling,
-    tissue_matrices,
-)
+from softgrasp.fem.system import BlockSystem, LayerBlocks, LayerMaterial, coupling, tissue_matrices
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.mesh_estimate import MeshEstimate

@@ -49,12 +49,7 @@ _FORMS = {
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Name and path of the scenes that ship with the project.
-
-    >>> import softgrasp as sg
-    >>> "paper_forward" in sg.shipped_scenes()
-    True
-    """
+    """Name and path of the scenes that ship with the project."""
     folder = (PACKAGE / "scenes").resolve()
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 

@@ -215,9 +215,7 @@ class StructuredGalerkin:
         if level.small.order == plant.layout.n_e:
             about = f"all {level.small.order} basis vectors that there are"
         iterate = Iterate(level.Z, level.gain, "galerkin", about, 1e-10, history, counts, seconds, lean=True)
-        result = make_solution(plant, iterate, check=False)
-        result.seconds["total"] = time.perf_counter() - begin
-        return result
+        return make_solution(plant, iterate, begin, check=False)
 
     def _grow(
         self,

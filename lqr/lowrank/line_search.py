@@ -48,13 +48,8 @@ def _least(r: Array, signs: Array, u: int, w: int) -> tuple[float, float, float]
 
 def mixed_residual(old: tuple[Block, Array] | None, W: Block, change: Block, t: float) -> tuple[Block, Array]:
     """(U, signs) of (1 - t) R_j + t W W' - t^2 dK'dK."""
-    parts, signs = (
-        [W.times(np.sqrt(t) * np.eye(W.columns)), change.times(t * np.eye(change.columns))],
-        [
-            np.ones(W.columns),
-            -np.ones(change.columns),
-        ],
-    )
+    parts = [W.times(np.sqrt(t) * np.eye(W.columns)), change.times(t * np.eye(change.columns))]
+    signs = [np.ones(W.columns), -np.ones(change.columns)]
     if t < 1 and old is not None:
         U, weights = old
         parts.append(U.times(np.sqrt(1 - t) * np.eye(U.columns)))

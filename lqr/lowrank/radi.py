@@ -144,12 +144,9 @@ class RADI:
                 "columns": state.Z.appended,
             }
             about = f"low rank from X = 0, {tissue.name} tissue solves"
-            result = make_solution(
-                plant,
-                Iterate(state.Z.block, state.gain.block, "radi", about, self.tol, state.history, counts, state.seconds),
-            )
-            result.seconds["total"] = time.perf_counter() - begin
-            return result
+            columns = state.Z.block, state.gain.block
+            iterate = Iterate(*columns, "radi", about, self.tol, state.history, counts, state.seconds)
+            return make_solution(plant, iterate, begin)
         finally:
             tissue.destroy()
 

@@ -23,8 +23,8 @@ from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_re
 from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
-from softgrasp.reduction.engines import EPS, factor, small_svd
-from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.bases.engines import EPS, factor, small_svd
+from softgrasp.reduction.bases.states import BasisError
 
 A_PRIORI = "structured"  # the basis that needs no P
 

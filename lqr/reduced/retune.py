@@ -143,7 +143,7 @@ def over_box(
         retuner: the reduced components.
         settings: materials of all layers, one tuple per point.
         solve: full solver, the reference.
-        start: start minus target, see :func:`softgrasp.lqr.reduced.riccati.hand_start`.
+        start: start minus target of hand and tissue, one column.
         modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
         law: instants of the loop; None judges the continuous law alone.
     """

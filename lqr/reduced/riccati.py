@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -232,11 +231,3 @@ class GainJudge:
             gain=reduced.gain,
             matrices=reduced.matrices,
         )
-
-
-def hand_start(problem: RiccatiProblem, displacement: Sequence[float] | Array) -> Block:
-    """Whole body at rest, displaced rigidly by hand coordinates [m, rad], (n_s,), as one column."""
-    n_s = problem.layout.n_s
-    hand = np.zeros((2 * n_s, 1))
-    hand[:n_s, 0] = displacement
-    return Block(hand, np.zeros((2 * problem.layout.n_local, 1)))

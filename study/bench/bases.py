@@ -13,7 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.reduction.engines import factor, small_svd
+from softgrasp.reduction.bases.engines import factor, small_svd
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Row
 from softgrasp.study.shell.jobs import launch_worker

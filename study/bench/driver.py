@@ -35,11 +35,7 @@ class Goal:
 
 
 def parse_list(text: str, pattern: str, advice: str) -> list[Any]:
-    """The groups of a regular expression for each part of a list with commas.
-
-    Raises:
-        typer.BadParameter: a part does not match.
-    """
+    """The groups of a regular expression for each part of a list with commas. Raises typer.BadParameter: no match."""
     parts = [part.strip() for part in text.split(",")]
     for part in parts:
         if not re.fullmatch(pattern, part):

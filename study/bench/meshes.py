@@ -19,7 +19,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.registry import METHODS, find_method
+from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
 from softgrasp.study.bench.driver import Curve, growth, loglog, parse_list
 from softgrasp.study.reduce.sweep import sweep
@@ -162,11 +162,7 @@ def draw(path: Path, rows: Sequence[MeshRow], trends: dict[str, Any]) -> tuple[P
 def run_mesh_study(
     sizes: Sequence[int], steps: int, method: str, N: int, out: Path, console: Console, comm: MPI.Intracomm
 ) -> dict[str, Any]:
-    """Measure all meshes and write mesh_study.json, mesh_study.png and .pdf. Collective.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Measure all meshes and write mesh_study.json, mesh_study.png and .pdf. Collective."""
     find_method(method)
     rows = []
     for size in sizes:

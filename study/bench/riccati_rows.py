@@ -73,14 +73,9 @@ def run_method(comm: MPI.Intracomm, problem: RiccatiProblem, name: str, repeats:
 
 
 def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str = "") -> dict[str, Any]:
-    """All methods on one mesh; gains are compared with the first one. Collective.
+    """All methods on nx x 2 nx cells; gains are compared with the first one. Collective.
 
-    Args:
-        nx: cells across.
-        beta: Kelvin-Voigt time [s].
-        methods: names in :data:`METHODS`.
-        repeats: runs behind each median.
-        partial: file that keeps the methods done so far.
+    ``beta`` is the Kelvin-Voigt time [s]; the file ``partial`` keeps the methods done so far.
     """
     comm = MPI.COMM_WORLD
     problem = problem_for(comm, nx, beta)

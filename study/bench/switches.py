@@ -33,11 +33,11 @@ from softgrasp.lqr.lowrank.modal_start import plant_modes, restrict, solve_small
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import make_shifted
+from softgrasp.reduction.bases.registry import make_basis
+from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project as project_model
 from softgrasp.reduction.propagator import propagator
-from softgrasp.reduction.registry import make_basis
-from softgrasp.reduction.states import States
 from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, write_bench
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
 from softgrasp.study.bench.riccati_rows import problem_for

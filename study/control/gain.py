@@ -15,7 +15,7 @@ from softgrasp.lqr.design.orders import BasisGains, orders, reduce_gains
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.loop import save_controllers, tick_seconds
 from softgrasp.study.control.result import Note, a_priori, gain_result
-from softgrasp.study.control.tables import controller_rows, gain_rows
+from softgrasp.study.control.tables import controller_rows, gain_rows, gain_summary
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -40,11 +40,7 @@ def run_gain(
     notes: list[Note],
     restart: Path | None,
 ) -> dict[str, Any]:
-    """Solve, reduce a priori, write the controllers. Collective; arguments as for ``control_model``.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Solve, reduce a priori, write the controllers. Collective; arguments as for ``control_model``."""
     feedback = design(linearised(model), watch, progress, restart)
     bases: tuple[BasisGains, ...] = ()
     if not feedback.modal:
@@ -59,7 +55,11 @@ def run_gain(
     result = gain_result(feedback, controller, tick, [*notes, *refused], {**model.watch.seconds, **watch.seconds})
     rows = [*gain_rows(feedback), *controller_rows(controller, tick)]
     page = Page(
-        f"{model.scene.name}: optimal gain", [Section("Result", rows=rows)], files=saved, options=" --gain-only"
+        f"{model.scene.name}: optimal gain",
+        gain_summary(feedback, controller, tick),
+        [Section("Result", rows=rows)],
+        files=saved,
+        options=" --gain-only",
     )
     files = session.write(model.scene, result, lambda: page)
     session.console.print(pairs(rows))

@@ -129,11 +129,7 @@ class ControlStudy:
 
 
 def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, Any]:
-    """The keys of ``result.json``. Collective.
-
-    Args:
-        seconds: of the stages.
-    """
+    """The keys of ``result.json``. Collective."""
     return gain_result(study.design, study.controller, study.tick, study.notes, seconds) | {
         "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
         "refused": {b.name: b.refused for b in study.bases if b.refused},
@@ -194,19 +190,10 @@ def radius_of(report: GainReport | BoxPoint) -> float:
 
 
 def _retuned(r: Retuned) -> dict[str, Any]:
+    keys = ("error_K", "cost_excess", "cost_excess_at_most", "abscissa_full", "stable", "reason")
     points = [
-        {
-            "lambda": p.materials[0].lam,
-            "mu": p.materials[0].mu,
-            "error_K": p.error_K,
-            "cost_excess": p.cost_excess,
-            "cost_excess_at_most": p.cost_excess_at_most,
-            "abscissa_full": p.abscissa_full,
-            "sampled_radius": radius_of(p),
-            "time": p.seconds,
-            "stable": p.stable,
-            "reason": p.reason,
-        }
+        {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "sampled_radius": radius_of(p), "time": p.seconds}
+        | {key: getattr(p, key) for key in keys}
         for p in r.points
     ]
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}

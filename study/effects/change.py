@@ -59,9 +59,6 @@ def force_of_motion(scene: Scene, model: Model) -> Force:
     """The force that would carry the bare hand along the prescribed motion, u_n = M_hand a_n.
 
     A hand with more freedoms than the scene's gets no load on them, one with fewer none of those it lacks.
-
-    Raises:
-        SceneError: a csv file does not fit.
     """
     u = motion_table(scene, model.system.layout.n_s).a @ model.system.M_hand.T
 
@@ -153,16 +150,7 @@ def judge_together(runs: Experiments, tried: tuple[str, ...], needed: Names, tol
     """Judge every effect again with all advised effects on, until no further one shows. Collective.
 
     An effect that does not show in the scene as it is joins when it shows beside those advised so far; then two that
-    show only as a pair do.
-
-    Args:
-        runs: of the scene.
-        tried: effects that can be switched.
-        needed: those of them that show in the scene as it is.
-        tolerance: relative change of the outputs that counts [1].
-
-    Raises:
-        SolverError: a solve failed.
+    show only as a pair do. ``tried`` can be switched; ``needed`` of them show in the scene as it is.
     """
     on = needed | (runs.on - frozenset(tried))
     joined: Joined = {}

@@ -189,13 +189,7 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
 def measure_builds(
     comm: MPI.Intracomm, scenes: dict[str, Scene], repeats: int, tick: Callable[[], None]
 ) -> dict[str, Case]:
-    """Build and factor every scene several times, in rotated order. Collective.
-
-    Args:
-        scenes: by name.
-        repeats: how often; fewer when that takes longer than `BUILD_SECONDS`, at least once.
-        tick: called after each build.
-    """
+    """Build and factor every scene in rotated order, ``repeats`` times or for `BUILD_SECONDS`. Collective."""
     cases: dict[str, Case] = {}
     names = list(scenes)
     spent = 0.0

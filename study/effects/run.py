@@ -114,11 +114,7 @@ def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
 
 
 def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
-    """Refuse so many variants of the scene where they would not fit in memory at once. Collective.
-
-    Raises:
-        ResourceError: with the memory that they need.
-    """
+    """Refuse so many variants of the scene where they would not fit in memory at once. Collective."""
     free = comm.bcast(psutil.virtual_memory().available)
     # matrices and vectors need about as much as the factor
     needed = 2 * count * explanation.solver.factor_bytes
@@ -132,11 +128,7 @@ def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> N
 def run_effects(
     path: Path, out: Path, overrides: list[str], console: Console, *, quiet: bool = False, empty: bool = False
 ) -> dict[str, Any]:
-    """Judge the effects of a scene file and write result.json, table, picture and report. Collective.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Judge the effects of a scene file and write result.json, table, picture and report. Collective."""
     session = Session("effects", path, overrides, out, console, quiet, empty=empty)
     comm, scene = session.comm, session.scene()
     console.print(f"effects at the tolerance {scene.study.tolerance:g}")
@@ -145,7 +137,7 @@ def run_effects(
         study = study_effects(scene, comm, lambda done, work: bar.update(task, completed=done, total=work))
     result = {"command": "effects", **origin(scene, comm.size), **study.to_dict()}
     result |= {"memory_peak_mb": peak_memory_mb(comm), "time": {}}
-    files = session.write(scene, result, lambda: compose(study, scene, result, session))
+    files = session.write(scene, result, lambda: compose(study, scene, session))
     if comm.rank == 0:
         show(study, console)
         list_files(console, files)

@@ -49,11 +49,7 @@ class Switch:
 
 
 def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
-    """A copy of the scene after ``edit`` changed its table in place.
-
-    Raises:
-        pydantic.ValidationError: the changed table is no scene.
-    """
+    """A copy of the scene after ``edit`` changed its table in place."""
     data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
     edit(data)
     result = Scene.model_validate(data)

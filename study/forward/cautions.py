@@ -38,13 +38,7 @@ def locking(poisson: dict[str, float], order: int) -> list[str]:
 
 
 def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
-    """A step too long for a period 2 pi / omega.
-
-    Args:
-        omega: angular frequency [1/s].
-        dt, end: step and end of the run [s].
-        period: what the period is, in words.
-    """
+    """A step dt [s] too long for a period 2 pi / omega; the period in words."""
     share = omega * dt / (2 * np.pi)
     if not share > COARSE_STEP:
         return []

@@ -89,12 +89,7 @@ class Explanation:
 
 
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
-    """Assemble a scene and say what it is. Collective.
-
-    Raises:
-        SceneError, MeshError: the scene cannot be built.
-        SolverError: its modes or its sag cannot be computed.
-    """
+    """Assemble a scene and say what it is. Collective."""
     return explain_model(build(scene, comm=comm, run=False))
 
 

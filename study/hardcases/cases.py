@@ -115,10 +115,14 @@ class Family:
     axis: Literal["log", "linear", "listed"] = "log"
 
 
-def _short(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    text = re.sub(r"/\S*/(?=[^/\s])", "", lines[0]) if lines else type(error).__name__  # no folders of this machine
+def short(text: str) -> str:
+    """A message without the folders of this machine, cut where it is long."""
+    text = re.sub(r"/\S*/(?=[^/\s])", "", text)
     return text if len(text) <= LENGTH else text[: LENGTH - 3] + "..."
+
+
+def _first_line(error: BaseException) -> str:
+    return short(next(iter(str(error).strip().splitlines()), type(error).__name__))
 
 
 def here(work: Callable[..., float], *arguments: Any) -> Outcome:
@@ -126,7 +130,7 @@ def here(work: Callable[..., float], *arguments: Any) -> Outcome:
     try:
         return Outcome(float(work(*arguments)))
     except SoftgraspError as error:
-        return Outcome(None, _short(error), refused=True)
+        return Outcome(None, _first_line(error), refused=True)
 
 
 def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
@@ -137,7 +141,7 @@ def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
             result = work(*arguments)
         except Exception as error:  # the point of the comparison is how it fails
             name = type(error).__name__
-            return Outcome(None, f"{name}: {_short(error)}", error=name)
+            return Outcome(None, f"{name}: {_first_line(error)}", error=name)
     if isinstance(result, Outcome):
         return result
     value = float(result)
@@ -148,11 +152,7 @@ def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
 
 
 def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Model:
-    """Build a shipped scene with overrides of the form `section.key=value`. Collective.
-
-    Raises:
-        SceneError, MeshError: as :func:`softgrasp.fem.model.build.build`.
-    """
+    """Build a shipped scene with overrides of the form `section.key=value`. Collective."""
     return build(load_scene(shipped_scenes()[name], overrides), comm=comm)
 
 

@@ -227,7 +227,7 @@ def residual_rows(quick: bool) -> Iterator[HardCase]:
     space.destroy()
     C = np.hstack([G, mass @ Phi, stiffness @ Phi])
     gram = C.T @ np.linalg.solve(mass, C)
-    T = np.hstack(norms.columns(norms.mass, model.system.materials)[:3])
+    T = np.hstack(norms.columns("mass", model.system.materials)[:3])
     length = float(np.sqrt(G[:, 0] @ np.linalg.solve(mass, G[:, 0])))
     scale = float(np.linalg.norm(squares * np.sqrt(np.diag(gram)[2:6])))
     for power in (0, -4, -8) if quick else range(0, -11, -2):

@@ -12,7 +12,6 @@ from rich.progress import TaskProgressColumn
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.certificate import MeshNumber
@@ -34,7 +33,7 @@ from softgrasp.reduction.parameters import run_at
 from softgrasp.study.forward.result import simulate_result
 from softgrasp.study.reduce.certify_check import BoxCheck, check_box
 from softgrasp.study.report.files import to_json
-from softgrasp.study.report.origin import origin, peak_memory_mb, provenance
+from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -63,10 +62,11 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     """
     model, file, console = session.model(scene), session.out / "models" / FILE, session.console
     watch, tolerance = Stopwatch(session.comm), scene.reduction.tolerance
-    state, Phi = _earlier(model, file)
+    earlier = _earlier(model, file)
+    state = None if earlier is None else state_of(earlier)
     if state is not None:
         console.print(f"going on from round {len(state.rounds)} in {file}", soft_wrap=True, markup=False)
-    trainer = Trainer(model, Phi)
+    trainer = Trainer(model, earlier)
     count = scene.reduction.grid
     about = f"trained in lambda {_range(trainer.box.lam)} and mu {_range(trainer.box.mu)} on {count} x {count} points"
     console.print(about, soft_wrap=True, markup=False)
@@ -112,8 +112,8 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         tables = {"greedy.csv": greedy_table(certified)}
         if check is not None:
             tables["tests.csv"] = tests_table(check)
-        parts = sections(model, certified, result, drawn)
-        return Page(f"{scene.name}: certified reduced model", parts, tables, [*drawn, file])
+        title, told = f"{scene.name}: certified reduced model", sentences(certified, result)[:3]
+        return Page(title, told, sections(certified, result, drawn), tables, [*drawn, file])
 
     files = session.write(scene, result, page)
     for sentence in sentences(certified, result):
@@ -130,18 +130,15 @@ def _range(pair: tuple[float, float]) -> str:
     return f"{pair[0]:.4g} to {pair[1]:.4g} Pa"
 
 
-def _earlier(model: Model, file: Path) -> tuple[Greedy | None, Array | None]:
-    """State and modes of an interrupted or coarser training of the same scene, if the folder has one. Collective."""
+def _earlier(model: Model, file: Path) -> CertifiedModel | None:
+    """An interrupted or coarser training of the same scene, if the folder has one. Collective."""
     if not model.system.layout.comm.bcast(file.exists()):
-        return None, None
+        return None
     try:
         old = load_certified(file, model.system.layout)
     except ModelError:
-        return None, None
-    if old.training.get("key") != train_key(model) or old.fine.lift is None:
-        return None, None
-    hand = 2 * model.system.layout.n_s
-    return state_of(old), old.fine.lift.L_q[:, hand : hand + old.k2]
+        return None
+    return old if old.training.get("key") == train_key(model) and old.fine.lift is not None else None
 
 
 def _mesh(model: Model, trainer: Trainer, certified: CertifiedModel) -> MeshNumber | None:
@@ -233,21 +230,23 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
     how = "estimated" if certified.certify == "estimate" else "proved"
     share, tolerance = certified.training["proved"], about["tolerance"]
     box = f"everywhere on the grid and at {about['checked'] - len(certified.training['points'])} random parameters"
-    result_line = f"certified model of N = {about['N']}"
+    result_line = f"The certified model has N = {about['N']} columns"
     if certified.k < certified.k2:
-        result_line += f", measured by one of N = {about['N2']}"
+        result_line += f" and is measured by one of N = {about['N2']}"
     if np.isfinite(share):
-        result_line += f": error at most {share:.1e} of the deformation {box}, {how}."
+        result_line += f": its error is at most {share:.1e} of the deformation {box}, {how}."
     else:
         result_line += ": in parts of the box its bound is larger than the deformation itself."
     if share > tolerance:
         result_line += f" That is above the tolerance {tolerance:g}: runs above it are refused."
     lines = [result_line, f"The greedy stopped after {len(about['rounds'])} rounds: {REASONS[about['reason']]}."]
+    if added := len(about["added"]):
+        lines.append(f"Of the random parameters {added} had a larger bound than the grid and were trained on too.")
     if "validation" in about:
         v = Validation(**about["validation"])
         lines.append(
-            f"{v.n} random full runs: the error was at most {v.factor:.3g} times the estimate; with 95 % confidence it "
-            f"is more on at most {v.share:.1%} of the box."
+            f"In {v.n} random full runs the error was at most {v.factor:.3g} times the estimate; with 95 % confidence "
+            f"it is larger on at most {v.share:.1%} of the box."
         )
     lines.append(f"At the scene's own material: {about['own']['sentence']}.")
     lines += about["own"]["reasons"]
@@ -266,16 +265,10 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def sections(
-    model: Model, certified: CertifiedModel, result: dict[str, Any], drawn: Sequence[Path] = ()
-) -> list[Section]:
+def sections(certified: CertifiedModel, result: dict[str, Any], drawn: Sequence[Path] = ()) -> list[Section]:
     """Parts of the page."""
     figures = [(file, CAPTIONS[file.name]) for name in CAPTIONS for file in drawn if file.name == name]
-    scene, comm = model.scene, model.system.layout.comm
-    rows = provenance(origin(scene, comm.size))
-    rows += [(f"time {key}", f"{value:.3g} s") for key, value in result["time"].items()]
     return [
         Section("What holds", text="\n\n".join(sentences(certified, result)), figures=figures),
         greedy_table(certified).section("Each round runs the full model where the proved bound was largest."),
-        Section("Made with", rows=rows),
     ]
