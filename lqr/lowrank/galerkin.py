@@ -44,7 +44,8 @@ class Space:
 
     def grown(self, plant: Plant, columns: Array) -> Space:
         """With the parts of more columns that are new: M-orthogonal to V, which is M-orthonormal. Collective."""
-        comm, size = plant.comm, _m_norms(plant, columns)
+        comm = plant.comm
+        size = np.sqrt(total(comm, np.einsum("ij,ij->j", columns, plant.mass(columns))))
         columns = columns / np.where(size > 0, size, 1.0)
         M_columns = columns
         for _ in range(2):  # a small part is orthogonal to rounding only after it is scaled to 1
@@ -96,10 +97,6 @@ def _root(X: Array) -> Array:
     values, vectors = np.linalg.eigh(X)
     keep = values > 1e-17 * values[-1]
     return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
-
-
-def _m_norms(plant: Plant, columns: Array) -> Array:
-    return np.sqrt(total(plant.comm, np.einsum("ij,ij->j", columns, plant.mass(columns))))
 
 
 def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
