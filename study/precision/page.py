@@ -205,8 +205,8 @@ def _how(study: WorkStudy) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
     if study.truth is not None:
         rows += [
-            ("deformation error", "max over the run of |y - y*|, over max |y*|; y the outputs against the hand"),
-            ("displacement error", "the same of the whole displacements, where the hand's motion hides the tissue"),
+            ("deform. error", "max over the run of |y - y*|, over max |y*|; y the outputs against the hand"),
+            ("displ. error", "the same of the whole displacements, where the hand's motion hides the tissue"),
             ("places", "the same points of the body on every mesh, not the nearest nodes"),
             ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
         ]

@@ -28,11 +28,11 @@ from softgrasp.study.report.tables import Table
 
 HEADERS: dict[str, tuple[str, ...]] = {
     "forward": (
-        "setting", "unknowns", "deformation error", "displacement error", "assembly [s]", "factor [s]", "step [us]",
+        "setting", "unknowns", "deform. error", "displ. error", "assembly [s]", "factor [s]", "step [us]",
         "run [s]", "front",
     ),
     "reduced": (
-        "setting", "N", "deformation error", "state error", "deformation error with the mesh", "online [s]",
+        "setting", "N", "deform. error", "state error", "deform. error with the mesh", "online [s]",
         "from nothing [s]", "front",
     ),
     "bases": ("engine", "tolerance", "vectors", "left of the snapshots", "|U'U - I|", "time [s]", "front"),
@@ -41,7 +41,7 @@ HEADERS: dict[str, tuple[str, ...]] = {
         "basis", "N", "gain error", "excess cost", "abscissa [1/s]", "equation [ms]", "from nothing [s]", "front",
     ),
     "loop": (
-        "controller", "steps", "deformation error", "displacement error", "error in time", "error of the cost",
+        "controller", "steps", "deform. error", "displ. error", "error in time", "error of the cost",
         "step [us]", "run [s]", "front",
     ),
 }  # fmt: skip
