@@ -48,7 +48,7 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     entries = scene.control.outputs if scene.control is not None else []
     if not entries:
         point, count = _farthest(system)
-        which = "the free one" if count == 1 else f"one of {count} free ones equally"
+        which = "the free one" if count == 1 else f"one of the {count} free ones"
         tip = _node(system, "tip", point)
         return (replace(tip, place=f"node {_coordinates(tip.point)}, {which} farthest from the hand"),)
     result = []
