@@ -253,9 +253,9 @@ def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
 
     for nx in (15, 60):
         cells = f"tissue.cells=[{nx}, {2 * nx}]"
-        samples = interleave({"off": run_of([cells]), "on": run_of([cells, "effects.finite_strain={}"])}, repeats)
-        seconds = [float(statistics.median(samples[key])) for key in ("off", "on")]
-        yield Row("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, *seconds)
+        runs = {"off": run_of([cells]), "on": run_of([cells, "effects.finite_strain={}"])}
+        seconds = medians(interleave(runs, repeats))
+        yield Row("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, seconds["off"], seconds["on"])
 
 
 def _two(
