@@ -69,7 +69,6 @@ def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array
     velocities, sqrt(m / d) of momenta, which makes |X|_F a norm that does not see where nodes crowd [W87].
 
     Args:
-        view: which state.
         system: gives T, G and the mass.
         z, v_z: local rows (n_local, m).
         q_s, v_s: (n_s, m), the same on every rank.
