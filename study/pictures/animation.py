@@ -89,21 +89,20 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
     images = []
     fast = speed_up(times)
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
-    note = f" ({fast:g}$\\times$)" if fast != 1 else ""
+    note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
         figure, axes = make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
         ax = axes[0]
         # The longest text first, so that all frames have the size of the first.
-        stamp = ax.set_title(f"$t$ = {times[-1]:.{digits}f} s{note}", pad=3)
+        stamp = ax.set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
-        draw_scene(ax, shot, frames[:1], None, shot.hands[:1])
         film = Film(figure, axes, [stamp])
         for i in range(len(frames)):
             film.clear()
             draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
             name_layers(ax, shot, frames[i], inside=True)  # beside the body they would change sides
-            stamp.set_text(f"$t$ = {times[i]:.{digits}f} s{note}")
+            stamp.set_text(f"t = {times[i]:.{digits}f} s{note}")
             images.append(film.frame())
         plt.close(figure)
     return images
@@ -113,18 +112,16 @@ class Film:
     """Frames of one figure: axes, colour bar and legend are drawn once, what moves over them in every frame.
 
     Args:
-        figure: with its first frame, whose size all frames get.
-        axes: whose collections, lines and texts move.
+        figure: without what moves; all frames get its size.
+        axes: whose lines lie under and over the collections and texts that move.
         others: further artists that change.
     """
 
     def __init__(self, figure: Any, axes: list[Any], others: Sequence[Any] = ()) -> None:
         self.figure, self.axes, self.others = figure, axes, others
         figure.set_dpi(DPI)
-        figure.canvas.draw()
-        _fit(figure, figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08))
-        self.clear()
-        for artist in others:
+        _fit(figure, figure.get_tightbbox().padded(0.08))
+        for artist in (*others, *(line for ax in axes for line in ax.lines)):
             artist.set_animated(True)  # no part of the background
         figure.canvas.draw()
         self.background = figure.canvas.copy_from_bbox(figure.bbox)
@@ -132,7 +129,7 @@ class Film:
     def clear(self) -> None:
         """Remove what moves."""
         for ax in self.axes:
-            for artist in [*ax.collections, *ax.lines, *ax.texts]:
+            for artist in [*ax.collections, *ax.texts]:
                 artist.remove()
 
     def frame(self) -> Any:
