@@ -103,12 +103,11 @@ def run_control(
         parts, files = sections(study, seconds, drawn), [*drawn, *fields, *saved]
         return Page(title, parts, tables(study), files, summary=summary(study))
 
-    files = session.write(model.scene, result, page)
     if session.comm.rank == 0:
         show(console, study, seconds)
-        list_files(console, files)
-        if restart is not None:
-            shutil.rmtree(restart, ignore_errors=True)
+    list_files(console, session.write(model.scene, result, page))
+    if session.comm.rank == 0 and restart is not None:
+        shutil.rmtree(restart, ignore_errors=True)
     session.comm.Barrier()
     return result
 

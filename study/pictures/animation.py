@@ -17,10 +17,10 @@ from PIL import Image
 from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
+from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
 
 MOST_FRAMES = 60
-SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them the animation runs slower or faster than the move
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
 MOST_BYTES = 3_000_000
 DPI = 110
@@ -53,22 +53,6 @@ def gif_move(
     shot = make_shot(picture, frames, times, np.asarray(table, dtype=np.float64), target)
     durations = [int(10 * n) for n in ticks] + [int(1000 * REST)]
     return write_gif(_render(shot, frames, times), durations, out_gif, _palette())
-
-
-def speed_up(times: Array) -> float:
-    """How many times faster than the move its animation runs: 1 from 0.3 to 30 s, else steps of 1, 2, 5 [1].
-
-    Longer moves are shown in at most 30 s, shorter ones in at least 1 s.
-    """
-    total = float(times[-1] - times[0])
-    if SHORTEST <= total <= LONGEST or total <= 0.0:
-        return 1.0
-    ratio = total / LONGEST if total > LONGEST else total
-    power = 10.0 ** np.floor(np.log10(ratio) + 1e-9)
-    steps = [m * power for m in (1, 2, 5, 10)]
-    if total > LONGEST:
-        return float(next(m for m in steps if m >= ratio * (1 - 1e-9)))
-    return float(max(m for m in steps if m <= ratio * (1 + 1e-9)))
 
 
 def _timing(times: Array) -> tuple[list[int], list[int]]:

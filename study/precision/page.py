@@ -74,9 +74,8 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
         title = f"{study.scene.name}: accuracy against time"
         return Page(title, sections, {"points.csv": points_table(study)}, figures, request.options)
 
-    files = session.write(study.scene, result, page)
     show(session.console, study, commands)
-    list_files(session.console, files)
+    list_files(session.console, session.write(study.scene, result, page))
     comm.Barrier()
     return result
 

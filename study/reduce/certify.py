@@ -115,10 +115,9 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         parts = sections(model, certified, result, drawn)
         return Page(f"{scene.name}: certified reduced model", parts, tables, [*drawn, file])
 
-    files = session.write(scene, result, page)
     for sentence in sentences(certified, result):
         console.print(sentence, markup=False)
-    list_files(console, files)
+    list_files(console, session.write(scene, result, page))
     return result
 
 

@@ -109,9 +109,8 @@ def run_reduce(
         tables = {"points.csv": point_table(study)}
         return Page(f"{scene.name}: reduced models", parts, tables, [*files, *models], summary=summary(study))
 
-    files = session.write(scene, result, page)
     show(console, study)
-    list_files(console, files)
+    list_files(console, session.write(scene, result, page))
     return result
 
 

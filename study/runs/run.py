@@ -78,8 +78,7 @@ def run_sweep(
         options = "".join(f" {text}" for text in axes) + (f" --reduced {reduced}" if reduced else "")
         return Page(f"{scene.name}: sweep", parts, {"sweep.csv": table}, files, options)
 
-    files = session.write(scene, result, page)
     console.print(table.terminal(wrap=range(len(table.header)), width=console.width))
     show_warnings(console, notes)
-    list_files(console, files)
+    list_files(console, session.write(scene, result, page))
     return result

@@ -76,6 +76,21 @@ def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path:
 
 
 @pytest.mark.serial
+def test_a_run_removes_what_the_run_before_left(tmp_path: Path) -> None:
+    first = run_simulate(SCENE, tmp_path, SMALL, QUIET, quiet=True, pictures=False)
+    assert {"result.json", "fields.pvd", "report.html"} <= set(first["files"])
+    for name in ("old.csv", "mine.txt", "../outside.txt"):
+        (tmp_path / name).write_text("x")
+    named = first | {"files": [*first["files"], "old.csv", "../outside.txt"]}
+    (tmp_path / "result.json").write_text(json.dumps(named))
+    again = run_simulate(SCENE, tmp_path, [*SMALL, "output.fields='none'"], QUIET, quiet=True, pictures=False)
+    there = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert there == {*again["files"], "mine.txt"}
+    assert (tmp_path / "../outside.txt").exists()
+    assert again["time"]["pictures_cpu"] < again["time"]["total_cpu"]
+
+
+@pytest.mark.serial
 def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     for name, mu in (("a", 50.0), ("b", 30.0)):
         changes = [*SMALL, f"tissue.material.mu={mu}"]
