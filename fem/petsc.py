@@ -18,9 +18,9 @@ from softgrasp.fem import _stack as _stack
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
-FEW_ROWS = 500  # up to which SciPy's product is the faster one for any storage
-MANY_COLUMNS = 8  # below, setting up a product of matrices costs more than it saves
-BLOCK_ENTRIES = 32_768  # about so many of a block of columns: room that the C library need not ask the system for
+FEW_COLUMNS = 2  # up to which setting up a product of matrices costs more than it saves
+BLOCK_COLUMNS = 8  # at least so many of a block
+BLOCK_ENTRIES = 131_072  # about so many of a block of columns: room that the C library need not ask the system for
 
 
 @contextmanager
@@ -97,20 +97,20 @@ def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
 def times_columns(A: PETSc.Mat, X: Array) -> Array:
     """A X for local rows of dense columns, (n_local, k), in the storage of the faster way. Collective.
 
-    On one rank X stored by rows goes by SciPy's product, for which the matrix keeps a copy, and X stored by columns by
-    PETSc's in blocks; on more ranks all columns go at once, since every block costs messages. One column, and a rank
-    without rows, on which PETSc's product crashes, go by the product with vectors. CPU ms of SciPy's and PETSc's way
-    at n = 14638 with 10, 30, 120 columns: 0.7, 1.7, 7 and 0.8, 3.6, 12 for X stored by rows; 0.8, 2.4, 13 and 0.7, 2.2,
-    8 for X stored by columns.
+    On one rank X stored by rows, or of few entries, goes by SciPy's product, for which the matrix keeps a copy, and
+    other X by PETSc's in blocks; on more ranks all columns go at once, since every block costs messages. One or two
+    columns, and a rank without rows, on which PETSc's product crashes, go by the product with vectors.
+    ``python -m softgrasp.study.bench switches --switches product`` measures the ways.
     """
-    (rows, n), k = A.getSizes()[0], X.shape[1]
-    serial, entries = A.comm.size == 1, A.getType() != PETSc.Mat.Type.PYTHON
-    if serial and entries and k > 1 and (rows <= FEW_ROWS or not X.flags.f_contiguous):
+    k, serial, entries = X.shape[1], A.comm.size == 1, A.getType() != PETSc.Mat.Type.PYTHON
+    few = k >= BLOCK_COLUMNS and X.size <= BLOCK_ENTRIES
+    if serial and entries and k > 1 and (few or not X.flags.f_contiguous):
         return np.asarray(_kept_rows(A) @ X)
-    result = np.empty((rows, k), order="F")
-    blocks = entries and k >= MANY_COLUMNS and np.diff(A.getOwnershipRanges()).min() > 0
-    multiply = _by_blocks if blocks else _by_vectors
-    multiply(A, X, result, max(MANY_COLUMNS, BLOCK_ENTRIES // max(n, 1)) if serial else k)
+    result = np.empty((A.getLocalSize()[0], k), order="F")
+    if entries and k > FEW_COLUMNS and np.diff(A.getOwnershipRanges()).min() > 0:
+        _by_blocks(A, X, result, max(1, min(X.size // BLOCK_ENTRIES, k // BLOCK_COLUMNS)) if serial else 1)
+    else:
+        _by_vectors(A, X, result)
     return result
 
 
@@ -123,7 +123,7 @@ def _kept_rows(A: PETSc.Mat) -> Any:
     return kept[1]
 
 
-def _by_vectors(A: PETSc.Mat, X: Array, result: Array, _: int) -> None:
+def _by_vectors(A: PETSc.Mat, X: Array, result: Array) -> None:
     """A X column by column. Collective."""
     x, y = A.createVecs()
     for j in range(X.shape[1]):
@@ -134,8 +134,9 @@ def _by_vectors(A: PETSc.Mat, X: Array, result: Array, _: int) -> None:
     y.destroy()
 
 
-def _by_blocks(A: PETSc.Mat, X: Array, result: Array, width: int) -> None:
+def _by_blocks(A: PETSc.Mat, X: Array, result: Array, blocks: int) -> None:
     """A X by PETSc's product with a dense matrix, which reads A once for several columns. Collective."""
+    width = -(-X.shape[1] // blocks)
     for first in range(0, X.shape[1], width):
         part = np.asfortranarray(X[:, first : first + width])
         dense = PETSc.Mat().createDense((A.getSizes()[1], (None, part.shape[1])), array=part, comm=A.comm)

@@ -52,7 +52,6 @@ def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str
     """Read arrays back.
 
     Args:
-        path: the file.
         sha256: what its manifest says; None if the manifest does not know it.
         advice: what to do about a damaged file.
 
@@ -85,11 +84,7 @@ def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
 
 
 def read_manifest(path: Path, format: int, advice: str = AGAIN) -> dict[str, Any]:
-    """Read a manifest back.
-
-    Raises:
-        CheckpointError: it is missing, of another format, or not as it was written.
-    """
+    """Read a manifest back. Raises CheckpointError: it is missing, of another format, or not as it was written."""
     try:
         entry = json.loads(path.read_bytes())
     except FileNotFoundError:

@@ -23,17 +23,11 @@ if TYPE_CHECKING:  # only scenes with finite strain load it
 
 @dataclass(frozen=True)
 class Component:
-    """One affine component A of the finite element matrix, in the blocks of hand and tissue.
+    """One affine component A of the finite element matrix, in the blocks of hand and tissue."""
 
-    Attributes:
-        ee: A on the free nodes, distributed (n_e, n_e).
-        es: A R on the free nodes, local rows (n_local, n_s).
-        ss: R' A R, (n_s, n_s), the same on every rank.
-    """
-
-    ee: PETSc.Mat
-    es: Array
-    ss: Array
+    ee: PETSc.Mat  # A on the free nodes, distributed (n_e, n_e)
+    es: Array  # A R on the free nodes, local rows (n_local, n_s)
+    ss: Array  # R' A R, (n_s, n_s), the same on every rank
 
 
 @dataclass(frozen=True)

@@ -28,17 +28,11 @@ Kind = Literal["error", "warning"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about the control problem; an error means that no solver should be started.
+    """One sentence about the control problem; an error means that no solver should be started."""
 
-    Attributes:
-        kind: error or warning.
-        topic: weights, data, outputs, inputs, damping.
-        sentence: what is wrong and what would be right.
-    """
-
-    kind: Kind
-    topic: str
-    sentence: str
+    kind: Kind  # error or warning
+    topic: str  # weights, data, outputs, inputs, damping
+    sentence: str  # what is wrong and what would be right
 
 
 @dataclass(frozen=True)
@@ -81,7 +75,6 @@ def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
     """Check weights and data, outputs and inputs, and the damping of the closed loop. Collective.
 
     Args:
-        problem: the plant.
         modes: lowest modes to look at.
     """
     unusable = _data(problem)
@@ -110,15 +103,8 @@ def _data(problem: RiccatiProblem) -> list[Finding]:
         bad.append(Finding("error", "weights", str(error)))
     matrices = {"M_ee": system.M_ee, "K_ee": system.K_ee}
     try:
-        check_finite(
-            C_s=problem.C_s,
-            C_z=problem.C_z,
-            G=system.G,
-            T=system.T,
-            M_hand=system.M_hand,
-            B_z=problem.B_z,
-            **{name: np.asarray(A.getValuesCSR()[2]) for name, A in matrices.items()},
-        )
+        check_finite(C_s=problem.C_s, C_z=problem.C_z, G=system.G, T=system.T, M_hand=system.M_hand, B_z=problem.B_z)
+        check_finite(**{name: np.asarray(A.getValuesCSR()[2]) for name, A in matrices.items()})
     except ControlError as error:
         bad.append(Finding("error", "data", f"{error}; check material, mesh and outputs"))
     whole = [f for part in problem.layout.comm.allgather(bad) for f in part]
@@ -135,15 +121,11 @@ def _outputs(problem: RiccatiProblem) -> list[Finding]:
     hidden = np.flatnonzero(sigma <= 1e3 * EPS * size)
     if len(hidden):
         motion = _motion(right[hidden[-1]], problem.layout.dimension)
-        findings.append(
-            Finding(
-                "error",
-                "outputs",
-                f"not detectable: the weighted outputs do not see {len(hidden)} of the {n_s} rigid motions of the "
-                f"hand, for example {motion}, which nothing else brings to rest; add outputs or give them "
-                "a weight in control.Q",
-            )
+        text = (
+            f"not detectable: the weighted outputs do not see {len(hidden)} of the {n_s} rigid motions of the hand, "
+            f"for example {motion}, which nothing else brings to rest; add outputs or give them a weight in control.Q"
         )
+        findings.append(Finding("error", "outputs", text))
     rows = np.abs(problem.Q).sum(axis=1)
     idle = [name for name, row in zip(problem.names, rows, strict=True) if row == 0]
     if idle and not len(hidden):
@@ -170,26 +152,19 @@ def _damping(problem: RiccatiProblem, rates: ModeRates) -> list[Finding]:
         seen = f"{lost} of the lowest {len(rates.omega)} modes cannot be stabilised in double precision at all"
         if not lost:
             seen = f"the slowest of the lowest {len(rates.omega)} modes would decay at {slowest:.1e}/s"
-        return [
-            Finding(
-                "error",
-                "damping",
-                f"no damping: feedback alone has to stabilise all {n_e} modes, {seen}, and X is not of low rank; "
-                f"{way_out}",
-            )
-        ]
+        text = (
+            f"no damping: feedback alone has to stabilise all {n_e} modes, {seen}, and X is not of low rank; {way_out}"
+        )
+        return [Finding("error", "damping", text)]
     if lost:
         return [Finding("error", "damping", lost_sentence(rates))]
     zeta = float(rates.own[0] / rates.omega[0])
     if zeta < WEAK:
-        return [
-            Finding(
-                "warning",
-                "damping",
-                f"nearly undamped: the first mode has the damping ratio {zeta:.1e}, so that X has a high rank and the "
-                f"low-rank solvers may not converge; {way_out}",
-            )
-        ]
+        text = (
+            f"nearly undamped: the first mode has the damping ratio {zeta:.1e}, so that X has a high rank and the "
+            f"low-rank solvers may not converge; {way_out}"
+        )
+        return [Finding("warning", "damping", text)]
     return []
 
 

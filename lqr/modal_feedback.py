@@ -27,7 +27,6 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
     them, so that the whole loop must be checked with :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`. Collective.
 
     Args:
-        problem: the plant.
         modes: number of modes in the model.
         candidates: lowest modes they are taken from; modes that inputs do not reach or outputs do not see are skipped.
 

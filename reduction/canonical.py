@@ -32,7 +32,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.galerkin import symmetric
 from softgrasp.reduction.operators import Operators, Parameters, Parts
 

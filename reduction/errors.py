@@ -21,7 +21,7 @@ from mpi4py import MPI
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.engines import factor
+from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.model import ModelError, ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
 

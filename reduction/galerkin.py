@@ -15,7 +15,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import BlockSystem, LayerMaterial, coupling
-from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.operators import Operators, Parameters, Parts
 
 

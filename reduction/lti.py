@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.columns import TURNS, hand_columns
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.bases.basis import ReductionError
 
 
 @dataclass(frozen=True)

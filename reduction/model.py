@@ -11,7 +11,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.basis import Coordinates, Frame, ReductionError, Structure
+from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
 from softgrasp.reduction.lti import LTI, make_lti
@@ -199,7 +199,7 @@ class ReducedModel:
         parts: small matrices, the same bits on every rank.
         materials: those of the projection.
         outputs: of the scene.
-        split: columns of every part of the basis, see :class:`softgrasp.reduction.basis.Basis`.
+        split: columns of every part of the basis, see :class:`softgrasp.reduction.bases.basis.Basis`.
         alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
         damped: damping terms were projected.
         hand_weight, two_way: effects of the scene.

@@ -12,8 +12,8 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import LayerMaterial
+from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import States
 
 GRID = 3  # test values of each constant, from corner to corner of the box
 LAMBDA_SHARES = (0.6, 10.0)  # of the scene's own constant: the paper's box around its 50, 50

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.canonical import canonical_parts
 from softgrasp.reduction.galerkin import galerkin_parts, relative_rows
 from softgrasp.reduction.model import Lift, Outputs, ReducedModel

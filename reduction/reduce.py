@@ -1,67 +1,181 @@
-"""A reduced model of a scene from one full run: basis, then projection with the outputs of the scene."""
+"""Reduced models of a scene from full runs, linear or at finite strain: how they are made, replayed and compared."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, overload
 
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.reduction.basis import Basis, ReductionError
-from softgrasp.reduction.engines import EngineName
-from softgrasp.reduction.inner import InnerName
+from softgrasp.reduction.bases.basis import Basis, ReductionError
+from softgrasp.reduction.bases.engines import EngineName
+from softgrasp.reduction.bases.inner import InnerName
+from softgrasp.reduction.bases.registry import make_basis
+from softgrasp.reduction.bases.states import States
+from softgrasp.reduction.bases.truncation import Truncation
+from softgrasp.reduction.errors import ModelErrors
 from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import make_basis
-from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import States
-from softgrasp.reduction.truncation import Truncation
+from softgrasp.reduction.replay import FullRun, as_full, errors_linear, replay_linear
+
+if TYPE_CHECKING:  # only scenes with finite strain pay for them
+    from softgrasp.reduction.strain.compare import StrainErrors
+    from softgrasp.reduction.strain.model import StrainModel, StrainRun
 
 
 def reduce(
     model: Model,
-    run: Trajectory | FullRun,
-    method: str = "psd_fixed",
+    runs: Trajectory | FullRun | Sequence[Trajectory | FullRun],
+    method: str | None = None,
     N: int | Truncation | None = 14,
     *,
     inner: InnerName | None = None,
     engine: EngineName = "tsqr",
-) -> ReducedModel:
-    """Reduced model E x' = A x + B u + F g, y = C x of a scene, from the snapshots of a full run. Collective.
+) -> ReducedModel | StrainModel:
+    """Reduced model of a scene, from the snapshots of one full run or of several. Collective.
+
+        E x' = A x + B u + F g, y = C x                            linear elasticity, x = V'X of the method's basis
+        a'' + D a' + dW_r/da = -G (a_s - g), y = C_z a + C_s q_s   effects.finite_strain, z = Phi a on sampled cells
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
     >>> rom = sg.reduce(model, sg.simulate(model), "psd_fixed", N=14)
     >>> rom.N, rom.split, rom.at().stable
     (14, (10,), True)
+    >>> strained = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
+    >>> rom = sg.reduce(strained, sg.simulate(strained), N=14)
+    >>> rom.N, rom.cells.count < 64
+    (14, True)
 
     Which method: on the paper's scene "craig_bampton", which needs no snapshots, has the least error of the deformation
     from N = 10 on; "psd_svd_like" and "componentwise_pod" come next, and the paper's "psd_fixed" needs about twice the
     columns. The symplectic ones and "craig_bampton" are stable at every N. `softgrasp reduce` compares all on a scene.
 
     Args:
-        model: scene; the reduced model is affine in its materials, see
-            :meth:`softgrasp.reduction.model.ReducedModel.at`.
-        run: a run of it with the snapshots in memory.
+        model: scene. A linear reduced model is affine in its materials, see
+            :meth:`softgrasp.reduction.model.ReducedModel.at`; one at finite strain answers inside the box of materials
+            and motions of its runs, see :meth:`softgrasp.reduction.strain.model.StrainModel.at`.
+        runs: of it, with the snapshots in memory.
         method: "global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed",
             "psd_cotangent_lift", "psd_svd_like" and their "_fixed" and "_relative" forms, or "craig_bampton"; all keys
-            in :data:`softgrasp.reduction.registry.METHODS`. "psd_fixed" is the paper's PSD with fixed solid modes
-            [SBRH21].
-        N: columns of V, the hand's included; or a rule; None keeps 99.9 % of the energy, as the paper does.
-        inner, engine: see :func:`softgrasp.reduction.registry.make_basis`.
+            in :data:`softgrasp.reduction.bases.registry.METHODS`. None is the paper's PSD with fixed solid modes
+            "psd_fixed" [SBRH21]; at finite strain there is one basis only, the cotangent lift.
+        N: dimension, the hand's 2 n_s included; linear: or a rule; None keeps 99.9 % of the energy, as the paper does.
+        inner, engine: see :func:`softgrasp.reduction.bases.registry.make_basis`; linear only.
 
     Returns:
-        A :class:`softgrasp.reduction.model.ReducedModel` with V, the N x N blocks and the hand's coupling; ``at`` gives
-        it at other materials, :func:`softgrasp.reduction.replay.replay` runs it under the same motion.
+        The small matrices, or the sampled cells with their weights, and the outputs of the scene; ``at`` gives the
+        model at other materials, :func:`replay` runs it under the same motion.
 
     Raises:
-        SceneError: the run kept no snapshots, or the body is at rest in all of them.
-        ReductionError: finite strain, see :func:`softgrasp.reduction.strain.training.reduce_strain`.
+        SceneError: a run kept no snapshots, or the body is at rest in all of them.
         BasisError: the method is unknown, or it has no basis of N columns.
-        SolverError: a factorisation failed.
+        ReductionError: a model at finite strain with a linear one's options, or no weights reach their tolerance.
+        SolverError: a factorisation failed, or a reduced run did not converge.
     """
+    fulls = [as_full(model, run) for run in ([runs] if isinstance(runs, Trajectory | FullRun) else runs)]
+    if model.system.points is None:
+        return reduce_linear(model, fulls, method or "psd_fixed", N, inner, engine)
+    from softgrasp.reduction.strain.training import train
+
+    if method is not None or inner is not None or not isinstance(N, int):
+        raise ReductionError(
+            f"scene {model.scene.name} has effects.finite_strain, whose models have one basis; give N and no method"
+        )
+    return train(model, fulls, N).reduce(N)
+
+
+@overload
+def replay(rom: ReducedModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> ReducedTrajectory: ...
+@overload
+def replay(rom: StrainModel, model: Model, run: Trajectory | FullRun, *, allow: bool = ...) -> StrainRun: ...
+def replay(
+    rom: ReducedModel | StrainModel, model: Model, run: Trajectory | FullRun, *, allow: bool = False
+) -> ReducedTrajectory | StrainRun:
+    """Run a reduced model under the hand of a full run, from its start. Collective.
+
+    The hand moves as it did where the basis keeps it apart (fixed solid modes), else it feels the force that gave its
+    motion. The materials are those of ``model``: a model with others replays a new parameter, and nothing of full order
+    is solved.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce(model, run, "psd_fixed", N=14)
+    >>> sg.replay(rom, model, run).x.shape  # steps + 1, N
+    (101, 14)
+
+    Args:
+        rom: reduced model.
+        model: gives the materials.
+        run: the full run; a :class:`softgrasp.reduction.replay.FullRun` is at materials of its own, a trajectory at
+            those of ``model`` or, without effects.reaction, at any.
+        allow: run a linear model with growing modes, or one at finite strain outside its training, all the same.
+
+    Raises:
+        SceneError: see :func:`softgrasp.reduction.replay.full_run`.
+        UnstableModelError: the reduced model has growing modes there.
+        ModelError: the reduced model cannot represent the materials, it has no run or no equilibrium to start in, or
+            the run lies outside the training box.
+        SolverError: a step at finite strain did not converge.
+    """
+    if isinstance(rom, ReducedModel):
+        return replay_linear(rom, model, run, allow_unstable=allow)
+    from softgrasp.reduction.strain.training import replay_strain
+
+    return replay_strain(rom, as_full(model, run), outside=allow)
+
+
+@overload
+def errors(
+    rom: ReducedModel, reduced_run: ReducedTrajectory, model: Model, run: Trajectory | FullRun
+) -> ModelErrors: ...
+@overload
+def errors(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajectory | FullRun) -> StrainErrors: ...
+def errors(
+    rom: ReducedModel | StrainModel, reduced_run: ReducedTrajectory, model: Model, run: Trajectory | FullRun
+) -> ModelErrors | StrainErrors:
+    """|X - X_r| / |X| over the snapshots X of a full run: states, deformation, energy. Collective.
+
+    >>> import softgrasp as sg
+    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
+    >>> run = sg.simulate(model)
+    >>> rom = sg.reduce(model, run, "psd_fixed", N=40)
+    >>> sg.errors(rom, sg.replay(rom, model, run), model, run).error_deformation < 0.01
+    True
+
+    Args:
+        rom: reduced model, with its lift.
+        reduced_run: its run on the time grid of the full one, at the materials of ``model``.
+        model: scene at the materials of both runs.
+        run: the full run.
+
+    Raises:
+        SceneError: see :func:`softgrasp.reduction.replay.full_run`.
+        ModelError: the reduced run is shorter than the full one, or the model was loaded without its lift.
+    """
+    full = as_full(model, run)
+    if isinstance(rom, ReducedModel):
+        return errors_linear(rom, reduced_run, full)
+    from softgrasp.reduction.strain.training import errors_strain
+
+    return errors_strain(rom, reduced_run, full)
+
+
+def reduce_linear(
+    model: Model,
+    runs: Sequence[FullRun],
+    method: str = "psd_fixed",
+    N: int | Truncation | None = 14,
+    inner: InnerName | None = None,
+    engine: EngineName = "tsqr",
+) -> ReducedModel:
+    """A linear model, see :func:`reduce`. Collective."""
     _check_linear(model)
-    full = run if isinstance(run, FullRun) else full_run(model, run)
-    states = States(model.system, ((full.model.system, full.snapshots),))
+    states = States(model.system, tuple((run.model.system, run.snapshots) for run in runs))
     return project_scene(make_basis(method, states, N, inner, engine), model)
 
 
@@ -80,5 +194,5 @@ def _check_linear(model: Model) -> None:
     if model.system.points is not None:
         raise ReductionError(
             f"scene {model.scene.name} has effects.finite_strain, and this model would be linear; "
-            "softgrasp.reduce_strain(model, runs, N) makes its reduced models"
+            "softgrasp.reduce(model, runs, N=N) makes its reduced models"
         )

@@ -16,7 +16,7 @@ from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction import online
-from softgrasp.reduction.engines import factor
+from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.errors import Comparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
@@ -115,63 +115,22 @@ def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots
     return np.asarray(u)
 
 
-def replay(
+def replay_linear(
     rom: ReducedModel, model: Model, run: Trajectory | FullRun, *, allow_unstable: bool = False
 ) -> ReducedTrajectory:
-    """Run a reduced model under the hand of a full run, from its start. Collective.
-
-    The hand moves as it did where the basis keeps it apart (fixed solid modes), else it feels the force that gave its
-    motion. The materials are those of ``model``: a model with others replays a new parameter, and nothing of full order
-    is solved.
-
-    >>> import softgrasp as sg
-    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
-    >>> run = sg.simulate(model)
-    >>> rom = sg.reduce(model, run, "psd_fixed", N=14)
-    >>> sg.replay(rom, model, run).x.shape  # steps + 1, N
-    (101, 14)
-
-    Args:
-        rom: reduced model.
-        model: gives the materials.
-        run: the full run; a :class:`FullRun` is at materials of its own, a trajectory at those of ``model`` or, without
-            effects.reaction, at any.
-        allow_unstable: run a model with growing modes all the same.
-
-    Raises:
-        SceneError: see :func:`full_run`.
-        UnstableModelError: the reduced model has growing modes there and ``allow_unstable`` is not set.
-        ModelError: the reduced model cannot represent the materials, or it has no run or no equilibrium to start in.
-    """
-    step, drive = replay_inputs(rom, rom.at(model.system.materials), _full(model, run))
+    """A linear model under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
+    step, drive = replay_inputs(rom, rom.at(model.system.materials), as_full(model, run))
     return online.run(step, allow_unstable=allow_unstable, **drive)
 
 
-def errors(rom: ReducedModel, reduced_run: ReducedTrajectory, model: Model, run: Trajectory | FullRun) -> ModelErrors:
-    """|X - X_r|_F / |X|_F over the snapshots X of a full run, and the error of the energy. Collective.
-
-    >>> import softgrasp as sg
-    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
-    >>> run = sg.simulate(model)
-    >>> rom = sg.reduce(model, run, "psd_fixed", N=40)
-    >>> sg.errors(rom, sg.replay(rom, model, run), model, run).error_deformation < 0.01
-    True
-
-    Args:
-        rom: reduced model, with its lift.
-        reduced_run: its run on the time grid of the full one, at the materials of ``model``.
-        model: scene at the materials of both runs.
-        run: the full run.
-
-    Raises:
-        SceneError: see :func:`full_run`.
-        ModelError: the reduced run is shorter than the full one, or the model was loaded without its lift.
-    """
-    comparison = comparison_of(rom, _full(model, run))
+def errors_linear(rom: ReducedModel, reduced_run: ReducedTrajectory, full: FullRun) -> ModelErrors:
+    """Errors of a linear model, see :func:`softgrasp.reduction.reduce.errors`. Collective."""
+    comparison = comparison_of(rom, full)
     return comparison.errors(rom, comparison.small, reduced_run)
 
 
-def _full(model: Model, run: Trajectory | FullRun) -> FullRun:
+def as_full(model: Model, run: Trajectory | FullRun) -> FullRun:
+    """A run as it is, or a trajectory at the materials of ``model`` by :func:`full_run`. Collective."""
     return run if isinstance(run, FullRun) else full_run(model, run)
 
 

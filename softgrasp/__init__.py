@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model as Model
     from softgrasp.fem.model.build import build as build
     from softgrasp.fem.run.simulate import simulate as simulate
-    from softgrasp.fem.run.trajectory import Trajectory as Trajectory
     from softgrasp.fem.scene.file import load_scene as load_scene
-    from softgrasp.fem.scene.file import shipped_scenes as shipped_scenes
     from softgrasp.fem.scene.scene import Scene as Scene
     from softgrasp.lqr.design import design as design
     from softgrasp.lqr.design import make_controller as make_controller
@@ -32,13 +30,9 @@ if TYPE_CHECKING:
     from softgrasp.lqr.spectrum.certificate import abscissa as abscissa
     from softgrasp.reduction.archive import load as load
     from softgrasp.reduction.archive import save as save
+    from softgrasp.reduction.reduce import errors as errors
     from softgrasp.reduction.reduce import reduce as reduce
-    from softgrasp.reduction.replay import errors as errors
-    from softgrasp.reduction.replay import replay as replay
-    from softgrasp.reduction.strain.archive import load_strain as load_strain
-    from softgrasp.reduction.strain.training import errors_strain as errors_strain
-    from softgrasp.reduction.strain.training import reduce_strain as reduce_strain
-    from softgrasp.reduction.strain.training import replay_strain as replay_strain
+    from softgrasp.reduction.reduce import replay as replay
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: ranks share the cores
     os.environ.setdefault(_variable, "1")
@@ -49,20 +43,14 @@ PACKAGE = Path(__file__).parent
 _FACE = {
     "Scene": "fem.scene.scene",
     "load_scene": "fem.scene.file",
-    "shipped_scenes": "fem.scene.file",
     "Model": "fem.model.build",
     "build": "fem.model.build",
-    "Trajectory": "fem.run.trajectory",
     "simulate": "fem.run.simulate",
     "reduce": "reduction.reduce",
-    "replay": "reduction.replay",
-    "errors": "reduction.replay",
-    "reduce_strain": "reduction.strain.training",
-    "replay_strain": "reduction.strain.training",
-    "errors_strain": "reduction.strain.training",
+    "replay": "reduction.reduce",
+    "errors": "reduction.reduce",
     "save": "reduction.archive",
     "load": "reduction.archive",
-    "load_strain": "reduction.strain.archive",
     "problem": "lqr.design",
     "design": "lqr.design",
     "solve": "lqr.riccati",
@@ -73,11 +61,7 @@ _FACE = {
 }
 """What a user imports -> the module that has it."""
 
-__all__ = [
-    "ClosedLoop", "Controller", "Model", "Scene", "Trajectory", "abscissa", "build", "design", "errors",
-    "errors_strain", "load", "load_scene", "load_strain", "make_controller", "problem", "reduce", "reduce_strain",
-    "replay", "replay_strain", "save", "shipped_scenes", "simulate", "solve",
-]  # fmt: skip
+__all__ = sorted(_FACE)
 
 
 def package_version() -> str:

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from softgrasp.fem import _stack as _stack
 from softgrasp.fem.scene.file import shipped_scenes
-from softgrasp.reduction.registry import PAPER_PLAIN
+from softgrasp.reduction.bases.registry import PAPER_PLAIN
 from softgrasp.study.control.result import TITLES
 from softgrasp.study.control.run import run_control
 from softgrasp.study.forward.accuracy import percent

@@ -104,7 +104,7 @@ def test_cheap_commands_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize(("name", "text"), PYTHON, ids=[name for name, _ in PYTHON])
 def test_python_of_a_page_runs(name: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from softgrasp.reduction.registry import METHODS
+    from softgrasp.reduction.bases.registry import METHODS
 
     monkeypatch.chdir(tmp_path)
     known = dict(METHODS)

@@ -27,13 +27,13 @@ def lines_of(package: str) -> list[list[str]]:
     for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]:
         if contract.get("containers") == [f"softgrasp.{package}"]:
             return [[room.strip() for room in line.split("|")] for line in contract["layers"]]
-    return [["all modules"]]
+    raise ValueError(f"pyproject.toml has no contract with the rooms of {package}")
 
 
 def room_of(module: str) -> tuple[str, str]:
     """Package and room of a module."""
     _, package, *rest = module.split(".")
-    return package, rest[0] if rest and package != "reduction" else "all modules"
+    return package, rest[0] if rest else ""
 
 
 def arrows(graph: grimp.ImportGraph) -> Counter[tuple[tuple[str, str], tuple[str, str]]]:
@@ -66,7 +66,6 @@ def place(
             x = wide / 2 + (j - (len(line) - 1) / 2) * (WIDTH + BESIDE)
             at[package, room] = x, y
             files = list((ROOT / package / room).glob("*.py")) if (ROOT / package / room).is_dir() else []
-            files = files or (list((ROOT / package).rglob("*.py")) if room == "all modules" else [])
             axes.add_patch(
                 FancyBboxPatch(
                     (x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT, "round,pad=0.02", fc="white", ec="#555", lw=0.8
@@ -79,7 +78,7 @@ def place(
 
 def main(file: Path) -> None:
     """Draw and save."""
-    figure, axes = plt.subplots(figsize=(9, 15))
+    figure, axes = plt.subplots(figsize=(9, 21))
     wide = max(len(line) for package in PACKAGES for line in lines_of(package)) * (WIDTH + BESIDE) + BESIDE
     at: dict[tuple[str, str], tuple[float, float]] = {}
     top = 0.0

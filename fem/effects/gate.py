@@ -13,25 +13,15 @@ from softgrasp.fem.system import LayerMaterial
 
 @dataclass(frozen=True)
 class Gate:
-    """A dimensionless number that says whether an effect matters.
+    """A dimensionless number that says whether an effect matters."""
 
-    Attributes:
-        number: its value, dimensionless.
-        symbol: how it is computed.
-        threshold: value above which the effect matters.
-        matters: the effect changes what this scene computes; for an effect that is off: it would.
-        sentence: the finding in words.
-        proviso: on what it hangs that the effect matters; empty when on nothing.
-        condition: what decides beside the number, wherever ``matters`` is not number > threshold; else empty.
-    """
-
-    number: float
-    symbol: str
-    threshold: float
-    matters: bool
-    sentence: str
-    proviso: str = ""
-    condition: str = ""
+    number: float  # its value, dimensionless
+    symbol: str  # how it is computed
+    threshold: float  # value above which the effect matters
+    matters: bool  # the effect changes what this scene computes; for an effect that is off: it would
+    sentence: str  # the finding in words
+    proviso: str = ""  # on what it hangs that the effect matters; empty when on nothing
+    condition: str = ""  # what decides beside the number, wherever ``matters`` is not number > threshold; else empty
 
     @property
     def comparison(self) -> str:
@@ -44,45 +34,29 @@ class Gate:
 
 @dataclass(frozen=True)
 class Problem:
-    """Scales of one scene; `fem.fields.scales` computes them.
-
-    Attributes:
-        scene: the scene.
-        dimension: 2 or 3.
-        length: largest extent of the tissue [m].
-        materials: one per layer that has cells.
-        tissue_mass: mass of the whole tissue [kg].
-        tissue_inertia: moments of inertia of the rigid tissue about the reference, one per rotation [kg m2].
-        omega: lowest angular frequencies of the clamped tissue [1/s], ascending; empty when not computed.
-        zeta: damping ratio of each of them [1].
-        sag: the tissue at rest under its weight.
-        response: gradient of the linear static response to the largest acceleration of the hand, and to gravity if on.
-    """
+    """Scales of one scene; `fem.fields.scales` computes them."""
 
     scene: Scene
-    dimension: int
-    length: float
-    materials: tuple[LayerMaterial, ...]
-    tissue_mass: float
+    dimension: int  # 2 or 3
+    length: float  # largest extent of the tissue [m]
+    materials: tuple[LayerMaterial, ...]  # one per layer that has cells
+    tissue_mass: float  # mass of the whole tissue [kg]
+    # moments of inertia of the rigid tissue about the reference, one per rotation [kg m2]
     tissue_inertia: tuple[float, ...]
+    # lowest angular frequencies of the clamped tissue [1/s], ascending; empty when not computed
     omega: tuple[float, ...]
-    zeta: tuple[float, ...]
-    sag: Sag
+    zeta: tuple[float, ...]  # damping ratio of each of them [1]
+    sag: Sag  # the tissue at rest under its weight
+    # gradient of the linear static response to the largest acceleration of the hand, and to gravity if on
     response: Gradient
 
 
 class Effect(Protocol):
-    """One unit of physics that a scene switches on.
+    """One unit of physics that a scene switches on."""
 
-    Attributes:
-        name: its key.
-        term: what it adds to the equation.
-        cost: what it costs, one sentence.
-    """
-
-    name: str
-    term: str
-    cost: str
+    name: str  # its key
+    term: str  # what it adds to the equation
+    cost: str  # what it costs, one sentence
 
     def active(self, scene: Scene) -> bool:
         """Whether the scene has it on."""

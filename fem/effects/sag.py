@@ -9,19 +9,12 @@ SMALL_SHARE = 0.01  # of the volume: at the edge of the contact zone the strain 
 
 @dataclass(frozen=True)
 class Gradient:
-    """Frobenius norm |grad z| of a displacement against the hand, rotations included, between the vertices of a cell.
+    """Frobenius norm |grad z| of a displacement against the hand, rotations included, between vertices of a cell."""
 
-    Attributes:
-        largest: in any cell [1]; at the edge of the contact zone it grows with every refinement.
-        typical: smallest number that at most `SMALL_SHARE` of the volume exceeds [1].
-        share: of the volume above `SMALL_STRAIN` [1].
-        rms: root of its mean square over the volume [1].
-    """
-
-    largest: float
-    typical: float
-    share: float
-    rms: float
+    largest: float  # in any cell [1]; at the edge of the contact zone it grows with every refinement
+    typical: float  # smallest number that at most `SMALL_SHARE` of the volume exceeds [1]
+    share: float  # of the volume above `SMALL_STRAIN` [1]
+    rms: float  # root of its mean square over the volume [1]
 
     @property
     def linear(self) -> bool:
@@ -31,14 +24,9 @@ class Gradient:
 
 @dataclass(frozen=True)
 class Sag:
-    """Static displacement z of K_ee z = G g, the hand held still.
+    """Static displacement z of K_ee z = G g, the hand held still."""
 
-    Attributes:
-        g: acceleration of gravity (d,) [m/s2]; without gravity in the scene that of the earth, along the last axis.
-        largest: largest |z| of a node [m].
-        gradient: of z.
-    """
-
+    # acceleration of gravity (d,) [m/s2]; without gravity in the scene that of the earth, along the last axis
     g: tuple[float, ...]
-    largest: float
-    gradient: Gradient
+    largest: float  # largest |z| of a node [m]
+    gradient: Gradient  # of z

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.petsc import Array, rows_on_root
@@ -21,27 +21,16 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class PictureMesh:
-    """The whole body in arrays.
+    """The whole body in arrays."""
 
-    Attributes:
-        points: vertices [m], shape (n, d).
-        cells: vertices of the cells, shape (m, d + 1).
-        facets: vertices of the boundary facets, shape (k, d), the body to their left or below.
-        contact: vertices of those that the hand holds, shape (c, d).
-        layers: number of the layer of each cell, shape (m,).
-        names: names of the layers.
-        reference: point the hand turns about [m], shape (d,).
-        n_s: hand degrees of freedom.
-    """
-
-    points: Array
-    cells: Integers
-    facets: Integers
-    contact: Integers
-    layers: Integers
+    points: Array  # vertices [m], shape (n, d)
+    cells: Integers  # vertices of the cells, shape (m, d + 1)
+    facets: Integers  # vertices of the boundary facets, shape (k, d), the body to their left or below
+    contact: Integers  # vertices of those that the hand holds, shape (c, d)
+    layers: Integers  # number of the layer of each cell, shape (m,)
     names: tuple[str, ...]
-    reference: Array
-    n_s: int
+    reference: Array  # point the hand turns about [m], shape (d,)
+    n_s: int  # hand degrees of freedom
 
     @property
     def dimension(self) -> int:
@@ -66,13 +55,7 @@ def gather_picture(model: Model) -> PictureMesh | None:
         return _numbered(nodes, _outward(mesh, d, facets))
 
     cells = np.asarray(cell_nodes(mesh)[: mesh.topology.index_map(d).size_local])
-    layers = np.zeros(len(cells), dtype=np.int64)
-    names: tuple[str, ...] = ("tissue",)
-    if model.scene.tissue.layers:
-        groups = cells_of_layers(tissue, model.scene)
-        names = tuple(groups)
-        for i, members in enumerate(groups.values()):
-            layers[members] = i
+    names, layers = layer_numbers(tissue, model.scene)
     outer = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     held = contact_facets(tissue, model.scene.contact)
     points = np.ascontiguousarray(mesh.geometry.x[: nodes.size_local, :d])
@@ -89,7 +72,6 @@ def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
     Collective.
 
     Args:
-        model: the model.
         z: relative displacement on the owned free dofs [m], shape (n_local,), or (n_local, k) for k instants.
         q_s: hand [m, rad], shape (n_s,) or (n_s, k).
 

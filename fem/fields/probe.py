@@ -20,19 +20,12 @@ from softgrasp.fem.petsc import Array, total
 
 @dataclass(frozen=True)
 class Probe:
-    """Outputs on one mesh, y = weights z[dofs] + C_s q_s, d components an output.
+    """Outputs on one mesh, y = weights z[dofs] + C_s q_s, d components an output."""
 
-    Attributes:
-        dofs: local tissue dofs that enter, (k,).
-        weights: (p, k), p = outputs times d.
-        C_s: rigid part, (p, n_s), on every rank.
-        dimension: d.
-    """
-
-    dofs: np.ndarray
-    weights: Array
-    C_s: Array
-    dimension: int
+    dofs: np.ndarray  # local tissue dofs that enter, (k,)
+    weights: Array  # (p, k), p = outputs times d
+    C_s: Array  # rigid part, (p, n_s), on every rank
+    dimension: int  # d
 
     def of_rows(self, comm: MPI.Intracomm, L: Array) -> Array:
         """Weights on the columns of a distributed block of displacements (n_local, N): (p, N). Collective."""
@@ -43,7 +36,6 @@ def make_probe(space: Discretisation, places: Sequence[Array], rotation: bool) -
     """Means of the displacement over several sets of points. Collective.
 
     Args:
-        space: mesh, function space and free nodes.
         places: one array of points (k, d) [m] an output, the same on every rank; empty for the hand's displacement.
         rotation: the hand turns.
     """

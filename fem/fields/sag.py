@@ -17,7 +17,6 @@ def measure_sag(model: Model, a: Array) -> tuple[Sag, Gradient]:
     """K_ee z = G g under the weight, and the gradient of z under G (g - a), with one factor. Collective.
 
     Args:
-        model: the model.
         a: largest acceleration of the hand, (n_s,).
 
     Raises:

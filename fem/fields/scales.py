@@ -9,7 +9,7 @@ from softgrasp.fem.effects.gate import Problem
 from softgrasp.fem.fields.sag import measure_sag
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import BlockSystem
@@ -19,7 +19,6 @@ def measure(model: Model, omega: Array, Phi: Array, a: Array) -> Problem:
     """Length, masses, damping ratios, sag and static response of a model. Collective.
 
     Args:
-        model: the model.
         omega: lowest angular frequencies [1/s], (k,), may be empty.
         Phi: their M-orthonormal modes, local rows (n_local, k).
         a: largest acceleration of the hand, (n_s,).
@@ -54,11 +53,7 @@ def rigid_inertia(model: Model) -> tuple[float, tuple[float, ...]]:
     mesh, scene, layout = model.space.mesh, model.scene, model.system.layout
     d, geometry = mesh.dimension, mesh.mesh.geometry
     owned = mesh.mesh.topology.index_map(d).size_local
-    density = np.full(owned, scene.tissue.material.rho)
-    if scene.tissue.layers:
-        cells = cells_of_layers(mesh, scene)
-        for blocks, material in zip(model.system.layers, model.system.materials, strict=True):
-            density[cells[blocks.name]] = material.rho
+    density = np.array([m.rho for m in model.system.materials])[layer_numbers(mesh, scene)[1]]
     x = geometry.x[cell_nodes(mesh.mesh)[:owned], :d] - layout.reference
     edges = x[:, 1:] - x[:, :1]
     weight = density * np.abs(np.linalg.det(edges)) / (2 if d == 2 else 6) * scene.tissue.thickness

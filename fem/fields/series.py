@@ -28,9 +28,6 @@ class FullField:
 
     Attributes:
         u: the function on the model's space.
-
-    Args:
-        model: the model.
     """
 
     def __init__(self, model: Model) -> None:
@@ -62,7 +59,6 @@ class SeriesWriter:
     displacement. Cells keep the order of the elements.
 
     Args:
-        model: the model.
         directory: made if missing.
         name: stem of the files.
 

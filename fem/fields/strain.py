@@ -18,7 +18,6 @@ def gradient(model: Model, z: Array) -> Gradient:
     """Gradient of a displacement against the hand. Collective.
 
     Args:
-        model: the model.
         z: displacement against the hand, local rows (n_local,) [m].
     """
     space, d = model.space, model.space.mesh.dimension
@@ -58,7 +57,6 @@ def magnified(system: BlockSystem, z: Array) -> float:
     are ten to a hundred times smaller than the error.
 
     Args:
-        system: the operators.
         z: local rows of a displacement against the hand, (n_local,).
     """
     diagonal = system.K_ee.getDiagonal()
@@ -76,7 +74,6 @@ def slowest(system: BlockSystem, Z: Array) -> float:
     A Ritz value, omega^2 = min_z z'K z / z'M z: at least the lowest frequency, near it if the run excites its mode.
 
     Args:
-        system: the model's operators.
         Z: displacements against the hand, local rows (n_local, k) [m].
     """
     comm, centre = system.layout.comm, np.eye(Z.shape[1]) - 1 / Z.shape[1]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.strain.laws import LAWS
@@ -37,10 +37,7 @@ class CellStress:
         x = mesh.geometry.x[cell_nodes(mesh)[:owned], :d]
         self.gradients = np.linalg.solve(x[:, 1:] - x[:, :1], slopes)  # (m, d, k)
         self.dofs = space.V.dofmap.list[:owned]
-        self.layer = np.zeros(owned, dtype=np.int32)
-        groups = cells_of_layers(space.mesh, model.scene) if model.scene.tissue.layers else {}
-        for i, cells in enumerate(groups.values()):
-            self.layer[cells] = i
+        self.layer = layer_numbers(space.mesh, model.scene)[1].astype(np.int32)
         finite = model.scene.effects.finite_strain
         self.law = None if finite is None else LAWS[finite.law]
         self.lam, self.mu = (np.array([getattr(m, key) for m in model.system.materials]) for key in ("lam", "mu"))

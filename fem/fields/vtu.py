@@ -22,17 +22,11 @@ TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # the order of a symmetric tensor
 
 @dataclass(frozen=True)
 class Field:
-    """One array of a grid.
+    """One array of a grid."""
 
-    Attributes:
-        name: as ParaView shows it; empty where the place in the file says it.
-        unit: e.g. "m/s".
-        values: shape (n,) or (n, components).
-    """
-
-    name: str
-    unit: str
-    values: npt.NDArray[np.generic]
+    name: str  # as ParaView shows it; empty where the place in the file says it
+    unit: str  # as "m/s"
+    values: npt.NDArray[np.generic]  # shape (n,) or (n, components)
 
     def block(self) -> bytes:
         """Length and numbers."""
@@ -53,17 +47,11 @@ class Field:
 
 @dataclass(frozen=True)
 class Grid:
-    """The cells of one rank.
+    """The cells of one rank."""
 
-    Attributes:
-        points: [m], shape (n, 3).
-        cells: local point numbers in VTK's order, shape (m, k).
-        kind: VTK's number of the kind of cell.
-    """
-
-    points: Array
-    cells: npt.NDArray[np.int32]
-    kind: int
+    points: Array  # [m], shape (n, 3)
+    cells: npt.NDArray[np.int32]  # local point numbers in VTK's order, shape (m, k)
+    kind: int  # VTK's number of the kind of cell
 
     def fields(self) -> dict[str, list[Field]]:
         """Points and cells as arrays of the file, by the XML element that holds them."""

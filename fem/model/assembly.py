@@ -31,24 +31,14 @@ class Inventory:
 
 @dataclass(frozen=True)
 class Discretisation:
-    """Function space and the split of its nodes into contact and free ones.
-
-    Attributes:
-        mesh: the tissue mesh.
-        V: displacement space (Lagrange P1 or P2, blocked).
-        contact: owned local node indices that follow the hand.
-        free: owned local node indices of the tissue unknowns.
-        is_e: PETSc index set of the free dofs (blocked).
-        R: rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s).
-        layout: sizes and ownership.
-    """
+    """Function space and the split of its nodes into contact and free ones."""
 
     mesh: TissueMesh
-    V: Any
-    contact: np.ndarray
-    free: np.ndarray
-    is_e: PETSc.IS
-    R: Array
+    V: Any  # displacement space (Lagrange P1 or P2, blocked)
+    contact: np.ndarray  # owned local node indices that follow the hand
+    free: np.ndarray  # owned local node indices of the tissue unknowns
+    is_e: PETSc.IS  # PETSc index set of the free dofs (blocked)
+    R: Array  # rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s)
     layout: BlockLayout
 
 
@@ -209,3 +199,12 @@ def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
     if counts[0]:
         cells["tissue"] = np.flatnonzero(label == -1).astype(np.int32)
     return cells
+
+
+def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names of the layers in the order of their blocks, and the number of the layer of each owned cell. Collective."""
+    cells = cells_of_layers(mesh, scene)
+    numbers = np.zeros(mesh.mesh.topology.index_map(mesh.dimension).size_local, dtype=np.intp)
+    for i, members in enumerate(cells.values()):
+        numbers[members] = i
+    return tuple(cells), numbers

@@ -23,13 +23,7 @@ from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.system import (
-    BlockSystem,
-    LayerBlocks,
-    LayerMaterial,
-    coupling,
-    tissue_matrices,
-)
+from softgrasp.fem.system import BlockSystem, LayerBlocks, LayerMaterial, coupling, tissue_matrices
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.mesh_estimate import MeshEstimate
@@ -151,7 +145,6 @@ def build(
     Args:
         scene: a scene, the path of its file, or the name of one that ships.
         overrides: "section.key=value" each, as after ``--set``; for a file or a name.
-        comm: ranks.
         mesh: on which; None makes that of the scene.
         run: its steps will be taken, so their tables must fit too.
 

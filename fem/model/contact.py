@@ -72,7 +72,6 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
     Collective.
 
     Args:
-        tissue: the mesh.
         facets: owned contact facets, from `contact_facets`.
 
     Raises:
@@ -106,7 +105,6 @@ def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
     a free motion.
 
     Args:
-        parts: the parts of the mesh.
         held: whether a part has a contact facet, shape (n_parts,).
         source: name of the mesh, for messages.
 
@@ -194,7 +192,6 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
 
     Args:
         points: coordinates, shape (n_nodes, 2 or 3) [m].
-        dimension: 2 or 3.
         rotation: append the rotations.
         reference: point the hand turns about, ``dimension`` entries [m].
 

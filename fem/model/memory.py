@@ -37,17 +37,11 @@ CONTAINER = Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True)
 class Need:
-    """Estimated memory [byte].
+    """Estimated memory [byte]."""
 
-    Attributes:
-        mesh: mesh, forms and matrices, spread over the ranks.
-        factor: of the matrix of a step, over all ranks.
-        tables: of hand, loads and outputs over the steps, on every rank.
-    """
-
-    mesh: float
-    factor: float
-    tables: float
+    mesh: float  # mesh, forms and matrices, spread over the ranks
+    factor: float  # of the matrix of a step, over all ranks
+    tables: float  # of hand, loads and outputs over the steps, on every rank
 
     def of(self, share: float, ranks: int) -> float:
         """What ``ranks`` ranks need that hold this share of the tissue."""
@@ -79,10 +73,7 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
     """Estimate the memory of a model and, if it will run, of its steps.
 
     Args:
-        scene: the scene.
-        dimension: 2 or 3.
         cells: triangles or tetrahedra in all.
-        comm: ranks.
         run: the steps are taken.
     """
     kind, d = (dimension, scene.tissue.order), dimension
@@ -123,10 +114,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
     """Refuse a model or run that the memory of some node cannot hold. Collective.
 
     Args:
-        scene: the scene.
-        comm: ranks.
         run: the steps are taken.
-        dimension: 2 or 3.
         cells: triangles or tetrahedra in all.
 
     Raises:

@@ -18,25 +18,15 @@ from softgrasp.fem.system import BlockSystem
 
 @dataclass(frozen=True)
 class Output:
-    """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m; angles rad].
+    """One named output y = C_e z + C_s q_s with d (or, for the hand, n_s) components [m; angles rad]."""
 
-    Attributes:
-        name: label in tables and files.
-        columns: one per component.
-        dofs: local tissue dofs that enter, shape (k, size); empty on ranks that own none.
-        weight: every listed dof enters with this factor.
-        C_s: rigid part, (size, n_s), on every rank.
-        point: coordinates [m] of the node, or of the centre of the region.
-        place: the node that is taken, or the nodes of the mean, in words; empty for the hand.
-    """
-
-    name: str
-    columns: Columns
-    dofs: np.ndarray
-    weight: float
-    C_s: Array
-    point: tuple[float, ...] = ()
-    place: str = ""
+    name: str  # label in tables and files
+    columns: Columns  # one per component
+    dofs: np.ndarray  # local tissue dofs that enter, shape (k, size); empty on ranks that own none
+    weight: float  # every listed dof enters with this factor
+    C_s: Array  # rigid part, (size, n_s), on every rank
+    point: tuple[float, ...] = ()  # coordinates [m] of the node, or of the centre of the region
+    place: str = ""  # the node that is taken, or the nodes of the mean, in words; empty for the hand
 
     @property
     def size(self) -> int:

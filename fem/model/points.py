@@ -7,7 +7,7 @@ import dolfinx.fem
 import numpy as np
 
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import Discretisation, cells_of_layers
+from softgrasp.fem.model.assembly import Discretisation, layer_numbers
 from softgrasp.fem.scene.scene import FiniteStrain, Scene
 from softgrasp.fem.strain.points import Ints, Points, make_gradient
 
@@ -27,10 +27,7 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
     gradients = np.einsum("kqa,cjk->cqaj", table, np.linalg.inv(edges))
     volume = np.abs(np.linalg.det(edges)) * scene.tissue.thickness
     vol = (volume[:, None] * weights).ravel()
-    names = cells_of_layers(space.mesh, scene).values() if scene.tissue.layers else ()
-    layer = np.zeros(cells, dtype=np.intp)
-    for number, chosen in enumerate(names):
-        layer[chosen] = number
+    layer = layer_numbers(space.mesh, scene)[1]
     first = mesh.topology.index_map(d).local_range[0]
     layout, each = space.layout, len(weights)
     B = make_gradient(layout.comm, gradients, _free_nodes(space)[V.dofmap.list[:cells]], (layout.n_local, layout.n_e))

@@ -70,8 +70,6 @@ def refined_mesh(comm: MPI.Intracomm, scene: Scene, tolerance: float | None = No
     """The a-priori mesh of a scene with `[tissue.refine]`. Collective; rank 0 bisects.
 
     Args:
-        comm: communicator.
-        scene: the scene.
         tolerance: instead of the scene's.
 
     Raises:
@@ -237,9 +235,7 @@ def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     """Singular ends of a scene's body, on all ranks; rank 0 looks at the whole mesh. Collective.
 
     Args:
-        comm: communicator.
         tissue: the mesh of the scene.
-        scene: the scene.
 
     Raises:
         MeshError: the mesh file cannot be read again.

@@ -28,7 +28,7 @@ BASES = (
     ),
     "craig_bampton",
 )
-"""Names of :mod:`softgrasp.reduction.registry`, here because scenes are read without what builds bases."""
+"""Names of :mod:`softgrasp.reduction.bases.registry`, here because scenes are read without what builds bases."""
 
 
 class Reduction(Section):

@@ -49,12 +49,7 @@ _FORMS = {
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """Name and path of the scenes that ship with the project.
-
-    >>> import softgrasp as sg
-    >>> "paper_forward" in sg.shipped_scenes()
-    True
-    """
+    """Name and path of the scenes that ship with the project."""
     folder = (PACKAGE / "scenes").resolve()
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
@@ -97,11 +92,7 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
 
 
 def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequence[str] = ()) -> Scene:
-    """`load_scene` on rank 0, broadcast to all. Collective.
-
-    Raises:
-        SceneError: on every rank, as rank 0 met it.
-    """
+    """`load_scene` on rank 0, broadcast to all. Collective. Raises SceneError: on every rank, as rank 0 met it."""
     result: Scene | Exception | None = None
     if comm.rank == 0:
         try:

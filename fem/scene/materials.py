@@ -61,11 +61,7 @@ LIBRARY: dict[str, LibraryMaterial] = {
 
 
 def lookup(name: str) -> LibraryMaterial:
-    """The library entry of this name.
-
-    Raises:
-        ValueError: the name is unknown; the message suggests the nearest one.
-    """
+    """The library entry of this name. Raises ValueError: the name is unknown; the message suggests the nearest one."""
     if name in LIBRARY:
         return LIBRARY[name]
     near = difflib.get_close_matches(name.lower(), LIBRARY, n=1, cutoff=0.4)

@@ -28,7 +28,6 @@ def factor_blocks(P: PETSc.Mat, prefix: str, entries: Literal["petsc", "mumps"] 
 
     Args:
         P: the matrix in blocks of d x d (BAIJ), on this rank alone.
-        prefix: PETSc options prefix.
         entries: who factors single entries where blocks are not stable.
 
     Raises:

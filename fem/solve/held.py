@@ -18,31 +18,18 @@ from softgrasp.fem.system import BlockSystem
 
 @dataclass(frozen=True)
 class Held:
-    """Stiffness, damping matrix and coupling as one rank steps them.
-
-    Attributes:
-        layout: sizes and ownership.
-        whole: all rows are here, on a communicator of this rank alone.
-        order: of the rows held; None: that of the layout.
-        rows: places of the owned rows among those held.
-        K: stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries.
-        G: coupling to the hand, (rows held, n_s).
-        S: matrix of the step; whoever factors it owns it.
-        D: damping matrix, or None.
-        M: mass, only beside D.
-        parts: further matrices that were asked for, on the same rows; whoever asked owns them.
-    """
+    """Stiffness, damping matrix and coupling as one rank steps them."""
 
     layout: BlockLayout
-    whole: bool
-    order: NodeOrder | None
-    rows: slice | NDArray[np.intp]
-    K: PETSc.Mat
-    G: Array
-    S: PETSc.Mat
+    whole: bool  # all rows are here, on a communicator of this rank alone
+    order: NodeOrder | None  # of the rows held; None: that of the layout
+    rows: slice | NDArray[np.intp]  # places of the owned rows among those held
+    K: PETSc.Mat  # stiffness, a copy, in blocks of d x d on one rank: a quarter less memory traffic than single entries
+    G: Array  # coupling to the hand, (rows held, n_s)
+    S: PETSc.Mat  # matrix of the step; whoever factors it owns it
     D: PETSc.Mat | None
-    M: PETSc.Mat | None
-    parts: tuple[PETSc.Mat, ...] = ()
+    M: PETSc.Mat | None  # mass, only beside D
+    parts: tuple[PETSc.Mat, ...] = ()  # further matrices that were asked for, on the same rows; whoever asked owns them
 
     def agree(self) -> AbstractContextManager[None]:
         """Guard of a block that is a rank's own affair when it holds everything, and collective otherwise. Collective.
@@ -78,7 +65,6 @@ def held_operators(
     """Operators of a system on the owned rows, or on all. Collective.
 
     Args:
-        system: operators.
         S: matrix of the step, consumed.
         whole: every rank holds all rows.
         ordered: in the order of elimination; all rows then.

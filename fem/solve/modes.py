@@ -25,7 +25,6 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     depend on the rank count. Collective.
 
     Args:
-        system: operators.
         k: number of modes, 1 <= k <= n_e.
 
     Returns:

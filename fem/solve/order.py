@@ -14,17 +14,11 @@ from softgrasp.fem.petsc import PETSc, to_scipy
 
 @dataclass(frozen=True)
 class NodeOrder:
-    """Nested dissection [GL81] of the nodes of one rank; the d rows of a node stay together.
+    """Nested dissection [GL81] of the nodes of one rank; the d rows of a node stay together."""
 
-    Attributes:
-        nodes: the node at each place, (nodes,).
-        places: the place of each node, its inverse.
-        d: rows of a node.
-    """
-
-    nodes: NDArray[np.intp]
-    places: NDArray[np.intp]
-    d: int
+    nodes: NDArray[np.intp]  # the node at each place, (nodes,)
+    places: NDArray[np.intp]  # the place of each node, its inverse
+    d: int  # rows of a node
 
     def enter(self, x: NDArray[Any]) -> NDArray[Any]:
         """Rows (n, ...) in this order, a copy."""
@@ -45,19 +39,12 @@ class NodeOrder:
 
 @dataclass(frozen=True)
 class Dissection:
-    """An order and the pattern of blocks of d x d in it, for as long as matrices are put in order.
+    """An order and the pattern of blocks of d x d in it, for as long as matrices are put in order."""
 
-    Attributes:
-        order: of the nodes.
-        before: row pointers and columns of the blocks before.
-        after: the same in this order.
-        source: where each block of ``after`` stood before.
-    """
-
-    order: NodeOrder
-    before: tuple[NDArray[Any], NDArray[Any]]
-    after: tuple[NDArray[Any], NDArray[Any]]
-    source: NDArray[np.intp]
+    order: NodeOrder  # of the nodes
+    before: tuple[NDArray[Any], NDArray[Any]]  # row pointers and columns of the blocks before
+    after: tuple[NDArray[Any], NDArray[Any]]  # the same in this order
+    source: NDArray[np.intp]  # where each block of ``after`` stood before
 
     def matrix(self, A: PETSc.Mat) -> PETSc.Mat:
         """A of the same pattern with rows and columns in this order, in blocks of d x d (BAIJ).

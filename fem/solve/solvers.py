@@ -65,21 +65,14 @@ def factor_on_every_rank(layout: BlockLayout, solver: SolverName, reproducible: 
 
 @dataclass(frozen=True)
 class TissueSolver:
-    """A factored (or preconditioned) symmetric positive definite matrix of the tissue block.
+    """A factored (or preconditioned) symmetric positive definite matrix of the tissue block."""
 
-    Attributes:
-        name: cholesky, mumps or cg.
-        ksp: the PETSc solver; its vectors are those of S with mumps and cg only, so solve by :meth:`solve`.
-        S: the matrix.
-        tolerance: relative residual that :meth:`check` accepts.
-        factor: what solves without a detour through ``ksp``: with cholesky the factor that every rank has whole, in an
-            order of its own (:mod:`softgrasp.fem.solve.cholesky`); with mumps that of one rank; else None.
-    """
-
-    name: SolverName
-    ksp: PETSc.KSP
+    name: SolverName  # cholesky, mumps or cg
+    ksp: PETSc.KSP  # the PETSc solver; its vectors are those of S with mumps and cg only, so call `solve`
     S: PETSc.Mat
-    tolerance: float
+    tolerance: float  # relative residual that check accepts
+    # what solves without a detour through ``ksp``: with cholesky the factor that every rank has whole, in an order of
+    # its own (softgrasp.fem.solve.cholesky); with mumps that of one rank; else None
     factor: PETSc.Mat | OrderedFactor | None = None
 
     @property
@@ -197,7 +190,6 @@ def make_solver(
         S: symmetric positive definite, owned by the solver from here on.
         name: cholesky (PETSc, every rank by itself), mumps (see ``reproducible``) or cg (GAMG [VMB96]).
         layout: sizes and node coordinates.
-        prefix: PETSc options prefix.
         rtol: relative tolerance of cg.
         reproducible: see :func:`factor_on_every_rank`.
         ordered: cholesky, S on one rank: its rows are in the order of elimination already, in blocks (BAIJ).

@@ -15,7 +15,6 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
     """Static displacement relative to the hand, K_ee z = G g or f(z) = G g; local rows (n_local,) [m]. Collective.
 
     Args:
-        system: the operators.
         solver: None takes the one that suits few solves.
         time: tolerance and reproducibility of the scene.
 

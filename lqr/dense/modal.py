@@ -54,23 +54,14 @@ class ModalPlant:
 
     E xi' = A xi + B u with E = L E_rel S, A = L A_rel S, B = L B_rel, C = C_rel S, S = blkdiag(I, I, Phi/omega, Phi),
     L = blkdiag(I, I, omega Phi'M, Phi'); X_rel = L' X L and K_rel = K S^{-1}.
-
-    Attributes:
-        omega: natural frequencies [1/s], ascending, (k,).
-        Phi: modes, (n_e, k).
-        massed: M_ee Phi, (n_e, k).
-        D: Phi' D_ee Phi, (k, k).
-        g: Phi' G, (k, n_s); without a hand Phi' B_z, (k, m).
-        c: outputs of the modes, (p, k).
-        space: the matrices.
     """
 
-    omega: Array
-    Phi: Array
-    massed: Array
-    D: Array
-    g: Array
-    c: Array
+    omega: Array  # natural frequencies [1/s], ascending, (k,)
+    Phi: Array  # modes, (n_e, k)
+    massed: Array  # M_ee Phi, (n_e, k)
+    D: Array  # Phi' D_ee Phi, (k, k)
+    g: Array  # Phi' G, (k, n_s); without a hand Phi' B_z, (k, m)
+    c: Array  # outputs of the modes, (p, k)
     space: StateSpace
 
 

@@ -25,18 +25,12 @@ class ModeRates:
 
     Re p_k = -sqrt(delta_k^2 + f_k^2), |p_k| = omega_k, delta_k = phi_k' D phi_k / 2,
     f_k = |R^{-1/2} M_s^{-1} g_k| |Q^{1/2} c_k| / (2 omega_k)
-
-    Attributes:
-        omega: natural frequencies [1/s], (k,).
-        own: delta_k, decay by the tissue's damping [1/s].
-        feedback: f_k, what optimal feedback would add alone [1/s].
-        size: frequency scale of the whole plant, for rounding [1/s].
     """
 
-    omega: Array
-    own: Array
-    feedback: Array
-    size: float
+    omega: Array  # natural frequencies [1/s], (k,)
+    own: Array  # delta_k, decay by the tissue's damping [1/s]
+    feedback: Array  # f_k, what optimal feedback would add alone [1/s]
+    size: float  # frequency scale of the whole plant, for rounding [1/s]
 
     @property
     def rate(self) -> Array:

@@ -123,14 +123,3 @@ def _residual(A: Array, G: Array, H: Array, Y: Array) -> tuple[Array, float]:
 
 def _left(real: float, imag: float) -> bool:
     return real < 0
-
-
-def closed_loop(matrices: ReducedMatrices, P_N: Array) -> Array:
-    """Eigenvalues of the reduced closed loop."""
-    m = matrices
-    K = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
-    try:
-        values = scipy.linalg.eigvals(np.linalg.solve(m.E, m.A + m.B @ K))
-    except np.linalg.LinAlgError as error:
-        raise ControlError("the reduced E_N is singular; take another order N") from error
-    return np.asarray(values)

@@ -29,17 +29,11 @@ class NoController(ControlError):
 
 @dataclass(frozen=True)
 class CertifiedController:
-    """The small controller of a scene.
+    """The small controller of a scene."""
 
-    Attributes:
-        controller: what a robot runs.
-        method: basis that its gain came from.
-        radius: of the plant under it from tick to tick, at the period, step and delay of the scene.
-    """
-
-    controller: Controller
-    method: str
-    radius: SampledRadius
+    controller: Controller  # what a robot runs
+    method: str  # basis that its gain came from
+    radius: SampledRadius  # of the plant under it from tick to tick, at the period, step and delay of the scene
 
 
 def make_controller(design: Design, order: int | None = None) -> Controller:
@@ -72,7 +66,6 @@ def certified_controller(design: Design, basis: BasisGains | None, order: int | 
     modes expands acts on them only, so that the small controller is the gain that was judged.
 
     Args:
-        design: the optimal feedback.
         basis: the a-priori gains; None where there are none.
         order: take this one; None takes the least cost up to :func:`softgrasp.lqr.design.orders.fast_order`.
 

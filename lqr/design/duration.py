@@ -15,26 +15,18 @@ LONGEST = 20  # times the steps of the scene that a run without [control] may ta
 
 @dataclass(frozen=True)
 class LoopPlan:
-    """How long the loop runs.
+    """How long the loop runs."""
 
-    Attributes:
-        dt: time step [s].
-        steps: number.
-        settle: time after which a rigid body under this gain is at the target [s].
-        note: why the scene's own end is not taken, or that it is too early; else empty.
-    """
-
-    dt: float
-    steps: int
-    settle: float
-    note: str = ""
+    dt: float  # time step [s]
+    steps: int  # number
+    settle: float  # time after which a rigid body under this gain is at the target [s]
+    note: str = ""  # why the scene's own end is not taken, or that it is too early; else empty
 
 
 def plan(design: Design, own_end: bool) -> LoopPlan:
     """Steps of the closed loop, from the poles of the hand alone: M_s q'' = K_s [q; q'].
 
     Args:
-        design: the optimal feedback.
         own_end: keep the end of the scene; else take as many steps as the move needs.
     """
     scene, n_s = design.model.scene, design.problem.layout.n_s

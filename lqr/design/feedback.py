@@ -93,7 +93,6 @@ def design(
     """Solve the Riccati equation of a scene and check the closed loop of the full plant. Collective.
 
     Args:
-        model: the built scene.
         watch: takes the seconds of "diagnosis", "are" and "judge".
         progress: called after every step of the solver with its history entry.
         checkpoint: folder for the solver's restart files.

@@ -24,19 +24,12 @@ Notify = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class BasisGains:
-    """One basis over its orders.
+    """One basis over its orders."""
 
-    Attributes:
-        name: key of :data:`softgrasp.lqr.reduced.bases.BASES`.
-        family: its bases; None when the basis is refused.
-        reports: one an order.
-        refused: why there are none.
-    """
-
-    name: str
-    family: BasisFamily | None
-    reports: tuple[GainReport, ...]
-    refused: str = ""
+    name: str  # key of softgrasp.lqr.reduced.bases.BASES
+    family: BasisFamily | None  # its bases; None when the basis is refused
+    reports: tuple[GainReport, ...]  # one an order
+    refused: str = ""  # why there are none
 
     def best(self, largest: int | None = None, least: int = 0) -> GainReport | None:
         """The stable gain of least cost, of any order or between two."""
@@ -69,7 +62,6 @@ def reduce_gains(
     """Gains of the reduced Riccati equations over their orders, judged on the full plant. Collective.
 
     Args:
-        design: the optimal feedback.
         orders: of the reduced equations; those that a basis has not are left out.
         notify: called with the number of equations done and in all.
         names: keys of :data:`softgrasp.lqr.reduced.bases.BASES`.

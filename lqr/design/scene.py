@@ -19,11 +19,7 @@ from softgrasp.lqr.spectrum.sampled import Sampling
 
 
 def weight(value: float | list[list[float]], size: int, key: str) -> Array:
-    """A number as multiple of the identity, a matrix as it is.
-
-    Raises:
-        SceneError: the matrix has the wrong size.
-    """
+    """A number as multiple of the identity, a matrix as it is. Raises SceneError: the matrix has the wrong size."""
     if isinstance(value, list):
         matrix = np.array(value, dtype=float)
         if matrix.shape != (size, size):
@@ -38,9 +34,6 @@ def problem(model: Model) -> RiccatiProblem:
     """Outputs y = C_s q_s + C_z' z and weights Q, R of the scene's ``[control]`` table.
 
     Without that table: the free node farthest from the hand, Q = R = 1. Collective.
-
-    Args:
-        model: a built scene.
 
     Raises:
         SceneError: an output lies outside the body, or Q or R has the wrong size.
@@ -113,11 +106,7 @@ def _per_axis(key: str, limit: float | list[float] | None, axes: int) -> tuple[f
 
 
 def sampling(model: Model) -> Sampling:
-    """The instants of the scene's loop.
-
-    Raises:
-        ControlError: the tick is no multiple of the time step.
-    """
+    """The instants of the scene's loop. Raises ControlError: the tick is no multiple of the time step."""
     return Sampling.of(actuation(model), model.scene.time_end / model.scene.time.steps)
 
 

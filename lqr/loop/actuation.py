@@ -89,11 +89,7 @@ class ImplicitInput:
         self.inverse = np.linalg.inv(self.one - H)
 
     def solve(self, u_0: Array) -> Array:
-        """The input of the step, (inputs,).
-
-        Raises:
-            SolverError: the set of saturated inputs does not settle.
-        """
+        """The input of the step, (inputs,). Raises SolverError: the set of saturated inputs does not settle."""
         u = self.inverse @ u_0
         if self.bound is None or (np.abs(u) <= self.bound).all():
             return np.asarray(u)

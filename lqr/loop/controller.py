@@ -176,7 +176,6 @@ class Controller:
         """Read a file of :meth:`save`.
 
         Args:
-            path: the file.
             scene_hash, layout_hash: refuse a controller that was made for another scene or mesh.
 
         Raises:

@@ -25,7 +25,6 @@ def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: floa
     Args:
         outputs: y - y_bar at the grid points [m], (steps + 1, p).
         inputs: u - u_bar of each step [N, N m], (steps, n_s).
-        Q: (p, p).
         R: (n_s, n_s).
         dt: step [s].
 

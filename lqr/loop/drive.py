@@ -27,7 +27,6 @@ class PlantStep:
     ([...] two-way only). No matrix of the closed loop is ever factored.
 
     Args:
-        system: operators.
         midpoint: factored step, before its start: its vectors are used as scratch.
     """
 
@@ -75,10 +74,8 @@ class ImplicitDrive:
 
     Args:
         plant: from :class:`PlantStep`.
-        gain: K.
         target: x_bar and u_bar.
         bound: limits of the input, or None.
-        steps: number of steps.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
@@ -120,10 +117,8 @@ class HeldDrive:
 
     Args:
         plant: from :class:`PlantStep`.
-        gain: K.
         target: x_bar and u_bar; u_bar acts until the first command arrives.
         actuation: rate, delay, limits.
-        steps: number of steps.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:

@@ -25,10 +25,8 @@ class FiniteDrive:
 
     Args:
         plant: :class:`softgrasp.lqr.loop.drive.PlantStep`.
-        gain: K.
         target: x_bar and u_bar.
         bound: limits of the input, or None.
-        steps: number of steps.
     """
 
     def __init__(self, plant: Any, gain: Gain | None, target: Target | None, bound: Array | None, steps: int) -> None:

@@ -160,7 +160,6 @@ class ClosedLoop:
             gain: u = u_bar + K (x - x_bar).
             target: where the loop goes, or the displacement of the hand there, see
                 :func:`softgrasp.lqr.plant.target.hand_target`.
-            steps: number of steps.
             actuation: sampling, delay, limits; default none of them.
             start: x(0); default at rest with the hand at 0, in equilibrium under gravity.
             options: what to keep and whom to tell.
@@ -198,7 +197,6 @@ class LoopRun(Stepped):
         loop: factor and plant.
         drive: feedback law.
         start: state at t = 0.
-        steps: number of steps.
         options: what to keep.
         target: where the cost is zero.
     """

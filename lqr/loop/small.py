@@ -17,27 +17,16 @@ from softgrasp.lqr.plant.checks import ControlError
 
 @dataclass(frozen=True)
 class ReducedLoopTrajectory:
-    """What a reduced run returns.
+    """What a reduced run returns."""
 
-    Attributes:
-        times: grid [s], (steps + 1,).
-        states: (steps + 1, N).
-        q_s: hand, (steps + 1, n_s).
-        inputs: u of each step [N, N m], (steps, n_s).
-        outputs: (steps + 1, p).
-        cost: J up to each grid point, (steps + 1,).
-        saturated: share of the steps in which an input sat at its limit.
-        seconds: prepare, steps.
-    """
-
-    times: Array
-    states: Array
-    q_s: Array
-    inputs: Array
-    outputs: Array
-    cost: Array
-    saturated: float
-    seconds: dict[str, float] = field(default_factory=dict)
+    times: Array  # grid [s], (steps + 1,)
+    states: Array  # (steps + 1, N)
+    q_s: Array  # hand, (steps + 1, n_s)
+    inputs: Array  # u of each step [N, N m], (steps, n_s)
+    outputs: Array  # (steps + 1, p)
+    cost: Array  # J up to each grid point, (steps + 1,)
+    saturated: float  # share of the steps in which an input sat at its limit
+    seconds: dict[str, float] = field(default_factory=dict)  # prepare, steps
 
 
 class ReducedLoop:
@@ -84,7 +73,6 @@ class ReducedLoop:
         Args:
             K: gain, (n_s, N).
             rest: x_bar and u_bar, see :meth:`SmallPlant.rest_at`.
-            steps: number of steps.
             weights: Q and R of the cost.
             actuation: sampling, delay, limits.
             start: x(0), default the state of rest with the hand at 0.

@@ -20,25 +20,18 @@ from softgrasp.reduction.lti import LTI, make_lti
 
 @dataclass(frozen=True)
 class SmallPlant:
-    """E x' = A x + B u + f, y = C x, q_s = S_q x, v_s = S_v x, of dimension N.
+    """E x' = A x + B u + f, y = C x, q_s = S_q x, v_s = S_v x, of dimension N."""
 
-    Attributes:
-        E, A: (N, N).
-        B: (N, n_s).
-        C: (p, N).
-        f: constant load, gravity (N,).
-        S_q, S_v: (n_s, N).
-        names: one per output.
-    """
-
+    # E, A: (N, N)
     E: Array
     A: Array
-    B: Array
-    C: Array
-    f: Array
+    B: Array  # (N, n_s)
+    C: Array  # (p, N)
+    f: Array  # constant load, gravity (N,)
+    # S_q, S_v: (n_s, N)
     S_q: Array
     S_v: Array
-    names: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()  # one per output
 
     @property
     def N(self) -> int:
@@ -73,15 +66,10 @@ class SmallPlant:
 
 @dataclass(frozen=True)
 class Shapes:
-    """z ~ V eta with V of a few columns, and the filter eta = W' z that takes z to them.
+    """z ~ V eta with V of a few columns, and the filter eta = W' z that takes z to them."""
 
-    Attributes:
-        V: local rows (n_local, k).
-        W: M_ee V (V' M_ee V)^{-1}, local rows (n_local, k), so that W'V = I.
-    """
-
-    V: Array
-    W: Array
+    V: Array  # local rows (n_local, k)
+    W: Array  # M_ee V (V' M_ee V)^{-1}, local rows (n_local, k), so that W'V = I
 
     def reduce(self, problem: RiccatiProblem, x: PlantState) -> Array:
         """[q_s, v_s, W'z, W'v_z], (2 n_s + 2 k,), on every rank. Collective."""
@@ -112,7 +100,6 @@ def galerkin(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
     Collective.
 
     Args:
-        problem: the plant.
         V: shapes of z, local rows (n_local, k), linearly independent; k = 0 leaves the hand alone.
 
     Raises:

@@ -28,7 +28,6 @@ class Columns:
     """Z as it grows, in costate form; compressed when it gets wide.
 
     Args:
-        plant: the plant.
         allowed: what a compression on the way may change in the Riccati residual.
         limit: columns from which it is compressed.
     """
@@ -87,20 +86,14 @@ class Columns:
 
 @dataclass
 class Sweep:
-    """State of one ADI sweep for A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K.
+    """State of one ADI sweep for A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K."""
 
-    Attributes:
-        state: [K', W, dK'] with K' of the sweep, the residual factor W, W W' the Lyapunov residual, and
-            dK = B'XE - K of the X found so far.
-        Z: factor of X.
-        steps: solves so far.
-        first: ||W_0 W_0'||.
-    """
-
+    # [K', W, dK'] with K' of the sweep, the residual factor W, W W' the Lyapunov residual, and dK = B'XE - K of the X
+    # found so far
     state: Right
-    Z: Columns
-    steps: int = 0
-    first: float = 0.0
+    Z: Columns  # factor of X
+    steps: int = 0  # solves so far
+    first: float = 0.0  # ||W_0 W_0'||
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
 
     @property

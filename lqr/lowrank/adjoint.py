@@ -17,15 +17,10 @@ from softgrasp.lqr.plant.block import Block
 
 @dataclass(frozen=True)
 class Right:
-    """A right-hand side W together with a = K_ee^{-1} of its z-row.
+    """A right-hand side W together with a = K_ee^{-1} of its z-row."""
 
-    Attributes:
-        hand: rows of the hand, (2 n_s, k), on every rank.
-        rows: local rows of z as they stand, of v_z and of a, one below the other, (3 n_local, k).
-    """
-
-    hand: Array
-    rows: Array
+    hand: Array  # rows of the hand, (2 n_s, k), on every rank
+    rows: Array  # local rows of z as they stand, of v_z and of a, one below the other, (3 n_local, k)
 
     @property
     def columns(self) -> int:
@@ -52,21 +47,13 @@ class Right:
 
 @dataclass(frozen=True)
 class Solution:
-    """V = [a_s; b_s; a; b] = (solutions of the open loop for K' and W) mix, a = (a_0 + b) / p.
-
-    Attributes:
-        p: shift.
-        hand: open loop, a_s and b_s, (2 n_s, k).
-        b: open loop, local rows (n_local, k), rows side by side in memory.
-        a: a_0 = K_ee^{-1} of the z-rows, local rows (n_local, k).
-        mix: (k, q), of the Sherman-Morrison-Woodbury formula.
-    """
+    """V = [a_s; b_s; a; b] = (solutions of the open loop for K' and W) mix, a = (a_0 + b) / p."""
 
     p: complex
-    hand: Complex
-    b: Complex
-    a: Array
-    mix: Complex
+    hand: Complex  # open loop, a_s and b_s, (2 n_s, k)
+    b: Complex  # open loop, local rows (n_local, k), rows side by side in memory
+    a: Array  # a_0 = K_ee^{-1} of the z-rows, local rows (n_local, k)
+    mix: Complex  # (k, q), of the Sherman-Morrison-Woodbury formula
 
     @property
     def columns(self) -> int:
@@ -168,7 +155,6 @@ def closed_adjoint(
     [N, L] = (A + pE)^{-T} [K', W],  V = L + N (I - B'N)^{-1} B'L. Collective.
 
     Args:
-        plant: the plant.
         tissue: solver with S(p).
         p: shift.
         right: [K', W].

@@ -35,12 +35,9 @@ BUDGET = 0.45  # share of omega at which a response's damping ratio is held belo
 
 @dataclass
 class Space:
-    """A displacement basis with its products, grown by blocks of columns.
+    """A displacement basis with its products, grown by blocks of columns."""
 
-    Attributes:
-        V, M_V, K_V: local rows (n_local, r).
-    """
-
+    # V, M_V, K_V: local rows (n_local, r)
     V: Array
     M_V: Array
     K_V: Array
@@ -76,22 +73,15 @@ class Space:
 
 @dataclass(frozen=True)
 class Level:
-    """One Galerkin space with its solution.
+    """One Galerkin space with its solution."""
 
-    Attributes:
-        small: the projected plant.
-        solution: its Riccati equation.
-        Z: X ~ Z Z', costate form.
-        a, b: tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m).
-        gain: K', z-row as it stands.
-    """
-
-    small: ModalSubspace
-    solution: SmallSolution
-    Z: Block
+    small: ModalSubspace  # the projected plant
+    solution: SmallSolution  # its Riccati equation
+    Z: Block  # X ~ Z Z', costate form
+    # a, b: tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m)
     a: Array
     b: Array
-    gain: Block
+    gain: Block  # K', z-row as it stands
 
 
 def _normalising(gram: Array) -> Array:
@@ -120,7 +110,6 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
     """Project, solve and expand: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
 
     Args:
-        plant: the plant.
         space: the Ritz basis of ``old`` and more.
         old: the level before, near the solution.
     """
@@ -221,9 +210,7 @@ class StructuredGalerkin:
         if level.small.order == plant.layout.n_e:
             about = f"all {level.small.order} basis vectors that there are"
         iterate = Iterate(level.Z, level.gain, "galerkin", about, 1e-10, history, counts, seconds, lean=True)
-        result = make_solution(plant, iterate, check=False)
-        result.seconds["total"] = time.perf_counter() - begin
-        return result
+        return make_solution(plant, iterate, begin, check=False)
 
     def _grow(
         self,

@@ -18,7 +18,6 @@ def best_step(comm: MPI.Intracomm, old: tuple[Block, Array], W: Block, change: B
     Residual of X_j + t (X_new - X_j), exactly. Collective.
 
     Args:
-        comm: ranks.
         old: (U, signs) with R_j = U diag(signs) U'.
         W: residual factor of the Lyapunov equation.
         change: dK' = K_new' - K_j'.
@@ -45,13 +44,8 @@ def best_step(comm: MPI.Intracomm, old: tuple[Block, Array], W: Block, change: B
 
 def mixed_residual(old: tuple[Block, Array] | None, W: Block, change: Block, t: float) -> tuple[Block, Array]:
     """(U, signs) of (1 - t) R_j + t W W' - t^2 dK'dK."""
-    parts, signs = (
-        [W.times(np.sqrt(t) * np.eye(W.columns)), change.times(t * np.eye(change.columns))],
-        [
-            np.ones(W.columns),
-            -np.ones(change.columns),
-        ],
-    )
+    parts = [W.times(np.sqrt(t) * np.eye(W.columns)), change.times(t * np.eye(change.columns))]
+    signs = [np.ones(W.columns), -np.ones(change.columns)]
     if t < 1 and old is not None:
         U, weights = old
         parts.append(U.times(np.sqrt(1 - t) * np.eye(U.columns)))

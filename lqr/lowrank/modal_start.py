@@ -26,17 +26,11 @@ CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost 
 
 @dataclass(frozen=True)
 class ModalSubspace:
-    """Galerkin projection of the plant on a displacement basis, z = V eta, in xi = [q_s, v_s, omega eta, eta'].
+    """Galerkin projection of the plant on a displacement basis, z = V eta, in xi = [q_s, v_s, omega eta, eta']."""
 
-    Attributes:
-        V: local rows of the basis, (n_local, r).
-        omega: frequencies of the basis vectors, V' K_ee V = diag(omega^2), (r,).
-        space: E, A, B, C of xi.
-    """
-
-    V: Array
-    omega: Array
-    space: StateSpace
+    V: Array  # local rows of the basis, (n_local, r)
+    omega: Array  # frequencies of the basis vectors, V' K_ee V = diag(omega^2), (r,)
+    space: StateSpace  # E, A, B, C of xi
 
     @property
     def order(self) -> int:
@@ -46,32 +40,20 @@ class ModalSubspace:
 
 @dataclass(frozen=True)
 class SmallSolution:
-    """X of the small equation, the gain K = B'XE (weights folded in) and the closed loop.
+    """X of the small equation, the gain K = B'XE (weights folded in) and the closed loop."""
 
-    Attributes:
-        X: (N, N) for E = E of the small plant.
-        gain: (m, N), acting on xi.
-    """
-
-    X: Array
-    gain: Array
+    X: Array  # (N, N) for E = E of the small plant
+    gain: Array  # (m, N), acting on xi
 
 
 @dataclass(frozen=True)
 class ModalStart:
-    """Gain and shifts of the modal problem.
+    """Gain and shifts of the modal problem."""
 
-    Attributes:
-        small: the plant on the modes.
-        solution: its Riccati equation.
-        gain: K', local rows, z-row as it stands.
-        poles: its closed-loop poles, most important first, one of each pair, Im >= 0.
-    """
-
-    small: ModalSubspace
-    solution: SmallSolution
-    gain: Block
-    poles: np.ndarray
+    small: ModalSubspace  # the plant on the modes
+    solution: SmallSolution  # its Riccati equation
+    gain: Block  # K', local rows, z-row as it stands
+    poles: np.ndarray  # its closed-loop poles, most important first, one of each pair, Im >= 0
 
 
 class _MovedMass:
@@ -128,7 +110,6 @@ def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) 
     """Riccati equation of the small plant on rank 0, the result on all. Collective.
 
     Args:
-        plant: the plant.
         small: its projection.
         guess: an X near the solution, (N, N).
 
@@ -226,11 +207,7 @@ def filtered_gain(plant: Plant, small: ModalSubspace, solution: SmallSolution, M
 
 
 def check_damped(plant: Plant) -> None:
-    """The tissue is damped at all.
-
-    Raises:
-        ControlError: it is not.
-    """
+    """The tissue is damped at all. Raises ControlError: it is not."""
     if not plant.system.damping.active:
         raise ControlError(
             "without damping X has no low rank and the high modes cannot be stabilised in double precision; "
@@ -242,7 +219,6 @@ def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     """Riccati equation of the hand and the lowest ``modes`` modes. Collective.
 
     Args:
-        plant: the plant.
         modes: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
 
     Raises:

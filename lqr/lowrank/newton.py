@@ -165,6 +165,4 @@ class NewtonADI:
         iterate = Iterate(
             sweep.Z.block, sweep.new.block, "newton_adi", about, self.tol, state.history, counts, dict(state.seconds)
         )
-        result = make_solution(plant, iterate)
-        result.seconds["total"] = time.perf_counter() - begin
-        return result
+        return make_solution(plant, iterate, begin)

@@ -25,17 +25,11 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 @dataclass
 class RadiState:
-    """W with Res(X_k) = W W', K_k' and Z.
+    """W with Res(X_k) = W W', K_k' and Z."""
 
-    Attributes:
-        both: [K', W], (B'X_k E)' and the residual factor with p columns.
-        Z: X_k = Z Z'.
-        solves: tissue solves done.
-    """
-
-    both: Right
-    Z: Columns
-    solves: int = 0
+    both: Right  # [K', W], (B'X_k E)' and the residual factor with p columns
+    Z: Columns  # X_k = Z Z'
+    solves: int = 0  # tissue solves done
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
 
@@ -151,12 +145,9 @@ class RADI:
                 "columns": state.Z.appended,
             }
             about = f"low rank from X = 0, {tissue.name} tissue solves"
-            result = make_solution(
-                plant,
-                Iterate(state.Z.block, state.gain.block, "radi", about, self.tol, state.history, counts, state.seconds),
-            )
-            result.seconds["total"] = time.perf_counter() - begin
-            return result
+            columns = state.Z.block, state.gain.block
+            iterate = Iterate(*columns, "radi", about, self.tol, state.history, counts, state.seconds)
+            return make_solution(plant, iterate, begin)
         finally:
             tissue.destroy()
 

@@ -22,25 +22,15 @@ FORMAT = 3
 
 @dataclass
 class Iteration:
-    """What Newton's method carries from step to step.
+    """What Newton's method carries from step to step."""
 
-    Attributes:
-        gain: K_j'.
-        step: Newton steps done.
-        solves: tissue solves done.
-        factor: (U, signs) with R_j = U diag(signs) U', unknown before the first step.
-        achieved: relative Riccati residual of the last finished step.
-        history: one dictionary a solve.
-        seconds: time by stage.
-    """
-
-    gain: Right
-    step: int = 0
-    solves: int = 0
-    factor: tuple[Block, Array] | None = None
-    achieved: float = np.inf
-    history: list[dict[str, float]] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=dict)
+    gain: Right  # K_j'
+    step: int = 0  # Newton steps done
+    solves: int = 0  # tissue solves done
+    factor: tuple[Block, Array] | None = None  # (U, signs) with R_j = U diag(signs) U', unknown before the first step
+    achieved: float = np.inf  # relative Riccati residual of the last finished step
+    history: list[dict[str, float]] = field(default_factory=list)  # one dictionary a solve
+    seconds: dict[str, float] = field(default_factory=dict)  # time by stage
 
 
 def fingerprint(plant: Plant) -> str:
@@ -70,11 +60,7 @@ def _unpack(name: str, data: dict[str, Array]) -> Right:
 
 
 def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> None:
-    """Write everything a resumed run needs. Collective.
-
-    Raises:
-        CheckpointError: the folder cannot be written.
-    """
+    """Write everything a resumed run needs. Collective. Raises CheckpointError: the folder cannot be written."""
     keys = sorted(set.intersection(*map(set, state.history))) if state.history else []  # the last of a sweep has more
     entries: dict[str, Any] = {
         "fingerprint": np.array(fingerprint(plant)),

@@ -75,11 +75,7 @@ def factor_bytes(n: int, dimension: int) -> float:
 
 
 def check_memory(layout: BlockLayout) -> None:
-    """The factor of S(p) fits in the memory that is free now. Collective.
-
-    Raises:
-        ResourceError: it does not.
-    """
+    """The factor of S(p) fits in the memory that is free now. Collective. Raises ResourceError: it does not."""
     needed = factor_bytes(layout.n_e, layout.dimension) / 2**30
     free = float(layout.comm.bcast(psutil.virtual_memory().available)) / 2**30
     if needed > free:

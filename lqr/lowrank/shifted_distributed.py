@@ -19,9 +19,6 @@ class DistributedTissue:
     """MUMPS on the symmetric real form of twice the order, [X, -Y; -Y, -X] for S = X + iY, unknowns interleaved.
 
     One matrix object for all shifts: the symbolic factorisation is made once. Collective throughout.
-
-    Args:
-        system: operators.
     """
 
     name = "distributed"

@@ -30,9 +30,6 @@ class GatheredTissue:
 
     SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
     program of one rank that may use another core makes the next factors there while it works with the present one.
-
-    Args:
-        system: operators.
     """
 
     name = "gathered"

@@ -71,7 +71,6 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
     is unstable. Collective.
 
     Args:
-        plant: the plant.
         V: columns of Z, costate form.
         W: residual factor.
         gain: K', None for K = 0.
@@ -164,17 +163,11 @@ def choose_shifts(candidates: np.ndarray, weights: Array, count: int, planned: S
 
 @dataclass
 class ShiftQueue:
-    """The next shifts of one sweep.
+    """The next shifts of one sweep."""
 
-    Attributes:
-        limits: admissible range.
-        pending: shifts to come.
-        projections: how often Ritz values were computed.
-    """
-
-    limits: ShiftRange
-    pending: list[complex] = field(default_factory=list)
-    projections: int = 0
+    limits: ShiftRange  # admissible range
+    pending: list[complex] = field(default_factory=list)  # shifts to come
+    projections: int = 0  # how often Ritz values were computed
 
     @classmethod
     def start(cls, limits: ShiftRange, poles: Sequence[complex] | np.ndarray) -> ShiftQueue:

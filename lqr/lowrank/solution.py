@@ -23,34 +23,25 @@ SLACK = 2.0
 
 @dataclass
 class Iterate:
-    """What a low-rank solver hands over.
+    """What a low-rank solver hands over."""
 
-    Attributes:
-        Z: columns in costate form.
-        gain: K' = (B'XE)', z-row as it stands.
-        method: the solver.
-        about: what it did, in words.
-        tol: tolerance asked for.
-        lean: Z has no columns to spare.
-    """
-
-    Z: Block
-    gain: Block
+    Z: Block  # columns in costate form
+    gain: Block  # K' = (B'XE)', z-row as it stands
     method: SolverName
-    about: str
-    tol: float
+    about: str  # what it did, in words
+    tol: float  # tolerance asked for
     history: list[dict[str, float]] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
-    lean: bool = False
+    lean: bool = False  # Z has no columns to spare
 
 
-def make_solution(plant: Plant, iterate: Iterate, check: bool = True) -> RiccatiSolution:
+def make_solution(plant: Plant, iterate: Iterate, start: float, check: bool = True) -> RiccatiSolution:
     """Compress, leave the costate scaling and recompute the residual from Z. Collective.
 
     Args:
-        plant: the plant.
         iterate: columns and gain.
+        start: clock when the solver began [s].
         check: raise when the true residual misses the tolerance.
 
     Raises:
@@ -64,7 +55,8 @@ def make_solution(plant: Plant, iterate: Iterate, check: bool = True) -> Riccati
     factor = Block(Z.hand, np.asfortranarray(np.concatenate([plant.stiff(Z.tall[:n]), Z.tall[n:]])))
     middle = time.perf_counter()
     value = residual(plant.problem, factor)
-    seconds = iterate.seconds | {"compress": middle - begin, "residual": time.perf_counter() - middle}
+    end = time.perf_counter()
+    seconds = iterate.seconds | {"compress": middle - begin, "residual": end - middle, "total": end - start}
     if check and not value <= SLACK * iterate.tol:
         raise SolverError(
             f"{iterate.method}: the residual recomputed from Z is {value:.1e}, tolerance "

@@ -12,15 +12,10 @@ from softgrasp.fem.petsc import Array
 
 @dataclass(frozen=True)
 class Block:
-    """A few columns of the size of the state.
+    """A few columns of the size of the state."""
 
-    Attributes:
-        hand: rows of q_s and v_s, (2 n_s, k), on every rank.
-        tall: local rows of z and v_z, one below the other, (2 n_local, k).
-    """
-
-    hand: Array
-    tall: Array
+    hand: Array  # rows of q_s and v_s, (2 n_s, k), on every rank
+    tall: Array  # local rows of z and v_z, one below the other, (2 n_local, k)
 
     @property
     def columns(self) -> int:

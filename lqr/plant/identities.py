@@ -26,17 +26,6 @@ def gain_rigid_velocity(problem: RiccatiProblem, solution: RiccatiSolution) -> A
     return np.asarray(solution.gain.K_s[:, n_s : n_s + problem.layout.dimension])
 
 
-def optimal_cost(problem: RiccatiProblem, solution: RiccatiSolution, displacement: Array) -> float:
-    """Cost x' E'XE x for the whole body at rest, displaced by hand coordinates from its target.
-
-    Args:
-        problem: sizes.
-        solution: the Riccati solution.
-        displacement: start minus target of the hand [m, rad], (n_s,).
-    """
-    return float(np.sum((solution.factor.hand[: problem.layout.n_s].T @ displacement) ** 2))
-
-
 def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float:
     """||(K x_T)'R(K x_T) - C_s'QC_s|| / ||C_s'QC_s||."""
     K = solution.gain.K_s[:, : problem.layout.n_s]

@@ -58,7 +58,6 @@ def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
     """Rest with the hand at q_bar. Collective.
 
     Args:
-        problem: the plant.
         q_bar: displacement of the hand [m], (d,), which moves it without turning, or with angles [rad], (n_s,).
 
     Raises:

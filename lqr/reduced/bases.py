@@ -23,8 +23,8 @@ from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_re
 from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
-from softgrasp.reduction.engines import EPS, factor, small_svd
-from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.bases.engines import EPS, factor, small_svd
+from softgrasp.reduction.bases.states import BasisError
 
 A_PRIORI = "structured"  # the basis that needs no P
 
@@ -35,16 +35,11 @@ class RiccatiBasis:
 
     For the paper's bases W = L'^{-1} V and U = S V, so that W' A_rel U = V' A V. The structured basis takes states from
     U and costates from W; P_hat is then W P_N W' with the same equations of reduced form.
-
-    Attributes:
-        name: key of :data:`BASES`.
-        W: costate basis, N columns.
-        U: state basis, N columns.
     """
 
-    name: str
-    W: Block
-    U: Block
+    name: str  # key of BASES
+    W: Block  # costate basis, N columns
+    U: Block  # state basis, N columns
 
     @property
     def N(self) -> int:
@@ -54,33 +49,22 @@ class RiccatiBasis:
 
 @dataclass(frozen=True)
 class BasisFamily:
-    """Nested bases of one method.
+    """Nested bases of one method."""
 
-    Attributes:
-        name: key of :data:`BASES`.
-        smallest, largest: orders that exist.
-        step: distance of orders that exist.
-        sigma: singular values the truncation is chosen from, one array per POD.
-        make: the basis of order N.
-    """
-
-    name: str
+    name: str  # key of BASES
+    # smallest, largest: orders that exist
     smallest: int
     largest: int
-    step: int
-    sigma: tuple[Array, ...]
-    make: Callable[[int], RiccatiBasis]
+    step: int  # distance of orders that exist
+    sigma: tuple[Array, ...]  # singular values the truncation is chosen from, one array per POD
+    make: Callable[[int], RiccatiBasis]  # the basis of order N
 
     def orders(self, sizes: Sequence[int]) -> list[int]:
         """Those of the orders that exist."""
         return [N for N in sizes if self.smallest <= N <= self.largest and (N - self.smallest) % self.step == 0]
 
     def at(self, N: int) -> RiccatiBasis:
-        """The basis of order N. Collective.
-
-        Raises:
-            ControlError: no such order.
-        """
+        """The basis of order N. Collective. Raises ControlError: no such order."""
         if not self.orders([N]):
             raise ControlError(
                 f"basis {self.name} has no order N = {N}; choose {self.smallest} to {self.largest} "
@@ -337,7 +321,6 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
 
     Args:
         name: key of :data:`BASES`.
-        problem: the plant.
         Z: factor of X in hand-relative coordinates, see :class:`softgrasp.lqr.plant.problem.RiccatiSolution`.
 
     Raises:

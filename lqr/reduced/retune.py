@@ -26,17 +26,11 @@ Materials = tuple[LayerMaterial, ...]
 
 @dataclass(frozen=True)
 class Tuned:
-    """Gain for one setting of the materials.
+    """Gain for one setting of the materials."""
 
-    Attributes:
-        P_N: (N, N), in the retuner's scaled basis.
-        K_N: gain on reduced states, u = K_N x_N, (n_s, N).
-        seconds: to combine the components and solve the equation.
-    """
-
-    P_N: Array
-    K_N: Array
-    seconds: float
+    P_N: Array  # (N, N), in the retuner's scaled basis
+    K_N: Array  # gain on reduced states, u = K_N x_N, (n_s, N)
+    seconds: float  # to combine the components and solve the equation
 
 
 class Retuner:
@@ -149,7 +143,7 @@ def over_box(
         retuner: the reduced components.
         settings: materials of all layers, one tuple per point.
         solve: full solver, the reference.
-        start: start minus target, see :func:`softgrasp.lqr.reduced.riccati.hand_start`.
+        start: start minus target of hand and tissue, one column.
         modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
         law: instants of the loop; None judges the continuous law alone.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,19 +24,12 @@ from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radiu
 
 @dataclass(frozen=True)
 class ReducedRiccati:
-    """P_hat = V P_N V' and its gain.
+    """P_hat = V P_N V' and its gain."""
 
-    Attributes:
-        basis: the basis, scaled to energy.
-        matrices: E_N, A_N, B_N, C_N with the weights.
-        P_N: (N, N).
-        gain: K_hat on the full plant.
-    """
-
-    basis: RiccatiBasis
-    matrices: ReducedMatrices
-    P_N: Array
-    gain: Gain
+    basis: RiccatiBasis  # the basis, scaled to energy
+    matrices: ReducedMatrices  # E_N, A_N, B_N, C_N with the weights
+    P_N: Array  # (N, N)
+    gain: Gain  # K_hat on the full plant
 
 
 @dataclass(frozen=True)
@@ -144,7 +136,6 @@ class GainJudge:
     """Compares reduced gains with the optimal one on the full plant.
 
     Args:
-        problem: the plant.
         solution: the Riccati solution of the full plant.
         start: start minus target of hand and tissue, hand-relative, one column.
         loop: the full closed loop; made here when None.
@@ -240,11 +231,3 @@ class GainJudge:
             gain=reduced.gain,
             matrices=reduced.matrices,
         )
-
-
-def hand_start(problem: RiccatiProblem, displacement: Sequence[float] | Array) -> Block:
-    """Whole body at rest, displaced rigidly by hand coordinates [m, rad], (n_s,), as one column."""
-    n_s = problem.layout.n_s
-    hand = np.zeros((2 * n_s, 1))
-    hand[:n_s, 0] = displacement
-    return Block(hand, np.zeros((2 * problem.layout.n_local, 1)))

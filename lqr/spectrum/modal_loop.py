@@ -21,19 +21,12 @@ SOME_MODES = 150
 
 @dataclass(frozen=True)
 class SampledRadius:
-    """Spectral radius of a loop from tick to tick, see :mod:`softgrasp.lqr.spectrum.sampled`.
+    """Spectral radius of a loop from tick to tick, see :mod:`softgrasp.lqr.spectrum.sampled`."""
 
-    Attributes:
-        value: largest modulus of an eigenvalue; of the modes kept where not ``exact``.
-        certified: the radius of the whole plant lies on the same side of 1.
-        exact: all modes were kept.
-        reason: why it is not certified; empty when it is.
-    """
-
-    value: float
-    certified: bool = True
-    exact: bool = True
-    reason: str = ""
+    value: float  # largest modulus of an eigenvalue; of the modes kept where not ``exact``
+    certified: bool = True  # the radius of the whole plant lies on the same side of 1
+    exact: bool = True  # all modes were kept
+    reason: str = ""  # why it is not certified; empty when it is
 
     @property
     def stable(self) -> bool:
@@ -43,24 +36,15 @@ class SampledRadius:
 
 @dataclass(frozen=True)
 class LoopQuality:
-    """The full plant under one gain.
+    """The full plant under one gain."""
 
-    Attributes:
-        abscissa: largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``.
-        cost_excess: J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable.
-        certified: its sign is certain: from the whole spectrum, or from
-            :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa`.
-        exact: the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth.
-        poles: eigenvalues behind it.
-        sampled: from tick to tick, where the instants of the loop are known.
-    """
-
-    abscissa: float
-    cost_excess: float
+    abscissa: float  # largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``
+    cost_excess: float  # J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable
+    # its sign is certain: from the whole spectrum, or from softgrasp.lqr.spectrum.certificate.certified_abscissa
     certified: bool = True
-    exact: bool = True
-    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))
-    sampled: SampledRadius | None = None
+    exact: bool = True  # the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth
+    poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))  # eigenvalues behind it
+    sampled: SampledRadius | None = None  # from tick to tick, where the instants of the loop are known
 
     @property
     def stable(self) -> bool:
@@ -75,7 +59,6 @@ class ModalLoop:
     :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa` for large scenes.
 
     Args:
-        problem: the plant.
         modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`SOME_MODES`. All modes are
             allowed up to :data:`DENSE_LIMIT`.
     """

@@ -26,41 +26,25 @@ DOUBLINGS, BISECTIONS = 24, 6  # of the rate, when a stable one is sought: to 16
 
 @dataclass(frozen=True)
 class Sampling:
-    """The instants of a loop.
+    """The instants of a loop."""
 
-    Attributes:
-        dt: time step of the midpoint rule [s].
-        every: steps in one tick, during which the input is held; 0 takes the law at the midpoint of every step.
-        delay: a command acts one tick after its sample.
-    """
-
-    dt: float
-    every: int = 0
-    delay: bool = False
+    dt: float  # time step of the midpoint rule [s]
+    every: int = 0  # steps in one tick, during which the input is held; 0 takes the law at the midpoint of every step
+    delay: bool = False  # a command acts one tick after its sample
 
     @classmethod
     def of(cls, actuation: Actuation, dt: float) -> Sampling:
-        """The instants of an actuation.
-
-        Raises:
-            ControlError: the tick is no multiple of dt.
-        """
+        """The instants of an actuation. Raises ControlError: the tick is no multiple of dt."""
         return cls(dt, actuation.ticks(dt), actuation.delay)
 
 
 @dataclass(frozen=True)
 class StableRate:
-    """A rate at which a loop is stable.
+    """A rate at which a loop is stable."""
 
-    Attributes:
-        rate: [Hz].
-        steps: time steps that fit it until the end of the scene.
-        radius: there.
-    """
-
-    rate: float
-    steps: int
-    radius: float
+    rate: float  # [Hz]
+    steps: int  # time steps that fit it until the end of the scene
+    radius: float  # there
 
 
 @dataclass(frozen=True)

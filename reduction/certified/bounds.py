@@ -1,12 +1,13 @@
 """The static residual bound of a run by the midpoint rule, exact for the discrete rule.
 
-With a nodal residual r^ (the mean of its neighbours) and e' = e + K^-1 r^ the error e = (z - z_r, v - v_r) obeys the
-same rule with the slow forces K^-1 (r^+ - r^) / dt and r - mean r^: in the energy norm |e|^2 = e_z'K e_z + e_v'M e_v
+With any nodal residual r^ and e' = e + K^-1 r^ the error e = (z - z_r, v - v_r) obeys the same rule with the slow
+forces K^-1 (r^+ - r^) / dt and r - mean r^: in the energy norm |e|^2 = e_z'K e_z + e_v'M e_v
 
     |e'_0| = |r^_0|_{K^-1},   |e'_+| <= |e'| + dt sqrt(|(r^+ - r^) / dt|_{K^-1}^2 + |r - mean r^|_{M^-1}^2),
     |e| <= |e'| + |r^|_{K^-1}.
 
-Damping only helps. The textbook bound |e| <= dt sum |r|_{M^-1} charges what the basis lacks at every step anew.
+Here r^ is the mean of its neighbours, which takes the ringing of steps out of it. Damping only helps. The textbook
+bound |e| <= dt sum |r|_{M^-1} charges what the basis lacks at every step anew.
 """
 
 from __future__ import annotations
@@ -23,20 +24,22 @@ SAFETY = 1.01  # of the kernel: its maximum is taken on a grid
 GAIN = 1.0  # decay over the run, in powers of e, from which a kernel is worth its cost
 
 
-def nodal(rows: Array, first: Array | None = None) -> Array:
-    """Values at the steps, (w, steps + 1): means of those at the middles (w, steps), ``first`` at the start."""
+def nodal(rows: Array, first: Array | None = None) -> tuple[Array, Array]:
+    """Means of neighbouring middles, (w, steps + 1), ``first`` at the start; and what their means leave of the middles.
+
+    Args:
+        rows: values at the middles, (w, steps).
+        first: (w,); None takes the first middle.
+    """
     nodes = np.empty((len(rows), rows.shape[1] + 1))
-    np.add(rows[:, 1:], rows[:, :-1], out=nodes[:, 1:-1])
-    nodes[:, 1:-1] *= 0.5
     nodes[:, 0] = rows[:, 0] if first is None else first
     nodes[:, -1] = rows[:, -1]
-    return nodes
-
-
-def remainder(rows: Array, first: Array | None = None) -> Array:
-    """What a smooth residual leaves at the middles, r - mean r^, (w, steps)."""
-    nodes = nodal(rows, first)
-    return np.asarray(rows - 0.5 * (nodes[:, 1:] + nodes[:, :-1]))
+    inner = np.add(rows[:, 1:], rows[:, :-1], out=nodes[:, 1:-1])
+    inner *= 0.5
+    left = nodes[:, 1:] + nodes[:, :-1]
+    left *= -0.5
+    left += rows
+    return nodes, left
 
 
 def lengths(columns: Array) -> Array:
@@ -49,10 +52,10 @@ Kernel = tuple[Array, Array]
 
 
 def static_bound(
-    static: Array,
+    nodes: Array,
     rest: Array,
     dt: float,
-    first: Array | None = None,
+    balanced: bool = False,
     kernel: Kernel | None = None,
     drift: Array | None = None,
     gap: Array | None = None,
@@ -61,20 +64,19 @@ def static_bound(
     """|e|_E at every step, (steps + 1,).
 
     Args:
-        static: T r at the middles with |T r| >= |r|_{K^-1}, (w, steps).
+        nodes: T r^ at the steps with |T r^| >= |r^|_{K^-1}, (w, steps + 1).
         rest: |r - mean r^|_{M^-1}, (steps,).
         dt: step [s].
-        first: T r^ at a start in equilibrium, where e_0 = -K^-1 r^_0; None: from rest, e_0 = 0.
+        balanced: a start in equilibrium, where e_0 = -K^-1 r^_0; else at rest, e_0 = 0.
         kernel: see :func:`decay`; None: nothing decays.
         drift: |z_r' - v~|_K of inexact kinematics, (steps,).
         gap: |v~ - v_r|_M of the same at the steps, (steps + 1,).
         start: |v~_0|_M of the same.
     """
-    nodes = nodal(static, first)
     node = lengths(nodes)
-    rate = lengths(np.diff(nodes, axis=1)) / dt
+    rate = lengths(np.diff(nodes)) / dt
     force = np.hypot(rate if drift is None else rate + drift, rest)
-    begin = np.hypot(node[0] if first is None else 0.0, start)
+    begin = np.hypot(0.0 if balanced else node[0], start)
     if kernel is None:
         moved = begin + np.concatenate([[0.0], dt * np.cumsum(force)])
     else:

@@ -82,13 +82,13 @@ def greedy(
         progress: called with the state after every round.
 
     Returns:
-        The last state, with the reason: "tolerance"; "stagnation", when three rounds gained nothing; "size", when there
-        are no modes left to add; "exhausted", when a run adds no mode to the basis.
+        The last state, with the reason: "tolerance"; "stagnation", when three rounds of this call gained nothing;
+        "size", when there are no modes left to add; "exhausted", when a run adds no mode to the basis.
     """
     begin = time.perf_counter() - (state.rounds[-1].seconds if state.rounds else 0.0)
     evaluations = state.rounds[-1].evaluations if state.rounds else 0
     rounds, known, reason = list(state.rounds), state.known.copy(), ""
-    at = rounds[-1].worst if rounds else first
+    at, since = rounds[-1].worst if rounds else first, max(len(rounds) - 1, 0)
     k = rounds[-1].k if rounds else 0
     if rounds and rounds[-1].bound <= tolerance:
         reason = "tolerance"
@@ -105,7 +105,7 @@ def greedy(
             evaluations += len(todo)
         worst = int(order[0])
         rounds.append(Round(at, more, float(known[worst]), worst, evaluations, time.perf_counter() - begin))
-        reason = _reason(rounds, tolerance, more == k, more >= most)
+        reason = _reason(rounds[since:], tolerance, more == k, more >= most)
         at, k = worst, more
         progress(Greedy(tuple(rounds), known.copy(), reason))
     return Greedy(tuple(rounds), known, reason)

@@ -285,7 +285,8 @@ class CertifiedModel:
             low, high = self.norms.frequencies(materials)
             kernel = bounds.decay(low, high, self.fine.alpha, betas.pop(), drive.dt, drive.steps)
         drift, gap, start = r.inexact or (None, None, 0.0)
-        return bounds.static_bound(r.static, r.rest, drive.dt, r.first, kernel, drift, gap, start)
+        balanced = drive.start == "equilibrium"
+        return bounds.static_bound(r.nodes, r.rest, drive.dt, balanced, kernel, drift, gap, start)
 
     def _reach(self, bound: Array, materials: Materials, drive: Drive) -> Array:
         """Bound of every output component from one of the energy, (steps + 1, p)."""

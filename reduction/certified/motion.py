@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import scipy.linalg
 
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import driven_table
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction import online
-from softgrasp.reduction.certified.bounds import lengths, remainder
+from softgrasp.reduction.certified.bounds import lengths, nodal
 from softgrasp.reduction.certified.oscillators import Modes, SecondOrder, march
 from softgrasp.reduction.certified.residual import ResidualNorms
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
@@ -20,6 +21,7 @@ from softgrasp.reduction.online import ReducedTrajectory, consistent
 from softgrasp.reduction.propagator import propagator
 
 Materials = tuple[LayerMaterial, ...]
+SLOW = 0.3  # angle of a mode in a step below which smoothing its residual gains less than 1 % of the bound
 
 
 @dataclass(frozen=True)
@@ -57,14 +59,12 @@ class Residual:
     """What the static bound takes of a run, see :func:`softgrasp.reduction.certified.bounds.static_bound`.
 
     Attributes:
-        static: T r in K^-1 at the middles, (w, steps).
-        first: the same at a start in equilibrium, (w,), or None.
+        nodes: T r^ in K^-1 at the steps, (w, steps + 1).
         rest: |r - mean r^|_{M^-1}, (steps,).
         inexact: drift (steps,), gap (steps + 1,) and start, where the kinematics are not exact.
     """
 
-    static: Array
-    first: Array | None
+    nodes: Array
     rest: Array
     inexact: tuple[Array, Array, float] | None = None
 
@@ -188,14 +188,14 @@ def modal_motions(
         eta = own[:, 0] / m.omega[:, None]
         residual = None
         if norms is not None:
-            residual = modal_residual(norms, materials, m, eta + m.beta * own[:, 1], c, -g if still else None)
+            residual = modal_residual(norms, materials, m, eta + m.beta * own[:, 1], c, -g if still else None, drive.dt)
         size = float(lengths(own.reshape(2 * k, -1)).max())
         result.append(Motion(q, v, ((C @ m.X) @ eta).T + rigid, size, residual, m, own))
     return result
 
 
 def modal_residual(
-    norms: ResidualNorms, materials: Materials, m: Modes, y: Array, c: Array, c_0: Array | None
+    norms: ResidualNorms, materials: Materials, m: Modes, y: Array, c: Array, c_0: Array | None, dt: float
 ) -> Residual:
     """Residual of a run in modes: what the modes are not modes of, (K - omega^2 M) Phi X y + (G - M Phi X g) c.
 
@@ -209,24 +209,26 @@ def modal_residual(
         y: (k, steps + 1).
         c: (n_s, steps).
         c_0: at a start in equilibrium, (n_s,); else None.
+        dt: step [s]; modes that turn by less than :data:`SLOW` in it are not smoothed and leave nothing at the middles.
     """
-    rows = np.vstack([c, (y[:, 1:] + y[:, :-1]) / 2])
-    first = None if c_0 is None else np.concatenate([c_0, y[:, 0]])
-    static, mass = (
-        _combined(norms, T, materials, m) * factor
-        for T, factor in (
-            (norms.static, norms.static_factor(materials)),
-            (norms.mass, norms.mass_factor(materials)),
-        )
-    )
-    rest = lengths(mass @ remainder(rows, first))
-    return Residual(static @ rows, None if first is None else static @ first, rest)
+    slow = int(np.searchsorted(m.omega * dt, SLOW))
+    middles = np.vstack([c, 0.5 * (y[slow:, 1:] + y[slow:, :-1])])
+    nodes, left = nodal(middles, None if c_0 is None else np.concatenate([c_0, y[slow:, 0]]))
+    G, M, K, _ = norms.columns("static", materials)
+    static = _triangle([G - M @ (m.X @ m.g), K @ m.X - (M @ m.X) * m.omega**2])
+    static *= norms.static_factor(materials)
+    X = m.X[:, slow:]
+    G, M, K, _ = norms.columns("mass", materials)
+    mass = _triangle([G - M @ (m.X @ m.g), K @ X - (M @ X) * m.omega[slow:] ** 2])
+    n_s = len(c)
+    at_steps = static @ np.vstack([nodes[:n_s], y[:slow], nodes[n_s:]])
+    return Residual(at_steps, norms.mass_factor(materials) * lengths(mass @ left))
 
 
-def _combined(norms: ResidualNorms, T: Array, materials: Materials, m: Modes) -> Array:
-    G, M, K, _ = norms.columns(T, materials)
-    inertia = M @ m.X
-    return np.linalg.qr(np.hstack([G - inertia @ m.g, K @ m.X - inertia * m.omega**2]), mode="r")
+def _triangle(columns: list[Array]) -> Array:
+    """R of a QR decomposition, at most as many rows as columns."""
+    A = np.concatenate(columns, axis=1)
+    return np.triu(scipy.linalg.lapack.dgeqrf(A)[0][: A.shape[1]])
 
 
 def stepped_motion(
@@ -270,11 +272,12 @@ def stepped_residual(
     first = None
     if drive.start == "equilibrium":
         first = np.concatenate([-g, np.zeros(len(b)), a[:, 0], np.zeros(len(b))])
-    static = norms.static_factor(materials) * np.linalg.qr(np.hstack(norms.columns(norms.static, materials)), mode="r")
-    mass = norms.mass_factor(materials) * np.hstack(norms.columns(norms.mass, materials))
+    nodes, left = nodal(rows, first)
+    static = norms.static_factor(materials) * np.linalg.qr(np.hstack(norms.columns("static", materials)), mode="r")
+    mass = norms.mass_factor(materials) * np.hstack(norms.columns("mass", materials))
     if model.two_way and drive.hand is None:
         G, root = hand_inertia(model, norms)
-        pulled = root.T @ G.T @ np.hstack(norms.columns(norms.mass, materials))
+        pulled = root.T @ G.T @ np.hstack(norms.columns("mass", materials))
         mass = np.vstack([mass, pulled * max(1.0, norms.mass_factor(materials))])
     inexact = None
     if not exact and norms.shape is not None:
@@ -283,8 +286,7 @@ def stepped_residual(
         both = norms.inertia_factor(materials) * M
         gap, begin = lengths(both @ np.vstack([b, -x / scale])), lengths(both[:, : len(b)] @ b[:, :1])
         inexact = drift, gap, float(begin[0])
-    rest = lengths(np.linalg.qr(mass, mode="r") @ remainder(rows, first))
-    return Residual(static @ rows, None if first is None else static @ first, rest, inexact)
+    return Residual(static @ nodes, lengths(np.linalg.qr(mass, mode="r") @ left), inexact)
 
 
 def hand_inertia(model: ReducedModel, norms: ResidualNorms) -> tuple[Array, Array]:
@@ -292,7 +294,7 @@ def hand_inertia(model: ReducedModel, norms: ResidualNorms) -> tuple[Array, Arra
 
     The coupled mass has on (r, 0) the inverse r'M^-1 r + (G'M^-1 r)' S^-1 (G'M^-1 r), M_ss = M_hand + M_rigid.
     """
-    G = norms.columns(norms.mass, norms.reference)[0]
+    G = norms.columns("mass", norms.reference)[0]
     rigid = np.einsum("l,lij->ij", [m.rho for m in norms.reference], model.parts["rigid"])
     S = model.parts["M_hand"] + rigid - G.T @ G
     return G, np.linalg.inv(np.linalg.cholesky((S + S.T) / 2)).T

@@ -12,6 +12,8 @@ coefficients. A Gram matrix of C would lose half of the digits [BEOR14].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from mpi4py import MPI
@@ -63,18 +65,29 @@ class ResidualNorms:
         width = len(self.reference) * (self.n_s + 3 * k)
         return replace(self, static=_leading(self.static, width), mass=_leading(self.mass, width))
 
-    def columns(self, T: Array, materials: tuple[LayerMaterial, ...]) -> tuple[Array, Array, Array, Array]:
+    @cached_property
+    def _parts(self) -> dict[str, tuple[Array, Array]]:
+        """Of both triangles: columns of G_1, (layers, rows n_s), and of M_1, K_mu and K_lambda, (3 layers, rows k)."""
+        layers, width = len(self.reference), len(self.reference) * self.n_s
+        return {
+            which: (
+                T[:, :width].reshape(len(T), layers, -1).transpose(1, 0, 2).reshape(layers, -1),
+                T[:, width:].reshape(len(T), -1, 3 * layers).transpose(2, 0, 1).reshape(3 * layers, -1),
+            )
+            for which, T in (("static", self.static), ("mass", self.mass))
+        }
+
+    def columns(
+        self, which: Literal["static", "mass"], materials: tuple[LayerMaterial, ...]
+    ) -> tuple[Array, Array, Array, Array]:
         """A triangle at a parameter: what multiplies c, (rows, n_s), b' + alpha b, a, and b by viscosity, (rows, k)."""
-        layers, n_s, rows = len(materials), self.n_s, len(T)
-        weights = np.zeros((layers, 3, 3))
-        for i, m in enumerate(materials):
-            weights[i, :, 0] = m.rho, 0.0, 0.0
-            weights[i, :, 1] = 0.0, m.mu, m.lam
-            weights[i, :, 2] = 0.0, m.beta * m.mu, m.beta * m.lam
-        G = np.tensordot(T[:, : layers * n_s].reshape(rows, layers, n_s), weights[:, 0, 0], (1, 0))
-        parts = T[:, layers * n_s :].reshape(-1, 3 * layers) @ weights.reshape(3 * layers, 3)
-        M, K, D = np.moveaxis(parts.reshape(rows, -1, 3), 2, 0)
-        return G, M, K, D
+        (hand, tissue), rows = self._parts[which], len(self.static if which == "static" else self.mass)
+        rho, mu, lam, beta = np.array([(m.rho, m.mu, m.lam, m.beta) for m in materials]).T
+        weights = np.zeros((3, len(materials), 3))  # of M_1, K_mu, K_lambda
+        weights[0, :, 0], weights[1, :, 1], weights[1, :, 2] = rho, mu, lam
+        weights[2] = beta[:, None] * weights[1]
+        M, K, D = (weights.reshape(3, -1) @ tissue).reshape(3, rows, -1)
+        return (rho @ hand).reshape(rows, -1), M, K, D
 
     def static_factor(self, materials: tuple[LayerMaterial, ...]) -> float:
         """Factor c with |r|_{K^-1} <= c |r|_{K_r^-1}: 0 <= K_lambda <= (d / 2) K_mu, since (tr e)^2 <= d e:e."""

@@ -31,6 +31,7 @@ COLUMNS = 200  # states of a full run that its modes are taken from
 CACHED = 3e8  # entries of full runs that are kept, in case a point comes again: 2.4 GB over all ranks
 SHARE = 0.5  # of the tolerance that the larger basis may use, so that the smaller one has the rest
 RANDOM = 100  # parameters beside the grid where the finished model is looked at
+ADDED = 10  # of these become points of the training at most, each as the worst one above what the grid has reached
 PLACES = 4  # trained parameters at which the mesh is estimated
 ROUNDING = 1e-11  # of a run's length: what is left of it below is rounding
 CHUNK = 50  # parameters that are looked at together
@@ -84,14 +85,14 @@ class Trainer:
 
     Args:
         model: the scene; ``reduction`` says how.
-        Phi: modes to go on from, local rows (n_local, k); None: none.
+        earlier: a model with lift, of the same :func:`train_key`, to go on from; None: none.
 
     Raises:
         SceneError: the scene's own material lies outside the box, or its motions cannot be trained.
         SolverError: a factorisation failed.
     """
 
-    def __init__(self, model: Model, Phi: Array | None = None) -> None:
+    def __init__(self, model: Model, earlier: CertifiedModel | None = None) -> None:
         if reason := outside(model):
             raise SceneError(f"{reason}; a certified model needs its box around the scene's own material")
         if model.system.points is not None:
@@ -113,9 +114,12 @@ class Trainer:
         self.drives = [scene_drive(m.scene, m.system.M_hand, 1) for m in self.models]
         self.Phi = np.zeros((model.system.layout.n_local, 0))
         self._runs: dict[int, list[Array]] = {}
-        self.full_runs = 0
-        if Phi is not None:
-            self._append(Phi)
+        self.full_runs, self.added = 0, list[int]()
+        if earlier is not None and earlier.fine.lift is not None:
+            hand = 2 * model.system.layout.n_s
+            self._append(earlier.fine.lift.L_q[:, hand : hand + earlier.k2])
+            for i in earlier.training["added"]:
+                self.add(i)
 
     def at(self, draws: Array) -> list[Materials]:
         """Materials of the box at coordinates of the unit cube, logarithmically, (n, layers or 1, 2)."""
@@ -202,9 +206,16 @@ class Trainer:
             values[rank :: self.comm.size] = part
         return [float(value) for value in values]
 
-    def checked(self) -> list[Materials]:
-        """The grid and random parameters of the box."""
-        return [*self.parameters, *self.random(RANDOM, SEED)]
+    def checks(self) -> list[Materials]:
+        """Random parameters of the box."""
+        return self.random(RANDOM, SEED)
+
+    def add(self, i: int) -> None:
+        """Make one of the random parameters a point of the training."""
+        place = self.checks()[i]
+        self.added.append(i)
+        self.parameters.append(place)
+        self.points.append((place[0].lam, place[0].mu))
 
     def random(self, n: int, seed: int) -> list[Materials]:
         """Random materials of the box, the same on every rank."""
@@ -238,6 +249,7 @@ def history(trainer: Trainer, state: Greedy) -> dict[str, Any]:
         "rounds": [asdict(r) for r in state.rounds],
         "known": state.known.tolist(),
         "points": trainer.points,
+        "added": trainer.added,
         "chosen": [trainer.points[r.at] for r in state.rounds],
         "reason": state.reason,
         "full_runs": trainer.full_runs,
@@ -251,6 +263,8 @@ def build_certified(
     progress: Callable[[Greedy, CertifiedModel], None] = lambda state, model: None,
 ) -> CertifiedModel:
     """Run the greedy to a tolerance, and choose the small basis. Collective.
+
+    Where the grid has reached the tolerance and a random parameter has not, that becomes a point of the training too.
 
     Args:
         trainer: at the basis of ``state``.
@@ -271,9 +285,18 @@ def build_certified(
 
     goal = tolerance if options.certify == "proof" else SHARE * tolerance
     most = max(1, (options.max_N - hand) // 2)
-    state = greedy(trainer.train, trainer.bound, state or start(count), middle, goal, most, after)
+    state = state or start(count)
+    while True:
+        state = greedy(trainer.train, trainer.bound, state, middle, goal, most, after)
+        bounds = trainer.bounds_at(trainer.checks(), trainer.certified)
+        worst = int(np.argmax(bounds))
+        if not state.reached or bounds[worst] <= goal or len(trainer.added) == ADDED:
+            break
+        trainer.add(worst)
+        last = replace(state.rounds[-1], bound=bounds[worst], worst=len(state.known))
+        state = Greedy((*state.rounds[:-1], last), np.append(state.known, bounds[worst]))
     model = replace(trainer.certified, training=history(trainer, state), tolerance=tolerance)
-    many = trainer.checked()
+    many = [*trainer.parameters, *trainer.checks()]
     if options.certify != "proof":
         model = smallest(trainer, model, many, tolerance)
     proved = trainer.bounds_at(many, model)

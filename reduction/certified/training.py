@@ -12,7 +12,7 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import force_values, motion_table
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.residual import ResidualSpace, kinematic_triangles

@@ -18,6 +18,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs
+from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.stepper import Problem, march
 
@@ -73,33 +74,31 @@ class Box:
 
 
 @dataclass(frozen=True)
-class StrainRun:
-    """What a reduced run at finite strain returns.
+class StrainRun(ReducedTrajectory):
+    """A reduced run at finite strain, x = [q_s, v_s, a, a'].
 
     Attributes:
-        times: (steps + 1,) [s].
-        a, v: reduced displacements and velocities, (steps + 1, k).
-        q_s, v_s: hand, (steps + 1, n_s).
-        outputs: y, (steps + 1, p) [m].
-        output_names: one per component.
         problem, load: what was stepped.
         evaluations: of the force, in the mean of a step.
         restarts: fresh tangents.
         engine: "C" or "NumPy".
     """
 
-    times: Array
-    a: Array
-    v: Array
-    q_s: Array
-    v_s: Array
-    outputs: Array
-    output_names: tuple[str, ...]
     problem: Problem = field(repr=False)
     load: Array = field(repr=False)
     evaluations: float
     restarts: int
     engine: str
+
+    @property
+    def a(self) -> Array:
+        """Coordinates of the displacement, (steps + 1, k)."""
+        return coordinates(self)[0]
+
+    @property
+    def v(self) -> Array:
+        """Their rates, (steps + 1, k)."""
+        return coordinates(self)[1]
 
     @cached_property
     def energy(self) -> Array:
@@ -116,6 +115,12 @@ class StrainRun:
         defect = np.abs(self.energy - self.energy[0] - work + lost).max()
         scale = max(float(np.abs(x).max()) for x in (self.energy, work, lost))
         return float(defect) / scale if scale > 0 else 0.0
+
+
+def coordinates(run: ReducedTrajectory) -> tuple[Array, Array]:
+    """A and a' of a run at finite strain, (steps + 1, k) each."""
+    a, v = np.split(run.x[:, 2 * run.q_s.shape[1] :], 2, axis=1)
+    return a, v
 
 
 @dataclass(frozen=True)
@@ -187,10 +192,9 @@ class SmallStrainModel:
         self._check(model.box.refuse_states(done.a))
         y = done.a @ model.outputs.C_z.T + q @ model.outputs.C_s.T
         times = dt * np.arange(float(len(q)))
-        return StrainRun(
-            times, done.a, done.v, q, v, y, model.outputs.names, self.problem, load, done.evaluations, done.restarts,
-            done.engine,
-        )  # fmt: skip
+        x = np.hstack([q, v, done.a, done.v])
+        counts = done.evaluations, done.restarts, done.engine
+        return StrainRun(times, x, q, v, y, model.outputs.names, self.problem, load, *counts)
 
     def _check(self, reason: str) -> None:
         if reason and not self.outside:

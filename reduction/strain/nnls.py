@@ -13,7 +13,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, rows_on_root
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.bases.basis import ReductionError
 
 LEAST_TAU = 1e-6  # normal equations lose half of the digits, so that a smaller residual cannot be told from rounding
 

@@ -26,21 +26,21 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import ReductionError
-from softgrasp.reduction.inner import Rows, Weight
+from softgrasp.reduction.bases.basis import ReductionError
+from softgrasp.reduction.bases.inner import Rows, Weight
+from softgrasp.reduction.bases.pod import pod_part
+from softgrasp.reduction.bases.states import BasisError
+from softgrasp.reduction.bases.truncation import Columns
 from softgrasp.reduction.model import Lift, ModelError
+from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.parameters import thinned
-from softgrasp.reduction.pod import pod_part
 from softgrasp.reduction.projection import project_outputs
-from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.replay import FullRun
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.compare import Reference, StrainErrors, errors_of, reference_of
-from softgrasp.reduction.strain.model import Box, SmallStrainModel, StrainModel, StrainRun
+from softgrasp.reduction.strain.model import Box, SmallStrainModel, StrainModel, StrainRun, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
-from softgrasp.reduction.truncation import Columns
 
 SNAPSHOTS = 400  # behind a basis, of all runs together
 STATES = 80  # of each run behind the weights
@@ -234,22 +234,21 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
     return columns.e_q
 
 
-def train(model: Model, runs: Sequence[Trajectory | FullRun], N: int) -> Training:
+def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
     """Basis for models up to dimension N, and all cells in its coordinates. Collective.
 
     Args:
         model: scene with effects.finite_strain.
-        runs: full runs to train on; a trajectory is at the materials and the motion of ``model``.
+        runs: full runs to train on.
         N: largest dimension, the hand's 2 n_s included.
 
     Raises:
         ReductionError: the scene has no finite strain, or the snapshots carry fewer columns.
-        SceneError: a run kept no snapshots, or stands still.
     """
     system, points = model.system, model.system.points
     if points is None:
         raise ReductionError("the scene has no effects.finite_strain; softgrasp.reduce makes its linear models")
-    fulls = tuple(run if isinstance(run, FullRun) else full_run(model, run) for run in runs)
+    fulls = tuple(runs)
     if not fulls:
         raise ReductionError("there is no full run to train on; give at least one")
     begin = time.perf_counter()
@@ -266,57 +265,15 @@ def train(model: Model, runs: Sequence[Trajectory | FullRun], N: int) -> Trainin
     return Training(model, fulls, Phi, cells, offset, tuple(reference_of(run, Phi) for run in fulls), seconds)
 
 
-def reduce_strain(
-    model: Model, runs: Trajectory | FullRun | Sequence[Trajectory | FullRun], N: int = 14, tau: float | None = None
-) -> StrainModel:
-    """Reduced model of a scene with effects.finite_strain, trained on full runs of it. Collective.
-
-    >>> import softgrasp as sg
-    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
-    >>> rom = sg.reduce_strain(model, sg.simulate(model), N=14)
-    >>> rom.N, rom.cells.count < 64
-    (14, True)
-
-    Args:
-        model: the scene.
-        runs: one full run, or several; the model answers inside the box of their materials and motions.
-        N: dimension, the hand's 2 n_s included.
-        tau: of the weights of the sampled cells; None takes half of the error of the model on all cells.
-
-    Raises:
-        ReductionError: no finite strain, N does not fit, or no weights reach tau.
-        SceneError: a run kept no snapshots, or stands still.
-        SolverError: a reduced run did not converge.
-    """
-    several = [runs] if isinstance(runs, Trajectory | FullRun) else runs
-    return train(model, several, N).reduce(N, tau)
-
-
-def replay_strain(
-    rom: StrainModel, model: Model, run: Trajectory | FullRun, *, outside: bool = False, engine: str = ""
-) -> StrainRun:
-    """Run a reduced model at finite strain under the hand of a full run, from its start. Collective.
-
-    >>> import softgrasp as sg
-    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
-    >>> run = sg.simulate(model)
-    >>> rom = sg.reduce_strain(model, run, N=14)
-    >>> sg.replay_strain(rom, model, run).energy_drift < 1e-8
-    True
+def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False, engine: str = "") -> StrainRun:
+    """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective.
 
     Args:
         rom: which.
-        model: gives the materials of a trajectory.
-        run: the full run; a :class:`softgrasp.reduction.replay.FullRun` has materials of its own.
+        full: run to repeat, at its own materials.
         outside: allow what the model was not trained on.
         engine: see :func:`softgrasp.reduction.strain.stepper.march`.
-
-    Raises:
-        ModelError: the run lies outside the training box, or there is no equilibrium to start in.
-        SceneError: see :func:`softgrasp.reduction.replay.full_run`.
-        SolverError: a step did not converge.
     """
-    full = run if isinstance(run, FullRun) else full_run(model, run)
     return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full, engine)
 
 
@@ -325,22 +282,11 @@ def _replay(small: SmallStrainModel, full: FullRun, engine: str = "") -> StrainR
     return small.run(full.hand, a0=a0, engine=engine)
 
 
-def errors_strain(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajectory | FullRun) -> StrainErrors:
-    """How far a reduced run is from a full one: deformation, its velocity, energy norm. Collective.
-
-    >>> import softgrasp as sg
-    >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100", "effects.finite_strain={}"])
-    >>> run = sg.simulate(model)
-    >>> rom = sg.reduce_strain(model, run, N=20)
-    >>> sg.errors_strain(rom, sg.replay_strain(rom, model, run), model, run).z < 0.01
-    True
-
-    Args and errors as in :func:`replay_strain`, which makes the reduced run; the model must hold its lift.
-    """
+def errors_strain(rom: StrainModel, reduced_run: ReducedTrajectory, full: FullRun) -> StrainErrors:
+    """Errors of deformation, velocity, energy norm, see :func:`softgrasp.reduction.reduce.errors`. Collective."""
     if rom.Phi is None:
         raise ModelError("the model holds no lift; load it with the layout of its mesh")
-    full = run if isinstance(run, FullRun) else full_run(model, run)
-    return reference_of(full, rom.Phi).errors(reduced_run.a, reduced_run.v)
+    return reference_of(full, rom.Phi).errors(*coordinates(reduced_run))
 
 
 def gathered(comm: MPI.Intracomm, cells: Cells, offset: int) -> Cells:

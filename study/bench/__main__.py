@@ -1,4 +1,4 @@
-"""``python -m softgrasp.study.bench forward | riccati | bases | switches | meshes | accuracy``."""
+"""``python -m softgrasp.study.bench forward | riccati | bases | switches | meshes | accuracy | certified``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ from typing import Any
 
 import typer
 
-from softgrasp.study.bench import accuracy, bases, forward, forward_rows, meshes, riccati, riccati_rows, switches
+from softgrasp.study.bench import (
+    accuracy,
+    bases,
+    certified,
+    forward,
+    forward_rows,
+    meshes,
+    riccati,
+    riccati_rows,
+    switches,
+)
 from softgrasp.study.shell.ending import run_command
 from softgrasp.study.shell.jobs import leave_result
 
@@ -33,6 +43,7 @@ for _name, _module in (
     ("switches", switches),
     ("meshes", meshes),
     ("accuracy", accuracy),
+    ("certified", certified),
 ):
     app.command(name=_name, help=_module.HELP)(_module.main)
 

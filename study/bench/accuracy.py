@@ -20,8 +20,8 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.reduction.reduce import reduce
-from softgrasp.reduction.replay import replay
+from softgrasp.reduction.reduce import reduce_linear
+from softgrasp.reduction.replay import full_run, replay_linear
 from softgrasp.study.bench.driver import Goal, open_console, show_goals, write_bench
 from softgrasp.study.report.origin import machine
 from softgrasp.study.report.tables import Table
@@ -113,8 +113,8 @@ def measure(name: str, sets: list[str], exact: Array, cost: float) -> Row:
     comm, scene = MPI.COMM_WORLD, load_scene("paper_forward", [f"time.steps={STEPS}", *sets])
     model = build(scene, comm=comm)
     full = simulate(model)
-    rom = reduce(model, full, METHOD, N)
-    small = replay(rom, model, full)
+    rom = reduce_linear(model, [full_run(model, full)], METHOD, N)
+    small = replay_linear(rom, model, full)
     found = controlled(sets)
     scale = np.linalg.norm(exact, axis=1).max()
 
@@ -127,7 +127,7 @@ def measure(name: str, sets: list[str], exact: Array, cost: float) -> Row:
         median(lambda: build(scene, comm=comm)),
         median(lambda: simulate(model)),
         error(full.outputs - full.outputs_rigid),
-        median(lambda: replay(rom, model, full)),
+        median(lambda: replay_linear(rom, model, full)),
         error(small.outputs - full.outputs_rigid),
         found.solution.seconds.get("total", sum(found.solution.seconds.values())),
         abs(found.judge.optimal - cost) / abs(cost),

@@ -13,9 +13,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.reduction.engines import factor, small_svd
-from softgrasp.study.bench.driver import list_bench, open_console, parse_list, parse_ranks, write_bench
-from softgrasp.study.report.tables import Table
+from softgrasp.reduction.bases.engines import factor, small_svd
+from softgrasp.study.bench import driver
+from softgrasp.study.bench.driver import Row
 from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.timing import interleave, medians, timed
 
@@ -47,17 +47,11 @@ matrix stands beside them on one rank.
 
 Keep the machine quiet while it runs. A fast look: --sizes 2000x100 --ranks 1 --repeats 3."""
 
-Row = dict[str, Any]
-
 
 def parse_shapes(text: str) -> list[tuple[int, int]]:
-    """``10000x600`` as pairs of rows and columns.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
+    """``10000x600`` as pairs of rows and columns. Raises typer.BadParameter: anything else."""
     advice = "shape; write 10000x600 with at least 4 columns and more rows"
-    shapes = [(int(n), int(m)) for n, m in parse_list(text, r"(\d+)x(\d+)", advice)]
+    shapes = [(int(n), int(m)) for n, m in driver.parse_list(text, r"(\d+)x(\d+)", advice)]
     for n, m in shapes:
         if not n >= m >= 4:
             raise typer.BadParameter(f"'{n}x{m}' is no {advice}")
@@ -168,22 +162,26 @@ def measure(n: int, m: int, repeats: int, comm: MPI.Intracomm = MPI.COMM_WORLD) 
     return {"rows": n, "columns": m, "ranks": comm.size, "repeats": repeats, "engines": rows}
 
 
-SHAPE = ("rows", "columns", "ranks")
-HEADER = ("engine", *SHAPE, "s", "/ default", f"right to {RIGHT:g}", f"to {ROUGH:g}", "|U'U - I|")
+COLUMNS = {
+    "engine": "title", "rows": "rows", "columns": "columns", "ranks": "ranks", "s": "seconds .3g",
+    "/ default": "slower .2f", f"right to {RIGHT:g}": "right .0e", f"to {ROUGH:g}": "rough .0e", "|U'U - I|": "off .0e",
+}  # fmt: skip
+CSV = {name: name for name in ("engine", "rows", "columns", "ranks", "seconds", "right", "rough")}
+CSV |= {"orthonormality": "off"}
 
 
-def table_of(results: Sequence[Row]) -> Table:
-    """The one table, accuracy against time."""
-    cells: list[tuple[Any, ...]] = []
+def flat(results: Sequence[Row]) -> list[Row]:
+    """One entry an engine."""
+    entries = []
     for row in results:
-        size = tuple(row[key] for key in SHAPE)
+        size = {key: row[key] for key in ("rows", "columns", "ranks")}
         if "error" in row:
-            cells.append(("failed", *size, *["-"] * 5))
+            entries.append(size | {"title": "failed", "error": row["error"]})
         for name, engine in row.get("engines", {}).items():
             default = row["engines"]["psd_tsqr" if name.startswith("psd") else "tsqr"]["seconds"]
-            seconds = f"{engine['seconds']:.3g}", f"{engine['seconds'] / default:.2f}"
-            cells.append((TITLES[name], *size, *seconds, *(f"{engine[key]:.0e}" for key in ("right", "rough", "off"))))
-    return Table(HEADER, cells, f"factoring snapshots: {KEPT} vectors, median seconds")
+            more = {"engine": name, "title": TITLES[name], "slower": engine["seconds"] / default}
+            entries.append(size | engine | more)
+    return entries
 
 
 def missed(results: Sequence[Row]) -> list[str]:
@@ -198,21 +196,10 @@ def missed(results: Sequence[Row]) -> list[str]:
     return [
         f"{TITLES[name]}, {row['rows']} x {row['columns']}, {row['ranks']} rank(s): "
         f"right down to {row['engines'][name]['right']:.1e}, goal {GOAL:g}"
-        for row in results
-        if "error" not in row
+        for row in driver.measured(results)
         for name, halves in columns.items()
         if row["engines"][name]["right"] > last(row["columns"] // halves)
     ]
-
-
-def csv_table(results: Sequence[Row]) -> Table:
-    """One line an engine, numbers in full."""
-    cells = [
-        (name, *(row[key] for key in SHAPE), *(engine[key] for key in ("seconds", "right", "rough", "off")))
-        for row in results
-        for name, engine in row.get("engines", {}).items()
-    ]
-    return Table(("engine", *SHAPE, "seconds", "right", "rough", "orthonormality"), cells)
 
 
 def main(
@@ -222,15 +209,17 @@ def main(
     out: Annotated[Path, typer.Option(help="folder for bench_bases.json and bench_bases.csv")] = Path("out"),
 ) -> None:
     """See HELP."""
-    shapes, counts = parse_shapes(sizes), parse_ranks(ranks)
-    console = open_console(130)
+    shapes, counts = parse_shapes(sizes), driver.parse_ranks(ranks)
+    console = driver.open_console(130)
     results = []
     for n, m in shapes:
         for k in counts:
             with console.status(f"{n} x {m}, {k} rank(s)"):
                 row = launch_worker("bases", {"n": n, "m": m, "repeats": repeats}, k)
             results.append({"rows": n, "columns": m, "ranks": k} | row)
-    console.print(table_of(results).terminal())
+    entries = flat(results)
+    title = f"factoring snapshots: {KEPT} vectors, median seconds"
+    console.print(driver.table_of(entries, COLUMNS, title).terminal())
     for row in results:
         if "error" in row:
             console.print(f"{row['rows']} x {row['columns']}, {row['ranks']} rank(s): {row['error']}", markup=False)
@@ -239,5 +228,6 @@ def main(
         console.print(f"goal [red]missed[/red]: {sentence}")
     if not late and not any("error" in row for row in results):
         console.print(f"goal [green]ok[/green]: the defaults are right to {RIGHT:g} down to sigma / sigma_1 = {GOAL:g}")
-    files = write_bench(out, "bench_bases", {"command": "bench_bases", "results": results}, csv_table(results))
-    list_bench(console, files, bool(late) or any("error" in row for row in results))
+    table = driver.table_of(driver.measured(entries), CSV)
+    files = driver.write_bench(out, "bench_bases", {"command": "bench_bases", "results": results}, table)
+    driver.list_bench(console, files, bool(late) or any("error" in row for row in results))

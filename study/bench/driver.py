@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from rich.console import Console
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.processes import IN_MPI_JOB
+
+Row = dict[str, Any]  # what a worker measured, as JSON has it
 
 
 @dataclass(frozen=True)
@@ -33,11 +35,7 @@ class Goal:
 
 
 def parse_list(text: str, pattern: str, advice: str) -> list[Any]:
-    """The groups of a regular expression for each part of a list with commas.
-
-    Raises:
-        typer.BadParameter: a part does not match.
-    """
+    """The groups of a regular expression for each part of a list with commas. Raises typer.BadParameter: no match."""
     parts = [part.strip() for part in text.split(",")]
     for part in parts:
         if not re.fullmatch(pattern, part):
@@ -46,12 +44,13 @@ def parse_list(text: str, pattern: str, advice: str) -> list[Any]:
 
 
 def parse_ranks(text: str) -> list[int]:
-    """``1,2`` as numbers.
+    """``1,2`` as numbers. Raises typer.BadParameter: anything else."""
+    return parse_numbers(text, r"([1-9]\d*)", "number of ranks; write 1,2")
 
-    Raises:
-        typer.BadParameter: anything else.
-    """
-    return [int(part) for part in parse_list(text, r"([1-9]\d*)", "number of ranks; write 1,2")]
+
+def parse_numbers(text: str, pattern: str, advice: str) -> list[int]:
+    """Whole numbers, see :func:`parse_list`."""
+    return [int(part) for part in parse_list(text, pattern, advice)]
 
 
 def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
@@ -70,12 +69,56 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
 
 
-def open_console(width: int) -> Console:
-    """A terminal wide enough for the table.
+def measured(rows: Sequence[Row]) -> list[Row]:
+    """Rows that did not fail."""
+    return [row for row in rows if "error" not in row]
 
-    Raises:
-        typer.BadParameter: the benchmark was started under mpiexec.
+
+def entry(row: Any, path: str) -> Any:
+    """What a row has at a path of keys, "step_us.ts"; None where it has nothing."""
+    for key in path.split("."):
+        row = row.get(key) if isinstance(row, dict) else None
+    return row
+
+
+def table_of(rows: Sequence[Row], columns: Mapping[str, str], title: str = "") -> Table:
+    """One line a row: for each heading the entry at a path, formatted as behind a blank it says, ``drift .0e``.
+
+    The format 3 is that of :func:`number`; without one the entry stands as it is.
     """
+
+    def cell(row: Row, column: str) -> Any:
+        path, _, form = column.partition(" ")
+        value = entry(row, path)
+        if not form:
+            return value
+        return number(value) if form == "3" or value is None else f"{value:{form}}"
+
+    return Table(tuple(columns), [[cell(row, column) for column in columns.values()] for row in rows], title)
+
+
+Curve = tuple[str, Sequence[tuple[float, float]], dict[str, Any]]  # label, points, look
+
+
+def loglog(path: Path, curves: Sequence[Curve], x: str, y: str, title: str = "") -> tuple[Path, ...]:
+    """Curves that have points, the legend beside them; PNG and PDF."""
+    import matplotlib.pyplot as plt
+
+    from softgrasp.study.pictures.style import paper_style, save
+
+    with paper_style():
+        figure, axes = plt.subplots(figsize=(4.2, 3.1))
+        for label, points, look in curves:
+            if points:
+                axes.loglog(*zip(*sorted(points), strict=True), label=label, **({"marker": "o", "ms": 4} | look))
+        axes.set(xlabel=x, ylabel=y)
+        axes.set_title(title, loc="left")
+        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5))
+        return save(figure, path)
+
+
+def open_console(width: int) -> Console:
+    """A terminal wide enough for the table. Raises typer.BadParameter: the benchmark was started under mpiexec."""
     if any(variable in os.environ for variable in IN_MPI_JOB):
         raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
     return Console(highlight=False, width=max(Console().width, width), soft_wrap=True)
@@ -104,11 +147,7 @@ def write_bench(out: Path, name: str, content: dict[str, Any], table: Table, mar
 
 
 def list_bench(console: Console, files: Sequence[Path], failed: bool) -> None:
-    """Print the files and leave with status 1 where a row failed.
-
-    Raises:
-        typer.Exit: a row failed.
-    """
+    """Print the files and leave with status 1 where a row failed. Raises typer.Exit: a row failed."""
     for file in files:
         console.print(f"  {file}")
     if failed:

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from softgrasp.study.bench import driver
-from softgrasp.study.bench.driver import Goal, number
+from softgrasp.study.bench.driver import Goal, Row, number
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker
 
@@ -44,15 +44,9 @@ whole run; growth exponents p of cost ~ n^p over the 2D sizes.
 Keep the machine quiet while it runs. A fast look: --sizes 2d:1000 --ranks 1 --repeats 3.
 --large adds 2D with 1e6 and 3D with 2e5 unknowns, {LARGE_STEPS} steps each on {LARGE_RANKS} ranks: minutes, GiB."""
 
-Row = dict[str, Any]
-
 
 def parse_sizes(text: str) -> list[tuple[str, int]]:
-    """``2d:1000,3d:50000`` as pairs; a bare number is 2D.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
+    """``2d:1000,3d:50000`` as pairs; a bare number is 2D. Raises typer.BadParameter: anything else."""
     advice = "size; write 2d:1000 or 3d:50000 with at least 20 unknowns"
     return [
         (kind or "2d", int(size))
@@ -63,7 +57,7 @@ def parse_sizes(text: str) -> list[tuple[str, int]]:
 def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Growth over the 2D sizes for each rank count, memory counted above that of the libraries."""
     result = {}
-    good = [row for row in rows if "error" not in row and row["dimension"] == 2 and not row["large"]]
+    good = [row for row in driver.measured(rows) if row["dimension"] == 2 and not row["large"]]
     for ranks in sorted({row["ranks"] for row in good}):
         own = [row for row in good if row["ranks"] == ranks]
         n = [row["n_e"] for row in own]
@@ -80,9 +74,7 @@ def exponents(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
 def goals(rows: Sequence[Row]) -> list[Goal]:
     """All goals that the rows can speak for."""
     result = []
-    for row in rows:
-        if "error" in row:
-            continue
+    for row in driver.measured(rows):
         label = f"{row['problem']}, {row['ranks']} rank(s)"
         if "ratio" in row:
             limit = LIMIT if row["n_e"] >= BIG else LIMIT_SMALL
@@ -98,38 +90,23 @@ def goals(rows: Sequence[Row]) -> list[Goal]:
     return result
 
 
-HEADER = (
-    "problem", "n_e", "ranks", "solver", "assembly [s]", "factor [s]", "TS step [µs]", "bare solve [µs]", "TS / solve",
-    "own solve [µs]", "TS / own", "SciPy step [µs]", "pyMOR step [µs]", "drift", "memory [MiB]",
-)  # fmt: skip
+COLUMNS = {
+    "problem": "problem", "n_e": "n_e", "ranks": "ranks", "solver": "solver", "assembly [s]": "seconds.assembly 3",
+    "factor [s]": "seconds.factor 3", "TS step [µs]": "step_us.ts 3", "bare solve [µs]": "step_us.solve 3",
+    "TS / solve": "ratio 3", "own solve [µs]": "step_us.own 3", "TS / own": "ratio_own 3",
+    "SciPy step [µs]": "step_us.scipy 3", "pyMOR step [µs]": "step_us.pymor 3", "drift": "drift .0e",
+    "memory [MiB]": "memory_mb 3",
+}  # fmt: skip
+CSV = {name: name for name in ("problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats")}
+CSV |= {f"{stage}_s": f"seconds.{stage}" for stage in ("mesh", "assembly", "factor")}
+CSV |= {f"{method}_us": f"step_us.{method}" for method in METHODS}
+CSV |= {name: name for name in ("ratio", "ratio_own", "drift", "residual", "memory_mb", "memory_base_mb", "error")}
 
 
 def table_of(rows: Sequence[Row]) -> Table:
     """The table of the terminal and the README."""
-    cells = []
-    for row in rows:
-        if "error" in row:
-            cells.append((row["problem"], "-", row["ranks"], "failed", *["-"] * (len(HEADER) - 4)))
-            continue
-        step, seconds = row["step_us"], row["seconds"]
-        values = [seconds["assembly"], seconds["factor"], step["ts"], step.get("solve"), row.get("ratio")]
-        values += [step.get("own"), row.get("ratio_own"), step.get("scipy"), step.get("pymor")]
-        last = f"{row['drift']:.0e}", number(row["memory_mb"])
-        cells.append((row["problem"], row["n_e"], row["ranks"], row["solver"], *map(number, values), *last))
-    return Table(HEADER, cells, "cost of a forward run, medians; µs are per time step")
-
-
-def csv_table(rows: Sequence[Row]) -> Table:
-    """One line a row, numbers in full."""
-    names = ["problem", "dimension", "n_e", "ranks", "solver", "steps_per_repeat", "repeats"]
-    stages = ["mesh", "assembly", "factor"]
-    last = ["ratio", "ratio_own", "drift", "residual", "memory_mb", "memory_base_mb", "error"]
-    cells = []
-    for row in rows:
-        seconds, step = row.get("seconds", {}), row.get("step_us", {})
-        values = [row.get(n) for n in names] + [seconds.get(s) for s in stages]
-        cells.append(values + [step.get(m) for m in METHODS] + [row.get(n) for n in last])
-    return Table((*names, *(f"{s}_s" for s in stages), *(f"{m}_us" for m in METHODS), *last), cells)
+    shown = [{"n_e": "-", "solver": "failed"} | row if "error" in row else row for row in rows]
+    return driver.table_of(shown, COLUMNS, "cost of a forward run, medians; µs are per time step")
 
 
 def show(console: Console, rows: Sequence[Row]) -> None:
@@ -161,33 +138,19 @@ def show(console: Console, rows: Sequence[Row]) -> None:
 
 def draw(path: Path, rows: Sequence[Row]) -> tuple[Path, ...]:
     """Per-step time against size for every method, log-log, 2D full and 3D hollow, on one rank (else the fewest)."""
-    import matplotlib.pyplot as plt
+    from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, SKY
 
-    from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, SKY, paper_style, save
-
-    good = [row for row in rows if "error" not in row]
-    fewest = min((row["ranks"] for row in good), default=1)
-    good = [row for row in good if row["ranks"] == fewest]
-    with paper_style():
-        figure, axes = plt.subplots(figsize=(5.4, 3.1))
-        colours = dict(zip(METHODS, (BLUE, HAND, SKY, GREEN, ORANGE, PURPLE), strict=True))
-        for name, label in METHODS.items():
-            for d, fill in ((2, "full"), (3, "none")):
-                points = sorted(
-                    (row["n_e"], row["step_us"][name])
-                    for row in good
-                    if row["dimension"] == d and name in row["step_us"]
-                )
-                if points:
-                    n, us = zip(*points, strict=True)
-                    style = "--" if name in ("solve", "own") else "-"
-                    axes.loglog(n, us, style, marker="o", ms=4, fillstyle=fill, color=colours[name], label=label)
-                    label = f"_{label}"  # named once
-        axes.set_xlabel("tissue unknowns $n_e$")
-        axes.set_ylabel("time of one step [µs]")
-        axes.set_title(f"median, {'one rank' if fewest == 1 else f'{fewest} ranks'}; hollow: 3D", loc="left")
-        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5))
-        return save(figure, path)
+    fewest = min((row["ranks"] for row in driver.measured(rows)), default=1)
+    good = [row for row in driver.measured(rows) if row["ranks"] == fewest]
+    curves: list[driver.Curve] = []
+    for (name, label), colour in zip(METHODS.items(), (BLUE, HAND, SKY, GREEN, ORANGE, PURPLE), strict=True):
+        for d, fill in ((2, "full"), (3, "none")):
+            own = [row for row in good if row["dimension"] == d and name in row["step_us"]]
+            look = {"color": colour, "ls": "--" if name in ("solve", "own") else "-", "fillstyle": fill}
+            curves.append((label, [(row["n_e"], row["step_us"][name]) for row in own], look))
+            label = f"_{label}" if own else label  # named once
+    title = f"median, {'one rank' if fewest == 1 else f'{fewest} ranks'}; hollow: 3D"
+    return driver.loglog(path, curves, "tissue unknowns $n_e$", "time of one step [µs]", title)
 
 
 def collect(console: Console, sizes: list[tuple[str, int]], ranks: list[int], repeats: int, large: bool) -> list[Row]:
@@ -218,13 +181,8 @@ def main(
     console = driver.open_console(175)
     rows = collect(console, parse_sizes(sizes), driver.parse_ranks(ranks), repeats, large)
     show(console, rows)
-    content = {
-        "command": "bench_forward",
-        "rows": rows,
-        "exponents": exponents(rows),
-        "goals": driver.goal_rows(goals(rows)),
-    }
-    files = driver.write_bench(
-        out, "bench", content, csv_table(rows), table_of([row for row in rows if "error" not in row]).markdown()
-    )
+    content = {"command": "bench_forward", "rows": rows, "exponents": exponents(rows)}
+    content |= {"goals": driver.goal_rows(goals(rows))}
+    markdown = table_of(driver.measured(rows)).markdown()
+    files = driver.write_bench(out, "bench", content, driver.table_of(rows, CSV), markdown)
     driver.list_bench(console, [*files, *draw(out / "bench.png", rows)], any("error" in row for row in rows))

@@ -203,16 +203,9 @@ def measure(
     whole: bool = False,
     peers: bool = True,
 ) -> dict[str, Any]:
-    """One row of the table. Collective.
+    """One row of the table, each number taken ``repeats`` times. Collective.
 
-    Args:
-        comm: ranks.
-        dimension: 2 or 3.
-        size: about so many tissue unknowns.
-        repeats: how often each number is taken.
-        repeat_seconds: aimed length of one repeat [s].
-        whole: also run the paper's 600 steps as a whole.
-        peers: also SciPy and pyMOR (one rank only).
+    One repeat takes about ``repeat_seconds``; ``whole``: also the paper's 600 steps; ``peers``: SciPy and pyMOR too.
     """
     cells = cells_for(dimension, size)
     build(bench_scene(comm, dimension, [2] * (dimension - 1) + [4], 1), comm=comm)  # compiles the forms

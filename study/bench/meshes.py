@@ -19,10 +19,9 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.registry import METHODS, find_method
+from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
-from softgrasp.study.bench.driver import growth, parse_list
-from softgrasp.study.reduce.result import Point
+from softgrasp.study.bench.driver import Curve, growth, loglog, parse_list
 from softgrasp.study.reduce.sweep import sweep
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
@@ -42,30 +41,22 @@ machine quiet."""
 
 @dataclass(frozen=True)
 class MeshRow:
-    """One mesh; times in seconds.
+    """One mesh; times in seconds."""
 
-    Attributes:
-        cells: of the short side.
-        n_e: tissue unknowns.
-        time_factor, time_full: factorisation and all steps of the full run.
-        time_offline: basis and projection.
-        time_setup, time_online: of the reduced model.
-        N: its dimension.
-        error, error_deformation: see :class:`softgrasp.study.reduce.result.Point`.
-        stable: of the reduced model.
-    """
-
-    cells: int
-    n_e: int
+    cells: int  # of the short side
+    n_e: int  # tissue unknowns
+    # time_factor, time_full: factorisation and all steps of the full run
     time_factor: float
     time_full: float
-    time_offline: float
+    time_offline: float  # basis and projection
+    # time_setup, time_online: of the reduced model
     time_setup: float
     time_online: float
-    N: int
+    N: int  # its dimension
+    # error, error_deformation: see softgrasp.study.reduce.result.Point
     error: float
     error_deformation: float
-    stable: bool
+    stable: bool  # of the reduced model
 
 
 def block(n_e: int, steps: int, method: str, N: int) -> Scene:
@@ -87,11 +78,7 @@ def block(n_e: int, steps: int, method: str, N: int) -> Scene:
 
 
 def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
-    """One mesh. Collective.
-
-    Raises:
-        SoftgraspError: a solve failed, the snapshots do not fit, or no model has this N.
-    """
+    """One mesh. Collective. Raises SoftgraspError: a solve failed, the snapshots do not fit, or no model has this N."""
     model = build(scene, comm=comm)
     run = simulate(model)
     steps = scene.time.steps
@@ -100,20 +87,10 @@ def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
         refused = [f"N = {N}: {reason}" for N, reason in result.refused.items()]
         reason = next(iter(refused), f"reduction.N = {scene.reduction.N} fits no basis of this method")
         raise SoftgraspError(f"{scene.reduction.methods[0]}: {reason}")
-    point: Point = result.points[0]
-    return MeshRow(
-        cells=scene.tissue.cells[0] if scene.tissue.cells else 0,
-        n_e=model.system.layout.n_e,
-        time_factor=run.seconds["factor"],
-        time_full=run.seconds["steps"] / max(steps - 1, 1) * steps,
-        time_offline=point.time_offline,
-        time_setup=point.time_setup,
-        time_online=point.time_online,
-        N=point.N,
-        error=point.error,
-        error_deformation=point.error_deformation,
-        stable=point.stable,
-    )
+    cells = scene.tissue.cells[0] if scene.tissue.cells else 0
+    times = run.seconds["factor"], run.seconds["steps"] / max(steps - 1, 1) * steps
+    names = ("time_offline", "time_setup", "time_online", "N", "error", "error_deformation", "stable")
+    return MeshRow(cells, model.system.layout.n_e, *times, **{name: getattr(result.points[0], name) for name in names})
 
 
 def break_even(rows: Sequence[MeshRow]) -> float | None:
@@ -169,37 +146,23 @@ def show(console: Console, rows: Sequence[MeshRow], trends: dict[str, Any], titl
 
 def draw(path: Path, rows: Sequence[MeshRow], trends: dict[str, Any]) -> tuple[Path, ...]:
     """Times against n_e; PNG and PDF."""
-    import matplotlib.pyplot as plt
+    from softgrasp.study.pictures.style import BLUE, GREEN, ORANGE
 
-    from softgrasp.study.pictures.style import BLUE, COLUMN, GREEN, ORANGE, paper_style, save
-
-    with paper_style():
-        figure, ax = plt.subplots(figsize=(COLUMN, 2.9), layout="constrained")
-        n_e = [row.n_e for row in rows]
-        curves = (
-            ("time_full", "full run", "exponent_full", ORANGE, "o"),
-            ("time_offline", "offline", "exponent_offline", BLUE, "s"),
-            ("time_online", "online run", "exponent_online", GREEN, "^"),
-        )
-        for key, label, slope, colour, marker in curves:
-            power = "" if trends[slope] is None else rf", $n_e^{{{trends[slope]:.2f}}}$"
-            seconds = [getattr(row, key) for row in rows]
-            ax.loglog(n_e, seconds, marker=marker, ms=3.5, color=colour, label=label + power)
-        ax.set_xlabel("tissue unknowns $n_e$")
-        ax.set_ylabel("time [s]")
-        ax.grid(axis="y", color="#e6e6e6", lw=0.5)
-        figure.legend(loc="outside upper center", ncols=3, handlelength=1.8, columnspacing=1.0)
-        return save(figure, path)
+    curves: list[Curve] = []
+    for key, text, colour, marker in (
+        ("full", "full run", ORANGE, "o"), ("offline", "offline", BLUE, "s"), ("online", "online run", GREEN, "^"),
+    ):  # fmt: skip
+        slope = trends[f"exponent_{key}"]
+        power = "" if slope is None else rf", $n_e^{{{slope:.2f}}}$"
+        points = [(row.n_e, getattr(row, f"time_{key}")) for row in rows]
+        curves.append((text + power, points, {"color": colour, "marker": marker}))
+    return loglog(path, curves, "tissue unknowns $n_e$", "time [s]")
 
 
 def run_mesh_study(
     sizes: Sequence[int], steps: int, method: str, N: int, out: Path, console: Console, comm: MPI.Intracomm
 ) -> dict[str, Any]:
-    """Measure all meshes and write mesh_study.json, mesh_study.png and .pdf. Collective.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Measure all meshes and write mesh_study.json, mesh_study.png and .pdf. Collective."""
     find_method(method)
     rows = []
     for size in sizes:
@@ -209,17 +172,8 @@ def run_mesh_study(
     trends = findings(rows)
     title = METHODS[method].title
     show(console, rows, trends, f"{title}, N = {N}, {comm.size} rank(s); !: unstable")
-    result = {
-        "command": "mesh_study",
-        "method": method,
-        "N": N,
-        "steps": steps,
-        "version": package_version(),
-        "ranks": comm.size,
-        "machine": machine(),
-        "rows": [asdict(row) for row in rows],
-        **trends,
-    }
+    result = {"command": "mesh_study", "method": method, "N": N, "steps": steps, "version": package_version()}
+    result |= {"ranks": comm.size, "machine": machine(), "rows": [asdict(row) for row in rows], **trends}
     if comm.rank == 0:
         out.mkdir(parents=True, exist_ok=True)
         numbers = write_json(out / "mesh_study.json", result)
@@ -229,11 +183,7 @@ def run_mesh_study(
 
 
 def parse_sizes(text: str) -> list[int]:
-    """Tissue unknowns from "1e3,1e4".
-
-    Raises:
-        typer.BadParameter: a part is no number from 50 on.
-    """
+    """Tissue unknowns from "1e3,1e4". Raises typer.BadParameter: a part is no number from 50 on."""
     advice = "number of unknowns; give numbers from 50 on, such as 1e3,1e4"
     sizes = [round(float(part)) for part in parse_list(text, r"([0-9.]+(?:e[0-9]+)?)", advice)]
     for size in sizes:

@@ -22,7 +22,6 @@ class TextbookLoop:
     """S w = l - K z + s M v, z += 2 w, v = 2 s w - v in a bare Python loop: one solve, two products. Collective.
 
     Args:
-        system: operators.
         dt: step [s].
         solve: S w = r with S = K + s^2 M and s = 2/dt, as a function of r and w.
         loads: c_n, shape (steps, n_s).
@@ -91,19 +90,14 @@ class ScipyLoop:
 
     def __init__(self, K: Any, M: Any, G: Array, dt: float, loads: Array) -> None:
         self.K, self.M, self.G, self.loads, self.s, self.n = K, M, G, loads, 2 / dt, 0
-        self.lu = scipy.sparse.linalg.splu(
-            (K + self.s**2 * M).tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        options: dict[str, Any] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+        self.lu = scipy.sparse.linalg.splu((K + self.s**2 * M).tocsc(), permc_spec="MMD_AT_PLUS_A", **options)
         self.z, self.v = np.zeros(K.shape[0]), np.zeros(K.shape[0])
 
     def advance(self, k: int) -> None:
         """Take k steps."""
-        for n in range(self.n, self.n + k):
-            self._step(n)
-        self.n += k
+        for _ in range(k):
+            self._step()
 
     def store(self, k: int) -> Array:
         """Take k steps and keep every [z; v], shape (2 n_e, k + 1)."""
@@ -111,14 +105,14 @@ class ScipyLoop:
         X = np.zeros((2 * n_e, k + 1), order="F")
         X[:n_e, 0], X[n_e:, 0] = self.z, self.v
         for n in range(k):
-            self._step(self.n + n)
+            self._step()
             X[:n_e, n + 1], X[n_e:, n + 1] = self.z, self.v
-        self.n += k
         return X
 
-    def _step(self, n: int) -> None:
+    def _step(self) -> None:
         s = self.s
-        w = self.lu.solve(self.G @ self.loads[n] - self.K @ self.z + s * (self.M @ self.v))
+        w = self.lu.solve(self.G @ self.loads[self.n] - self.K @ self.z + s * (self.M @ self.v))
+        self.n += 1
         self.z += 2 * w
         self.v = 2 * s * w - self.v
 
@@ -151,10 +145,8 @@ class PymorLoop:
             return GenericParameterFunctional(lambda mu: loads[int(mu["t"][0] / dt), j], {"t": 1})
 
         columns = [np.concatenate([np.zeros(n_e), G[:, j]]) for j in range(G.shape[1])]
-        F = LincombOperator(
-            [VectorOperator(A.source.from_numpy(c[:, None])) for c in columns],
-            [component(j) for j in range(G.shape[1])],
-        )
+        vectors = [VectorOperator(A.source.from_numpy(c[:, None])) for c in columns]
+        F = LincombOperator(vectors, [component(j) for j in range(G.shape[1])])
         stepper = ImplicitMidpointTimeStepper(steps)
         self._states: Iterator[Any] = stepper.iterate(0.0, steps * dt, A.source.zeros(1), A, rhs=F, mass=E)
         next(self._states)

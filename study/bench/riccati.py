@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from softgrasp.study.bench import driver
-from softgrasp.study.bench.driver import Goal, number
+from softgrasp.study.bench.driver import Goal, Row, number
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker
 
@@ -37,16 +37,10 @@ second core where there is one. bench_riccati.json is written after every row; -
 Keep the machine quiet while it runs. A fast look: --sizes 10 --ranks 1 --no-peers.
 --large adds nx = {LARGEST} (2n > 1e6) on {LARGEST_RANKS} ranks by Newton-ADI and Galerkin: up to half an hour."""
 
-Row = dict[str, Any]
-
 
 def parse_meshes(text: str) -> list[int]:
-    """``10,20`` as numbers of cells.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
-    return [int(part) for part in driver.parse_list(text, r"([2-9]|[1-9]\d+)", "number of cells; write 10,20,40")]
+    """``10,20`` as numbers of cells. Raises typer.BadParameter: anything else."""
+    return driver.parse_numbers(text, r"([2-9]|[1-9]\d+)", "number of cells; write 10,20,40")
 
 
 def launch(spec: dict[str, Any], ranks: int) -> Row:
@@ -67,16 +61,11 @@ def launch(spec: dict[str, Any], ranks: int) -> Row:
 
 @dataclass
 class Record:
-    """Rows as they come, in a file that outlives whatever goes wrong with the next one.
+    """Rows as they come, in a file that outlives whatever goes wrong with the next one."""
 
-    Attributes:
-        file: bench_riccati.json.
-        beta: Kelvin-Voigt time of all rows [s].
-        rows, peers: what is measured.
-    """
-
-    file: Path
-    beta: float
+    file: Path  # bench_riccati.json
+    beta: float  # Kelvin-Voigt time of all rows [s]
+    # rows, peers: what is measured
     rows: list[Row] = field(default_factory=list)
     peers: list[Row] = field(default_factory=list)
 
@@ -110,7 +99,7 @@ def flat(rows: Sequence[Row]) -> list[Row]:
 def exponents(rows: Sequence[Row]) -> dict[str, float | None]:
     """Growth of time with the number of states, from nx = 20 on, by method and rank count."""
     result: dict[str, float | None] = {}
-    good = [entry for entry in flat(rows) if "error" not in entry and entry["nx"] >= 20]
+    good = [entry for entry in driver.measured(flat(rows)) if entry["nx"] >= 20]
     for key in sorted({(entry["method"], entry["ranks"]) for entry in good}):
         own = [entry for entry in good if (entry["method"], entry["ranks"]) == key]
         result[f"{key[0]}, {key[1]} rank(s)"] = driver.growth([e["states"] for e in own], [e["seconds"] for e in own])
@@ -120,7 +109,7 @@ def exponents(rows: Sequence[Row]) -> dict[str, float | None]:
 def goals(rows: Sequence[Row]) -> list[Goal]:
     """All goals that the rows can speak for."""
     result = []
-    good = [entry for entry in flat(rows) if "error" not in entry]
+    good = driver.measured(flat(rows))
     for entry in good:
         label = f"{entry['method']}, 2n = {entry['states']}, {entry['ranks']} rank(s)"
         limit = LIMITS.get((entry["method"], entry["nx"]))
@@ -143,20 +132,20 @@ def goals(rows: Sequence[Row]) -> list[Goal]:
     return result
 
 
-HEADS = ["nx", "2n", "ranks", "method", "solves", "rank", "total s", *(f"{name} s" for name in SPLIT)]
-HEADS += ["true residual", "gain diff.", "MiB"]
+COLUMNS = {
+    "nx": "nx", "2n": "states", "ranks": "ranks", "method": "method", "solves": "solves", "rank": "rank",
+    "total s": "seconds 3", **{f"{name} s": f"split.{name} 3" for name in SPLIT}, "true residual": "residual .1e",
+    "gain diff.": "gain_difference .1e", "MiB": "memory_mb 3",
+}  # fmt: skip
+CSV = {name: name for name in ("nx", "states", "ranks", "method", "solves", "newton_steps", "rank", "seconds")}
+CSV |= {name: name for name in ("residual", "gain_difference", "memory_mb", "memory_base_mb", "error")}
+CSV |= {f"{name}_s": f"split.{name}" for name in SPLIT}
 
 
-def cells_of(entry: Row) -> list[str]:
-    """One table line."""
-    first = [str(entry[name]) for name in ("nx", "states", "ranks", "method")]
-    if "error" in entry:
-        return [*first, "failed", *[""] * (len(HEADS) - 5)]
-    split = [number(entry["split"][name]) for name in SPLIT]
-    middle = [str(entry["solves"]), str(entry["rank"]), number(entry["seconds"]), *split]
-    difference = entry.get("gain_difference")
-    last = [f"{entry['residual']:.1e}", "-" if difference is None else f"{difference:.1e}"]
-    return [*first, *middle, *last, number(entry["memory_mb"])]
+def table_of(rows: Sequence[Row], title: str = "") -> Table:
+    """One line a mesh, rank count and method."""
+    shown = [{"solves": "failed"} | entry if "error" in entry else entry for entry in flat(rows)]
+    return driver.table_of(shown, COLUMNS, title)
 
 
 def peer_line(peer: Row) -> str:
@@ -176,8 +165,7 @@ def peer_line(peer: Row) -> str:
 
 def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
     """Table, failures, peers, exponents and goals."""
-    title = "large Riccati equation, paper scene; seconds are medians"
-    console.print(Table(tuple(HEADS), [cells_of(entry) for entry in flat(rows)], title).terminal())
+    console.print(table_of(rows, "large Riccati equation, paper scene; seconds are medians").terminal())
     for row in [*rows, *flat(rows)]:
         if "error" in row:
             label = f"nx = {row['nx']}, {row.get('ranks', '?')} rank(s) {row.get('method', '')}"
@@ -190,49 +178,27 @@ def show(console: Console, rows: Sequence[Row], peers: Sequence[Row]) -> None:
     driver.show_goals(console, goals(rows))
 
 
-def csv_table(rows: Sequence[Row]) -> Table:
-    """One line a mesh, rank count and method, numbers in full."""
-    names = ["nx", "states", "ranks", "method", "solves", "newton_steps", "rank", "seconds", "residual"]
-    names += ["gain_difference", "memory_mb", "memory_base_mb", "error"]
-    cells = [
-        [*(entry.get(name) for name in names), *(entry.get("split", {}).get(name) for name in SPLIT)]
-        for entry in flat(rows)
-    ]
-    return Table((*names, *(f"{name}_s" for name in SPLIT)), cells)
-
-
 def markdown(rows: Sequence[Row], peers: Sequence[Row]) -> str:
     """The table as the README shows it, and a line a peer."""
-    table = Table(tuple(HEADS), [cells_of(entry) for entry in flat(rows)]).markdown()
-    return table + "".join(f"\n- {peer_line(peer)}" for peer in peers) + "\n"
+    return table_of(rows).markdown() + "".join(f"\n- {peer_line(peer)}" for peer in peers) + "\n"
 
 
 def draw(path: Path, rows: Sequence[Row], peers: Sequence[Row]) -> tuple[Path, ...]:
     """Time against states for every method on the fewest ranks, peers as single marks, log-log."""
-    import matplotlib.pyplot as plt
+    from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE
 
-    from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, paper_style, save
-
-    good = [entry for entry in flat(rows) if "error" not in entry]
+    good = driver.measured(flat(rows))
     fewest = min((entry["ranks"] for entry in good), default=1)
-    with paper_style():
-        figure, axes = plt.subplots(figsize=(4.2, 3.1))
-        for name, colour in zip(("newton_adi", "radi", "galerkin"), (BLUE, GREEN, ORANGE), strict=True):
-            points = sorted((e["states"], e["seconds"]) for e in good if e["method"] == name and e["ranks"] == fewest)
-            if points:
-                axes.loglog(*zip(*points, strict=True), marker="o", ms=4, color=colour, label=name)
-        marks = {"scipy": ("s", HAND), "slycot": ("^", HAND), "pymor": ("x", PURPLE)}
-        for name, (mark, colour) in marks.items():
-            points = sorted((p["states"], p["seconds"]) for p in peers if p["peer"] == name and "residual" in p)
-            if points:
-                worst = max(p["residual"] for p in peers if p["peer"] == name and "residual" in p)
-                label = f"{name} (residual to {worst:.0e})"
-                axes.loglog(*zip(*points, strict=True), mark, ms=5, color=colour, label=label)
-        axes.set_xlabel("states 2n")
-        axes.set_ylabel("time [s]")
-        axes.set_title(f"{fewest} rank(s), median", loc="left")
-        axes.legend(fontsize=7)
-        return save(figure, path)
+    curves: list[driver.Curve] = []
+    for name, colour in (("newton_adi", BLUE), ("radi", GREEN), ("galerkin", ORANGE)):
+        own = [(e["states"], e["seconds"]) for e in good if e["method"] == name and e["ranks"] == fewest]
+        curves.append((name, own, {"color": colour}))
+    for name, mark, colour in (("scipy", "s", HAND), ("slycot", "^", HAND), ("pymor", "x", PURPLE)):
+        ran = [p for p in peers if p["peer"] == name and "residual" in p]
+        label = f"{name} (residual to {max((p['residual'] for p in ran), default=0.0):.0e})"
+        look = {"color": colour, "ls": "", "marker": mark, "ms": 5}
+        curves.append((label, [(p["states"], p["seconds"]) for p in ran], look))
+    return driver.loglog(path, curves, "states 2n", "time [s]", f"{fewest} rank(s), median")
 
 
 def collect(
@@ -299,6 +265,7 @@ def main(
     record.save()
     show(console, rows, others)
     (out / "bench_riccati.md").write_text(markdown(rows, others))
-    files = [out / "bench_riccati.json", out / "bench_riccati.md", csv_table(rows).write_csv(out / "bench_riccati.csv")]
+    table = driver.table_of(flat(rows), CSV).write_csv(out / "bench_riccati.csv")
+    files = [out / "bench_riccati.json", out / "bench_riccati.md", table]
     files += draw(out / "bench_riccati.png", rows, others)
     driver.list_bench(console, files, any("error" in entry for entry in [*rows, *flat(rows)]))

@@ -20,6 +20,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.lqr.dense.modal import factor_psd
 from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
@@ -72,14 +73,9 @@ def run_method(comm: MPI.Intracomm, problem: RiccatiProblem, name: str, repeats:
 
 
 def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str = "") -> dict[str, Any]:
-    """All methods on one mesh; gains are compared with the first one. Collective.
+    """All methods on nx x 2 nx cells; gains are compared with the first one. Collective.
 
-    Args:
-        nx: cells across.
-        beta: Kelvin-Voigt time [s].
-        methods: names in :data:`METHODS`.
-        repeats: runs behind each median.
-        partial: file that keeps the methods done so far.
+    ``beta`` is the Kelvin-Voigt time [s]; the file ``partial`` keeps the methods done so far.
     """
     comm = MPI.COMM_WORLD
     problem = problem_for(comm, nx, beta)
@@ -120,20 +116,13 @@ def _answer(problem: RiccatiProblem, E: Any, B: Array, Z: Array, seconds: float)
     return Answer(relative, gain_to_relative(problem.system, Block(gain[:s], gain[s:])), seconds)
 
 
-def _factor(X: Array) -> Array:
-    """Z with X = Z Z', negative eigenvalues left out."""
-    values, vectors = np.linalg.eigh((X + X.T) / 2)
-    keep = values > 0
-    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
-
-
 def scipy_answer(problem: RiccatiProblem) -> Answer:
     """SciPy's dense solver on the paper's matrices as they stand."""
     E, A, B, C = paper_form(problem)
     begin = time.perf_counter()
     X = scipy.linalg.solve_continuous_are(A.toarray(), B, C.T @ problem.Q @ C, problem.R, e=E.toarray())
     seconds = time.perf_counter() - begin
-    return _answer(problem, E, B, _factor(X), seconds)
+    return _answer(problem, E, B, factor_psd(X), seconds)
 
 
 def slycot_answer(problem: RiccatiProblem) -> Answer:
@@ -148,7 +137,7 @@ def slycot_answer(problem: RiccatiProblem) -> Answer:
         C.T @ problem.Q @ C, problem.R, np.zeros((n, m)),
     )  # fmt: skip
     seconds = time.perf_counter() - begin
-    return _answer(problem, E, B, _factor(X), seconds)
+    return _answer(problem, E, B, factor_psd(X), seconds)
 
 
 def pymor_answer(problem: RiccatiProblem) -> Answer:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import operator
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +18,7 @@ import numpy as np
 import typer
 from mpi4py import MPI
 
+import softgrasp.fem.petsc
 import softgrasp.fem.solve.solvers
 import softgrasp.lqr.lowrank.modal_start
 import softgrasp.lqr.lowrank.shifted
@@ -23,6 +26,7 @@ import softgrasp.lqr.riccati
 import softgrasp.reduction.online
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.petsc import Array, PETSc, times_columns, to_scipy
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.solve.solvers import SolverName
@@ -31,20 +35,22 @@ from softgrasp.lqr.lowrank.modal_start import plant_modes, restrict, solve_small
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import make_shifted
+from softgrasp.reduction.bases.registry import make_basis
+from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project as project_model
 from softgrasp.reduction.propagator import propagator
-from softgrasp.reduction.registry import make_basis
-from softgrasp.reduction.states import States
 from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, write_bench
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
 from softgrasp.study.bench.riccati_rows import problem_for
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.jobs import launch_worker
-from softgrasp.study.shell.timing import interleave, timed
+from softgrasp.study.shell.timing import interleave, medians, timed
 
 BATCH = 100  # models of a batch
 STEPS = 600
+CALLS = 8  # products of one sample
+FREED = 3_900_000  # numbers, a little less than the 32 MiB up to which it keeps any
 SHIFT = -0.5 + 5.0j  # a shift in the middle of the paper's spectrum
 HELP = """Measure two methods at sizes near those at which softgrasp changes from one to the other.
 
@@ -61,6 +67,8 @@ set-up, step: of the forward run with PETSc Cholesky (first) or MUMPS (second), 
 CHOLESKY_LIMIT.
 whole: the same with MUMPS' whole factor on every rank (first) or a spread one (second), fem.solve.solvers.
 REPEATED_LIMIT.
+product: K_ee times many columns on one rank by fem.petsc.times_columns (first), or by SciPy's CSR product or PETSc's
+matMult (second), CPU seconds; fem.petsc.BLOCK_ENTRIES.
 
 Keep the machine quiet. A fast look: --switches batch,start --repeats 3."""
 
@@ -208,6 +216,39 @@ def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         yield from _two(comm, model, ("mumps", True), ("mumps", False), heads, names, 1 if size > 60_000 else repeats)
 
 
+def product(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """K_ee times columns stored by rows and by columns. CPU seconds; a sample is a mean of calls in a row. One rank."""
+    rng = np.random.default_rng(0)
+    np.ones(FREED)  # given back at once: from now on the C library keeps arrays up to this size, as in any longer run
+    for size in (1_000, 14_638, *((100_000,) if large else ())):
+        A = build(bench_scene(comm, 2, cells_for(2, size), 1), comm=comm).system.K_ee
+        rows, n = to_scipy(A), A.getSize()[0]
+        limit = f"BLOCK_ENTRIES = {softgrasp.fem.petsc.BLOCK_ENTRIES}"
+        for k, storage in itertools.product((10, 30, 120), ("rows", "columns")):
+            X = np.asarray(rng.standard_normal((n, k)), order="C" if storage == "rows" else "F")
+            calls = (partial(times_columns, A, X), partial(operator.matmul, rows, X), partial(by_petsc, A, X))
+            ways = zip(("ours", "SciPy", "PETSc"), (partial(cpu_seconds, call) for call in calls), strict=True)
+            seconds = medians(interleave(dict(ways), 3 * repeats))
+            for way in ("SciPy", "PETSc"):
+                setting = f"n_e = {n}, {k} columns by {storage}"
+                yield Row(f"product, {way}", limit, setting, comm.size, seconds["ours"], seconds[way])
+
+
+def by_petsc(A: PETSc.Mat, X: Array) -> Array:
+    """A X by PETSc's matMult with all columns at once."""
+    with setting_of(softgrasp.fem.petsc, "BLOCK_COLUMNS", X.shape[1] + 1):
+        return times_columns(A, np.asfortranarray(X))
+
+
+def cpu_seconds(call: Callable[[], Any]) -> float:
+    """Mean CPU seconds of a call after one that is not counted: it pays for the pages that the way before left cold."""
+    call()
+    begin = time.process_time()
+    for _ in range(CALLS):
+        call()
+    return (time.process_time() - begin) / CALLS
+
+
 def _two(
     comm: MPI.Intracomm,
     model: Any,
@@ -248,8 +289,9 @@ SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
     "shift": shift,
     "step": step_and_set_up,
     "whole": whole,
+    "product": product,
 }
-SERIAL = ("batch", "start", "dense")
+SERIAL = ("batch", "start", "dense", "product")
 
 
 def measure(switch: str, repeats: int, large: bool) -> dict[str, Any]:

@@ -40,11 +40,7 @@ def run_gain(
     notes: list[Note],
     restart: Path | None,
 ) -> dict[str, Any]:
-    """Solve, reduce a priori, write the controllers. Collective; arguments as for ``control_model``.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Solve, reduce a priori, write the controllers. Collective; arguments as for ``control_model``."""
     feedback = design(linearised(model), watch, progress, restart)
     bases: tuple[BasisGains, ...] = ()
     if not feedback.modal:

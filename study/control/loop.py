@@ -59,15 +59,7 @@ def save_controllers(
 def run_finite(design: Design, model: Model, linear: LoopTrajectory, plan: LoopPlan, notify: Notify) -> FiniteLoop:
     """The optimal gain of the linear plant on that of finite strain, from the same start. Collective.
 
-    Args:
-        design: of the linearised model.
-        model: with finite strain.
-        linear: the run of the linear plant under the same gain.
-        plan: times.
-        notify: called with steps done and in all.
-
-    Raises:
-        SolverError: there is no equilibrium under gravity.
+    ``linear`` is the run of the linear plant. Raises SolverError: there is no equilibrium under gravity.
     """
     scene, points = model.scene, model.system.points
     assert points is not None
@@ -95,8 +87,7 @@ def run_loops(
 ) -> LoopRuns:
     """Full plant under the optimal gain with frames, then under the best stable gain of each basis. Collective.
 
-    Raises:
-        SolverError: the loop under the optimal gain diverges.
+    Raises SolverError: the loop under the optimal gain diverges.
     """
     problem, scene, law = design.problem, design.model.scene, design.actuation
     others = [] if design.modal else best_gains(bases, problem.layout)

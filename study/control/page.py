@@ -40,13 +40,7 @@ def captions(drawn: Sequence[Path], settle: float) -> dict[str, tuple[Path, str]
 
 
 def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[Path]) -> list[Section]:
-    """Parts of the page.
-
-    Args:
-        study: what was found.
-        seconds: of the stages.
-        drawn: picture files.
-    """
+    """Parts of the page."""
     figures = captions(drawn, study.loops.plan.settle)
 
     def pick(*names: str) -> list[tuple[Path, str]]:

@@ -37,30 +37,19 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Note:
-    """What was chosen for the user, or why a part is missing.
+    """What was chosen for the user, or why a part is missing."""
 
-    Attributes:
-        topic: table, modal, orders, retune, controller, sampling, end.
-        text: one sentence.
-    """
-
-    topic: str
-    text: str
+    topic: str  # table, modal, orders, retune, controller, sampling, end
+    text: str  # one sentence
 
 
 @dataclass(frozen=True)
 class Retuned:
-    """One basis of one parameter over the box of lambda and mu.
+    """One basis of one parameter over the box of lambda and mu."""
 
-    Attributes:
-        name: basis.
-        N: order.
-        points: gains at the settings.
-    """
-
-    name: str
-    N: int
-    points: tuple[BoxPoint, ...]
+    name: str  # basis
+    N: int  # order
+    points: tuple[BoxPoint, ...]  # gains at the settings
 
     @property
     def slowest(self) -> float:
@@ -70,58 +59,35 @@ class Retuned:
 
 @dataclass(frozen=True)
 class ReducedLoopRun:
-    """The full plant under the best stable gain of one basis.
+    """The full plant under the best stable gain of one basis."""
 
-    Attributes:
-        method: key of the basis.
-        N: order.
-        run: None when it failed.
-        reason: why it failed; else empty.
-    """
-
-    method: str
-    N: int
-    run: LoopTrajectory | None
-    reason: str = ""
+    method: str  # key of the basis
+    N: int  # order
+    run: LoopTrajectory | None  # None when it failed
+    reason: str = ""  # why it failed; else empty
 
 
 @dataclass(frozen=True)
 class LoopRuns:
-    """All closed-loop runs.
+    """All closed-loop runs."""
 
-    Attributes:
-        plan: times.
-        full: under the optimal gain.
-        to_come: cost still to come at the end, from the Riccati solution.
-        reduced: under the best stable gain of each basis.
-        limits: of the inputs [N, N m], inf for none; None without any.
-    """
-
-    plan: LoopPlan
-    full: LoopTrajectory
-    to_come: float
-    reduced: tuple[ReducedLoopRun, ...]
-    limits: Array | None = None
+    plan: LoopPlan  # times
+    full: LoopTrajectory  # under the optimal gain
+    to_come: float  # cost still to come at the end, from the Riccati solution
+    reduced: tuple[ReducedLoopRun, ...]  # under the best stable gain of each basis
+    limits: Array | None = None  # of the inputs [N, N m], inf for none; None without any
 
 
 @dataclass(frozen=True)
 class FiniteLoop:
-    """The linear gain on the plant of finite strain.
+    """The linear gain on the plant of finite strain."""
 
-    Attributes:
-        law: of the material.
-        run: None when it failed.
-        target: where the loop goes; its shape is the equilibrium of finite strain.
-        reason: why the gain does not stabilise this plant; else empty.
-        cost_excess: cost over that of the linear plant, less one [1].
-        overshoot, overshoot_linear: farthest past the target over the way, here and on the linear plant [1].
-    """
-
-    law: str
-    run: LoopTrajectory | None
-    target: Target
-    reason: str = ""
-    cost_excess: float = float("nan")
+    law: str  # of the material
+    run: LoopTrajectory | None  # None when it failed
+    target: Target  # where the loop goes; its shape is the equilibrium of finite strain
+    reason: str = ""  # why the gain does not stabilise this plant; else empty
+    cost_excess: float = float("nan")  # cost over that of the linear plant, less one [1]
+    # overshoot, overshoot_linear: farthest past the target over the way, here and on the linear plant [1]
     overshoot: float = float("nan")
     overshoot_linear: float = float("nan")
 
@@ -136,27 +102,16 @@ class FiniteLoop:
 
 @dataclass(frozen=True)
 class ControlStudy:
-    """All that ``softgrasp control`` finds.
+    """All that ``softgrasp control`` finds."""
 
-    Attributes:
-        design: the optimal feedback.
-        bases: gains of the reduced equations.
-        retuned: gains over the box.
-        controller: the small controller; None when no small gain is certified.
-        tick: seconds of one tick of it, median.
-        loops: closed loops.
-        notes: what was chosen for the user, and why parts are missing.
-        finite: the loop on the plant of finite strain; None where the effect is off.
-    """
-
-    design: Design
-    bases: tuple[BasisGains, ...]
-    retuned: tuple[Retuned, ...]
-    controller: CertifiedController | None
-    tick: float
-    loops: LoopRuns
-    notes: tuple[Note, ...]
-    finite: FiniteLoop | None = None
+    design: Design  # the optimal feedback
+    bases: tuple[BasisGains, ...]  # gains of the reduced equations
+    retuned: tuple[Retuned, ...]  # gains over the box
+    controller: CertifiedController | None  # the small controller; None when no small gain is certified
+    tick: float  # seconds of one tick of it, median
+    loops: LoopRuns  # closed loops
+    notes: tuple[Note, ...]  # what was chosen for the user, and why parts are missing
+    finite: FiniteLoop | None = None  # the loop on the plant of finite strain; None where the effect is off
 
     @cached_property
     def margins(self) -> LoopMargins | None:
@@ -174,12 +129,7 @@ class ControlStudy:
 
 
 def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, Any]:
-    """The keys of ``result.json``. Collective.
-
-    Args:
-        study: what was found.
-        seconds: of the stages.
-    """
+    """The keys of ``result.json``. Collective."""
     return gain_result(study.design, study.controller, study.tick, study.notes, seconds) | {
         "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
         "refused": {b.name: b.refused for b in study.bases if b.refused},
@@ -240,19 +190,10 @@ def radius_of(report: GainReport | BoxPoint) -> float:
 
 
 def _retuned(r: Retuned) -> dict[str, Any]:
+    keys = ("error_K", "cost_excess", "cost_excess_at_most", "abscissa_full", "stable", "reason")
     points = [
-        {
-            "lambda": p.materials[0].lam,
-            "mu": p.materials[0].mu,
-            "error_K": p.error_K,
-            "cost_excess": p.cost_excess,
-            "cost_excess_at_most": p.cost_excess_at_most,
-            "abscissa_full": p.abscissa_full,
-            "sampled_radius": radius_of(p),
-            "time": p.seconds,
-            "stable": p.stable,
-            "reason": p.reason,
-        }
+        {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "sampled_radius": radius_of(p), "time": p.seconds}
+        | {key: getattr(p, key) for key in keys}
         for p in r.points
     ]
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}

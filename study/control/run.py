@@ -48,23 +48,8 @@ def run_control(
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
     Nothing is written before the Riccati equation is solved, but restart files of a large plant: the next call with
-    the same scene, folder and rank count goes on from them; they are removed at the end.
-
-    Args:
-        path: scene file.
-        out: folder of the results.
-        overrides: key=value changes of the scene.
-        console: where the tables go.
-        quiet: no progress bars.
-        pictures: draw figures and the animation.
-        empty: remove what an earlier run has left in the folder.
-        gain_only: solve the Riccati equation and write the controllers; no closed loop, no pictures.
-
-    Returns:
-        What result.json holds.
-
-    Raises:
-        SoftgraspError: with one sentence.
+    the same scene, folder and rank count goes on from them; they are removed at the end. ``gain_only`` writes the
+    controllers, without closed loop and pictures.
     """
     session = Session("control", path, overrides, out, console, quiet, pictures, empty)
     model, sentence = with_control(session.model(session.scene(), steps=False))
@@ -123,18 +108,9 @@ def restart_folder(model: Model, out: Path) -> Path | None:
 def control_model(
     session: Session, model: Model, watch: Stopwatch, bar: Progress, notes: list[Note], restart: Path | None = None
 ) -> tuple[ControlStudy, Frames]:
-    """Solve, reduce, re-tune and close the loop. Collective.
+    """Solve, reduce, re-tune and close the loop of a scene with a control table. Collective.
 
-    Args:
-        session: where field files go, and whether frames are kept.
-        model: the scene, with a control table.
-        watch: takes the seconds of the stages.
-        bar: shows what is done.
-        notes: what is to be said in the report; more is added to the result.
-        restart: folder for the solver's restart files.
-
-    Raises:
-        SoftgraspError: with one sentence.
+    ``watch`` takes the seconds of the stages; more is added to ``notes``; ``restart`` is the folder of restart files.
     """
     own_end = not notes  # a scene made for control says how long its loop runs
     finite_strain = model.system.points is not None

@@ -25,15 +25,10 @@ Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a 
 
 @dataclass(frozen=True)
 class Shown:
-    """Where a run takes its outputs, angles of the hand left out.
+    """Where a run takes its outputs, angles of the hand left out."""
 
-    Attributes:
-        places: displacements, (steps + 1, outputs, d) [m].
-        rigid: their share of the hand's rigid motion [m].
-    """
-
-    places: Array
-    rigid: Array
+    places: Array  # displacements, (steps + 1, outputs, d) [m]
+    rigid: Array  # their share of the hand's rigid motion [m]
 
 
 def shown(model: Model, run: Trajectory) -> Shown:
@@ -64,9 +59,6 @@ def force_of_motion(scene: Scene, model: Model) -> Force:
     """The force that would carry the bare hand along the prescribed motion, u_n = M_hand a_n.
 
     A hand with more freedoms than the scene's gets no load on them, one with fewer none of those it lacks.
-
-    Raises:
-        SceneError: a csv file does not fit.
     """
     u = motion_table(scene, model.system.layout.n_s).a @ model.system.M_hand.T
 
@@ -85,7 +77,6 @@ class Experiments:
     the force that would make that motion.
 
     Args:
-        scene: the scene.
         scales: what trial values rest on.
         models: already built, by the set of effects that are on; the scene's own among them.
     """
@@ -114,11 +105,7 @@ class Experiments:
         return build(scene, comm=self.comm)
 
     def of(self, on: Names, forced: bool = False) -> Shown:
-        """Outputs with exactly these effects on. Collective.
-
-        Raises:
-            SolverError: a solve failed.
-        """
+        """Outputs with exactly these effects on. Collective. Raises SolverError: a solve failed."""
         if (on, forced) not in self.runs:
             model = self.model(on)
             self.runs[on, forced] = shown(model, simulate(model, RunOptions(), self.force if forced else None))
@@ -150,15 +137,10 @@ class Experiments:
 
 @dataclass(frozen=True)
 class Together:
-    """All effects judged again.
+    """All effects judged again."""
 
-    Attributes:
-        on: effects that are advised, those that cannot be tried as they are.
-        company: of each effect that was tried.
-    """
-
-    on: tuple[str, ...]
-    company: dict[str, Company]
+    on: tuple[str, ...]  # effects that are advised, those that cannot be tried as they are
+    company: dict[str, Company]  # of each effect that was tried
 
 
 Joined = dict[str, tuple[tuple[str, ...], bool, float, bool]]
@@ -168,16 +150,7 @@ def judge_together(runs: Experiments, tried: tuple[str, ...], needed: Names, tol
     """Judge every effect again with all advised effects on, until no further one shows. Collective.
 
     An effect that does not show in the scene as it is joins when it shows beside those advised so far; then two that
-    show only as a pair do.
-
-    Args:
-        runs: of the scene.
-        tried: effects that can be switched.
-        needed: those of them that show in the scene as it is.
-        tolerance: relative change of the outputs that counts [1].
-
-    Raises:
-        SolverError: a solve failed.
+    show only as a pair do. ``tried`` can be switched; ``needed`` of them show in the scene as it is.
     """
     on = needed | (runs.on - frozenset(tried))
     joined: Joined = {}

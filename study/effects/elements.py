@@ -17,11 +17,7 @@ from softgrasp.study.forward.cautions import LOCKING
 
 
 def judge_elements(model: Model, trajectory: Trajectory, tolerance: float) -> Elements | None:
-    """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective.
-
-    Raises:
-        SolverError: a solve failed.
-    """
+    """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective."""
     nu = max(young_poisson(m.lam, m.mu)[1] for m in model.system.materials)
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None

@@ -10,13 +10,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import Changes, Together
-from softgrasp.study.effects.measure import (
-    AGAIN,
-    SCENE,
-    Case,
-    fingerprint,
-    objects_of,
-)
+from softgrasp.study.effects.measure import AGAIN, SCENE, Case, fingerprint, objects_of
 from softgrasp.study.effects.objects import difference
 from softgrasp.study.effects.result import Change, Company, Cost, Finding, OffProof, listed
 from softgrasp.study.effects.switch import Switch, neutral

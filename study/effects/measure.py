@@ -34,25 +34,17 @@ SCENE, AGAIN = "scene", "scene again"  # cases: as it is, before and after its e
 
 @dataclass
 class Case:
-    """One scene under measurement.
+    """One scene under measurement."""
 
-    Attributes:
-        model: the last one built.
-        seconds: samples of each stage: mesh, assembly, setup (factor and the drive's own solves), step.
-        prints: hash of each operator, see `fingerprint`.
-        bytes: memory of what the run holds, over all ranks [byte].
-        flops: operations of PETSc in a step, over all ranks [1].
-        objects: what PETSc's log counts as created by build, factor, start and the first step, by class.
-        objects_in_steps: the same of the next steps.
-    """
-
-    model: Model
+    model: Model  # the last one built
+    # samples of each stage: mesh, assembly, setup (factor and the drive's own solves), step
     seconds: dict[str, list[float]] = field(default_factory=dict)
-    prints: dict[str, str] = field(default_factory=dict)
-    bytes: dict[str, float] = field(default_factory=dict)
-    flops: float = 0.0
+    prints: dict[str, str] = field(default_factory=dict)  # hash of each operator, see `fingerprint`
+    bytes: dict[str, float] = field(default_factory=dict)  # memory of what the run holds, over all ranks [byte]
+    flops: float = 0.0  # operations of PETSc in a step, over all ranks [1]
+    # what PETSc's log counts as created by build, factor, start and the first step, by class
     objects: dict[str, int] = field(default_factory=dict)
-    objects_in_steps: dict[str, int] = field(default_factory=dict)
+    objects_in_steps: dict[str, int] = field(default_factory=dict)  # the same of the next steps
 
 
 class Stepper:
@@ -197,14 +189,7 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
 def measure_builds(
     comm: MPI.Intracomm, scenes: dict[str, Scene], repeats: int, tick: Callable[[], None]
 ) -> dict[str, Case]:
-    """Build and factor every scene several times, in rotated order. Collective.
-
-    Args:
-        comm: ranks.
-        scenes: by name.
-        repeats: how often; fewer when that takes longer than `BUILD_SECONDS`, at least once.
-        tick: called after each build.
-    """
+    """Build and factor every scene in rotated order, ``repeats`` times or for `BUILD_SECONDS`. Collective."""
     cases: dict[str, Case] = {}
     names = list(scenes)
     spent = 0.0

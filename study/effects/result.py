@@ -11,38 +11,24 @@ from softgrasp.study.forward.explain import EffectReport, Explanation
 
 @dataclass(frozen=True)
 class Change:
-    """Largest change of the outputs over the run.
+    """Largest change of the outputs over the run."""
 
-    Attributes:
-        outputs: max |y - y'| over max |y|, y the displacements of all outputs [1].
-        deformation: the same of the outputs relative to the rigid motion of the hand [1].
-        absolute: max |y - y'| [m].
-    """
-
-    outputs: float
-    deformation: float
-    absolute: float
+    outputs: float  # max |y - y'| over max |y|, y the displacements of all outputs [1]
+    deformation: float  # the same of the outputs relative to the rigid motion of the hand [1]
+    absolute: float  # max |y - y'| [m]
 
 
 @dataclass(frozen=True)
 class Company:
-    """One effect judged beside all others that are advised.
+    """One effect judged beside all others that are advised."""
 
-    Attributes:
-        change: of the outputs when it alone is switched, the others as advised.
-        control: the same under a force [1]; None when that is no question.
-        partners: effects whose switching makes it show, though it does not show in the scene as it is.
-        either: it and its partner are on, each can go, but not both.
-        together: change that made it count beside the partners [1].
-        forced: it shows only when a force moves the hand.
-    """
-
-    change: Change
-    control: float | None
+    change: Change  # of the outputs when it alone is switched, the others as advised
+    control: float | None  # the same under a force [1]; None when that is no question
+    # effects whose switching makes it show, though it does not show in the scene as it is
     partners: tuple[str, ...] = ()
-    either: bool = False
-    together: float = 0.0
-    forced: bool = False
+    either: bool = False  # it and its partner are on, each can go, but not both
+    together: float = 0.0  # change that made it count beside the partners [1]
+    forced: bool = False  # it shows only when a force moves the hand
 
 
 COUNTED = 1e-3  # relative growth of work or memory that counts as a cost; gravity's n_s numbers do not
@@ -50,37 +36,27 @@ COUNTED = 1e-3  # relative growth of work or memory that counts as a cost; gravi
 
 @dataclass(frozen=True)
 class Cost:
-    """What the effect adds: the scene with it minus the scene without it.
+    """What the effect adds: the scene with it minus the scene without it."""
 
-    Attributes:
-        assembly, setup, step: seconds, medians of paired samples; setup is factor and solves before the first step.
-        assembly_range, setup_range: smallest and largest paired sample [s].
-        step_relative: added share of a step's time [1].
-        step_low, step_high: smallest and largest paired share [1].
-        step_noise: share that a step of the scene differs from itself by [1].
-        step_quartiles: lower and upper quartile of the paired shares [1].
-        flops: added operations of PETSc in a step [1]; flops_relative: their share.
-        memory: added memory [byte]; memory_relative: its share.
-        holds: names of what only the scene with the effect holds.
-        objects: what PETSc counts as created more, by class.
-    """
-
+    # assembly, setup, step: seconds, medians of paired samples; setup is factor and solves before the first step
     assembly: float
     setup: float
+    # assembly_range, setup_range: smallest and largest paired sample [s]
     assembly_range: tuple[float, float]
     setup_range: tuple[float, float]
     step: float
-    step_relative: float
+    step_relative: float  # added share of a step's time [1]
+    # step_low, step_high: smallest and largest paired share [1]
     step_low: float
     step_high: float
-    step_noise: float
-    step_quartiles: tuple[float, float]
-    flops: float
+    step_noise: float  # share that a step of the scene differs from itself by [1]
+    step_quartiles: tuple[float, float]  # lower and upper quartile of the paired shares [1]
+    flops: float  # added operations of PETSc in a step [1]; flops_relative: their share
     flops_relative: float
-    memory: float
+    memory: float  # added memory [byte]; memory_relative: its share
     memory_relative: float
-    holds: tuple[str, ...]
-    objects: dict[str, int]
+    holds: tuple[str, ...]  # names of what only the scene with the effect holds
+    objects: dict[str, int]  # what PETSc counts as created more, by class
 
     @property
     def any(self) -> bool:
@@ -95,18 +71,13 @@ class Cost:
 
 @dataclass(frozen=True)
 class OffProof:
-    """What is counted to show that an effect that is off costs nothing; times are too noisy for it.
+    """What is counted to show that an effect that is off costs nothing; times are too noisy for it."""
 
-    Attributes:
-        same_operators: the hashes of all operators are the same before the effect was tried, after it, and with the
-            effect named at strength zero, where it has one.
-        same_objects: PETSc's log counts the same objects in these three, by class, and none in the steps.
-        same_work: as many operations in a step after the trial as before.
-    """
-
+    # the hashes of all operators are the same before the effect was tried, after it, and with the effect named at
+    # strength zero, where it has one
     same_operators: bool
-    same_objects: bool
-    same_work: bool
+    same_objects: bool  # PETSc's log counts the same objects in these three, by class, and none in the steps
+    same_work: bool  # as many operations in a step after the trial as before
 
     @property
     def holds(self) -> bool:
@@ -116,53 +87,31 @@ class OffProof:
 
 @dataclass(frozen=True)
 class Elements:
-    """What quadratic elements on the same mesh change where linear ones may lock.
+    """What quadratic elements on the same mesh change where linear ones may lock."""
 
-    Attributes:
-        nu: largest ratio of Poisson in the tissue [1].
-        change: of the outputs of the run, P2 against P1.
-        unknowns: n_e with P2 over n_e with P1 [1].
-        needed: the change is above the tolerance.
-        advice: one sentence.
-    """
-
-    nu: float
-    change: Change
-    unknowns: float
-    needed: bool
-    advice: str
+    nu: float  # largest ratio of Poisson in the tissue [1]
+    change: Change  # of the outputs of the run, P2 against P1
+    unknowns: float  # n_e with P2 over n_e with P1 [1]
+    needed: bool  # the change is above the tolerance
+    advice: str  # one sentence
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One effect.
+    """One effect."""
 
-    Attributes:
-        name: the effect.
-        on: the scene has it on.
-        value: in the scene, or the trial value.
-        gate: number, threshold and sentence of its gate, with what explain says.
-        verdict: needed, optional, wasted, or not tried.
-        advice: one sentence.
-        change: of the outputs of the run; None when not tried.
-        control: change of the outputs when a force moves the hand; None when that is no question, or not needed to
-            judge.
-        company: the same judged again beside all other advised effects; None when not tried.
-        cost: None when not tried.
-        proof: for an effect that is off.
-    """
-
-    name: str
-    on: bool
-    value: str
-    gate: EffectReport
-    verdict: str
-    advice: str
-    change: Change | None
+    name: str  # the effect
+    on: bool  # the scene has it on
+    value: str  # in the scene, or the trial value
+    gate: EffectReport  # number, threshold and sentence of its gate, with what explain says
+    verdict: str  # needed, optional, wasted, or not tried
+    advice: str  # one sentence
+    change: Change | None  # of the outputs of the run; None when not tried
+    # change of the outputs when a force moves the hand; None when that is no question, or not needed to judge
     control: float | None
-    company: Company | None
-    cost: Cost | None
-    proof: OffProof | None
+    company: Company | None  # the same judged again beside all other advised effects; None when not tried
+    cost: Cost | None  # None when not tried
+    proof: OffProof | None  # for an effect that is off
 
     @property
     def label(self) -> str:
@@ -187,33 +136,19 @@ class Finding:
 
 @dataclass(frozen=True)
 class EffectsStudy:
-    """All findings of a scene.
+    """All findings of a scene."""
 
-    Attributes:
-        findings: in the order of `fem.effects.EFFECTS`.
-        advised: effects that are on when every advice is followed, for control alone included.
-        explanation: of the scene as it is; its warnings are repeated in the report.
-        tolerance: relative change that counts [1].
-        repeats: samples behind each median of a step; builds may have fewer.
-        builds: samples behind each median of assembly and factor.
-        noise: step times of the scene against itself, smallest and largest paired ratio less 1 [1].
-        noise_quartiles: the middle half of them [1].
-        base: medians of the scene as it is: assembly, setup, step [s], and memory [byte].
-        sizes: n_s, n_e, states, steps and cells of the scene.
-        elements: what P2 changes; None unless P1 may lock.
-    """
-
-    findings: tuple[Finding, ...]
-    advised: tuple[str, ...]
-    explanation: Explanation
-    tolerance: float
-    repeats: int
-    builds: int
-    noise: tuple[float, float]
-    noise_quartiles: tuple[float, float]
-    base: dict[str, float]
-    sizes: dict[str, int]
-    elements: Elements | None
+    findings: tuple[Finding, ...]  # in the order of `fem.effects.EFFECTS`
+    advised: tuple[str, ...]  # effects that are on when every advice is followed, for control alone included
+    explanation: Explanation  # of the scene as it is; its warnings are repeated in the report
+    tolerance: float  # relative change that counts [1]
+    repeats: int  # samples behind each median of a step; builds may have fewer
+    builds: int  # samples behind each median of assembly and factor
+    noise: tuple[float, float]  # step times of the scene against itself, smallest and largest paired ratio less 1 [1]
+    noise_quartiles: tuple[float, float]  # the middle half of them [1]
+    base: dict[str, float]  # medians of the scene as it is: assembly, setup, step [s], and memory [byte]
+    sizes: dict[str, int]  # n_s, n_e, states, steps and cells of the scene
+    elements: Elements | None  # what P2 changes; None unless P1 may lock
 
     @property
     def warnings(self) -> tuple[str, ...]:

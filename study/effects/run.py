@@ -39,7 +39,6 @@ def study_effects(
 
     Args:
         scene: the scene; tolerance and repeats are those of its section study.
-        comm: ranks.
         progress: called with steps of work done and in all.
 
     Raises:
@@ -115,11 +114,7 @@ def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
 
 
 def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
-    """Refuse so many variants of the scene where they would not fit in memory at once. Collective.
-
-    Raises:
-        ResourceError: with the memory that they need.
-    """
+    """Refuse so many variants of the scene where they would not fit in memory at once. Collective."""
     free = comm.bcast(psutil.virtual_memory().available)
     # matrices and vectors need about as much as the factor
     needed = 2 * count * explanation.solver.factor_bytes
@@ -133,11 +128,7 @@ def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> N
 def run_effects(
     path: Path, out: Path, overrides: list[str], console: Console, *, quiet: bool = False, empty: bool = False
 ) -> dict[str, Any]:
-    """Judge the effects of a scene file and write result.json, table, picture and report. Collective.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Judge the effects of a scene file and write result.json, table, picture and report. Collective."""
     session = Session("effects", path, overrides, out, console, quiet, empty=empty)
     comm, scene = session.comm, session.scene()
     console.print(f"effects at the tolerance {scene.study.tolerance:g}")

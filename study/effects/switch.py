@@ -26,50 +26,30 @@ Table = dict[str, Any]
 
 @dataclass(frozen=True)
 class Scales:
-    """What the trial values rest on.
+    """What the trial values rest on."""
 
-    Attributes:
-        dimension: 2 or 3.
-        mass: of the whole tissue [kg].
-        inertia: moments of the rigid tissue about the reference, one per rotation [kg m2].
-        omega: lowest angular frequency of the clamped tissue [1/s], or None when it was not computed.
-    """
-
-    dimension: int
-    mass: float
-    inertia: tuple[float, ...]
-    omega: float | None
+    dimension: int  # 2 or 3
+    mass: float  # of the whole tissue [kg]
+    inertia: tuple[float, ...]  # moments of the rigid tissue about the reference, one per rotation [kg m2]
+    omega: float | None  # lowest angular frequency of the clamped tissue [1/s], or None when it was not computed
 
 
 @dataclass(frozen=True)
 class Switch:
-    """One effect and the scene with it switched the other way.
+    """One effect and the scene with it switched the other way."""
 
-    Attributes:
-        name: the effect.
-        on: the scene has it on.
-        value: its value in the scene, or the trial value.
-        other: the scene with the effect switched; None when there is no such scene.
-        reason: why there is none; empty otherwise.
-        strength: size of the value in its own unit, for effects whose change grows with it; None for the others.
-        unit: of the strength.
-    """
-
-    name: str
-    on: bool
-    value: str
-    other: Scene | None
-    reason: str = ""
+    name: str  # the effect
+    on: bool  # the scene has it on
+    value: str  # its value in the scene, or the trial value
+    other: Scene | None  # the scene with the effect switched; None when there is no such scene
+    reason: str = ""  # why there is none; empty otherwise
+    # size of the value in its own unit, for effects whose change grows with it; None for the others
     strength: float | None = None
-    unit: str = ""
+    unit: str = ""  # of the strength
 
 
 def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
-    """A copy of the scene after ``edit`` changed its table in place.
-
-    Raises:
-        pydantic.ValidationError: the changed table is no scene.
-    """
+    """A copy of the scene after ``edit`` changed its table in place."""
     data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
     edit(data)
     result = Scene.model_validate(data)

@@ -28,7 +28,6 @@ def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | N
     """The estimate of a model's mesh where it is there, cheap or asked for, and why it is not. Collective.
 
     Args:
-        model: the model.
         seconds: what its run took, equal on all ranks.
         certify: estimate whatever it costs.
 

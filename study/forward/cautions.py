@@ -38,13 +38,7 @@ def locking(poisson: dict[str, float], order: int) -> list[str]:
 
 
 def coarse(omega: float, dt: float, end: float, period: str) -> list[str]:
-    """A step too long for a period 2 pi / omega.
-
-    Args:
-        omega: angular frequency [1/s].
-        dt, end: step and end of the run [s].
-        period: what the period is, in words.
-    """
+    """A step dt [s] too long for a period 2 pi / omega; the period in words."""
     share = omega * dt / (2 * np.pi)
     if not share > COARSE_STEP:
         return []
@@ -92,8 +86,6 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     that of :func:`slowest`, which needs snapshots in memory.
 
     Args:
-        model: the model.
-        run: its run.
         most: time [s] and local rows (n_local,) [m] of a large displacement that was seen on the way.
     """
     scene, system, d = model.scene, model.system, model.space.mesh.dimension

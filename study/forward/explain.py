@@ -61,44 +61,26 @@ class EffectReport:
 
 @dataclass(frozen=True)
 class Explanation:
-    """All that explain says.
+    """All that explain says."""
 
-    Attributes:
-        name: of the scene.
-        equation: with exactly the terms of this scene.
-        sizes: unknowns and entities.
-        solver: choice and cost.
-        time: step against periods.
-        effects: by name.
-        poisson: Poisson's ratio of each material by layer name [1].
-        missing: effects that are off and would matter.
-        idle: effects that are on and do not matter.
-        sag: the tissue at rest under its weight.
-        warnings: one sentence each.
-        outputs: name and place of each output.
-        memory: estimated need of mesh, factor and steps.
-        snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks.
-        mesh: singular ends, and the error they leave.
-        dimension: 2 or 3.
-    """
-
-    name: str
-    equation: Equation
-    sizes: Sizes
-    solver: SolverPlan
-    time: TimePlan
-    effects: dict[str, EffectReport]
-    poisson: dict[str, float]
-    missing: tuple[str, ...]
-    idle: tuple[str, ...]
-    sag: Sag
-    warnings: tuple[str, ...]
-    outputs: dict[str, str]
-    memory: Need
+    name: str  # of the scene
+    equation: Equation  # with exactly the terms of this scene
+    sizes: Sizes  # unknowns and entities
+    solver: SolverPlan  # choice and cost
+    time: TimePlan  # step against periods
+    effects: dict[str, EffectReport]  # by name
+    poisson: dict[str, float]  # Poisson's ratio of each material by layer name [1]
+    missing: tuple[str, ...]  # effects that are off and would matter
+    idle: tuple[str, ...]  # effects that are on and do not matter
+    sag: Sag  # the tissue at rest under its weight
+    warnings: tuple[str, ...]  # one sentence each
+    outputs: dict[str, str]  # name and place of each output
+    memory: Need  # estimated need of mesh, factor and steps
+    # snapshot_columns, snapshot_bytes: what the run stores in memory, over all ranks
     snapshot_columns: int
     snapshot_bytes: int
-    mesh: MeshReport
-    dimension: int
+    mesh: MeshReport  # singular ends, and the error they leave
+    dimension: int  # 2 or 3
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None."""
@@ -107,21 +89,12 @@ class Explanation:
 
 
 def explain(scene: Scene, comm: MPI.Intracomm) -> Explanation:
-    """Assemble a scene and say what it is. Collective.
-
-    Raises:
-        SceneError, MeshError: the scene cannot be built.
-        SolverError: its modes or its sag cannot be computed.
-    """
+    """Assemble a scene and say what it is. Collective."""
     return explain_model(build(scene, comm=comm, run=False))
 
 
 def explain_model(model: Model) -> Explanation:
-    """Say what a built model is. Collective.
-
-    Raises:
-        SolverError: its modes or its sag cannot be computed.
-    """
+    """Say what a built model is. Collective. Raises SolverError: its modes or its sag cannot be computed."""
     scene, system = model.scene, model.system
     layout = system.layout
     d, ranks = layout.dimension, layout.comm.size

@@ -26,32 +26,20 @@ class EndReport:
 
 @dataclass(frozen=True)
 class MeshReport:
-    """What is known of the mesh's error before a run.
+    """What is known of the mesh's error before a run."""
 
-    Attributes:
-        ends: singular ends by kind and exponent, the strongest first.
-        order: expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1].
-        graded: whether cells shrink towards the ends.
-        estimate, bound: relative error of the deformation [1]; None where the estimate costs more than a second.
-        time_error: that of the time steps [1].
-        shift: of the ends of the zone against contact.box [m].
-    """
-
-    ends: tuple[EndReport, ...]
-    order: float
-    graded: bool
+    ends: tuple[EndReport, ...]  # singular ends by kind and exponent, the strongest first
+    order: float  # expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1]
+    graded: bool  # whether cells shrink towards the ends
+    # estimate, bound: relative error of the deformation [1]; None where the estimate costs more than a second
     estimate: float | None
     bound: float | None
-    time_error: float | None
-    shift: float | None
+    time_error: float | None  # that of the time steps [1]
+    shift: float | None  # of the ends of the zone against contact.box [m]
 
 
 def mesh_report(model: Model) -> MeshReport:
-    """Look for singular ends and estimate the error. Collective.
-
-    Raises:
-        MeshError: the mesh file changed since the model was built.
-    """
+    """Look for singular ends and estimate the error. Collective."""
     comm, scene, tissue = model.system.layout.comm, model.scene, model.space.mesh
     refine = scene.tissue.refine
     small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE

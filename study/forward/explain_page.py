@@ -26,11 +26,7 @@ COSTS = ("effect", "adds", "allocates", "cost")
 def run_explain(
     path: Path, out: Path | None, overrides: Sequence[str], console: Console, *, empty: bool = False
 ) -> Explanation:
-    """Explain a scene file, and write result.json and report.html if there is a folder for them. Collective.
-
-    Raises:
-        SceneError, MeshError, SolverError: as :func:`softgrasp.study.forward.explain.explain`.
-    """
+    """Explain a scene file, and write result.json and report.html if there is a folder for them. Collective."""
     session = Session("explain", path, overrides, out or Path(), console, empty=empty)
     scene = session.scene(writes=out is not None)
     explanation = explain(scene, session.comm)

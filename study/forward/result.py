@@ -56,29 +56,17 @@ def output_places(model: Model) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Simulation:
-    """A run of the full model.
+    """A run of the full model."""
 
-    Attributes:
-        scene: as it was run.
-        sizes: unknowns and entities.
-        dimension: 2 or 3.
-        run: the trajectory.
-        places: where each output is taken, in words.
-        warnings: one sentence each.
-        memory_peak_mb: largest memory, over all ranks [MiB].
-        forms: number of compiled forms.
-        operators: names of the assembled operators.
-    """
-
-    scene: Scene
-    sizes: Sizes
-    dimension: int
-    run: Trajectory
-    places: dict[str, str]
-    warnings: tuple[str, ...]
-    memory_peak_mb: float
-    forms: int
-    operators: Sequence[str]
+    scene: Scene  # as it was run
+    sizes: Sizes  # unknowns and entities
+    dimension: int  # 2 or 3
+    run: Trajectory  # the trajectory
+    places: dict[str, str]  # where each output is taken, in words
+    warnings: tuple[str, ...]  # one sentence each
+    memory_peak_mb: float  # largest memory, over all ranks [MiB]
+    forms: int  # number of compiled forms
+    operators: Sequence[str]  # names of the assembled operators
 
     @property
     def force_peak(self) -> dict[str, float]:

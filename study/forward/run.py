@@ -46,14 +46,7 @@ def run_simulate(
     certify: bool = False,
     empty: bool = False,
 ) -> dict[str, Any]:
-    """Simulate a scene file and write its results. Collective.
-
-    Returns:
-        What result.json holds.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Simulate a scene file and write its results. Collective."""
     if resume and empty:
         raise SceneError("--empty removes what --resume goes on from; give one of them")
     session = Session("simulate", path, overrides, out, console, quiet, pictures, empty)

@@ -16,6 +16,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.care import care
 from softgrasp.study.hardcases.cases import EPS, Family, HardCase, here, textbook, thin
 
+Solve = Callable[[Array, Array, Array, Array, Array], Array]  # X from A, B, C, Q, R
 BYERS = "as many roundings as the Hamiltonian matrix has rows, times the condition of the equation [B85]"
 
 
@@ -118,31 +119,22 @@ EXAMPLES: tuple[tuple[str, Callable[[float], Example], tuple[float, ...]], ...] 
 )
 
 
-def _error(X: Array, exact: Array) -> float:
-    return float(np.linalg.norm(X - exact) / np.linalg.norm(exact))
+def _here(A: Array, B: Array, C: Array, Q: Array, R: Array) -> Array:
+    return care(A, B, C, Q, R).X
 
 
-def _here(x: Example) -> float:
-    return _error(care(x.A, x.B, x.C, x.Q, x.R).X, x.X)
+def _scipy(A: Array, B: Array, C: Array, Q: Array, R: Array) -> Array:
+    return np.asarray(scipy.linalg.solve_continuous_are(A, B, C.T @ Q @ C, R))
 
 
-def _scipy(x: Example) -> float:
-    return _error(scipy.linalg.solve_continuous_are(x.A, x.B, x.C.T @ x.Q @ x.C, x.R), x.X)
+def _error(solve: Solve, x: Example) -> float:
+    return float(np.linalg.norm(solve(x.A, x.B, x.C, x.Q, x.R) - x.X) / np.linalg.norm(x.X))
 
 
-def chain(n: int = 21) -> tuple[Array, Array, Array]:
+def _chain(solve: Solve, n: int = 21) -> float:
     """CAREX [BLM95] 4.1: n integrators in a row, pushed at the last, seen at the first; x_1n = 1."""
-    return np.eye(n, k=1), np.eye(n)[:, -1:], np.eye(n)[:1]
-
-
-def _chain_here() -> float:
-    A, B, C = chain()
-    return abs(float(care(A, B, C, np.eye(1), np.eye(1)).X[0, -1]) - 1)
-
-
-def _chain_scipy() -> float:
-    A, B, C = chain()
-    return abs(float(scipy.linalg.solve_continuous_are(A, B, C.T @ C, np.eye(1))[0, -1]) - 1)
+    X = solve(np.eye(n, k=1), np.eye(n)[:, -1:], np.eye(n)[:1], np.eye(1), np.eye(1))
+    return abs(float(X[0, -1]) - 1)
 
 
 def carex_rows(quick: bool) -> Iterator[HardCase]:
@@ -152,9 +144,9 @@ def carex_rows(quick: bool) -> Iterator[HardCase]:
         for e in parameters[:1] + parameters[-1:] if quick and len(parameters) > 1 else parameters:
             x = make(e)
             name = f"CAREX {number}" + (f", parameter {e:g}" if len(parameters) > 1 else "")
-            yield HardCase(name, next(place), here(_here, x), textbook(_scipy, x), x.bound, BYERS)
+            yield HardCase(name, next(place), here(_error, _here, x), textbook(_error, _scipy, x), x.bound, BYERS)
     reason = "X has the condition 2e17, so nothing is certain; three digits are asked, the tolerance of every study"
-    yield HardCase("CAREX 4.1, entry x_1n", next(place), here(_chain_here), textbook(_chain_scipy), 1e-3, reason)
+    yield HardCase("CAREX 4.1, entry x_1n", next(place), here(_chain, _here), textbook(_chain, _scipy), 1e-3, reason)
 
 
 def reach_rows(quick: bool) -> Iterator[HardCase]:
@@ -163,7 +155,7 @@ def reach_rows(quick: bool) -> Iterator[HardCase]:
         e = 10.0**power
         x = example_2_1(e)
         reason = BYERS + "; X grows like 2 / e^2 and from 1e12 on it may be refused"
-        answers = here(_here, x), textbook(_scipy, x)
+        answers = here(_error, _here, x), textbook(_error, _scipy, x)
         yield HardCase(f"B = [{e:.0e}, 0]", e, *answers, x.bound, reason, may_refuse=power < -6)
 
 

@@ -26,19 +26,12 @@ LENGTH = 400  # characters of a message that are kept
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one way: a number, or the sentence with which it ended.
+    """Result of one way: a number, or the sentence with which it ended."""
 
-    Attributes:
-        value: the measured number; None when there is none.
-        text: the refusal or failure in words, or a remark on the number.
-        refused: it ended by one of our own errors.
-        error: name of the exception that ended the textbook way.
-    """
-
-    value: float | None
-    text: str = ""
-    refused: bool = False
-    error: str = ""
+    value: float | None  # the measured number; None when there is none
+    text: str = ""  # the refusal or failure in words, or a remark on the number
+    refused: bool = False  # it ended by one of our own errors
+    error: str = ""  # name of the exception that ended the textbook way
 
     def __str__(self) -> str:
         """Number and remark as a table shows them."""
@@ -48,26 +41,17 @@ class Outcome:
 
 @dataclass(frozen=True)
 class HardCase:
-    """One case.
+    """One case."""
 
-    Attributes:
-        case: what is special, in words.
-        x: the varied number, the position in the picture.
-        here, textbook: what softgrasp and the textbook way gave.
-        bound: the number from here must not exceed it; None when the case has to be refused.
-        reason: where the bound comes from.
-        may_refuse: a refusal is as good as a number within the bound.
-        group: curve of the picture it belongs to.
-    """
-
-    case: str
-    x: float
+    case: str  # what is special, in words
+    x: float  # the varied number, the position in the picture
+    # here, textbook: what softgrasp and the textbook way gave
     here: Outcome
     textbook: Outcome
-    bound: float | None
-    reason: str
-    may_refuse: bool = False
-    group: str = ""
+    bound: float | None  # the number from here must not exceed it; None when the case has to be refused
+    reason: str  # where the bound comes from
+    may_refuse: bool = False  # a refusal is as good as a number within the bound
+    group: str = ""  # curve of the picture it belongs to
 
     @property
     def verdict(self) -> Verdict:
@@ -118,33 +102,27 @@ class HardCase:
 
 @dataclass(frozen=True)
 class Family:
-    """Cases that vary one thing.
+    """Cases that vary one thing."""
 
-    Attributes:
-        name: short name, as `--family` takes it.
-        title: what is hard, in words.
-        varied: label of the varied number with its unit.
-        quantity: label of the measured number with its unit.
-        textbook: the textbook way in a few words.
-        lesson: what the comparison shows, one or two sentences.
-        cases: runs them; True for the quick half.
-        axis: of the varied number in the picture: a logarithm, linear, or the cases one below the other.
-    """
-
-    name: str
-    title: str
-    varied: str
-    quantity: str
-    textbook: str
-    lesson: str
-    cases: Callable[[bool], Iterable[HardCase]]
+    name: str  # short name, as `--family` takes it
+    title: str  # what is hard, in words
+    varied: str  # label of the varied number with its unit
+    quantity: str  # label of the measured number with its unit
+    textbook: str  # the textbook way in a few words
+    lesson: str  # what the comparison shows, one or two sentences
+    cases: Callable[[bool], Iterable[HardCase]]  # runs them; True for the quick half
+    # of the varied number in the picture: a logarithm, linear, or the cases one below the other
     axis: Literal["log", "linear", "listed"] = "log"
 
 
-def _short(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    text = re.sub(r"/\S*/(?=[^/\s])", "", lines[0]) if lines else type(error).__name__  # no folders of this machine
+def short(text: str) -> str:
+    """A message without the folders of this machine, cut where it is long."""
+    text = re.sub(r"/\S*/(?=[^/\s])", "", text)
     return text if len(text) <= LENGTH else text[: LENGTH - 3] + "..."
+
+
+def _first_line(error: BaseException) -> str:
+    return short(next(iter(str(error).strip().splitlines()), type(error).__name__))
 
 
 def here(work: Callable[..., float], *arguments: Any) -> Outcome:
@@ -152,7 +130,7 @@ def here(work: Callable[..., float], *arguments: Any) -> Outcome:
     try:
         return Outcome(float(work(*arguments)))
     except SoftgraspError as error:
-        return Outcome(None, _short(error), refused=True)
+        return Outcome(None, _first_line(error), refused=True)
 
 
 def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
@@ -163,7 +141,7 @@ def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
             result = work(*arguments)
         except Exception as error:  # the point of the comparison is how it fails
             name = type(error).__name__
-            return Outcome(None, f"{name}: {_short(error)}", error=name)
+            return Outcome(None, f"{name}: {_first_line(error)}", error=name)
     if isinstance(result, Outcome):
         return result
     value = float(result)
@@ -174,11 +152,7 @@ def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
 
 
 def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Model:
-    """Build a shipped scene with overrides of the form `section.key=value`. Collective.
-
-    Raises:
-        SceneError, MeshError: as :func:`softgrasp.fem.model.build.build`.
-    """
+    """Build a shipped scene with overrides of the form `section.key=value`. Collective."""
     return build(load_scene(shipped_scenes()[name], overrides), comm=comm)
 
 

@@ -39,24 +39,16 @@ TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class Asked:
-    """One question to a certified model.
+    """One question to a certified model."""
 
-    Attributes:
-        case: in words.
-        scene: overrides of the scene that the model is trained on.
-        at: lambda and mu [Pa].
-        motion: overrides of the question alone.
-        k, k2: modes of the answer, and of the basis that certifies it.
-        refuse: the answer must be refused.
-    """
-
-    case: str
-    scene: tuple[str, ...] = (KV,)
-    at: tuple[float, float] = (60.0, 45.0)
-    motion: tuple[str, ...] = ()
+    case: str  # in words
+    scene: tuple[str, ...] = (KV,)  # overrides of the scene that the model is trained on
+    at: tuple[float, float] = (60.0, 45.0)  # lambda and mu [Pa]
+    motion: tuple[str, ...] = ()  # overrides of the question alone
+    # k, k2: modes of the answer, and of the basis that certifies it
     k: int = 12
     k2: int = 36
-    refuse: bool = False
+    refuse: bool = False  # the answer must be refused
 
 
 QUESTIONS = (
@@ -235,7 +227,7 @@ def residual_rows(quick: bool) -> Iterator[HardCase]:
     space.destroy()
     C = np.hstack([G, mass @ Phi, stiffness @ Phi])
     gram = C.T @ np.linalg.solve(mass, C)
-    T = np.hstack(norms.columns(norms.mass, model.system.materials)[:3])
+    T = np.hstack(norms.columns("mass", model.system.materials)[:3])
     length = float(np.sqrt(G[:, 0] @ np.linalg.solve(mass, G[:, 0])))
     scale = float(np.linalg.norm(squares * np.sqrt(np.diag(gram)[2:6])))
     for power in (0, -4, -8) if quick else range(0, -11, -2):

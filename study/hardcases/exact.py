@@ -26,13 +26,7 @@ def exact_gain(problem: RiccatiProblem) -> Array:
 
     A'XE + E'XA - K'RK + C'QC is evaluated in :data:`DIGITS` decimal digits from the matrices as they are in doubles;
     the correction by Newton's method needs a few right digits only and is computed in doubles, in modal coordinates.
-    What starts it does not matter: the limit solves the equation, and its closed loop decays.
-
-    Args:
-        problem: of one rank, some fifty states, R diagonal.
-
-    Returns:
-        K, (m, states), rounded to doubles.
+    What starts it does not matter: the limit solves the equation, and its closed loop decays. For some fifty states.
 
     Raises:
         ValueError: more than one rank, R with entries beside the diagonal, or corrections that do not die out.

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.hardcases.cases import LENGTH, Family, HardCase, Outcome, textbook
+from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, short, textbook
 from softgrasp.study.shell.processes import IN_MPI_JOB, child_environment, find_mpiexec, run_limited
 
 # what happens, what must be said, and the same in a bare script
@@ -37,11 +36,7 @@ FAULTY = ["-m", "softgrasp.study.hardcases.faulty"]  # then fault and folder
 
 
 def healthy_seconds() -> float:
-    """Seconds of the command on two ranks without a fault: what this machine needs, loaded as it is.
-
-    Raises:
-        SoftgraspError: there is no mpiexec, or the run fails.
-    """
+    """Seconds of the command on two ranks without a fault: what this machine needs, loaded as it is."""
     with tempfile.TemporaryDirectory() as folder:
         status, output, seconds = job([*FAULTY, "", folder], HEALTHY_LIMIT)
     if status != 0:
@@ -51,11 +46,7 @@ def healthy_seconds() -> float:
 
 
 def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
-    """Run two ranks for at most ``limit`` [s]; status, None when that was not enough, output and seconds.
-
-    Raises:
-        SoftgraspError: there is no mpiexec.
-    """
+    """Run two ranks for at most ``limit`` [s]; status, None when that was not enough, output and seconds."""
     mpiexec = find_mpiexec()
     if mpiexec is None:
         raise SoftgraspError("no mpiexec found; `softgrasp doctor` says what to do")
@@ -74,7 +65,7 @@ def judge(command: list[str], patience: float, healthy: float, sentence: str) ->
     if sentence not in output:
         return Outcome(None, f"ended without saying '{sentence}'")
     said = next((line.strip() for line in output.splitlines() if sentence and sentence in line), f"status {status}")
-    return Outcome(seconds / healthy, re.sub(r"/\S*/(?=[^/\s])", "", said)[:LENGTH])
+    return Outcome(seconds / healthy, short(said))
 
 
 def rank_rows(quick: bool) -> Iterator[HardCase]:

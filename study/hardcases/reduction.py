@@ -20,13 +20,13 @@ from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.reduction.engines import factor
-from softgrasp.reduction.inner import orthonormality
+from softgrasp.reduction.bases.engines import factor
+from softgrasp.reduction.bases.inner import orthonormality
+from softgrasp.reduction.bases.registry import make_bases, make_basis
+from softgrasp.reduction.bases.states import States, states_of
 from softgrasp.reduction.model import SmallModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import make_bases, make_basis
-from softgrasp.reduction.states import States, states_of
 from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, qr_rounding, textbook, thin
 
 REASON = "rounding of a QR factorisation, rows x columns x eps [H02]"

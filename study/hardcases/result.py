@@ -57,19 +57,10 @@ class HardCaseResult:
     quick: bool
 
     @property
-    def cases(self) -> int:
-        """Number of cases."""
-        return sum(len(f.cases) for f in self.families)
-
-    @property
-    def passed(self) -> int:
-        """Number of cases that keep their bound."""
-        return sum(f.passed for f in self.families)
-
-    @property
-    def refused(self) -> int:
-        """Number of cases that are refused as they may be."""
-        return sum(f.refused for f in self.families)
+    def counts(self) -> dict[str, int]:
+        """Number of cases, of those that keep their bound, and of those that are refused as they may be."""
+        names = {"cases": lambda f: len(f.cases), "passed": lambda f: f.passed, "refused": lambda f: f.refused}
+        return {name: sum(map(count, self.families)) for name, count in names.items()}
 
     @property
     def failed(self) -> list[str]:
@@ -79,9 +70,9 @@ class HardCaseResult:
     @property
     def summary(self) -> str:
         """One sentence on the whole suite."""
+        cases, passed, refused = self.counts.values()
         text = (
-            f"{self.cases} cases: {self.passed} keep their bound, {self.refused} are refused as they may be, "
-            f"{len(self.failed)} fail"
+            f"{cases} cases: {passed} keep their bound, {refused} are refused as they may be, {len(self.failed)} fail"
         )
         return text + (f": {'; '.join(self.failed)}" if self.failed else "")
 
@@ -94,9 +85,7 @@ class HardCaseResult:
                 "machine": machine(),
                 "quick": self.quick,
                 "ok": not self.failed,
-                "cases": self.cases,
-                "passed": self.passed,
-                "refused": self.refused,
+                **self.counts,
                 "failed": self.failed,
                 "families": {f.family.name: f.to_dict() for f in self.families},
                 "time": {"total": sum(f.seconds for f in self.families)},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -16,7 +16,7 @@ from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.diagnosis import diagnose
 from softgrasp.lqr.lowrank.newton import NewtonADI
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, textbook, thin
 from softgrasp.study.hardcases.exact import exact_gain, worst_part_error
 
@@ -37,44 +37,24 @@ def problem_of(*more: str, beta: float = 0.002) -> RiccatiProblem:
     return make_problem(make("paper_lqr", "tissue.cells=[2, 4]", damping, *more))
 
 
-def gain_of(solution: RiccatiSolution) -> Array:
-    """K, (m, states), of a solution of one rank."""
-    return np.hstack([solution.gain.K_s, solution.gain.K_z.T, solution.gain.K_v.T])
-
-
-def dense(problem: RiccatiProblem) -> Array:
-    """Diagnose and solve densely; the gain.
-
-    Raises:
-        ControlError, SolverError: there is no gain, or none within the tolerance.
-    """
-    diagnose(problem).require()
-    return gain_of(DenseRiccati().solve(problem))
-
-
-def low_rank(problem: RiccatiProblem) -> Array:
-    """The same by Newton's method with low-rank ADI.
-
-    Raises:
-        ControlError, SolverError: there is no gain, or none within the tolerance.
-    """
-    diagnose(problem).require()
-    return gain_of(NewtonADI(tol=TOLERANCE).solve(problem))
-
-
-SOLVERS: dict[str, tuple[Callable[[RiccatiProblem], Array], float]] = {
-    "dense": (dense, DENSE),
-    "low rank": (low_rank, LOW_RANK),
+# solver and bound of each way
+SOLVERS: dict[str, tuple[DenseRiccati | NewtonADI, float]] = {
+    "dense": (DenseRiccati(), DENSE),
+    "low rank": (NewtonADI(tol=TOLERANCE), LOW_RANK),
 }
+
+
+def gain(way: str, problem: RiccatiProblem) -> Array:
+    """K, (m, states), of one rank after the diagnosis; ControlError or SolverError where there is none."""
+    diagnose(problem).require()
+    K = SOLVERS[way][0].solve(problem).gain
+    return np.hstack([K.K_s, K.K_z.T, K.K_v.T])
 
 
 def scipy_error(problem: RiccatiProblem, exact: Array | None, pencil: bool = False) -> Outcome:
     """SciPy's solver, which balances, on x' = E^{-1}A x + E^{-1}B u of the paper; error of its gain.
 
-    Args:
-        problem: the control problem.
-        exact: the gain to compare with; None when there is none, and the answer is where the closed loop's poles lie.
-        pencil: hand over E as it is, as the solver also allows.
+    Without ``exact`` there is no gain, and the answer is where the closed loop's poles lie. ``pencil`` hands over E.
     """
     (E, A, B, C), T = paper_form(problem), problem.system.T
     E, A, H = E.toarray(), A.toarray(), C.T @ problem.Q @ C
@@ -109,8 +89,8 @@ def gain_rows(
     exact = exact_gain(problem)
     scipy_ = both_ways(problem, exact)
     for group in solvers:
-        solve, bound = SOLVERS[group]
-        error = here(lambda: worst_part_error(solve(problem), exact, problem.layout.n_s))  # noqa: B023  (called at once)
+        bound = SOLVERS[group][1]
+        error = here(lambda: worst_part_error(gain(group, problem), exact, problem.layout.n_s))  # noqa: B023  (at once)
         case, group = (f"{name}, {group}", group) if len(solvers) > 1 else (name, "")
         yield HardCase(case, x, error, scipy_, bound, REASONS[bound] + note, may_refuse=bool(note), group=group)
 
@@ -146,14 +126,14 @@ def output_rows(quick: bool) -> Iterator[HardCase]:
     for i, (name, case, refuse) in enumerate(cases[::2] if quick else cases):
         if refuse:
             reason = "there is no stabilising feedback, or no minimum"
-            yield HardCase(name, i + 1, here(gain_size, dense, case), both_ways(case, None), None, reason)
+            yield HardCase(name, i + 1, here(gain_size, "dense", case), both_ways(case, None), None, reason)
         else:
             yield from gain_rows(name, i + 1, case, solvers=("dense",))
 
 
-def gain_size(solver: Callable[[RiccatiProblem], Array], problem: RiccatiProblem) -> float:
+def gain_size(way: str, problem: RiccatiProblem) -> float:
     """Size of a gain that ought to have been refused."""
-    return float(np.linalg.norm(solver(problem)))
+    return float(np.linalg.norm(gain(way, problem)))
 
 
 # --- damping
@@ -168,7 +148,7 @@ def lqr_damping_rows(quick: bool) -> Iterator[HardCase]:
     if not quick:
         undamped.append(("paper_lqr_undamped, 880 states", make_problem(make("paper_lqr_undamped"))))
     for name, case in undamped:
-        answer = here(gain_size, low_rank, case)
+        answer = here(gain_size, "low rank", case)
         yield HardCase(name, 0.0, answer, textbook(scipy_error, case, None), None, reason, group="low rank")
 
 

@@ -23,11 +23,7 @@ FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for fam
 
 
 def choose(family: str | None) -> list[Family]:
-    """The families to run.
-
-    Raises:
-        SoftgraspError: there is no family of this name.
-    """
+    """The families to run. Raises SoftgraspError: there is no family of this name."""
     if family is None:
         return list(FAMILIES.values())
     if family not in FAMILIES:
@@ -47,11 +43,7 @@ def run_hardcases(
 ) -> dict[str, Any]:
     """Run the cases, print one table a family, and write result.json, hardcases.csv, pictures and report.html.
 
-    Returns:
-        What result.json holds; ``ok`` tells whether every promise is kept.
-
-    Raises:
-        SoftgraspError: the family is unknown, or the command was started under mpiexec.
+    Raises SoftgraspError: the family is unknown, or the command was started under mpiexec.
     """
     if MPI.COMM_WORLD.size > 1:
         raise SoftgraspError("hardcases starts the ranks that it needs by itself; run it without mpiexec")

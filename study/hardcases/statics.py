@@ -27,11 +27,7 @@ COLUMN = ("tissue.size=[1.0, 2.0]", "contact={sides=['top']}", "effects={gravity
 
 
 def static(model: Model) -> Array:
-    """Displacement under gravity with the residual checked, all dofs of one rank.
-
-    Raises:
-        SolverError: the stiffness is singular or the residual is too large.
-    """
+    """Displacement under gravity with the residual checked, all dofs of one rank."""
     name, _ = choose_solver(model.system.layout)
     return equilibrium(model.system, name, model.scene.time)
 

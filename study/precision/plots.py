@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import Formatter, LogLocator
 
-from softgrasp.reduction.registry import METHODS
+from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, WIDTH, paper_style, save
 from softgrasp.study.precision.fit import Slope, error_of, pareto, seconds_of, series_of, usable
 from softgrasp.study.precision.forward import on_meshes, over_steps

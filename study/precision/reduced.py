@@ -18,14 +18,14 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.reduction.engines import ENGINES, EngineName, Factor, factor, small_svd
+from softgrasp.reduction.bases.engines import ENGINES, EngineName, Factor, factor, small_svd
+from softgrasp.reduction.bases.registry import METHODS, possible_sizes
+from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper, prepared, run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator
-from softgrasp.reduction.registry import METHODS, possible_sizes
 from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs
-from softgrasp.reduction.states import States
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint

@@ -18,7 +18,7 @@ from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
-from softgrasp.reduction.engines import ENGINES
+from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
 from softgrasp.study.precision.balance import companion, error_budget
 from softgrasp.study.precision.cache import Cache, Guard

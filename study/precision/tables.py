@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.reduction.registry import METHODS
+from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.precision.fit import pareto
 from softgrasp.study.precision.points import (

@@ -23,6 +23,7 @@ from softgrasp.reduction.certified.motion import Drive, Materials
 
 KEYS = ("lambda", "mu", "rho")
 FINER = 8  # steps for one, of the runs that tell the error of the step
+ROUNDING = 1e-9  # of the time of a move
 MOST = 1_000_000  # steps of a run, which stands in memory as a whole
 
 
@@ -120,6 +121,8 @@ def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None
     if motion is None and dt is None:
         return own
     times, columns, rates, end = _table(model, own, motion)
+    if dt is not None and dt > end * (1 + ROUNDING):
+        raise SceneError(f"--dt {dt:g}: the step is longer than the whole move of {end:g} s; give less")
     if dt is not None and end > MOST * dt:
         raise SceneError(f"--dt {dt:g}: a run of {end:g} s takes at most {MOST} steps; give {end / MOST:.3g} s or more")
     steps = max(1, round(end / (dt or own.dt)))

@@ -67,6 +67,9 @@ def run_query(
         raise SceneError(f"--fallback {fallback}: the only model to fall back on is full")
     if tolerance is not None and not tolerance > 0:
         raise SceneError(f"--tolerance {tolerance:g}: the largest relative error must be positive, for example 1e-2")
+    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):
+        why = "it is a folder" if out.is_dir() else f"there is no folder {out.parent}"
+        raise SceneError(f"--csv {out}: {why}; name a file in a folder that is there")
     own = parse_settings(settings)
     asked = [own] if batch is None else [{**own, **row} for row in read_batch(batch)]
     if not h5py.is_hdf5(path):

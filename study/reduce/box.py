@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.replay import FullRun, comparison_of, replay
-from softgrasp.reduction.states import States
+from softgrasp.reduction.replay import FullRun, comparison_of, replay_linear
 from softgrasp.study.reduce.result import COMPARED, LARGER, Box, BoxErrors, BoxPoint, Sweep, TestedModel, nearest
 from softgrasp.study.reduce.sweep import bases_of
 
@@ -51,7 +51,7 @@ def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]
     errors = []
     for m in models:
         with np.errstate(all="ignore"):  # may be unstable away from the training parameter
-            reduced = replay(m.model, full.model, full, allow_unstable=True)
+            reduced = replay_linear(m.model, full.model, full, allow_unstable=True)
             small = m.model.at(full.model.system.materials)
             errors.append(comparisons[m.family].state_error("deformation", m.model, small, reduced))
     return tuple(errors)

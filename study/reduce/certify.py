@@ -12,7 +12,6 @@ from rich.progress import TaskProgressColumn
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.certificate import MeshNumber
@@ -63,10 +62,11 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     """
     model, file, console = session.model(scene), session.out / "models" / FILE, session.console
     watch, tolerance = Stopwatch(session.comm), scene.reduction.tolerance
-    state, Phi = _earlier(model, file)
+    earlier = _earlier(model, file)
+    state = None if earlier is None else state_of(earlier)
     if state is not None:
         console.print(f"going on from round {len(state.rounds)} in {file}", soft_wrap=True, markup=False)
-    trainer = Trainer(model, Phi)
+    trainer = Trainer(model, earlier)
     count = scene.reduction.grid
     about = f"trained in lambda {_range(trainer.box.lam)} and mu {_range(trainer.box.mu)} on {count} x {count} points"
     console.print(about, soft_wrap=True, markup=False)
@@ -129,18 +129,15 @@ def _range(pair: tuple[float, float]) -> str:
     return f"{pair[0]:.4g} to {pair[1]:.4g} Pa"
 
 
-def _earlier(model: Model, file: Path) -> tuple[Greedy | None, Array | None]:
-    """State and modes of an interrupted or coarser training of the same scene, if the folder has one. Collective."""
+def _earlier(model: Model, file: Path) -> CertifiedModel | None:
+    """An interrupted or coarser training of the same scene, if the folder has one. Collective."""
     if not model.system.layout.comm.bcast(file.exists()):
-        return None, None
+        return None
     try:
         old = load_certified(file, model.system.layout)
     except ModelError:
-        return None, None
-    if old.training.get("key") != train_key(model) or old.fine.lift is None:
-        return None, None
-    hand = 2 * model.system.layout.n_s
-    return state_of(old), old.fine.lift.L_q[:, hand : hand + old.k2]
+        return None
+    return old if old.training.get("key") == train_key(model) and old.fine.lift is not None else None
 
 
 def _mesh(model: Model, trainer: Trainer, certified: CertifiedModel) -> MeshNumber | None:
@@ -242,6 +239,8 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
     if share > tolerance:
         result_line += f" That is above the tolerance {tolerance:g}: runs above it are refused."
     lines = [result_line, f"The greedy stopped after {len(about['rounds'])} rounds: {REASONS[about['reason']]}."]
+    if added := len(about["added"]):
+        lines.append(f"Of the random parameters {added} had a larger bound than the grid and were trained on too.")
     if "validation" in about:
         v = Validation(**about["validation"])
         lines.append(

@@ -7,7 +7,7 @@ from itertools import groupby
 
 import numpy as np
 
-from softgrasp.reduction.registry import PAPER_METHODS, PAPER_PLAIN
+from softgrasp.reduction.bases.registry import PAPER_METHODS, PAPER_PLAIN
 from softgrasp.study.reduce.result import COMPARED, Point, Sweep
 
 MEASURES = (

@@ -15,8 +15,8 @@ from matplotlib.patches import Patch
 from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.registry import PAPER_METHODS
-from softgrasp.reduction.replay import FullRun, replay
+from softgrasp.reduction.bases.registry import PAPER_METHODS
+from softgrasp.reduction.replay import FullRun, replay_linear
 from softgrasp.study.pictures.animation import Film, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, segments
 from softgrasp.study.pictures.shapes import seen, shadow, speed_up
@@ -125,7 +125,7 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views |
     for s, i in compared(sweeps):
         point, reduced = s.points[i], s.models[i]
         with np.errstate(all="ignore"):  # an unstable model may overflow
-            motion = replay(reduced, model, run, allow_unstable=True)
+            motion = replay_linear(reduced, model, run, allow_unstable=True)
             z, _ = reduced.reconstruct(reduced.at(), motion.x[steps].T, motion.v_s[steps].T)
         states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
         if states is not None:

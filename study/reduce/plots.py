@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from softgrasp.reduction.registry import PAPER_METHODS
+from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.study.pictures.style import (
     BLUE,
     COLUMN,

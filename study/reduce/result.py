@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from softgrasp.reduction.bases.registry import Method
 from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.registry import Method
 from softgrasp.reduction.replay import FullRun
 
 COMPARED = 14  # N at which methods are compared: the paper's

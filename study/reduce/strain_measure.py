@@ -12,7 +12,7 @@ from scipy.stats import qmc
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.compare import Reference, errors_of, reference_of
@@ -168,7 +168,7 @@ def _measure(
 ) -> StrainPoint:
     """Errors on training runs and on held-out ones, drift, times."""
     pairs = list(zip(training.references, training.runs, strict=True))
-    done = [replay_strain(rom, run.model, run, outside=True) for _, run in pairs]
+    done = [replay_strain(rom, run, outside=True) for _, run in pairs]
     trained = errors_of([r.missed(x.a, x.v) for (r, _), x in zip(pairs, done, strict=True)])
     own = training.references[0].errors(done[0].a, done[0].v)
     worst = {kind: _worst(rom, kind, held, references) for kind in ("material", "motion")}
@@ -195,7 +195,7 @@ def _worst(rom: StrainModel, kind: str, held: Sequence[Held], references: Sequen
 def _error(rom: StrainModel, held: Held, reference: Reference) -> float | None:
     """Error in z on a held-out run; None where the model refuses it or fails."""
     try:
-        run = replay_strain(rom, held.full.model, held.full)
+        run = replay_strain(rom, held.full)
     except (ReductionError, SolverError):
         return None
     return reference.errors(run.a, run.v).z

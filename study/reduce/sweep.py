@@ -11,12 +11,8 @@ from mpi4py import MPI
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.scene.control import Reduction
-from softgrasp.reduction.basis import Basis
-from softgrasp.reduction.errors import Comparison
-from softgrasp.reduction.model import ModelError, ReducedModel
-from softgrasp.reduction.online import run
-from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import (
+from softgrasp.reduction.bases.basis import Basis
+from softgrasp.reduction.bases.registry import (
     METHODS,
     PAPER_METHODS,
     find_method,
@@ -24,9 +20,13 @@ from softgrasp.reduction.registry import (
     make_bases,
     possible_sizes,
 )
+from softgrasp.reduction.bases.states import BasisError, States
+from softgrasp.reduction.bases.truncation import Truncation
+from softgrasp.reduction.errors import Comparison
+from softgrasp.reduction.model import ModelError, ReducedModel
+from softgrasp.reduction.online import run
+from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs
-from softgrasp.reduction.states import BasisError, States
-from softgrasp.reduction.truncation import Truncation
 from softgrasp.study.reduce.result import Point, Sweep, kept_points
 from softgrasp.study.shell.timing import median_seconds
 

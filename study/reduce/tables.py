@@ -8,7 +8,7 @@ from dataclasses import astuple, fields
 
 import numpy as np
 
-from softgrasp.reduction.registry import METHODS
+from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.study.reduce.result import COMPARED, Box, Point, ReductionStudy, Speed, Sweep, nearest
 from softgrasp.study.report.tables import Table
 

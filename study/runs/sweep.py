@@ -21,8 +21,8 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.model import ReducedModel
-from softgrasp.reduction.reduce import reduce
-from softgrasp.reduction.replay import errors, replay
+from softgrasp.reduction.reduce import reduce_linear
+from softgrasp.reduction.replay import errors_linear, full_run, replay_linear
 
 Row = dict[str, Any]
 METHOD = "craig_bampton"  # needs no snapshots of the other values, and is stable at all of them
@@ -130,15 +130,15 @@ class Runner:
         if self.rom is None:
             first = self.at(self.sweep.scene({}))
             self.base = simulate(first)
-            self.rom = reduce(first, self.base, METHOD, N)
+            self.rom = reduce_linear(first, [full_run(first, self.base)], METHOD, N)
         model = self.at(scene)
         if self.base is None or not only_material(self.sweep.scene({}), scene):
             raise SceneError(f"--reduced {N}: the reduced model is affine in tissue.material only; sweep its keys")
         begin = MPI.Wtime()
-        small = replay(self.rom, model, self.base)
+        small = replay_linear(self.rom, model, self.base)
         row = {**values, **_outputs(self.base, small.outputs), "seconds": MPI.Wtime() - begin, "error": None}
         if judged:
-            row["error"] = float(errors(self.rom, small, model, simulate(model)).error_deformation)
+            row["error"] = float(errors_linear(self.rom, small, full_run(model, simulate(model))).error_deformation)
         return row
 
 

@@ -16,7 +16,7 @@ from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory, run
 from softgrasp.reduction.projection import project

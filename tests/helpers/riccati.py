@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.dense.small_care import ReducedMatrices
 from softgrasp.lqr.design.scene import problem as make_problem
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from tests.helpers.models import CUBE, LAYERS, gather_rows, make_scene
 
@@ -74,3 +78,17 @@ def factor(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
 def x_error(problem: RiccatiProblem, ours: RiccatiSolution, theirs: RiccatiSolution) -> float:
     a, b = factor(problem, ours), factor(problem, theirs)
     return float(np.linalg.norm(a @ a.T - b @ b.T, 2) / np.linalg.norm(b @ b.T, 2))
+
+
+def hand_start(problem: RiccatiProblem, displacement: Sequence[float] | Array) -> Block:
+    """Whole body at rest, displaced rigidly by hand coordinates [m, rad], (n_s,), as one column."""
+    n_s = problem.layout.n_s
+    hand = np.zeros((2 * n_s, 1))
+    hand[:n_s, 0] = displacement
+    return Block(hand, np.zeros((2 * problem.layout.n_local, 1)))
+
+
+def closed_loop(m: ReducedMatrices, P_N: Array) -> Array:
+    """Eigenvalues of the reduced closed loop."""
+    K = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
+    return np.asarray(scipy.linalg.eigvals(np.linalg.solve(m.E, m.A + m.B @ K)))

@@ -12,10 +12,10 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.reduction.basis import Basis
-from softgrasp.reduction.inner import InnerName
-from softgrasp.reduction.registry import METHODS
-from softgrasp.reduction.states import States, states_of
+from softgrasp.reduction.bases.basis import Basis
+from softgrasp.reduction.bases.inner import InnerName
+from softgrasp.reduction.bases.registry import METHODS
+from softgrasp.reduction.bases.states import States, states_of
 from tests.helpers.models import Array, gather_matrix, gather_rows, make_scene
 
 SNAPSHOT_METHODS = [key for key, method in METHODS.items() if method.snapshots]

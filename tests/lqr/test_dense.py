@@ -41,8 +41,6 @@ from tests.helpers.models import (
     reference,
 )
 
-pytestmark = pytest.mark.ranks
-
 EPS = np.finfo(float).eps
 Example = tuple[Array, Array, Array, Array, Array, Array]  # A, B, C, Q, R, X
 
@@ -120,6 +118,7 @@ EXAMPLES: list[tuple[str, Callable[[], Example], float]] = [  # of X: 1e-14 is 4
 ]
 
 
+@pytest.mark.serial
 def test_carex_with_known_solution() -> None:
     for name, example, tolerance in EXAMPLES:
         A, B, C, Q, R, X = example()
@@ -131,6 +130,7 @@ def test_carex_with_known_solution() -> None:
         assert all((copy == M).all() for M, copy in zip((A, B, C, Q, R), copies, strict=True)), name
 
 
+@pytest.mark.serial
 def test_carex_2_5_indefinite_constant_term() -> None:
     for e in (1.0, 1e-2, 1e-4):
         A, B = _a([[3 - e, 1], [4, 2 - e]]), np.ones((2, 1))
@@ -142,12 +142,14 @@ def test_carex_2_5_indefinite_constant_term() -> None:
         care(A, B, np.eye(2), H, np.eye(1))
 
 
+@pytest.mark.serial
 def test_carex_2_5_on_the_axis_is_refused() -> None:
     A, B = _a([[3, 1], [4, 2]]), np.ones((2, 1))
     with pytest.raises(ControlError, match="on the imaginary axis to working precision"):
         riccati_schur(A, B @ B.T, _a([[-11, -5], [-5, -2]]))
 
 
+@pytest.mark.serial
 def test_carex_4_1_chain_of_integrators() -> None:
     n = 21
     A, one = np.diag(np.ones(n - 1), 1), np.eye(n)
@@ -156,6 +158,7 @@ def test_carex_4_1_chain_of_integrators() -> None:
     assert found.backward < 1e-13  # eps n^2
 
 
+@pytest.mark.serial
 def test_carex_4_3_springs() -> None:
     """A free chain of masses: the rigid motion is a zero eigenvalue, as the hand's is."""
     k = 30
@@ -171,6 +174,7 @@ def test_carex_4_3_springs() -> None:
     assert np.linalg.eigvalsh(found.X)[0] > 0
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("seed", range(2))
 def test_random_with_descriptor_against_scipy(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -208,6 +212,7 @@ def triple_chain(k: int, alpha: float, beta: float) -> tuple[Array, Array, Array
     return E, A, np.vstack([np.zeros((n, 1)), np.ones((n, 1))]), np.hstack([np.ones((1, n)), np.zeros((1, n))])
 
 
+@pytest.mark.serial
 def test_triple_chain_oscillator() -> None:
     E, A, B, C = triple_chain(20, 0.002, 0.002)
     found = care(A, B, C, np.eye(1), np.eye(1), E)
@@ -230,6 +235,7 @@ REFUSED: list[tuple[str, dict[str, Array], str]] = [
 ]
 
 
+@pytest.mark.serial
 def test_refused_with_one_sentence() -> None:
     data = {"A": np.diag([1.0, -2]), "B": np.ones((2, 1)), "C": np.ones((1, 2)), "Q": np.eye(1), "R": np.eye(1)}
     care(**data)
@@ -239,6 +245,7 @@ def test_refused_with_one_sentence() -> None:
         assert re.search(message, str(caught.value)), name
 
 
+@pytest.mark.serial
 def test_undamped_oscillator_that_nothing_reaches() -> None:
     A = scipy.linalg.block_diag(_a([[0, 1], [-1, 0]]), -1.0)
     with pytest.raises(ControlError, match=r"eigenvalue 0\+1j"):
@@ -278,6 +285,7 @@ def gather_block(layout, X: Block) -> Array:  # type: ignore[no-untyped-def]
     return np.concatenate([X.hand[:n_s], q, X.hand[n_s:], v])
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize(("changes", "held"), [pytest.param(c, h, id=name) for name, c, h in PLANTS])
 def test_solution_in_the_papers_coordinates_against_scikit_fem(changes: list[dict], held: Callable) -> None:
     """Residual of P in E, A, B assembled by another code in absolute displacements, and K = -R^-1 B'PE."""

@@ -20,8 +20,6 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.models import close, gather_matrix, gather_rows, make_scene, same_everywhere
 
-pytestmark = pytest.mark.ranks
-
 SMALL = {"tissue": {"cells": [3, 6]}}
 
 
@@ -146,6 +144,7 @@ def test_an_output_without_weight_is_a_warning() -> None:
     assert sentences(found, "warning") == ["control.Q gives no weight to grip_x: the cost ignores it"]
 
 
+@pytest.mark.ranks
 def test_a_nan_on_one_rank_is_told_on_all() -> None:
     problem = make(damped(0.002))
     bad = problem.C_z.copy()

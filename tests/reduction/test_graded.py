@@ -12,8 +12,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.errors import row_weights
-from softgrasp.reduction.reduce import reduce
-from softgrasp.reduction.replay import errors, replay
+from softgrasp.reduction.reduce import errors, reduce, replay
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.ranks

@@ -14,7 +14,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.basis import Basis
+from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.model import ModelError, ReducedModel, SmallModel, UnstableModelError
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project

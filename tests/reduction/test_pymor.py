@@ -9,8 +9,8 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array
+from softgrasp.reduction.bases.registry import METHODS, make_basis
 from softgrasp.reduction.online import run
-from softgrasp.reduction.registry import METHODS, make_basis
 from tests.helpers.models import close, first_order, gather_matrix, gather_rows, reference
 from tests.helpers.reduced import DAMPED, KINDS, dense_columns, model_of, reduced, small_of, symplectic_basis, wiggle
 from tests.helpers.snapshots import basis_halves, case, gap, halves

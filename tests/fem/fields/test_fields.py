@@ -17,8 +17,6 @@ from softgrasp.fem.fields.series import FullField, SeriesWriter
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.scene import Scene
 
-pytestmark = pytest.mark.ranks
-
 EXACT = 1e-14  # coordinates of order 1 times rounding
 
 
@@ -83,6 +81,7 @@ def test_relative_field_lands_on_its_nodes(comm: MPI.Intracomm, d: int, order: i
         np.testing.assert_allclose(two[1], -3 * expected, atol=3 * EXACT)
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("d", [2, 3])
 def test_picture_has_the_whole_body_once(comm: MPI.Intracomm, d: int) -> None:
     picture = gather_picture(make_model(comm, d, 1))
@@ -116,6 +115,7 @@ def test_picture_knows_the_layers(comm: MPI.Intracomm) -> None:
         np.testing.assert_array_equal(picture.layers, (height > 1.0).astype(int))
 
 
+@pytest.mark.ranks
 def test_full_field_updates_ghosts(comm: MPI.Intracomm) -> None:
     model, q = make_model(comm, 2, 2), hand_of(2)
     full = FullField(model)

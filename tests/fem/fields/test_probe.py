@@ -13,8 +13,6 @@ from softgrasp.fem.fields.probe import locate, make_probe
 from softgrasp.fem.model.build import Model, build
 from tests.helpers.models import Array, make_scene
 
-pytestmark = pytest.mark.ranks
-
 
 def model_of(comm: MPI.Intracomm, order: int, cells: tuple[int, ...] = (3, 7)) -> Model:
     tissue: dict[str, Any] = {"cells": list(cells), "order": order}
@@ -30,6 +28,7 @@ def field(order: int, X: Array) -> Array:
     return np.column_stack([value, -value])
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("order", [1, 2])
 def test_probe_is_exact_for_polynomials_of_its_order(comm: MPI.Intracomm, order: int) -> None:
     model = model_of(comm, order)

@@ -20,8 +20,6 @@ from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import note_of
 from tests.fem.fields.test_fields import EXACT, hand_of, make_model, turned
 
-pytestmark = pytest.mark.ranks
-
 SINGLE = 1e-6  # strains are kept as 4-byte numbers
 PARAVIEW = """
 from paraview.simple import PVDReader
@@ -130,6 +128,7 @@ def test_cauchy_stress_of_finite_strain(comm: MPI.Intracomm, law: str) -> None:
         np.testing.assert_allclose(strain, np.tile(green, (len(strain), 1)), atol=1e-14)
 
 
+@pytest.mark.ranks
 def test_meshio_reads_the_same(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     """A reader that is not VTK's; layers count in the order of the scene."""
     stiff = {"box": [[0.0, 0.0], [1.0, 0.8]], "material": {"young": 100.0, "poisson": 0.3, "rho": 1.0}}

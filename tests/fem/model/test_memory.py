@@ -14,8 +14,6 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import check_memory, free_bytes, need, simplices
 from tests.helpers.models import CUBE, make_scene
 
-pytestmark = pytest.mark.ranks
-
 GIB = 2.0**30
 
 
@@ -76,6 +74,7 @@ def test_cells_of_a_box_are_those_of_its_mesh(comm: MPI.Intracomm, table: dict[s
     assert simplices(scene.tissue.cells or []) == mesh.topology.index_map(d).size_global
 
 
+@pytest.mark.ranks
 def test_shares_of_the_nodes_add_up(comm: MPI.Intracomm) -> None:
     found = need(make_scene(), 2, 10**6, comm, run=True)
     assert found.of(1.0, comm.size) == found.mesh + found.factor + comm.size * found.tables

@@ -26,8 +26,6 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import LayerMaterial, tissue_matrices
 from tests.helpers.models import dof_order, gather_matrix, gather_rows, local_rows, make_scene
 
-pytestmark = pytest.mark.ranks
-
 Array = NDArray[np.float64]
 SIDES = {2: ["left", "right", "bottom", "top"], 3: ["x-", "x+", "y-", "y+", "z-", "z+"]}
 
@@ -68,6 +66,7 @@ def bent(mesh: TissueMesh, size: list[float]) -> TissueMesh:
     return mesh
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize(("size", "cells"), [([1.0, 0.7], [5, 4]), ([1.0, 0.7, 0.6], [3, 4, 3])])
 def test_patch(comm: MPI.Intracomm, size: list[float], cells: list[int], order: int) -> None:

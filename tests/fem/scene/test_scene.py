@@ -19,7 +19,7 @@ from softgrasp.fem.scene import materials
 from softgrasp.fem.scene.file import load_scene, load_scene_collective, resolved_toml, shipped_scenes
 from softgrasp.fem.scene.scene import check_dimension, scene_schema
 
-pytestmark = pytest.mark.ranks
+pytestmark = pytest.mark.ranks(1)  # nothing here knows of ranks, but the one test that says so
 
 SCENES = shipped_scenes()
 PAPER = SCENES["paper_forward"]
@@ -363,6 +363,7 @@ def test_scene_is_frozen() -> None:
         load_scene(PAPER).hand.mass = 1.0
 
 
+@pytest.mark.ranks
 def test_collective_load_agrees_on_scene_and_error() -> None:
     comm = MPI.COMM_WORLD
     scene = load_scene_collective(comm, PAPER, ["hand.mass=3"])

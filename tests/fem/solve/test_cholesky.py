@@ -22,8 +22,6 @@ from softgrasp.fem.solve.order import dissect
 from softgrasp.fem.solve.solvers import FEW_LIMIT, choose_solver, make_solver
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 
-pytestmark = pytest.mark.ranks
-
 UNEQUAL: dict[str, Any] = {"tissue": {"material": {"lambda": 90.0, "mu": 20.0, "rho": 1.0}}}
 SCENES = {"2d": [UNEQUAL], "3d": [UNEQUAL, CUBE], "p2": [UNEQUAL, {"tissue": {"order": 2}}]}
 # a block 1e6 times as stiff as the one it hangs from, lambda = 0
@@ -55,6 +53,7 @@ def kept_nonzeros(P: PETSc.Mat, ordering: str) -> float:
     return kept
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("name", SCENES)
 def test_order_moves_nodes_and_comes_back(comm: MPI.Intracomm, name: str) -> None:
     system = build(make_scene(*SCENES[name]), comm=comm).system
@@ -85,6 +84,7 @@ def test_order_keeps_the_factor_thin(comm: MPI.Intracomm) -> None:
     ksp.destroy()
 
 
+@pytest.mark.ranks
 @pytest.mark.parametrize("name", SCENES)
 def test_solves_agree_with_a_dense_solve_on_any_ranks(comm: MPI.Intracomm, name: str) -> None:
     system = build(make_scene(*SCENES[name]), comm=comm).system
@@ -201,6 +201,7 @@ def test_backward_error_is_that_of_the_matrix_solved_with(comm: MPI.Intracomm) -
     ksp.destroy()
 
 
+@pytest.mark.ranks
 def test_vanishing_pivot_is_named_on_every_rank(comm: MPI.Intracomm) -> None:
     system = build(make_scene(), comm=comm).system
     S = system.K_ee.copy()
@@ -209,6 +210,7 @@ def test_vanishing_pivot_is_named_on_every_rank(comm: MPI.Intracomm) -> None:
         make_solver(S, "cholesky", system.layout, "test_")
 
 
+@pytest.mark.ranks
 def test_state_and_vectors_held_whole_keep_the_same_bits(comm: MPI.Intracomm) -> None:
     system = build(make_scene(), comm=comm).system
     layout = system.layout
@@ -224,6 +226,7 @@ def test_state_and_vectors_held_whole_keep_the_same_bits(comm: MPI.Intracomm) ->
     midpoint.destroy()
 
 
+@pytest.mark.ranks
 def test_restart_file_holds_the_right_hand_side_in_the_order_of_the_layout(
     comm: MPI.Intracomm, mpi_tmp_path: Path
 ) -> None:

@@ -26,10 +26,8 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import hand_target, rest
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.bases.basis import ReductionError
 from tests.helpers.models import close, gather_rows, make_scene, same_everywhere
-
-pytestmark = pytest.mark.ranks
 
 Array = np.ndarray
 Q, R = 30.0, 0.5
@@ -191,6 +189,7 @@ def test_towards_moves_the_target_only(small: tuple[SmallPlant, Shapes, Array]) 
     assert (other.command(other.x_bar) == other.u_bar).all() or close(other.command(other.x_bar), other.u_bar) < 1e-12
 
 
+@pytest.mark.ranks
 def test_a_full_gain_survives_its_file(
     model: Model, problem: RiccatiProblem, small: tuple[SmallPlant, Shapes, Array], tmp_path_factory: Any
 ) -> None:
@@ -215,6 +214,7 @@ def test_a_full_gain_survives_its_file(
         load_gain(path, layout, scene_hash(other.scene))
 
 
+@pytest.mark.ranks
 def test_hash_knows_the_mesh_only(problem: RiccatiProblem) -> None:
     ours = layout_hash(problem.layout)
     soft = make_model(tissue={"material": {"lambda": 10.0, "mu": 5.0, "rho": 1.0}})

@@ -15,10 +15,11 @@ from softgrasp.lqr.loop.gap import DualityGap, duality_gaps
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import make_family
-from softgrasp.lqr.reduced.riccati import GainJudge, hand_start, reduce_riccati
+from softgrasp.lqr.reduced.riccati import GainJudge, reduce_riccati
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.loop import CASES, Setup, setup
 from tests.helpers.models import local_rows, make_scene, same_everywhere
+from tests.helpers.riccati import hand_start
 
 pytestmark = pytest.mark.ranks
 

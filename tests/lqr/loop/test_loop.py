@@ -22,8 +22,6 @@ from softgrasp.lqr.plant.target import hand_target, output_target, rest
 from tests.helpers.loop import CASES, Setup, aim, enumerate_input, plain_loop, setup
 from tests.helpers.models import close, gather_rows, gather_states, local_rows, same_everywhere
 
-pytestmark = pytest.mark.ranks
-
 Array = np.ndarray
 STEPS, END = 40, 4.0
 
@@ -42,6 +40,7 @@ def test_rest_is_rest(case: Setup) -> None:
     assert close(case.C @ x, target.y) < 1e-12  # rounding of one sum
 
 
+@pytest.mark.ranks
 def test_full_order_loop_is_the_dense_recursion(case: Setup) -> None:
     """SMW with columns made once equals the factored closed loop, also far from its optimum and with a coarse step."""
     target = hand_target(case.problem, aim(case))
@@ -116,6 +115,7 @@ def test_actuation_against_a_plain_loop(name: str, law: Actuation) -> None:
     loop.destroy()
 
 
+@pytest.mark.serial
 def test_implicit_input_with_limits_finds_the_only_solution() -> None:
     rng = np.random.default_rng(3)
     for _ in range(200):
@@ -215,6 +215,7 @@ def test_an_unreachable_output_is_refused() -> None:
         hand_target(case.problem, np.array([1.0]))
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize(
     ("law", "words"),
     [

@@ -21,8 +21,6 @@ from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, _responses, _R
 from tests.helpers.loop import CASES, Setup, aim, setup
 from tests.helpers.models import local_rows
 
-pytestmark = pytest.mark.ranks
-
 Array = np.ndarray
 MODES = 12  # of about 30
 LAWS = [Sampling(0.1, 1, False), Sampling(0.1, 1, True), Sampling(0.05, 8, True), Sampling(0.02, 20, False)]

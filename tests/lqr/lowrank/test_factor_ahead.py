@@ -18,7 +18,7 @@ from softgrasp.lqr.lowrank.factor_ahead import FactorsAhead
 from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue
 from tests.helpers.models import make_scene
 
-pytestmark = pytest.mark.ranks
+pytestmark = pytest.mark.serial
 
 SHIFTS = [-0.5 + 5j, -1.0, -0.7 + 9j, -0.2 + 2j, -3.0 + 40j]
 

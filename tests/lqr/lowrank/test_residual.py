@@ -15,8 +15,6 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import LAYERS, make_scene
 
-pytestmark = pytest.mark.ranks
-
 CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}], "Q": 7.0, "R": [[2.0, 0.5], [0.5, 1.0]]}}
 KELVIN = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.003}}}
 DRAG = {"effects": {"damping": {"kind": "rayleigh", "alpha": 0.3, "beta": 0.003, "drag": "space"}}}
@@ -50,6 +48,7 @@ def test_residual_of_any_z_is_the_dense_one(name: str) -> None:
     assert residual(problem, spread(problem, nothing)) == pytest.approx(1.0, rel=1e-12)  # C'QC over itself
 
 
+@pytest.mark.ranks
 def test_residual_sees_a_small_error() -> None:
     problem = make_problem(build(make_scene(CONTROL, KELVIN, tissue={"cells": [3, 6]}), comm=MPI.COMM_WORLD))
     found = DenseRiccati().solve(problem).factor

@@ -10,16 +10,15 @@ import typer
 from mpi4py import MPI
 from typer.testing import CliRunner
 
-from softgrasp.reduction.engines import ENGINES, EngineName, factor, small_svd
+from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, small_svd
 from softgrasp.study.bench import bases as bench_bases
 from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.bases import known_matrix, parse_shapes, right_down_to, spectrum_of
 from softgrasp.study.shell.processes import IN_MPI_JOB
 from tests.helpers.models import same_everywhere
 
-pytestmark = pytest.mark.ranks
 
-
+@pytest.mark.ranks
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("complex_valued", [False, True])
 def test_singular_values_are_right_down_to_the_stated_limit(
@@ -46,6 +45,7 @@ def test_shapes_of_the_benchmark() -> None:
         parse_shapes("10x100")
 
 
+@pytest.mark.ranks(2)
 def test_benchmark_measures_every_engine(comm: MPI.Intracomm) -> None:
     row = bench_bases.measure(900, 200, 1, comm)
     names = {"tsqr", "svd", "svd_all", "gram", "psd_tsqr", "psd_gram"}

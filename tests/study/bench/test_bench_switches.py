@@ -13,7 +13,7 @@ import softgrasp.lqr.lowrank.modal_start
 import softgrasp.reduction.online
 from softgrasp.study.bench import switches as bench_switches
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.switches import Row, start, table_of
+from softgrasp.study.bench.switches import Row, product, start, table_of
 from softgrasp.study.shell.processes import IN_MPI_JOB
 
 
@@ -26,6 +26,18 @@ def test_rows_compare_two_methods_and_leave_the_constants_alone(comm: MPI.Intrac
     assert rows[0].limit == f"FEW_MODES = {before[0]}"
     assert before == (softgrasp.lqr.lowrank.modal_start.FEW_MODES, softgrasp.reduction.online.TOGETHER)
     assert len(table_of(rows).rows) == 4
+
+
+@pytest.mark.serial
+def test_products_are_measured_beside_scipy_and_petsc_by_rows_and_by_columns(
+    comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes = iter(([2, 4], [3, 6]))
+    monkeypatch.setattr(bench_switches, "cells_for", lambda d, size: next(sizes))
+    rows = list(product(comm, 1, False))
+    assert len(rows) == 2 * 3 * 2 * 2
+    assert {row.switch for row in rows} == {"product, SciPy", "product, PETSc"}
+    assert all(row.first > 0 and row.second > 0 for row in rows)
 
 
 @pytest.mark.serial

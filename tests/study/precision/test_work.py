@@ -24,7 +24,7 @@ from softgrasp.fem.fields.probe import make_probe
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene_collective
-from softgrasp.reduction.engines import ENGINES
+from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision import full as wp_full
 from softgrasp.study.precision import meshes as wp_meshes
 from softgrasp.study.precision import plots as work_plots

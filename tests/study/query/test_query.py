@@ -264,12 +264,15 @@ def test_files_that_make_no_sense(file: Path, tmp_path: Path) -> None:
         ask(other)
     with pytest.raises(SceneError, match="--fallback"):
         ask(file, fallback="none")
+    for out, words in ((tmp_path / "no" / "answer.csv", "there is no folder"), (tmp_path, "it is a folder")):
+        with pytest.raises(SceneError, match=f"--csv .*{words}"):
+            ask(tmp_path / "none.h5", out=out)  # before the model is looked at
     alone = tmp_path / "a" / "b" / "certified.h5"
     alone.parent.mkdir(parents=True)
     alone.write_bytes(file.read_bytes())
     with pytest.raises(SceneError, match=r"no scene\.toml"):
         ask(alone, tolerance=1e-9, fallback="full")
-    with pytest.raises(SoftgraspError, match="another mesh"):
+    with pytest.raises(SoftgraspError, match="belongs to a mesh of"):
         ask(file, tolerance=1e-9, fallback="full", scene=SCENES / "paper_forward.toml")
 
 
@@ -277,6 +280,9 @@ def test_a_step_that_no_memory_holds_is_refused() -> None:
     for dt in (1e-300, 1e-7):
         with pytest.raises(SceneError, match=r"at most 1000000 steps; give 3e-06 s or more"):
             drive_of(made()[1], dt=dt)
+    with pytest.raises(SceneError, match=r"--dt 1e\+09: the step is longer than the whole move of 3 s"):
+        drive_of(made()[1], dt=1e9)
+    assert drive_of(made()[1], dt=3.0).steps == 1
 
 
 def test_the_command_line(file: Path) -> None:

@@ -19,11 +19,11 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.reduction.archive import load
+from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_bases
+from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.parameters import grid_of, outside, training_of, training_states
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import METHODS, PAPER_METHODS, make_bases
-from softgrasp.reduction.replay import FullRun, full_run, replay
-from softgrasp.reduction.states import BasisError, States
+from softgrasp.reduction.replay import FullRun, full_run, replay_linear
 from softgrasp.study.reduce.box import box_models, measure_box
 from softgrasp.study.reduce.pictures import gather_views, instants
 from softgrasp.study.reduce.result import FullTimes
@@ -132,7 +132,7 @@ def dense_error(against: FullRun, name: str, N: int) -> tuple[float, float]:
     swept = sweep(name, against, wanted(against, [N]))
     model = swept.models[0]
     reduced = model.at()
-    found = replay(model, against.model, against, allow_unstable=True)
+    found = replay_linear(model, against.model, against, allow_unstable=True)
     T, G = gather_rows(layout, system.T), gather_rows(layout, system.G)
     M = gather_matrix(layout, system.M_ee)
 
@@ -307,7 +307,7 @@ def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: FullRun)
     assert again.N == 20  # the best stable model, with the hand's columns
     assert again.split == (16,)
     assert (
-        np.abs(replay(again, small.model, small).outputs - small.trajectory.outputs).max() < 1e-2
+        np.abs(replay_linear(again, small.model, small).outputs - small.trajectory.outputs).max() < 1e-2
     )  # m, of a way of 5 m
 
 

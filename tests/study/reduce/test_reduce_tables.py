@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from softgrasp.reduction.registry import METHODS, PAPER_METHODS
+from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.result import Point, Sweep, best, kept_points, nearest
 from softgrasp.study.reduce.sweep import FURTHER, chosen_methods

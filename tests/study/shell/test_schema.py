@@ -14,7 +14,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene import materials
 from softgrasp.fem.scene.control import BASES
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
-from softgrasp.reduction.registry import METHODS
+from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.study.cli import app
 
 pytestmark = pytest.mark.serial

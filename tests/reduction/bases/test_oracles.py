@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softgrasp.reduction.inner import INNERS, InnerName
-from softgrasp.reduction.registry import METHODS, make_basis
+from softgrasp.reduction.bases.inner import INNERS, InnerName
+from softgrasp.reduction.bases.registry import METHODS, make_basis
 from tests.helpers.models import Array
 from tests.helpers.snapshots import (
     Case,

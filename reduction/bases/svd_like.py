@@ -9,8 +9,8 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root
-from softgrasp.reduction.engines import EPS
-from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.bases.engines import EPS
+from softgrasp.reduction.bases.states import BasisError
 
 # eigenvalues of X'JX carry an absolute error eps * |X|^2: a stage takes those that keep about ten digits
 STAGE = 1e-6

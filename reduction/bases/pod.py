@@ -10,11 +10,11 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root
-from softgrasp.reduction.basis import Coordinates
-from softgrasp.reduction.engines import EngineName, Factor, factor, small_svd
-from softgrasp.reduction.inner import InnerName, Rows, Weight, weights
-from softgrasp.reduction.states import BasisError, Blocks, States
-from softgrasp.reduction.truncation import Columns, Part
+from softgrasp.reduction.bases.basis import Coordinates
+from softgrasp.reduction.bases.engines import EngineName, Factor, factor, small_svd
+from softgrasp.reduction.bases.inner import InnerName, Rows, Weight, weights
+from softgrasp.reduction.bases.states import BasisError, Blocks, States
+from softgrasp.reduction.bases.truncation import Columns, Part
 
 Halves = list[tuple[Array, Array]]
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.bases.states import BasisError
 
 PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Equally many basis columns in the row blocks of :class:`softgrasp.reduction.basis.Basis`."""
+    """Equally many basis columns in the row blocks of :class:`softgrasp.reduction.bases.basis.Basis`."""
 
     s_q: Array
     s_p: Array
@@ -38,7 +38,7 @@ class Part:
         rank: number of units that are more than noise.
         columns: makes the leading k units; one set of columns per half of the pair. Collective.
         scale: power of two taken out of sigma, so that squares neither overflow nor vanish.
-        rate: weight c between displacement and momentum, see `reduction.inner`.
+        rate: weight c between displacement and momentum, see `reduction/bases/inner.py`.
     """
 
     title: str

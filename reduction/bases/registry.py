@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.basis import Basis, Coordinates, Frame, Structure
-from softgrasp.reduction.craig_bampton import craig_bampton_parts
-from softgrasp.reduction.engines import EngineName
-from softgrasp.reduction.inner import INNERS, InnerName
-from softgrasp.reduction.pod import Request, componentwise_parts, joint_parts
-from softgrasp.reduction.psd import complex_svd_parts, cotangent_lift_parts, svd_like_parts
-from softgrasp.reduction.states import BasisError, Blocks, States
-from softgrasp.reduction.truncation import PAPER_ENERGY, Columns, Part, Truncation, counts_of
+from softgrasp.reduction.bases.basis import Basis, Coordinates, Frame, Structure
+from softgrasp.reduction.bases.craig_bampton import craig_bampton_parts
+from softgrasp.reduction.bases.engines import EngineName
+from softgrasp.reduction.bases.inner import INNERS, InnerName
+from softgrasp.reduction.bases.pod import Request, componentwise_parts, joint_parts
+from softgrasp.reduction.bases.psd import complex_svd_parts, cotangent_lift_parts, svd_like_parts
+from softgrasp.reduction.bases.states import BasisError, Blocks, States
+from softgrasp.reduction.bases.truncation import PAPER_ENERGY, Columns, Part, Truncation, counts_of
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Method:
         paper: what the paper calls it, None for those beyond it.
         preserving: the reduced model keeps the Hamiltonian or the second-order structure.
         build: makes the parts from the snapshots.
-        coordinates, frame, structure: of the basis, see :class:`softgrasp.reduction.basis.Basis`.
+        coordinates, frame, structure: of the basis, see :class:`softgrasp.reduction.bases.basis.Basis`.
         fixed: the hand's unit columns are kept apart from the decomposition.
         pairs: units are pairs of columns, so N is even.
         snapshots: whether it needs any.

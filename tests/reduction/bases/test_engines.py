@@ -8,10 +8,10 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import on_root, total
-from softgrasp.reduction.engines import ENGINES, EngineName, factor, magnitude, small_svd
-from softgrasp.reduction.states import BasisError
-from softgrasp.reduction.svd_like import balanced, form, svd_like_pairs
-from softgrasp.reduction.truncation import Columns, Part, Truncation, allocate, counts_of, needed
+from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, magnitude, small_svd
+from softgrasp.reduction.bases.states import BasisError
+from softgrasp.reduction.bases.svd_like import balanced, form, svd_like_pairs
+from softgrasp.reduction.bases.truncation import Columns, Part, Truncation, allocate, counts_of, needed
 from tests.helpers.models import Array, close, same_everywhere
 
 pytestmark = pytest.mark.ranks

@@ -16,6 +16,7 @@ from softgrasp.fem.petsc import times_columns, total
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.greedy import Greedy, greedy, start
 from softgrasp.reduction.certified.trainer import (
+    ADDED,
     Trainer,
     build_certified,
     mesh_number,
@@ -128,8 +129,7 @@ def test_a_training_goes_on_from_its_file(comm: MPI.Intracomm, mpi_tmp_path: Any
     save_certified(coarse, mpi_tmp_path / "model.h5")
     old = load_certified(mpi_tmp_path / "model.h5", model.system.layout)
     assert old.training["key"] == train_key(model)
-    hand = 2 * model.system.layout.n_s
-    again = Trainer(model, old.fine.lift.L_q[:, hand : hand + old.k2])
+    again = Trainer(model, old)
     finer = build_certified(again, 0.1, state_of(old))
     _, other, whole = trained(comm, 0.1)
     assert finer.training["chosen"] == whole.training["chosen"]
@@ -158,6 +158,21 @@ def test_unit_motions_train_for_every_direction(comm: MPI.Intracomm) -> None:
         motions_of(build(make_scene(unit, {"motion": {"target": None, "profile": "hold"}}), comm=comm))
     one.destroy()
     both.destroy()
+
+
+@pytest.mark.serial
+def test_random_parameters_above_the_grid_are_trained_too(comm: MPI.Intracomm) -> None:
+    """One point of the grid alone leaves its box uncovered; the random ones that show it join the training."""
+    one: dict[str, Any] = {"reduction": {**BOX["reduction"], "grid": 1, "certify": "proof"}}
+    _, trainer, certified = trained(comm, 0.3, one)
+    count = len(certified.training["added"])
+    assert certified.training["reason"] == "tolerance"
+    assert 0 < count < ADDED
+    assert len(trainer.points) == 1 + count
+    assert certified.training["proved"] <= 0.3
+    last = certified.training["rounds"][-1]
+    assert last["bound"] <= 0.3
+    trainer.destroy()
 
 
 @pytest.mark.serial

@@ -11,13 +11,13 @@ import scipy.linalg
 
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.solve.statics import solve_columns
-from softgrasp.reduction.engines import ENGINES, EngineName
-from softgrasp.reduction.inner import INNERS, InnerName, orthonormality, symplecticity
+from softgrasp.reduction.bases.engines import ENGINES, EngineName
+from softgrasp.reduction.bases.inner import INNERS, InnerName, orthonormality, symplecticity
+from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_bases, make_basis
+from softgrasp.reduction.bases.states import BasisError, states_of
+from softgrasp.reduction.bases.svd_like import symplectic_repair
+from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.registry import METHODS, PAPER_METHODS, make_bases, make_basis
-from softgrasp.reduction.states import BasisError, states_of
-from softgrasp.reduction.svd_like import symplectic_repair
-from softgrasp.reduction.truncation import Truncation
 from tests.helpers.models import close, gather_rows
 from tests.helpers.snapshots import (
     CANONICAL,

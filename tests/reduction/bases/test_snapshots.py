@@ -10,9 +10,9 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.reduction.inner import INNERS, InnerName, symplecticity
-from softgrasp.reduction.registry import METHODS, PAPER_METHODS, make_basis
-from softgrasp.reduction.states import BasisError, States, states_of
+from softgrasp.reduction.bases.inner import INNERS, InnerName, symplecticity
+from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_basis
+from softgrasp.reduction.bases.states import BasisError, States, states_of
 from tests.helpers.models import close
 from tests.helpers.snapshots import (
     SNAPSHOT_METHODS,

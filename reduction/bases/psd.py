@@ -19,11 +19,11 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.fem.solve.statics import solve_columns
-from softgrasp.reduction.engines import Factor, magnitude, small_svd
-from softgrasp.reduction.inner import Rows, Weight, weights
-from softgrasp.reduction.pod import Request, cholesky_of, weighted_factor
-from softgrasp.reduction.svd_like import svd_like_pairs, symplectic_repair
-from softgrasp.reduction.truncation import Columns, Part
+from softgrasp.reduction.bases.engines import Factor, magnitude, small_svd
+from softgrasp.reduction.bases.inner import Rows, Weight, weights
+from softgrasp.reduction.bases.pod import Request, cholesky_of, weighted_factor
+from softgrasp.reduction.bases.svd_like import svd_like_pairs, symplectic_repair
+from softgrasp.reduction.bases.truncation import Columns, Part
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ def svd_like_parts(request: Request) -> tuple[Part, ...]:
     """PSD SVD-like decomposition [BBH19, Algorithm 1]: X = S D Q with S symplectic, the pairs of largest weight.
 
     V' J V = J; V is not orthonormal. Directions without a well-conditioned partner in the snapshots get one from
-    outside, see :func:`softgrasp.reduction.svd_like.svd_like_pairs`. The two columns of a pair are balanced to equal
-    norm and pairs are ordered by w_k = sigma_k sqrt(|s_k|^2 + |s_n+k|^2), in the inner product, for which |X|_F^2 = sum
-    w_k^2. Collective.
+    outside, see :func:`softgrasp.reduction.bases.svd_like.svd_like_pairs`. The two columns of a pair are balanced to
+    equal norm and pairs are ordered by w_k = sigma_k sqrt(|s_k|^2 + |s_n+k|^2), in the inner product, for which
+    |X|_F^2 = sum w_k^2. Collective.
     """
     c = canonical(request)
     comm = request.states.layout.comm

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.reduction.pod import Request
-from softgrasp.reduction.truncation import Columns, Part
+from softgrasp.reduction.bases.pod import Request
+from softgrasp.reduction.bases.truncation import Columns, Part
 
 
 def craig_bampton_parts(request: Request) -> tuple[Part, ...]:

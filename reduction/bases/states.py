@@ -11,7 +11,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import Coordinates, Frame, ReductionError
+from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError
 
 
 class BasisError(ReductionError):
@@ -28,7 +28,7 @@ class BasisError(ReductionError):
 
 @dataclass(frozen=True)
 class Blocks:
-    """Snapshot columns in the rows of :class:`softgrasp.reduction.basis.Basis`.
+    """Snapshot columns in the rows of :class:`softgrasp.reduction.bases.basis.Basis`.
 
     Attributes:
         s_q: hand displacement, (n_s, m), on every rank [m, rad].

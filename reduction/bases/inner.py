@@ -34,8 +34,8 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
-from softgrasp.reduction.basis import Basis
-from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.bases.basis import Basis
+from softgrasp.reduction.bases.states import BasisError
 
 InnerName = Literal["euclidean", "mass", "energy"]
 INNERS: tuple[InnerName, ...] = get_args(InnerName)

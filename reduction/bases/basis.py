@@ -43,7 +43,7 @@ class Basis:
         V_q, V_p: local rows of the tissue, (n_local, N): displacement, and velocity or momentum.
         coordinates, frame, structure: see above.
         fixed_solid: the first 2 n_s columns are the hand's own unit vectors.
-        inner: inner product it was built in, see `reduction.inner`.
+        inner: inner product it was built in, see `reduction/bases/inner.py`.
         rate: weight c between displacement and momentum there; 1 unless the coordinates are canonical and weighted.
         pairs: columns come as (first half; second half) with one complex structure on (q, p) or (q, v).
         sigma: singular values the truncation was chosen from, descending (empty when no snapshots were used).

@@ -15,16 +15,15 @@ from softgrasp.fem.petsc import times_columns, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.strain.body import Body
-from softgrasp.reduction.archive import save
-from softgrasp.reduction.basis import ReductionError
+from softgrasp.reduction.archive import load, save
+from softgrasp.reduction.bases.basis import ReductionError
+from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import moved_to, run_at
-from softgrasp.reduction.reduce import reduce
+from softgrasp.reduction.reduce import errors, reduce, reduce_linear, replay
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.states import BasisError
-from softgrasp.reduction.strain.archive import load_strain
 from softgrasp.reduction.strain.cells import Potential
-from softgrasp.reduction.strain.training import Training, errors_strain, reduce_strain, replay_strain, train
+from softgrasp.reduction.strain.training import Training, errors_strain, replay_strain, train
 
 SMALL = ("tissue.cells=[6, 12]", "time.steps=120", "effects.finite_strain={}")
 
@@ -73,8 +72,8 @@ def test_models_of_one_run(trained: Training) -> None:
     # measured 6.3e-3 and 1.2e-3; the mesh is coarse, and its linear model 0.13 off
     for N, most in ((14, 1e-2), (24, 2e-3)):
         rom = trained.reduce(N)
-        run = replay_strain(rom, trained.model, full)
-        errors = errors_strain(rom, run, trained.model, full)
+        run = replay_strain(rom, full)
+        errors = errors_strain(rom, run, full)
         assert rom.residual <= rom.tau == pytest.approx(rom.error_galerkin / 2)
         assert trained.references[0].floor(rom.k) < rom.error_galerkin < 1.1 * most
         assert errors.z < most
@@ -96,9 +95,7 @@ def test_every_rank_count_gives_the_same_models(trained: Training) -> None:
     mine, theirs = trained.reduce(14), single.reduce(14)
     assert mine.cells.weight.sum() == pytest.approx(theirs.cells.weight.sum(), rel=0.1)
     assert abs(mine.cells.count - theirs.cells.count) <= 5  # rounding may decide between two cells of equal use
-    errors = [errors_strain(rom, replay_strain(rom, m, r), m, r).z for rom, m, r in (
-        (mine, trained.model, trained.runs[0]), (theirs, alone, full),
-    )]  # fmt: skip
+    errors = [errors_strain(rom, replay_strain(rom, r), r).z for rom, r in ((mine, trained.runs[0]), (theirs, full))]
     assert errors[0] == pytest.approx(errors[1], rel=0.2)
 
 
@@ -110,16 +107,16 @@ def test_runs_that_trained_nothing(own: FullRun) -> None:
     materials = train(model, corners, 24).reduce(24)
     for lam, mu in ((50.0, 50.0), (70.0, 45.0), (100.0, 100.0)):
         test = run_at(model, lam, mu)
-        assert errors_strain(materials, replay_strain(materials, model, test), model, test).z < 2.5e-2
+        assert errors_strain(materials, replay_strain(materials, test), test).z < 2.5e-2
     with pytest.raises(ModelError, match="mu = 30 Pa of layer 1 is outside"):
-        replay_strain(materials, model, run_at(model, 50.0, 30.0))
+        replay_strain(materials, run_at(model, 50.0, 30.0))
     others = [run_at(moved_to(model, target), 50.0, 50.0) for target in ([5.0, -3.0], [-5.0, 3.0], [-5.0, -3.0])]
     motions = train(model, [own, *others], 24).reduce(24)
     for target in ([3.0, 2.0], [5.0, 0.0], [-4.0, -2.0]):
         test = run_at(moved_to(model, target), 50.0, 50.0)
-        assert errors_strain(motions, replay_strain(motions, model, test), model, test).z < 1.5e-2
+        assert errors_strain(motions, replay_strain(motions, test), test).z < 1.5e-2
     with pytest.raises(ModelError, match="acceleration in degree of freedom 1"):
-        replay_strain(motions, model, run_at(moved_to(model, [6.0, 0.0]), 50.0, 50.0))
+        replay_strain(motions, run_at(moved_to(model, [6.0, 0.0]), 50.0, 50.0))
 
 
 EFFECTS = {
@@ -136,9 +133,9 @@ EFFECTS = {
 def test_with_other_effects(effect: str) -> None:
     model = built(*SMALL, *EFFECTS[effect])
     run = simulate(model)
-    rom = reduce_strain(model, run, N=20)
-    again = replay_strain(rom, model, run)
-    assert errors_strain(rom, again, model, run).z < 1e-2
+    rom = reduce(model, run, N=20)
+    again = replay(rom, model, run)
+    assert errors(rom, again, model, run).z < 1e-2
     assert again.energy_drift < 1e-8
     np.testing.assert_allclose(again.outputs, run.outputs, atol=0.02 * np.abs(run.outputs).max())
 
@@ -151,9 +148,9 @@ def test_scenes_that_ship(scene: str) -> None:
                "layers_2d": ("tissue.cells=[10, 25]",)}  # fmt: skip
     model = built(*smaller[scene], "time.steps=60", "effects.finite_strain={}", scene=scene)
     run = simulate(model)
-    rom = reduce_strain(model, run, N=18)
-    again = replay_strain(rom, model, run)
-    assert errors_strain(rom, again, model, run).z < 2e-2
+    rom = reduce(model, run, N=18)
+    again = replay(rom, model, run)
+    assert errors(rom, again, model, run).z < 2e-2
     assert again.energy_drift < 1e-8
 
 
@@ -163,28 +160,30 @@ def test_a_file_brings_the_lift_back_on_any_rank_count(trained: Training, tmp_pa
     path = Path(comm.bcast(str(tmp_path))) / "rom.h5"
     rom = trained.reduce(14)
     save(rom, path)
-    read = load_strain(path, trained.model.system.layout, rom.scene_hash)
+    read = load(path, trained.model.system.layout, rom.scene_hash)
     assert rom.Phi is not None
     assert read.Phi is not None
     np.testing.assert_array_equal(read.Phi, rom.Phi)
-    online = load_strain(path)
+    online = load(path)
     with pytest.raises(ModelError, match="no lift"):
         online.displacement(np.zeros((1, 5)))
 
 
 @pytest.mark.serial
 def test_what_does_not_fit_is_refused(own: FullRun, trained: Training) -> None:
-    with pytest.raises(ReductionError, match=r"softgrasp.reduce_strain\(model, runs, N\)"):
-        reduce(own.model, own)
+    with pytest.raises(ReductionError, match="one basis; give N and no method"):
+        reduce(own.model, own, "psd")
+    with pytest.raises(ReductionError, match=r"softgrasp.reduce\(model, runs, N=N\)"):
+        reduce_linear(own.model, [own])
     linear = built(*SMALL[:2])
     with pytest.raises(ReductionError, match=r"no effects.finite_strain"):
-        reduce_strain(linear, own)
+        train(linear, [own], 14)
     with pytest.raises(ReductionError, match="N = 13"):
         trained.reduce(13)
     with pytest.raises(BasisError, match="ask for N <="):
         train(own.model, [own], 500)
     with pytest.raises(SceneError, match=r"output\.snapshots"):
-        train(own.model, [replace(own.trajectory, snapshots=None)], 14)
+        reduce(own.model, replace(own.trajectory, snapshots=None))
 
 
 @pytest.mark.slow
@@ -196,16 +195,16 @@ def test_the_paper_scene_meets_what_was_asked_for() -> None:
     single = train(model, [own], 24)
     for N, most, cells in ((14, 1e-2, 25), (24, 2e-3, 75)):
         rom = single.reduce(N)
-        run = replay_strain(rom, model, own)
+        run = replay_strain(rom, own)
         assert errors_strain(rom, run, model, own).z <= most
         assert rom.cells.count <= cells
         assert run.energy_drift <= 1e-8
     corners = train(model, [run_at(model, lam, mu) for lam in (40.0, 120.0) for mu in (40.0, 120.0)], 24).reduce(24)
     for place in ((50.0, 50.0), (70.0, 45.0), (45.0, 70.0), (110.0, 50.0), (100.0, 100.0)):
         test = run_at(model, *place)
-        assert errors_strain(corners, replay_strain(corners, model, test), model, test).z <= 2.5e-2
+        assert errors_strain(corners, replay_strain(corners, test), test).z <= 2.5e-2
     moves = [run_at(moved_to(model, target), 50.0, 50.0) for target in ([5.0, -3.0], [-5.0, 3.0], [-5.0, -3.0])]
     moving = train(model, [own, *moves], 24).reduce(24)
     for target in ([4.0, 3.0], [5.0, 0.0], [0.0, 3.0], [-4.0, 2.0], [3.0, 2.0]):
         test = run_at(moved_to(model, target), 50.0, 50.0)
-        assert errors_strain(moving, replay_strain(moving, model, test), model, test).z <= 1.5e-2
+        assert errors_strain(moving, replay_strain(moving, test), test).z <= 1.5e-2

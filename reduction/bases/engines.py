@@ -25,7 +25,7 @@ from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, on_root, total
-from softgrasp.reduction.states import BasisError
+from softgrasp.reduction.bases.states import BasisError
 
 EngineName = Literal["tsqr", "svd", "gram"]
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)

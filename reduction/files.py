@@ -1,0 +1,161 @@
+"""HDF5 files of reduced models of every kind: format, SHA-256 of all that they hold, the lift with its nodes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+from scipy.spatial import cKDTree
+
+from softgrasp.fem.errors import agree
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
+from softgrasp.reduction.model import Lift, ModelError
+
+LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 2"
+SEALS = ("sha256", "sha256_lift")  # attributes: of everything but the lift, and of the lift
+ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns
+
+
+def write_model(
+    path: Path, kind: str, about: dict[str, Any], lift: Lift | None, small: Callable[[h5py.File], None]
+) -> None:
+    """Write a file beside its place and move it there whole. Collective with a lift.
+
+    Args:
+        path: of the file; folders are created.
+        kind: :data:`LINEAR` or :data:`STRAIN`.
+        about: what goes into JSON, the scene's hash among it.
+        lift: every rank adds its rows in turn.
+        small: writes the arrays, on one rank.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    comm = MPI.COMM_SELF if lift is None else lift.layout.comm
+    partial = path.with_name(path.name + ".part")
+    with agree(comm):
+        if comm.rank == 0:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with h5py.File(partial, "w") as file:
+                file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
+                small(file)
+    for rank in range(comm.size):
+        # one file, one writer at a time: the file library here is not a parallel one
+        with agree(comm):
+            if lift is not None and comm.rank == rank:
+                _write_rows(lift, partial)
+    with agree(comm):
+        if comm.rank == 0:
+            with h5py.File(partial, "r+") as file:
+                seal(file)
+            partial.replace(path)
+
+
+@contextmanager
+def reading(
+    path: Path, layout: BlockLayout | None, scene_hash: str | None = None
+) -> Iterator[tuple[h5py.File, dict[str, Any]]]:
+    """A file that is what was written, and what it says about its model. Collective over ``layout.comm``.
+
+    The block must not communicate. The hash of the lift counts where a layout takes it.
+
+    Raises:
+        ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
+    """
+    comm = MPI.COMM_SELF if layout is None else layout.comm
+    with agree(comm):
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") not in (LINEAR, STRAIN):
+                    raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
+                # one rank reads a lift twice, not all of them
+                for name in SEALS if layout is not None and comm.rank == 0 else SEALS[:1]:
+                    if file.attrs[name] != _digest(file, name == SEALS[1]):
+                        raise ModelError(f"{path} is damaged: it is not what was written; reduce the scene again")
+                about = json.loads(file.attrs["model"])
+                if scene_hash is not None and about["scene_hash"] != scene_hash:
+                    other = about["scene_hash"][:12]
+                    raise ModelError(f"{path} was made for another scene (hash {other}); reduce the scene again")
+                yield file, about
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            reason = f"{error} is missing" if isinstance(error, KeyError) else error
+            raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error
+
+
+def seal(file: h5py.File) -> None:
+    """Write the hashes of all that a file holds."""
+    for name in SEALS:
+        file.attrs[name] = _digest(file, name == SEALS[1])
+
+
+def _digest(file: h5py.File, lift: bool) -> str:
+    """SHA-256 of the numbers of the lift, or of all others with their attributes."""
+    names: list[str] = []
+    file.visit(names.append)
+    digest = hashlib.sha256()
+    for name in ["/", *sorted(names)]:
+        item = file[name]
+        if name.startswith("lift") is lift:
+            attributes = sorted((key, str(value)) for key, value in item.attrs.items() if key not in SEALS)
+            digest.update(repr((name, attributes)).encode())
+            if isinstance(item, h5py.Dataset):
+                digest.update(repr(item.shape).encode())
+                for at in range(0, item.shape[0] if item.ndim else 1, ROWS):
+                    digest.update(np.ascontiguousarray(item[at : at + ROWS] if item.ndim else item[()]))
+    return digest.hexdigest()
+
+
+def _lift_arrays(lift: Lift) -> dict[str, Array]:
+    arrays = {"L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
+    return {key: array for key, array in arrays.items() if array is not None}
+
+
+def _write_rows(lift: Lift, path: Path) -> None:
+    layout, d = lift.layout, lift.layout.dimension
+    parts = {"nodes": layout.nodes, **_lift_arrays(lift)}
+    with h5py.File(path, "r+") as file:
+        for key, part in parts.items():
+            n, start = (layout.n_e // d, layout.start // d) if key == "nodes" else (layout.n_e, layout.start)
+            rows = file.require_dataset(f"lift/{key}", (n, part.shape[1]), "f8")
+            for at in range(0, len(part), ROWS):
+                rows[start + at : start + min(at + ROWS, len(part))] = part[at : at + ROWS]
+
+
+def read_lift(file: h5py.File, layout: BlockLayout) -> Lift:
+    """Rows of this rank, found by the coordinates of its nodes."""
+    path, d = file.filename, layout.dimension
+    if "lift" not in file:
+        raise ModelError(f"{path} holds no lift; load it without a layout, or reduce the scene again")
+    nodes = file["lift/nodes"][()]
+    if nodes.shape != (layout.n_e // d, d):
+        raise ModelError(
+            f"{path} belongs to a mesh of {len(nodes)} free nodes in {nodes.shape[1]}D, this one has "
+            f"{layout.n_e // d} in {d}D; load it with its own scene"
+        )
+    distance, index = cKDTree(nodes).query(layout.nodes) if len(layout.nodes) else (np.zeros(0), np.zeros(0, int))
+    size = float(np.ptp(nodes, axis=0).max())
+    # coordinates are read back bit for bit; another partition may have computed them with other rounding
+    if distance.max(initial=0.0) > 1e-9 * size or len(np.unique(index)) != len(index):
+        raise ModelError(f"{path} belongs to another mesh: its nodes lie elsewhere; load it with its own scene")
+    rows = (index[:, None] * d + np.arange(d)).ravel()
+    arrays = {key: _pick(file[f"lift/{key}"], rows) for key in ("L_q", "L_v", "W_G") if f"lift/{key}" in file}
+    return Lift(layout, arrays["L_q"], arrays["L_v"], arrays.get("W_G"))
+
+
+def _pick(dataset: h5py.Dataset, rows: np.ndarray) -> Array:
+    """Rows of a dataset, read slab by slab."""
+    result = np.empty((len(rows), dataset.shape[1]), order="F")
+    slab = rows // ROWS
+    for s in np.unique(slab):
+        block = dataset[s * ROWS : (s + 1) * ROWS]
+        inside = np.flatnonzero(slab == s)
+        result[inside] = block[rows[inside] - s * ROWS]
+    return result
