@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 # Measured on the scenes that ship: cells across the shortest side that leave 1e-2 of the deformation away from the
 # ends, and the power of the tolerance with which they grow: 1 / (2 p), as outputs converge with twice the order.
-ACROSS = {2: {1: 32.0, 2: 3.75, 3: 3.0}, 3: {1: 12.0, 2: 4.0, 3: 3.0}}
+ACROSS = {2: {1: 32.0, 2: 3.75, 3: 3.0}, 3: {1: 8.0, 2: 2.5, 3: 2.0}}
 LINES_ACROSS = {2: {1: 24.0, 2: 8.0, 3: 5.0}, 3: {1: 16.0, 2: 6.0, 3: 4.0}}
 # Smallest cell over tolerance times shortest side: what an end costs is about proportional to it.
-FLOOR = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 2.0, 2: 6.0, 3: 8.0}}
+FLOOR = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
 DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a tolerance: edges in 3D fill a body quickly
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
 

@@ -15,7 +15,7 @@ from softgrasp.lqr.design.orders import BasisGains, orders, reduce_gains
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.loop import save_controllers, tick_seconds
 from softgrasp.study.control.result import Note, a_priori, gain_result
-from softgrasp.study.control.tables import controller_rows, gain_rows
+from softgrasp.study.control.tables import controller_rows, gain_rows, gain_summary
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -55,7 +55,11 @@ def run_gain(
     result = gain_result(feedback, controller, tick, [*notes, *refused], {**model.watch.seconds, **watch.seconds})
     rows = [*gain_rows(feedback), *controller_rows(controller, tick)]
     page = Page(
-        f"{model.scene.name}: optimal gain", [Section("Result", rows=rows)], files=saved, options=" --gain-only"
+        f"{model.scene.name}: optimal gain",
+        gain_summary(feedback, controller, tick),
+        [Section("Result", rows=rows)],
+        files=saved,
+        options=" --gain-only",
     )
     session.console.print(pairs(rows))
     list_files(session.console, session.write(model.scene, result, lambda: page))

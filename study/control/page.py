@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from softgrasp.study.control.result import TITLES, ControlStudy
 from softgrasp.study.control.tables import BOX_HEADER, box_rows, loop_table, reduced_table, summary_rows
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation_control import control_text
-from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section
 
 CAPTIONS = {
@@ -46,13 +44,12 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     def pick(*names: str) -> list[tuple[Path, str]]:
         return [figures[name] for name in names if name in figures]
 
-    scene, layout = study.design.model.scene, study.design.problem.layout
     notes = "\n\n".join((*study.findings, *(note.text for note in study.notes)))
     parts = [
         Section("", figures=pick("move.png", "move.gif")),
         *([Section("Notes", text=notes)] if notes else []),
         Section("Result", rows=summary_rows(study, dict(seconds)), figures=pick("histories.png", "decay.png")),
-        Section("Equation", code=control_text(scene)),
+        Section("Equation", code=control_text(study.design.model.scene)),
     ]
     if study.bases:
         parts += _reduced(study, pick("errors.png"))
@@ -67,11 +64,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
         text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
         own = [] if i else pick("retune.png")
         parts.append(Section("" if i else "Re-tuning", text, header=BOX_HEADER, rows=box_rows(r), figures=own))
-    about: list[tuple[str, Any]] = [("n_s", layout.n_s), ("n_e", layout.n_e), ("states", layout.states)]
-    about += provenance(origin(scene, layout.comm.size))
-    about += [(f"time {k}", f"{v:.3g} s") for k, v in seconds.items()]
-    about += [(f"solver {k}", f"{v:.3g} s") for k, v in study.design.solution.seconds.items()]
-    return [*parts, Section("Made with", rows=about)]
+    return parts
 
 
 def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:
@@ -82,10 +75,7 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
         f"The excess cost is J/J* - 1 on the modes kept; the bound beside it is proved for the whole plant by the "
         f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with room for what is to come after it."
     )
-    table = reduced_table(study.bases)
-    best = [i for i, (b, r) in enumerate((b, r) for b in study.bases for r in b.reports) if r is b.best()]
-    shown = best if len(table.rows) == sum(len(b.reports) for b in study.bases) else []
-    parts = [Section(table.title, text, header=table.header, rows=table.rows, figures=figures, best=shown)]
+    parts = [reduced_table(study.bases).section(text, figures=figures)]
     refused = [(TITLES[b.name], b.refused) for b in study.bases if b.refused]
     refused += [(f"{TITLES[b.name]}, N = {r.N}", r.reason) for b in study.bases for r in b.reports if r.reason]
     if refused:

@@ -86,7 +86,7 @@ def run_control(
             drawn = draw_all(out, study, poles, frames)
         title = f"{model.scene.name}: optimal feedback"
         parts, files = sections(study, seconds, drawn), [*drawn, *fields, *saved]
-        return Page(title, parts, tables(study), files, summary=summary(study))
+        return Page(title, summary(study), parts, tables(study), files)
 
     if session.comm.rank == 0:
         show(console, study, seconds)
@@ -120,7 +120,7 @@ def control_model(
     retuned: tuple[Retuned, ...] = ()
     notes, duration = list(notes), plan(feedback, own_end)
     if feedback.modal:
-        sentence = "control.method = 'modal': no P of the whole plant to compare reduced equations with"
+        sentence = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
         notes.append(Note("modal", sentence))
     else:
         sizes, few = orders(feedback)

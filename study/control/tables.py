@@ -70,14 +70,27 @@ def summary(study: ControlStudy) -> list[str]:
         told.append(f"With the limits of the loads the move costs {excess:.2%} more than without them.")
     else:
         told.append(f"The move costs {full.cost[-1]:.4g}; the Riccati equation predicts {optimal:.4g}.")
-    if study.controller is None:
-        return [*told, "No small controller is certified, see the notes."]
-    c = study.controller.controller
+    return [*told, _controller(study.controller, study.tick)]
+
+
+def gain_summary(design: Design, controller: CertifiedController | None, tick: float) -> list[str]:
+    """What came out of the Riccati equation alone, in three sentences."""
+    solution, quality = design.solution, design.quality
     return [
-        *told,
-        f"The small controller has {c.plant.N} states and takes {1e6 * study.tick:.2g} us of each tick of "
-        f"{1e3 * c.period:g} ms.",
+        f"The Riccati equation is solved to the relative residual {solution.residual:.1e}.",
+        f"The move costs {design.judge.optimal:.4g} at least; the abscissa of its loop is {quality.abscissa:.3g} 1/s.",
+        _controller(controller, tick),
     ]
+
+
+def _controller(controller: CertifiedController | None, tick: float) -> str:
+    if controller is None:
+        return "No small controller is certified, see the notes."
+    c = controller.controller
+    return (
+        f"The small controller has N = {c.plant.N} columns and takes {1e6 * tick:.2g} us of each tick of "
+        f"{1e3 * c.period:g} ms."
+    )
 
 
 def gain_rows(design: Design) -> list[tuple[str, str]]:
@@ -167,7 +180,9 @@ def reduced_table(bases: Sequence[BasisGains]) -> Table:
         for b in bases
         for r in b.reports
     ]
-    return Table(REDUCED_HEADER, rows, "Reduced Riccati equations")
+    reports = [(b, r) for b in bases for r in b.reports]
+    best = [i for i, (b, r) in enumerate(reports) if r is b.best()]
+    return Table(REDUCED_HEADER, rows, "Reduced Riccati equations", best)
 
 
 def best_table(bases: Sequence[BasisGains]) -> Table:

@@ -12,9 +12,11 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import Changes, Together
 from softgrasp.study.effects.measure import AGAIN, SCENE, Case, fingerprint, objects_of
 from softgrasp.study.effects.objects import difference
-from softgrasp.study.effects.result import Change, Company, Cost, Finding, OffProof, listed
+from softgrasp.study.effects.result import Change, Company, Cost, Finding, OffProof
 from softgrasp.study.effects.switch import Switch, neutral
+from softgrasp.study.forward.accuracy import percent
 from softgrasp.study.forward.explain import EffectReport, Explanation
+from softgrasp.study.report.tables import listed
 
 
 def judge(change: float, controls: bool, costs: bool, tolerance: float) -> str:
@@ -116,7 +118,7 @@ def shows(s: Switch, changes: tuple[Change, float | None], gate: EffectReport, s
 def needed_for_control(s: Switch, control: float | None, gate: EffectReport, scene: Scene) -> str:
     """Why the control problem needs an effect that does not show in the run; empty if it does not."""
     if control is not None and control > scene.study.tolerance:
-        return f"when a force moves the hand, as in the control problem, it changes them by {control:.2g}"
+        return f"when a force moves the hand, as in the control problem, it changes them by {percent(control)}"
     if s.name == "damping" and scene.control is not None and gate.gate.matters:
         return "without damping no feedback stabilises the high modes in the control problem"
     return ""
@@ -158,7 +160,7 @@ def _change_in_words(change: float) -> str:
 def _cost_in_words(cost: Cost) -> str:
     parts = []
     if cost.flops_relative > 0:
-        parts.append(f"{cost.flops_relative:.2g} of the operations of a step")
+        parts.append(f"{percent(cost.flops_relative)} to the operations of a step")
     if cost.memory_relative > 0:
-        parts.append(f"{cost.memory_relative:.2g} of the memory")
+        parts.append(f"{percent(cost.memory_relative)} to the memory")
     return " and ".join(parts)

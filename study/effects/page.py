@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import astuple
 from typing import Any
 
@@ -13,10 +12,10 @@ from rich.padding import Padding
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.objects import in_words
 from softgrasp.study.effects.plots import figure_effects
-from softgrasp.study.effects.result import EffectsStudy, Finding, listed
-from softgrasp.study.report.origin import provenance
+from softgrasp.study.effects.result import EffectsStudy, Finding
+from softgrasp.study.forward.accuracy import percent
 from softgrasp.study.report.page import Section
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Table, listed
 from softgrasp.study.shell.session import Page, Session
 
 CAPTION = (
@@ -30,14 +29,14 @@ CAPTION = (
 
 
 PROOFS = {
-    "operators": "SHA-256 of all operators, after the effect was on in this process and with the effect named at "
-    "strength zero, is that from before",
+    "operators": "all operators have the same SHA-256 before the effect was on in this process, after it, and with the "
+    "effect named at strength zero",
     "objects": "PETSc's own log counts the same matrices, vectors, index sets and solvers, and none in a step",
-    "work": "PETSc counts as many operations in a step",
+    "work": "PETSc counts as many operations in a step as before",
 }
 
 
-def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: Session) -> Page:
+def compose(study: EffectsStudy, scene: Scene, session: Session) -> Page:
     """Draw the picture and compose the page."""
     advice = [
         (f"{f.name}: {f.value}" if f.on else f"{f.name}, tried: {f.value}" if f.value else f.name, f.advice)
@@ -46,20 +45,20 @@ def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: 
     advice += [("all together", in_company(study)), *(("warning", text) for text in study.warnings)]
     how = [
         ("tolerance", f"{study.tolerance:g}: relative change of the outputs that counts"),
-        ("needed", "changes the outputs of the run by more than the tolerance, alone or with others that are advised"),
-        ("beside advised", "the effect switched alone, all others as advised; effects that show only so join them"),
-        ("optional", "does not, but costs nothing, or the control problem needs it"),
-        ("wasted", "costs work or memory and nothing shows it"),
-        ("noise", "paired samples do not agree, or by less than steps of the scene differ from one another"),
-        ("costs", "decided by counted operations and held memory; times are shown with their noise"),
+        ("needed", "the effect changes the outputs by more than the tolerance, alone or with others that are advised"),
+        ("beside advised", "the change when this effect alone is switched and all others are as advised"),
+        ("optional", "the effect does not show, but it costs nothing or the control problem needs it"),
+        ("wasted", "the effect costs work or memory, and no output shows it"),
+        ("noise", "paired samples disagree, or differ by less than two steps of the same scene do"),
+        ("costs", "counted operations and held memory decide; times are shown with their noise"),
         (
             "samples",
             f"{study.repeats} of the steps, {study.builds} of the builds, interleaved; medians of paired samples",
         ),
-        ("factor", "factor of S and what the hand's equation solves before the first step"),
+        ("factor", "the time to factor S and to solve for the hand's equation before the first step"),
         *PROOFS.items(),
     ]
-    text = "Objects that PETSc's own log counts as created more with the effect, up to the first step:"
+    text = "PETSc's own log counts these objects more with the effect, up to the first step:"
     objects = [(f.name, in_words(f.cost.objects)) for f in study.findings if f.cost is not None]
     files = figure_effects(study.findings, study.tolerance, study.noise_quartiles, session.out / "effects.png")
     proofs = proof_table(study)
@@ -71,21 +70,35 @@ def compose(study: EffectsStudy, scene: Scene, result: dict[str, Any], session: 
         Section("", text, rows=objects),
         *([proofs.section()] if proofs.rows else []),
         Section("How it is judged", rows=how),
-        Section("Size", rows=list(study.sizes.items())),
-        Section("Made with", rows=[*provenance(result), ("time", f"{time.perf_counter() - session.begin:.1f} s")]),
     ]
-    return Page(f"{scene.name}: effects", sections, {"effects.csv": csv_table(study)}, files)
+    return Page(f"{scene.name}: effects", summary(study), sections, {"effects.csv": csv_table(study)}, files)
+
+
+def summary(study: EffectsStudy) -> list[str]:
+    """What came out, in three sentences."""
+    groups: dict[str, list[str]] = {}
+    for f in study.findings:
+        groups.setdefault(f.label, []).append(f.name)
+    verdicts = [f"{label}: {listed(names)}" for label, names in groups.items()]
+    change, name = max((f.change.outputs, f.name) for f in study.findings if f.change is not None)
+    off = [f.proof.holds for f in study.findings if f.proof is not None]
+    return [
+        f"The verdicts on the effects are {'; '.join(verdicts)}.",
+        f"{name.capitalize()} changes the outputs most, by {percent(change)}; what changes them by less than "
+        f"{percent(study.tolerance)} does not count.",
+        f"{sum(off)} of the {len(off)} effects that are off are shown to cost nothing.",
+    ]
 
 
 def in_company(study: EffectsStudy) -> str:
     """What each effect changes beside all that are advised, one sentence."""
     parts = [
-        f"{f.name} {f.company.change.outputs:.1e}"
-        + (f" ({f.company.control:.1e} under a force)" if f.company.control is not None else "")
+        f"{f.name} {percent(f.company.change.outputs)}"
+        + (f" ({percent(f.company.control)} under a force)" if f.company.control is not None else "")
         for f in study.findings
         if f.company is not None
     ]
-    return f"judged again with {listed(study.advised)} on, each changes the outputs by: {', '.join(parts)}."
+    return f"With {listed(study.advised)} on, switching one effect alone changes the outputs by: {', '.join(parts)}."
 
 
 def csv_table(study: EffectsStudy) -> Table:
@@ -190,13 +203,15 @@ def show(study: EffectsStudy, console: Console) -> None:
         say(f"{f.name}{value}: {f.advice}")
     say(in_company(study))
     for text in study.warnings:
-        say(f"look at: {text}")
+        say(f"warning: {text}")
     proofs = {f.name: f.proof for f in study.findings if f.proof is not None}
     if proofs:
         free = [name for name, proof in proofs.items() if proof.holds]
-        console.print(f"off and without cost, by hashes, PETSc's objects and operations: {', '.join(free) or 'none'}")
+        console.print(
+            f"off, and shown to cost nothing by hashes, PETSc's objects and operations: {', '.join(free) or 'none'}"
+        )
         console.print(f"step time of the scene against itself: {study.noise[0]:+.1%} to {study.noise[1]:+.1%}")
     for name, proof in proofs.items():
         if not proof.holds:
             lost = [key for key, same in zip(PROOFS, astuple(proof), strict=True) if not same]
-            say(f"{name}: not shown: same {', '.join(lost)}")
+            say(f"{name} is not shown to cost nothing: {', '.join(lost)} differ.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -172,8 +171,3 @@ class EffectsStudy:
             "elements": None if self.elements is None else asdict(self.elements),
             "sizes": self.sizes,
         }
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names as one reads them: a, b and c."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]])) or "none"

@@ -139,5 +139,5 @@ def run_effects(
     result |= {"memory_peak_mb": peak_memory_mb(comm), "time": {}}
     if comm.rank == 0:
         show(study, console)
-    list_files(console, session.write(scene, result, lambda: compose(study, scene, result, session)))
+    list_files(console, session.write(scene, result, lambda: compose(study, scene, session)))
     return result

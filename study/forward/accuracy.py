@@ -140,16 +140,10 @@ def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, ..
         figure, ax = plt.subplots(figsize=(COLUMN, 2.4), layout="constrained")
         for k, i in enumerate(shown):
             color = CYCLE[k % len(CYCLE)]
-            ax.fill_between(
-                run.times,
-                factor * (relative[:, i] - band),
-                factor * (relative[:, i] + band),
-                color=color,
-                alpha=0.15,
-                lw=0,
-            )
-            ax.plot(run.times, factor * relative[:, i], color=color, label=f"{run.output_names[i]} of this mesh")
-            ax.plot(run.times, factor * corrected[:, i], color=color, ls="--", label=f"{run.output_names[i]} corrected")
+            y, name = factor * relative[:, i], run.output_names[i]
+            ax.fill_between(run.times, y - factor * band, y + factor * band, color=color, alpha=0.15, lw=0)
+            ax.plot(run.times, y, color=color, label=f"{name} of this mesh")
+            ax.plot(run.times, factor * corrected[:, i], color=color, ls="--", label=f"{name} corrected")
         ax.set_xlabel("time [s]")
         ax.set_ylabel(f"relative to hand [{unit}]")
         figure.legend(loc="outside upper center", ncols=2)

@@ -61,16 +61,24 @@ def mesh_report(model: Model) -> MeshReport:
 def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
     """The report in sentences."""
     place = "points" if dimension == 2 else "edges"
-    lines = [f"{e.count} {place} of kind '{e.kind}': u ~ r^{e.alpha:.3g}" for e in report.ends[:6]]
+    lines = [
+        f"At {e.count} {place} of kind '{e.kind}' the displacement grows like r^{e.alpha:.3g}." for e in report.ends[:6]
+    ]
     if len(report.ends) > len(lines):
-        lines.append(f"and {len(report.ends) - len(lines)} more kinds of ends with larger exponents")
+        lines.append(f"{len(report.ends) - len(lines)} more kinds of ends have larger exponents.")
     if report.graded:
-        lines.append(f"graded cells: outputs converge with order {report.order:g} in n_e^(1/{dimension})")
+        lines.append(f"The cells are graded: outputs converge with the order {report.order:g} in n_e^(1/{dimension}).")
     elif report.ends:
-        lines.append(f"even cells: outputs converge with order {report.order:.2g} in h, whatever tissue.order")
+        lines.append(
+            f"The cells are even: outputs converge with the order {report.order:.2g} in h, whatever tissue.order is."
+        )
     if report.estimate is not None and report.bound is not None and report.time_error is not None:
-        lines.append(f"deformation about {percent(report.estimate)} off on this mesh (bound {percent(report.bound)})")
-        lines.append(f"and about {percent(report.time_error)} by the time step")
+        lines.append(
+            f"The deformation is about {percent(report.estimate)} off on this mesh (bound {percent(report.bound)}) and "
+            f"about {percent(report.time_error)} by the time step."
+        )
     else:
-        lines.append("error of the mesh not estimated, it would take more than a second: simulate --certify does it")
+        lines.append(
+            "The error of the mesh is not estimated here, as it takes more than a second; simulate --certify does it."
+        )
     return lines

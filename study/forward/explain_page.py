@@ -16,7 +16,7 @@ from softgrasp.study.forward.explain import EffectReport, Explanation, explain
 from softgrasp.study.forward.explain_mesh import mesh_lines
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import EQUATION, Section, equation_text
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Table, listed
 from softgrasp.study.shell.session import Page, Session, list_files
 
 EFFECTS = ("effect", "verdict", "gate", "number", "matters from", "what it says")
@@ -34,7 +34,7 @@ def run_explain(
     render(explanation, parts, console)
     if out is not None:
         result = {"command": "explain", **origin(scene, session.comm.size), **explanation.to_dict()}
-        page = Page(f"{scene.name}: what it simulates", parts, options=" --out out")
+        page = Page(f"{scene.name}: what it simulates", summary(explanation), parts, options=" --out out")
         list_files(console, session.write(scene, result, lambda: page, clock=False))
     return explanation
 
@@ -57,9 +57,8 @@ def render(result: Explanation, parts: Sequence[Section], console: Console) -> N
                 line(f"{name} adds {adds}; allocates {operators}.")
                 line(cost, 4)
         elif part.header:
-            console.print(
-                Padding.indent(Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header))), 2)
-            )
+            table = Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header)))
+            console.print(Padding.indent(table, 2))
         for text in (*part.text.split("\n\n"), *part.code.splitlines()):
             if text:
                 line(text.strip(), 2 + len(text) - len(text.lstrip()))
@@ -100,6 +99,20 @@ def sections(result: Explanation) -> list[Section]:
         Section("Effects", header=EFFECTS, rows=effects),
         *([Section("What is on", header=COSTS, rows=costs)] if costs else []),
         Section("First modes of the clamped tissue", no_modes, header=modes if periods else (), rows=periods),
+    ]
+
+
+def summary(result: Explanation) -> list[str]:
+    """What it is, in three sentences."""
+    on = [name for name, e in result.effects.items() if e.on]
+    sag, s = result.sag, result.sizes
+    return [
+        f"The tissue has n_e = {s.n_e} unknowns in {s.cells} cells; {result.solver.name} solves its "
+        f"{result.time.steps} steps of {result.time.dt:.3g} s.",
+        f"Effects that are on: {listed(on)}; on although they do not matter: {listed(result.idle)}; off although they "
+        f"would matter: {listed(result.missing)}.",
+        f"Under its weight the tissue sags by {sag.largest:.2g} m; linear elasticity "
+        f"{'holds' if sag.gradient.linear else 'does not hold'} there.",
     ]
 
 

@@ -100,7 +100,7 @@ class Simulation:
             "output_final": run.outputs[-1].tolist(),
             "output_places": self.places,
             "energy_drift": run.energy_drift,
-            **self._newton(),
+            **({} if run.newton is None else {"newton": newton_keys(run.newton)}),
             **({"force_peak": self.force_peak} if run.force is not None else {}),
             "time": {
                 **stages,
@@ -113,9 +113,6 @@ class Simulation:
             "operators": list(self.operators),
             "warnings": list(self.warnings),
         }
-
-    def _newton(self) -> dict[str, Any]:
-        return {} if self.run.newton is None else {"newton": newton_keys(self.run.newton)}
 
     def rows(self) -> list[tuple[str, str]]:
         """The short table of a run as label and text."""

@@ -20,7 +20,6 @@ from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import equation
-from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section, equation_text
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
@@ -86,7 +85,7 @@ def run_simulate(
         sections = _sections(result, rows, drawn)
         told = [*result.summary(), *accuracy.summary(judged)]
         tables = {"trajectory.csv": result.trajectory()}
-        return Page(scene.name, sections, tables, [*fields, *drawn], summary=told)
+        return Page(scene.name, told, sections, tables, [*fields, *drawn])
 
     numbers = result.to_json() | accuracy.keys(judged, run)
     console.print(pairs(rows))
@@ -106,20 +105,11 @@ def _lost(frames: Frames, run: Run) -> str:
 
 
 def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: list[Path]) -> list[Section]:
-    scene, sizes = result.scene, result.sizes
+    scene = result.scene
     faster = speed_up(np.array([0.0, scene.time_end]))
     move = "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed."
     shown = {path.name: path for path in drawn}
     figures = [(shown[name], text or move) for name, text in CAPTIONS.items() if name in shown]
-    rows = [
-        ("hand n_s", sizes.n_s),
-        ("tissue n_e", sizes.n_e),
-        ("states 2n", sizes.states),
-        ("cells", sizes.cells),
-        ("steps", scene.time.steps),
-        ("time step", f"{scene.time_end / scene.time.steps:.6g} s"),
-        ("end", f"{scene.time_end:.6g} s"),
-    ]
     effects = [
         (name, effect.active(scene), *((effect.term, effect.cost) if effect.active(scene) else ("", "")))
         for name, effect in EFFECTS.items()
@@ -130,6 +120,4 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
         *([Section("Warnings", text="\n\n".join(result.warnings))] if result.warnings else []),
         Section("Equation", code=equation_text(equation(scene))),
         Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
-        Section("Size", rows=rows),
-        Section("Made with", rows=provenance(origin(scene, sizes.ranks))),
     ]

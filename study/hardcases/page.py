@@ -54,11 +54,22 @@ def write_files(out: Path, result: HardCaseResult, family: str | None, pictures:
         write_report(
             out / "report.html",
             title="Hard cases",
-            subtitle=result.summary,
+            summary=summary(result),
             sections=sections(result, {name: pair[0] for name, pair in figures.items()}),
             reproduce=f"softgrasp hardcases{options}",
             numbers="result.json and hardcases.csv",
         ),
+    ]
+
+
+def summary(result: HardCaseResult) -> list[str]:
+    """What came out, in three sentences."""
+    cases = [case for f in result.families for case in f.cases]
+    broken = [c for c in cases if c.textbook.value is None or (c.bound is not None and not c.textbook.value <= c.bound)]
+    return [
+        f"{result.summary}.",
+        f"The textbook way keeps the same bound in {len(cases) - len(broken)} of them.",
+        f"All took {sum(f.seconds for f in result.families):.3g} s.",
     ]
 
 
@@ -87,11 +98,10 @@ def sections(result: HardCaseResult, pictures: Mapping[str, Path]) -> list[Secti
         text = f"{family.lesson}\n\nMeasured: {bare_label(family.quantity)}. Textbook way: {family.textbook}."
         text += f" Why these bounds: {reasons}." if reasons else ""
         figures = [(pictures[family.name], caption(family))] if family.name in pictures else []
-        rows = [brief(case) for case in f.cases]
-        columns = ("case", "bound", "here", "textbook", "verdict") if rows else ()
-        parts.append(Section(family.title, text, header=columns, rows=rows, figures=figures))
+        table = Table(("case", "bound", "here", "textbook", "verdict"), [brief(case) for case in f.cases])
+        parts.append(table.section(text, family.title, figures))
         if texts := sentences(f):
-            parts.append(Section("", "In their own words:", rows=texts))
+            parts.append(Section("", "Refusals and remarks in full:", rows=texts))
     return parts
 
 

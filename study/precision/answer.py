@@ -196,15 +196,15 @@ class Answers:
         closest = None
         if full is not None:
             words.append(
-                f"Cheapest full run within {tolerance:g}: {full.point.label}: {_prediction(full)}, measured "
+                f"The cheapest full run within {tolerance:g} is {full.point.label}: {_prediction(full)}, measured "
                 f"{full.point.error:.1e} of the deformation ({full.point.error_displacement:.1e} of the displacement) "
                 f"in {seconds_text(full.point.seconds)}."
             )
         if reduced is not None and isinstance(reduced.point, ReducedPoint):
             point = reduced.point
             words.append(
-                f"For many runs: {point.label}: {_prediction(reduced)} a run, measured {point.error:.1e} in "
-                f"{seconds_text(point.seconds)}; from nothing, with the full run behind it, "
+                f"The fastest model for many runs is {point.label}: {_prediction(reduced)} a run, measured "
+                f"{point.error:.1e} in {seconds_text(point.seconds)}; from nothing, with the full run behind it, "
                 f"{seconds_text(point.scratch)}."
             )
         if full is None and reduced is None:
@@ -258,7 +258,7 @@ class Answers:
         if self.runs.reference is not None:
             sets.append(f"hand.reference={self.runs.reference}")  # the default moves a little with the mesh
         if isinstance(point, ReducedPoint):
-            sets += [f"reduction.methods=['{point.method}']", f"reduction.N=[{point.N}]"]
+            sets += [f'reduction.methods=["{point.method}"]', f"reduction.N=[{point.N}]"]
         return Choice(point, self.shares(point), tuple(sets), predicted)
 
     def _against_own_mesh(self, tolerance: float) -> list[str]:

@@ -19,7 +19,7 @@ FASTEST, SLOWEST = 0.2, 0.6  # errors of graded meshes fall about as their toler
 # Tolerances of the a-priori graded meshes of the diagram, by dimension and order.
 GOALS = {
     2: {1: (0.3, 0.1, 0.03), 2: (0.1, 0.03, 0.01, 3e-3, 1e-3), 3: (0.1, 0.03, 0.01, 3e-3, 1e-3)},
-    3: {1: (0.3, 0.1), 2: (0.3, 0.1, 0.03), 3: (0.3, 0.1)},
+    3: {1: (0.3, 0.1), 2: (0.3, 0.03, 0.01), 3: (0.3, 0.03, 0.01)},
 }
 
 

@@ -28,11 +28,11 @@ from softgrasp.study.precision.points import (
 )
 from softgrasp.study.precision.result import LoopReference, RiccatiReference, WorkStudy
 from softgrasp.study.precision.series import TimedRun
-from softgrasp.study.precision.tables import budget_table, points_table, question_table, slope_table
+from softgrasp.study.precision.tables import budget_table, front_of, points_table, question_table, slope_table
 from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.files import to_json
-from softgrasp.study.report.origin import command_line, origin, peak_memory_mb, provenance
+from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
 from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -70,14 +70,29 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
 
     def page() -> Page:
         figures = draw(study, request.budget, session.out)
-        sections = _sections(study, result, commands, {f.stem: f for f in figures if f.suffix == ".png"})
+        sections = _sections(study, commands, {f.stem: f for f in figures if f.suffix == ".png"})
         title = f"{study.scene.name}: accuracy against time"
-        return Page(title, sections, {"points.csv": points_table(study)}, figures, request.options)
+        return Page(title, summary(study), sections, {"points.csv": points_table(study)}, figures, request.options)
 
     show(session.console, study, commands)
     list_files(session.console, session.write(study.scene, result, page))
     comm.Barrier()
     return result
+
+
+def summary(study: WorkStudy) -> list[str]:
+    """What came out, in three sentences."""
+    texts = [answer.sentences[0] for answer in study.answers]
+    for name, question in study.questions.items():
+        if front := front_of(question.points):
+            (slow, low), (fast, high) = ((seconds_text(p.seconds), f"{p.error:.1e}") for p in (front[-1], front[0]))
+            texts.append(
+                f"{TITLES[name]}: {len(front)} of {len(question.points)} points are beaten by no other, from the error "
+                f"{high} in {fast} to {low} in {slow}."
+            )
+    if study.truth is not None:
+        texts.insert(2, f"The reference itself is known to {study.truth.error:.1e} of the deformation.")
+    return texts[:3]
 
 
 def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
@@ -153,9 +168,7 @@ def _left_out(study: WorkStudy) -> list[tuple[str, str]]:
     return [(", ".join(titles), reason) for reason, titles in names.items()]
 
 
-def _sections(
-    study: WorkStudy, result: dict[str, Any], commands: list[dict[str, str]], figures: dict[str, Path]
-) -> list[Section]:
+def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[str, Path]) -> list[Section]:
     """Parts of the page."""
     sections = [
         Section("Answer", text="\n\n".join(answer.sentences), code="\n".join(lines.values()))
@@ -169,8 +182,7 @@ def _sections(
         rows.append(("runs behind it", "; ".join(s.label for s in truth.settings)))
         sections.append(Section("Reference", text=truth.note, rows=rows))
     for budget in study.error_budgets:
-        sections += [Section(f"Error budget of {budget.label}", text=budget.sentence), budget_table(budget).section()]
-    sections.append(Section("Size", rows=_sizes(study)))
+        sections.append(budget_table(budget).section(budget.sentence))
     answered = {name: question for name, question in study.questions.items() if question.points}
     feedback = [name for name in answered if name in CONTROL]
     if feedback and len(feedback) == len(answered):
@@ -180,31 +192,15 @@ def _sections(
             sections.append(Section(f"{EQUATION} under feedback", code=control_text(study.scene)))
         drawn = [(figures[f"work_{name}"], CAPTIONS[name])] if f"work_{name}" in figures else []
         text = reference_text(question, paper_of(study.scene) == "control")
-        sections.append(Section(TITLES[name], text=text, figures=drawn))
-        sections.append(question_table(name, question.points).section())
+        sections.append(question_table(name, question.points).section(text, TITLES[name], drawn))
     sections += [Section("Left out", text=f"{titles}: {reason}.") for titles, reason in _left_out(study)]
     if "work_budget" in figures:
         sections.append(Section("Budget", figures=[(figures["work_budget"], CAPTIONS["budget"])]))
     sections.append(slope_table(study).section(title="Slopes"))
-    return [*sections, Section("How it is measured", rows=_how(study, result))]
+    return [*sections, Section("How it is measured", rows=_how(study))]
 
 
-def _sizes(study: WorkStudy) -> list[tuple[str, Any]]:
-    """The scene's own mesh and steps, and the span of the settings."""
-    tissue, time = study.scene.tissue, study.scene.time
-    rows: list[tuple[str, Any]] = [
-        ("cells", " x ".join(str(n) for n in tissue.cells) if tissue.cells else tissue.mesh),
-        ("element", f"P{tissue.order}"),
-        ("steps", f"{time.steps} to {study.scene.time_end:.6g} s"),
-        ("layers", len(tissue.layers)),
-    ]
-    sizes = [p.n_e for p in study.of(ForwardPoint)]
-    if sizes:
-        rows.append(("tissue n_e, settings tried", f"{min(sizes)} to {max(sizes)}"))
-    return [row for row in rows if row[1]]
-
-
-def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
+def _how(study: WorkStudy) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
     if study.truth is not None:
         rows += [
@@ -213,10 +209,12 @@ def _how(study: WorkStudy, result: dict[str, Any]) -> list[tuple[Any, ...]]:
             ("places", "the same points of the body on every mesh, not the nearest nodes"),
             ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
         ]
+    if sizes := [p.n_e for p in study.of(ForwardPoint)]:
+        rows.append(("tissue n_e, settings tried", f"{min(sizes)} to {max(sizes)}"))
     rows += [
         ("repeats", f"{study.scene.study.repeats}; of a run, the first is the whole run, the others its first steps"),
         ("front", "no other point is faster and more accurate"),
     ]
     if paper_of(study.scene) == "forward":
         rows.append(("the paper", f"{PAPER_FULL} s full, {PAPER}, own machine"))
-    return [*rows, *provenance(result), ("time of this study", seconds_text(result["time"]["total"]))]
+    return rows

@@ -257,7 +257,7 @@ class ErrorBudget:
         text = f"Of the error of {self.label}, {first.name} carries {100 * first.share:.0f} %"
         text += f" and is halved by {first.halved_by}, in {first.cost:.2g} of the time." if first.cost else "."
         wasted = [f"{p.wasted} of {p.name}" for p in self.parts if p.wasted]
-        return text + (f" Digits that nobody sees: {', '.join(wasted)}." if wasted else "")
+        return text + (f" Wasted digits: {', '.join(wasted)}." if wasted else "")
 
 
 @dataclass(frozen=True)

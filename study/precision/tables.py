@@ -66,7 +66,8 @@ def question_table(name: str, points: Sequence[WorkPoint], front_only: bool = Fa
     if front_only:
         return Table(HEADERS[name][:-1], [_cells(p) for p in front], f"{TITLES[name]}, Pareto front")
     marks = ["*" if p in front else "" if p.ok else _why(p) for p in points]
-    return Table(HEADERS[name], [(*_cells(p), mark) for p, mark in zip(points, marks, strict=True)])
+    best = [i for i, p in enumerate(points) if p in front]
+    return Table(HEADERS[name], [(*_cells(p), mark) for p, mark in zip(points, marks, strict=True)], best=best)
 
 
 def _cells(p: WorkPoint) -> tuple[Any, ...]:
@@ -121,7 +122,7 @@ def budget_table(budget: ErrorBudget) -> Table:
     ]  # fmt: skip
     rows += [(name, "-", "-", reason, "-", "-") for name, reason in budget.missing]
     header = ("error of", "relative", "share", "halved by", "in a time of", "wasted digits")
-    return Table(header, rows, f"error budget of {budget.label}")
+    return Table(header, rows, f"Error budget of {budget.label}")
 
 
 def slope_table(study: WorkStudy) -> Table:

@@ -33,7 +33,7 @@ from softgrasp.reduction.parameters import run_at
 from softgrasp.study.forward.result import simulate_result
 from softgrasp.study.reduce.certify_check import BoxCheck, check_box
 from softgrasp.study.report.files import to_json
-from softgrasp.study.report.origin import origin, peak_memory_mb, provenance
+from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -112,8 +112,8 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         tables = {"greedy.csv": greedy_table(certified)}
         if check is not None:
             tables["tests.csv"] = tests_table(check)
-        parts = sections(model, certified, result, drawn)
-        return Page(f"{scene.name}: certified reduced model", parts, tables, [*drawn, file])
+        title, told = f"{scene.name}: certified reduced model", sentences(certified, result)[:3]
+        return Page(title, told, sections(certified, result, drawn), tables, [*drawn, file])
 
     for sentence in sentences(certified, result):
         console.print(sentence, markup=False)
@@ -229,11 +229,11 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
     how = "estimated" if certified.certify == "estimate" else "proved"
     share, tolerance = certified.training["proved"], about["tolerance"]
     box = f"everywhere on the grid and at {about['checked'] - len(certified.training['points'])} random parameters"
-    result_line = f"certified model of N = {about['N']}"
+    result_line = f"The certified model has N = {about['N']} columns"
     if certified.k < certified.k2:
-        result_line += f", measured by one of N = {about['N2']}"
+        result_line += f" and is measured by one of N = {about['N2']}"
     if np.isfinite(share):
-        result_line += f": error at most {share:.1e} of the deformation {box}, {how}."
+        result_line += f": its error is at most {share:.1e} of the deformation {box}, {how}."
     else:
         result_line += ": in parts of the box its bound is larger than the deformation itself."
     if share > tolerance:
@@ -244,8 +244,8 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
     if "validation" in about:
         v = Validation(**about["validation"])
         lines.append(
-            f"{v.n} random full runs: the error was at most {v.factor:.3g} times the estimate; with 95 % confidence it "
-            f"is more on at most {v.share:.1%} of the box."
+            f"In {v.n} random full runs the error was at most {v.factor:.3g} times the estimate; with 95 % confidence "
+            f"it is larger on at most {v.share:.1%} of the box."
         )
     lines.append(f"At the scene's own material: {about['own']['sentence']}.")
     lines += about["own"]["reasons"]
@@ -264,16 +264,10 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def sections(
-    model: Model, certified: CertifiedModel, result: dict[str, Any], drawn: Sequence[Path] = ()
-) -> list[Section]:
+def sections(certified: CertifiedModel, result: dict[str, Any], drawn: Sequence[Path] = ()) -> list[Section]:
     """Parts of the page."""
     figures = [(file, CAPTIONS[file.name]) for name in CAPTIONS for file in drawn if file.name == name]
-    scene, comm = model.scene, model.system.layout.comm
-    rows = provenance(origin(scene, comm.size))
-    rows += [(f"time {key}", f"{value:.3g} s") for key, value in result["time"].items()]
     return [
         Section("What holds", text="\n\n".join(sentences(certified, result)), figures=figures),
         greedy_table(certified).section("Each round runs the full model where the proved bound was largest."),
-        Section("Made with", rows=rows),
     ]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from softgrasp.study.reduce.result import ReductionStudy
 from softgrasp.study.reduce.tables import (
@@ -18,7 +17,6 @@ from softgrasp.study.reduce.tables import (
     refused_table,
     time_table,
 )
-from softgrasp.study.report.origin import origin, provenance
 from softgrasp.study.report.page import Section
 
 CAPTIONS = {
@@ -41,16 +39,14 @@ CAPTIONS = {
 }
 
 
-def sections(study: ReductionStudy, seconds: Mapping[str, float], files: Sequence[Path]) -> list[Section]:
+def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
     """Parts of the page. Rank 0 only.
 
     Args:
         study: the result.
-        seconds: of every stage.
         files: figures that are drawn.
     """
-    scene, layout = study.full.model.scene, study.full.model.system.layout
-    energy, drawn = scene.reduction.energy, {file.name: file for file in files}
+    energy, drawn = study.full.model.scene.reduction.energy, {file.name: file for file in files}
     text = (
         f"{N_NOTE}\n\n{error_note(energy)} Each method is built from the snapshots of one run and repeats it, driven "
         f"by the same hand. {inner_note(study.sweeps)}"
@@ -64,15 +60,7 @@ def sections(study: ReductionStudy, seconds: Mapping[str, float], files: Sequenc
     refused = refused_table(study.sweeps)
     if refused.rows:
         parts.append(refused.section())
-    about: list[tuple[str, Any]] = [
-        ("n_s", layout.n_s),
-        ("n_e", layout.n_e),
-        ("states", layout.states),
-        ("steps", scene.time.steps),
-    ]
-    about += provenance(origin(scene, layout.comm.size))
-    about += [(f"time {key}", f"{value:.3g} s") for key, value in seconds.items()]
-    return [*parts, *box_sections(study), Section("Made with", rows=about)]
+    return [*parts, *box_sections(study)]
 
 
 def box_sections(study: ReductionStudy) -> list[Section]:

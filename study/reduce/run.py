@@ -105,9 +105,9 @@ def run_reduce(
 
     def page() -> Page:
         files = draw(out, study, views) if pictures else []
-        parts = sections(study, result["time"], files)
+        parts = sections(study, files)
         tables = {"points.csv": point_table(study)}
-        return Page(f"{scene.name}: reduced models", parts, tables, [*files, *models], summary=summary(study))
+        return Page(f"{scene.name}: reduced models", summary(study), parts, tables, [*files, *models])
 
     show(console, study)
     list_files(console, session.write(scene, result, page))

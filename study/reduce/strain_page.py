@@ -123,6 +123,18 @@ def sentences(study: StrainStudy) -> list[str]:
     return lines
 
 
+def summary(study: StrainStudy) -> list[str]:
+    """What came out, in three sentences."""
+    p, f = min(((p, f) for f in study.families for p in f.points), key=lambda pair: pair[0].error_own)
+    again, new, _ = speed_up(p, study.times)
+    return [
+        f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
+        f"The most accurate reduced model, {TITLES[f.key]}, is {p.error_own:.2%} off with N = {p.N} columns and "
+        f"{p.cells} sampled cells.",
+        f"It runs {again:.3g} times as fast as the full model, and {new:.3g} times at a new parameter.",
+    ]
+
+
 def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
     """Parts of the page."""
     drawn = {file.name: file for file in files}

@@ -16,7 +16,7 @@ from softgrasp.reduction.archive import save
 from softgrasp.reduction.replay import full_run
 from softgrasp.study.forward.result import simulate_result
 from softgrasp.study.reduce.strain_measure import measure_strain
-from softgrasp.study.reduce.strain_page import cell_table, error_table, sections, sentences, time_table
+from softgrasp.study.reduce.strain_page import cell_table, error_table, sections, sentences, summary, time_table
 from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy, speed_up
 from softgrasp.study.reduce.times import full_times
 from softgrasp.study.report.files import to_json
@@ -66,7 +66,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         rows = [(f.runs, *asdict(p).values()) for f in study.families for p in f.curves]
         points = {"points.csv": Table(("runs", *names), rows)}
         title = f"{scene.name}: reduced models at finite strain, {last.points[0].engine} stepper"
-        return Page(title, sections(study, files), points, [*files, *models])
+        return Page(title, summary(study), sections(study, files), points, [*files, *models])
 
     for table in (error_table(study), time_table(study), cell_table(study)):
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))

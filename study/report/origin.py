@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import resource
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -58,10 +58,12 @@ def command_line(command: str, path: Path, overrides: Sequence[str], ranks: int,
     return f"{launch}softgrasp {command} {shlex.quote(str(path))}{sets}{options}"
 
 
-def provenance(result: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Rows on where the numbers of a result come from, see :func:`softgrasp.study.report.origin.origin`."""
-    names = {"version": "softgrasp", "machine": "machine", "ranks": "ranks", "scene_hash": "scene hash"}
-    return [(name, result[key]) for key, name in names.items()]
+def made_with(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Sizes, versions and seconds behind a result."""
+    known = {**result, **result.get("sizes", {})}
+    sizes = [(key, known[key]) for key in ("n_s", "n_e", "states", "cells", "steps", "ranks") if key in known]
+    times = [(f"time, {k}", f"{v:.3g} s") for k, v in result.get("time", {}).items() if isinstance(v, float)]
+    return [*sizes, *versions(), *((k, result[k]) for k in ("scene_hash",) if k in result), *times]
 
 
 def versions() -> list[tuple[str, str]]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,18 +18,18 @@ from PIL import Image
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.equation import Equation, Rows, equation
-from softgrasp.study.report.origin import versions
+from softgrasp.study.report.origin import made_with
 from softgrasp.study.report.typeset import equation_html
 from softgrasp.study.report.words import words_of
 
 TEMPLATE = Path(__file__).with_name("page.html")
-KINDS = {".png": "image/png", ".gif": "image/gif", ".svg": "image/svg+xml", ".jpg": "image/jpeg"}
+KINDS = {".png": "image/png", ".gif": "image/gif"}
 PIXELS_PER_INCH = 135  # width of a figure on the screen against its width in print
 EQUATION = "Equation"  # first word of the heading of a section whose code is an equation
 HOW = (
-    "In a checkout, after `make env`, with OMP_NUM_THREADS=1. All numbers of this page are in {numbers} beside it. "
-    "Sizes, counts and errors come out again up to rounding, which the number of ranks changes; times depend on the "
-    "machine and on what else it does."
+    "Run it in a checkout, after make env, with OMP_NUM_THREADS=1. All numbers of this page are in {numbers} beside "
+    "it. Sizes, counts and errors come out again up to rounding, which the number of ranks changes; times depend on "
+    "the machine and on what else it does."
 )
 ADDRESS = re.compile(
     r"""<(?:script|link|iframe|object|embed|base|form)\b[^>]*|\b(?:src|srcset|action|data)\s*=\s*["']?(?!data:)[^"'>\s]+"""
@@ -39,7 +40,6 @@ ADDRESS = re.compile(
 NUMBERS = (int, float, np.integer, np.floating)
 LONG = 24  # [letters]
 SHOWN, MOST_ROWS = 8, 14  # rows of a longer table that stand unfolded
-SVG_WIDTH = 800  # [pixel]
 
 
 @dataclass(frozen=True)
@@ -99,26 +99,28 @@ def write_report(
     path: Path,
     *,
     title: str,
+    summary: Sequence[str],
     subtitle: str = "",
     sections: Sequence[Section] = (),
     scene: Scene | None = None,
     reproduce: str = "",
+    result: Mapping[str, Any] = MappingProxyType({}),
     numbers: str = "result.json",
-    summary: Sequence[str] = (),
     files: Sequence[Path] = (),
 ) -> Path:
     """Write the page; what is empty is left out. Not collective: call on one rank.
 
-    The equation of the scene is added unless a section has it, and the versions unless there is nothing to reproduce.
+    The equation of the scene is added unless a section has it, and what the page was made with.
 
     Args:
         path: the HTML file.
         title, subtitle: first lines.
+        summary: sentences that say what came out.
         sections: what follows, in this order.
         scene: what was run.
         reproduce: the commands that made this page.
+        result: what result.json holds, for sizes and times.
         numbers: the files beside it that hold its numbers.
-        summary: sentences that say what came out.
         files: what lies beside the page; the page links to it.
 
     Raises:
@@ -126,9 +128,9 @@ def write_report(
     """
     given = list(sections)
     if scene and all(section.title != EQUATION for section in given):
-        given.insert(1 if given and not given[0].title else 0, of_scene(scene))
+        given.insert(1, of_scene(scene))
     if reproduce:
-        given.append(Section("Versions", rows=versions()))
+        given.append(Section("Made with", rows=made_with(result)))
     page = Environment(autoescape=True, trim_blocks=True, undefined=StrictUndefined).from_string(
         TEMPLATE.read_text(encoding="utf-8")
     )
@@ -196,8 +198,6 @@ def shown(cell: Any) -> str:
 
 def _width(path: Path) -> int:
     """Width of a picture on the page: figures by their size in print, animations by their pixels."""
-    if path.suffix == ".svg":
-        return SVG_WIDTH
     with Image.open(path) as image:
         dpi = image.info.get("dpi", (0, 0))[0]
         return round(image.width / dpi * PIXELS_PER_INCH) if dpi and path.suffix == ".png" else image.width

@@ -25,11 +25,13 @@ class Table:
         rows: cells, as many in each row as there are columns; None is an empty cell. Numbers are shown with four
             digits and written in full.
         title: heading.
+        best: rows that stand unfolded on a page where the table is long; the first ones if there are none.
     """
 
     header: tuple[str, ...]
     rows: Sequence[Sequence[Any]]
     title: str = ""
+    best: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -44,9 +46,10 @@ class Table:
             writer.writerows(["" if cell is None else cell for cell in row] for row in self.rows)
         return path
 
-    def section(self, text: str = "", title: str | None = None) -> Section:
+    def section(self, text: str = "", title: str | None = None, figures: Sequence[tuple[Path, str]] = ()) -> Section:
         """The table as a part of a page."""
-        return Section(self.title if title is None else title, text, header=self.header, rows=self.rows)
+        title = self.title if title is None else title
+        return Section(title, text, header=self.header, rows=self.rows, figures=figures, best=self.best)
 
     def markdown(self) -> str:
         """The table as a README shows it."""
@@ -78,6 +81,11 @@ class Table:
         for row in self.rows:
             table.add_row(*(escape(shown(cell)) for cell in row))
         return table
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as one reads them: a, b and c."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]])) or "none"
 
 
 def pairs(rows: Sequence[Sequence[str]]) -> rich.table.Table:

@@ -15,7 +15,10 @@ import numpy as np
 from rich.console import Console
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.mesh.check import counted
 from softgrasp.study.report.files import write_json
+from softgrasp.study.report.origin import command_line
+from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.folder import claim, read_result
 from softgrasp.study.shell.session import list_files
@@ -86,7 +89,8 @@ def compare(a: Path, b: Path) -> Comparison:
         if not (result := read_result(folder)):
             raise SceneError(f"{folder}: there is no result.json of a run in this folder; `softgrasp list` shows them")
         results.append(dict(flat(result)))
-    scenes = [dict(flat(tomllib.loads(_text(folder / "scene.toml")))) for folder in (a, b)]
+    files = [folder / "scene.toml" for folder in (a, b)]
+    scenes = [dict(flat(tomllib.loads(file.read_text()) if file.exists() else {})) for file in files]
     names = list(dict.fromkeys([*scenes[0], *scenes[1]]))
     keys = [
         (name, *(str(s.get(name, "-")) for s in scenes)) for name in names if scenes[0].get(name) != scenes[1].get(name)
@@ -102,10 +106,6 @@ def compare(a: Path, b: Path) -> Comparison:
     return Comparison(
         Table(("key of the scene", *heads), keys), Table(("number", *heads, "B / A - 1"), numbers), _traces(a, b)
     )
-
-
-def _text(file: Path) -> str:
-    return file.read_text() if file.exists() else ""
 
 
 def _traces(a: Path, b: Path) -> tuple[list[str], np.ndarray, np.ndarray] | None:
@@ -139,14 +139,37 @@ def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool
     result: dict[str, Any] = {"command": "compare", "scene": f"{a.name} {b.name}", "a": str(a), "b": str(b)}
     result |= {"keys": [list(row) for row in keys.rows], "numbers": [list(row) for row in numbers.rows]}
     files = [write_json(out / "result.json", result), numbers.write_csv(out / "compare.csv")]
+    drawn: tuple[Path, ...] = ()
     if pictures and (comparison.traces is not None or numbers.rows):
         from softgrasp.study.runs.plots import figure_numbers, figure_two  # brings Matplotlib
 
         names = (a.name, b.name)
         file = out / "compare.png"
-        files += (
+        drawn = (
             figure_numbers(numbers, names, file)
             if comparison.traces is None
             else figure_two(*comparison.traces, names, file)
         )
+    files += drawn
+    first = [f"{name} is {x} in A and {y} in B" for name, x, y in keys.rows[:3]]
+    files.append(
+        write_report(
+            out / "report.html",
+            title=f"{a.name} (A) and {b.name} (B)",
+            summary=[
+                f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows), 'number')} of the results differ.",
+                f"{'; '.join(first) or 'The scenes are the same'}.",
+            ],
+            sections=[
+                Section(
+                    "", figures=[(file, "A and B, and their difference.") for file in drawn if file.suffix == ".png"]
+                ),
+                keys.section(title="Keys of the scene"),
+                numbers.section(title="Numbers of result.json"),
+            ],
+            reproduce=command_line("compare", a, [], 1, f" {b}"),
+            numbers="compare.csv and result.json",
+            files=files,
+        )
+    )
     list_files(console, files)

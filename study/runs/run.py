@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from rich.console import Console
@@ -10,11 +12,12 @@ from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.report.origin import origin
-from softgrasp.study.report.page import Section
+from softgrasp.study.report.page import SHOWN, Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.runs.sweep import METHOD, Row, Sweep, parse_axis, run_sweep_points
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
 
+UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
 COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of
 LAG = "lag: largest distance of an output from where it would be if the tissue moved rigidly with the hand."
 REDUCED = (
@@ -25,8 +28,25 @@ REDUCED = (
 
 def sweep_table(rows: list[Row]) -> Table:
     """One row a point; a reason where it failed."""
-    header = list(dict.fromkeys(key for row in rows for key in row))
-    return Table(tuple(header), [[row.get(key) for key in header] for row in rows])
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    best = sorted({round(i * (len(rows) - 1) / (SHOWN - 1)) for i in range(SHOWN)})
+    header = tuple(UNITS.get(key, key) for key in keys)
+    return Table(header, [[row.get(key) for key in keys] for row in rows], best=best)
+
+
+def summary(sweep: Sweep, rows: Sequence[Row]) -> list[str]:
+    """What came out, in three sentences."""
+    good = [row for row in rows if "reason" not in row]
+    keys = [f"{a.key} ({len(a.values)} values from {min(a.values):g} to {max(a.values):g})" for a in sweep.axes]
+    model = f"a reduced model of {sweep.N} columns" if sweep.N else "the full model"
+    texts = [f"{len(good)} of {len(rows)} points of {' and '.join(keys)} were run with {model}."]
+    if name := next((name for name in good[0] if " lag " in name), ""):
+        low, high = (pick(good, key=lambda row: row[name]) for pick in (min, max))
+        at = [", ".join(f"{a.key} = {row[a.key]:g}" for a in sweep.axes) for row in (low, high)]
+        texts.append(
+            f"The largest {name} is least, {low[name]:.3g}, at {at[0]}, and most, {high[name]:.3g}, at {at[1]}."
+        )
+    return [*texts, f"One run took {median(row['seconds'] for row in good):.2g} s in the median."]
 
 
 def run_sweep(
@@ -74,11 +94,12 @@ def run_sweep(
         text = f"{LAG} {REDUCED}" if reduced else LAG
         parts = [Section("", figures=[(files[0], "Largest lag of every output.")] if files else []),
                  *([Section("Warnings", text="\n\n".join(notes))] if notes else []),
-                 Section("Points", text, header=table.header, rows=table.rows)]  # fmt: skip
+                 table.section(text, "Points")]  # fmt: skip
         options = "".join(f" {text}" for text in axes) + (f" --reduced {reduced}" if reduced else "")
-        return Page(f"{scene.name}: sweep", parts, {"sweep.csv": table}, files, options)
+        return Page(f"{scene.name}: sweep", summary(sweep, rows), parts, {"sweep.csv": table}, files, options)
 
-    console.print(table.terminal(wrap=range(len(table.header)), width=console.width))
+    short = sweep_table([{k: v for k, v in row.items() if " end " not in k and k not in UNITS} for row in rows])
+    console.print(short.terminal(wrap=range(len(short.header)), width=console.width))
     show_warnings(console, notes)
     list_files(console, session.write(scene, result, page))
     return result

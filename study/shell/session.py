@@ -32,19 +32,19 @@ class Page:
 
     Attributes:
         title: first line of the page.
+        summary: three sentences that say what came out.
         sections: parts of the page.
         tables: CSV file name -> table.
         files: what is written already, pictures and fields.
         options: of the command line, for the page's last line: " --tolerance 1e-2".
-        summary: three sentences that say what came out.
     """
 
     title: str
+    summary: Sequence[str]
     sections: Sequence[Section]
     tables: Mapping[str, Table] = field(default_factory=dict)
     files: Sequence[Path] = ()
     options: str = ""
-    summary: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -161,6 +161,7 @@ class Session:
                         summary=content.summary,
                         files=files,
                         scene=scene,
+                        result=result,
                         reproduce=command_line(
                             self.command, self.path, self.overrides, self.comm.size, content.options
                         ),

@@ -253,8 +253,8 @@ EVEN = ["tissue.refine=false", "tissue.order=1"]
 FINE = {
     "franka_muscle": ["tissue.order=3", "tissue.refine={tolerance=1e-4}"],
     "layers_2d": ["tissue.order=3", "tissue.refine={tolerance=1e-4}"],
-    "block_3d": ["tissue.cells=[6,6,12]"],
-    "pillow_3d": ["tissue.refine={tolerance=0.06,passes=0}"],
+    "block_3d": ["tissue.cells=[8,6,10]"],
+    "pillow_3d": ["tissue.refine={tolerance=5e-3,passes=0}"],
 }
 
 
@@ -266,9 +266,9 @@ FINE = {
         ("franka_muscle", EVEN, 0.2),
         ("layers_2d", [], 2e-3),
         ("layers_2d", EVEN, 0.05),
-        ("block_3d", [], 0.025),
+        ("block_3d", [], 5e-3),
         ("block_3d", [*EVEN, "tissue.cells=[8,8,16]"], 0.5),
-        ("pillow_3d", [], 0.2),
+        ("pillow_3d", [], 5e-3),
     ],
     ids=lambda value: "even" if isinstance(value, list) and value else value if isinstance(value, str) else "",
 )

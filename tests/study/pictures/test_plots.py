@@ -270,7 +270,8 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
         "Errors", "First.\n\nSecond <b>.", header=("N", "error", "ok"), rows=[(4, 1.25e-7, True), (6, None, False)]
     )
     path = write_report(
-        tmp_path / "r.html", title="A & B", subtitle="s", scene=make_scene(), reproduce="softgrasp reduce x.toml",
+        tmp_path / "r.html", title="A & B", summary=["One."], subtitle="s", scene=make_scene(),
+        reproduce="softgrasp reduce x.toml",
         sections=[Section("", figures=[(png, "caption")]), Section("Short", rows=[("a", 1)]), table],
     )  # fmt: skip
     page = Page(path.read_text())
@@ -285,8 +286,8 @@ def test_report_is_one_balanced_page(tmp_path: Path) -> None:
         ("td", "yes"),
         ("td", "a"),
         ("h2", "Equation"),
-        ("h2", "Versions"),
+        ("h2", "Made with"),
     ):
         assert cell in page.cells
     with pytest.raises(ValueError, match="'Bad' has 2 columns"):
-        write_report(tmp_path / "x.html", title="t", sections=[Section("Bad", rows=[(1, 2), (1, 2, 3)])])
+        write_report(tmp_path / "x.html", title="t", summary=(), sections=[Section("Bad", rows=[(1, 2), (1, 2, 3)])])

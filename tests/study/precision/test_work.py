@@ -226,7 +226,7 @@ def test_wasted_digits_are_those_below_a_tenth_of_the_largest_part() -> None:
     budget = balanced("x", [Part("a", 1e-5), Part("b", 0.03), Part("c", 0.004), Part("d", 0.0)])
     assert [(p.name, p.wasted) for p in budget.parts] == [("b", 0), ("c", 0), ("a", 2), ("d", 13)]
     assert budget.parts[0].share == pytest.approx(0.03 / 0.03401)
-    assert budget.sentence == "Of the error of x, b carries 88 %. Digits that nobody sees: 2 of a, 13 of d."
+    assert budget.sentence == "Of the error of x, b carries 88 %. Wasted digits: 2 of a, 13 of d."
 
 
 def test_tolerance_of_the_reduced_model_counts_the_error_of_its_mesh(result: dict[str, Any]) -> None:
