@@ -4,19 +4,15 @@
 # add and at what they change.
 
 # %%
-from pathlib import Path
-
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import load_scene
 
 comm = MPI.COMM_WORLD
-file = Path(__file__).parent / "scenes" / "paper_forward.toml"
-plain = build(load_scene(file), comm=comm)
-heavy = build(load_scene(file, ["effects.gravity.g=[0.0,-1.0]"]), comm=comm)
+plain = build("paper_forward", comm=comm)
+heavy = build("paper_forward", ["effects.gravity.g=[0.0,-1.0]"], comm=comm)
 
 # %% [markdown]
 # Gravity reuses the coupling `G` of the moving hand, so it adds no form and no operator; it still changes the motion.
@@ -35,8 +31,8 @@ assert np.abs(a.outputs - b.outputs).max() > 1e-3
 # %%
 longer = ["time.end=6.0", "time.steps=1200"]  # the hand rests from t = 3 s on
 viscous = ["effects.damping.kind='kelvin-voigt'", "effects.damping.beta=0.2"]
-free = simulate(build(load_scene(file, longer), comm=comm))
-damped = simulate(build(load_scene(file, longer + viscous), comm=comm))
+free = simulate(build("paper_forward", longer, comm=comm))
+damped = simulate(build("paper_forward", longer + viscous, comm=comm))
 swing, calm = (np.ptp((r.outputs - r.outputs_rigid)[-200:], axis=0).max() for r in (free, damped))
 if comm.rank == 0:
     print(f"swing of the tip in the last second: {swing:.3g} m undamped, {calm:.3g} m damped")

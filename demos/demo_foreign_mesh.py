@@ -16,10 +16,10 @@ from mpi4py import MPI
 from softgrasp.fem.errors import agree
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import load_scene
+from softgrasp.fem.scene.file import load_scene, shipped_scenes
 
 comm = MPI.COMM_WORLD
-scenes = Path(__file__).parent / "scenes"
+scenes = shipped_scenes()["pillow_3d"].parent
 scene = load_scene(scenes / "pillow_3d.toml", ["tissue.refine=false", "tissue.order=1", "time.steps=200"])
 model = build(scene, comm=comm)
 run = simulate(model)

@@ -115,6 +115,20 @@ def test_python_of_a_page_runs(name: str, text: str, tmp_path: Path, monkeypatch
         METHODS.update(known)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("script", sorted((ROOT / "demos").glob("demo_*.py")), ids=lambda path: path.stem)
+def test_tutorial_runs_as_a_notebook(script: Path, tmp_path: Path) -> None:
+    """As a reader runs it: cell by cell in a kernel of this Python."""
+    jupytext, nbclient = pytest.importorskip("jupytext"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    book = jupytext.read(script)
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    client = nbclient.NotebookClient(book, timeout=300, resources={"metadata": {"path": str(tmp_path)}})
+    client.execute(env=environment)
+    assert all(cell.execution_count for cell in book.cells if cell.cell_type == "code" and cell.source.strip())
+
+
 def test_pages_build_strictly(tmp_path: Path) -> None:
     """Links and anchors are checked; what the reader's browser loads lies beside the pages."""
     pytest.importorskip("mkdocs")

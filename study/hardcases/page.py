@@ -47,19 +47,21 @@ def write_files(out: Path, result: HardCaseResult, family: str | None, pictures:
         if pictures and f.cases
     }
     options = (" --quick" if result.quick else "") + (f" --family {family}" if family else "")
-    return [
+    files = [
         write_json(out / "result.json", result.to_dict()),
         csv_table(result).write_csv(out / "hardcases.csv"),
         *(file for pair in figures.values() for file in pair),
-        write_report(
-            out / "report.html",
-            title="Hard cases",
-            summary=summary(result),
-            sections=sections(result, {name: pair[0] for name, pair in figures.items()}),
-            reproduce=f"softgrasp hardcases{options}",
-            numbers="result.json and hardcases.csv",
-        ),
     ]
+    page = write_report(
+        out / "report.html",
+        title="Hard cases",
+        summary=summary(result),
+        sections=sections(result, {name: pair[0] for name, pair in figures.items()}),
+        reproduce=f"softgrasp hardcases{options}",
+        numbers="result.json and hardcases.csv",
+        files=files,
+    )
+    return [*files, page]
 
 
 def summary(result: HardCaseResult) -> list[str]:

@@ -88,8 +88,7 @@ def figure_forward(
         for line in series_of(sorted(good, key=lambda p: p.steps)).values():
             look = _look(line[-1])
             ax.plot([p.seconds for p in line], [p.error for p in line], **look, **THIN)
-        for line in on_meshes(good).values():
-            last = line[-1]
+        for last in (line[-1] for line in on_meshes(good).values() if line[-1].refine != "off"):
             ax.annotate(
                 f"n = {last.n_e}", (last.seconds, last.error), (4, 6 * last.order - 14), fontsize=6,
                 textcoords="offset points", color=ORDER_LOOK[last.order][0],
@@ -137,7 +136,8 @@ def _orders(space: Any, time: Any, points: Sequence[ForwardPoint], slopes: Seque
         time.plot([], [], color=BLUE, label=f"slope {np.median(powers):.2f} (-2)", **THIN)
     axes_log(time, "time steps", "change against the\nmost steps")
     if space.get_legend_handles_labels()[0]:
-        space.legend(loc="best", fontsize=5, handlelength=1.4, title="order (theory)", title_fontsize=5)
+        space.set_ylim(bottom=space.get_ylim()[0] / 30)  # room for the legend below the curves
+        space.legend(loc="lower left", fontsize=5, ncols=2, handlelength=1.4, title="order (theory)", title_fontsize=5)
     if powers:
         time.legend(loc="best", fontsize=6.5, handlelength=1.4)
 

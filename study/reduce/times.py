@@ -73,17 +73,12 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
     # tissue unknowns at which a full run would take as long as a reduced one, at this mesh's time per unknown
     mesh, model = n_e * chosen.time_online / full.steps, f"{chosen.title}, N = {chosen.N}"
     if mesh < LEAST_MESH:
-        pays = (
-            f"the reduced run ({model}) is faster on every mesh; at this mesh's time per unknown it already pays from "
-            f"n_e = {mesh:.0f} on"
-        )
+        pays = f"the reduced run ({model}) is faster than a full run on every mesh"
     else:
-        pays = (
-            f"at this mesh's time per unknown a full run of n_e = {mesh:.0f} takes as long as the reduced one ({model})"
-        )
+        pays = f"a full run of n_e = {mesh:.0f} would take as long as the reduced one ({model})"
     return (
         against,
-        f"Break-even mesh: {pays}. The reduced time does not grow with the mesh, see "
+        f"Break-even mesh: {pays}, at this mesh's time per unknown. The reduced time does not grow with the mesh, see "
         "python -m softgrasp.study.bench meshes.",
         f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
         f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
