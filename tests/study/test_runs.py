@@ -14,6 +14,7 @@ from rich.console import Console
 
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.runs import sweep as sweep_module
 from softgrasp.study.runs.listing import compare, run_compare, runs_below
@@ -23,7 +24,7 @@ from softgrasp.study.runs.sweep import parse_axis
 from softgrasp.study.shell.schema import full_schema
 
 SMALL = ["tissue.cells=[3,6]", "time.steps=60"]
-SCENE = sg.shipped_scenes()["paper_forward"]
+SCENE = shipped_scenes()["paper_forward"]
 QUIET = Console(quiet=True)
 
 
@@ -144,4 +145,4 @@ def test_materials_have_sources() -> None:
 def test_the_schema_beside_the_shipped_scenes_is_current() -> None:
     shipped = json.loads((SCENE.parent / SCHEMA).read_text())
     assert shipped == full_schema(), f"write it again: softgrasp schema > demos/scenes/{SCHEMA}"
-    assert all(path.read_text().startswith(f"#:schema ./{SCHEMA}\n") for path in sg.shipped_scenes().values())
+    assert all(path.read_text().startswith(f"#:schema ./{SCHEMA}\n") for path in shipped_scenes().values())
