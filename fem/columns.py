@@ -15,15 +15,10 @@ AXES, TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class OutputColumn:
-    """One component of an output, or one degree of freedom of the hand.
+    """One component of an output, or one degree of freedom of the hand."""
 
-    Attributes:
-        name: of the output, "tip".
-        axis: x, y, z of a displacement, rx, ry, rz of a rotation; empty for a number without direction.
-    """
-
-    name: str
-    axis: str = ""
+    name: str  # of the output, "tip"
+    axis: str = ""  # x, y, z of a displacement, rx, ry, rz of a rotation; empty for a number without direction
 
     @property
     def label(self) -> str:

@@ -37,20 +37,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is known before the solve.
+    """What is known before the solve."""
 
-    Attributes:
-        findings: problems, worst first.
-        rates: estimated closed-loop poles of the lowest modes; None when the data are unusable.
-        rank_estimate: singular values of X above :data:`RANK_LEVEL` of the largest on hand and these modes; a lower
-            bound of the rank when it is close to 2 (n_s + modes). 0 when there is no solution.
-        damping_enough: Kelvin-Voigt time beta [s] from which the low-rank solvers converge quickly; nan if unknown.
-    """
-
-    findings: tuple[Finding, ...]
-    rates: ModeRates | None
+    findings: tuple[Finding, ...]  # problems, worst first
+    rates: ModeRates | None  # estimated closed-loop poles of the lowest modes; None when the data are unusable
+    # singular values of X above RANK_LEVEL of the largest on hand and these modes; a lower bound of the rank when it is
+    # close to 2 (n_s + modes). 0 when there is no solution.
     rank_estimate: int
-    damping_enough: float
+    damping_enough: float  # Kelvin-Voigt time beta [s] from which the low-rank solvers converge quickly; nan if unknown
 
     @property
     def solvable(self) -> bool:

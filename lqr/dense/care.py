@@ -16,23 +16,14 @@ PBH_LIMIT = 12  # eigenvalues that are examined one by one, each by an SVD of or
 
 @dataclass(frozen=True)
 class DenseSolution:
-    """X of A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 and what belongs to it.
+    """X of A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 and what belongs to it."""
 
-    Attributes:
-        X: (n, n), symmetric.
-        K: feedback u = K x, -R^{-1} B'XE, (m, n).
-        poles: eigenvalues of E^{-1}(A + B K), (n,).
-        residual: ||Res||_F / ||C'QC||_F.
-        backward: ||Res||_F against the sum of the norms of the four terms.
-        newton_steps: accepted Newton steps after the Schur form.
-    """
-
-    X: Array
-    K: Array
-    poles: Complex
-    residual: float
-    backward: float
-    newton_steps: int
+    X: Array  # (n, n), symmetric
+    K: Array  # feedback u = K x, -R^{-1} B'XE, (m, n)
+    poles: Complex  # eigenvalues of E^{-1}(A + B K), (n,)
+    residual: float  # ||Res||_F / ||C'QC||_F
+    backward: float  # ||Res||_F against the sum of the norms of the four terms
+    newton_steps: int  # accepted Newton steps after the Schur form
 
     @property
     def abscissa(self) -> float:

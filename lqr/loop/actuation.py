@@ -13,17 +13,14 @@ from softgrasp.lqr.plant.checks import ControlError
 
 @dataclass(frozen=True)
 class Actuation:
-    """How u = u_bar + K (x - x_bar) reaches the hand.
+    """How u = u_bar + K (x - x_bar) reaches the hand."""
 
-    Attributes:
-        rate: samples a second [Hz]; the input is computed at the start of a tick and held (a robot: 1000). None
-            evaluates the law at the midpoint of every step, implicitly: the continuous feedback.
-        delay: whether a command acts one tick after its sample; during the first tick u_bar acts. Needs ``rate``.
-        limits: bound on |u_i| [N, N m], a number or one per input (may be inf); None for none.
-    """
-
+    # samples a second [Hz]; the input is computed at the start of a tick and held (a robot: 1000). None evaluates the
+    # law at the midpoint of every step, implicitly: the continuous feedback.
     rate: float | None = None
+    # whether a command acts one tick after its sample; during the first tick u_bar acts. Needs ``rate``.
     delay: bool = False
+    # bound on |u_i| [N, N m], a number or one per input (may be inf); None for none
     limits: float | tuple[float, ...] | None = None
 
     def bound(self, inputs: int) -> Array | None:

@@ -52,12 +52,12 @@ class FiniteDrive:
         free = np.ones(layout.n_s, dtype=bool)
         while True:
             a, law = self.push(n, known, free, state)
-            beyond = free & (np.abs(law) > (np.inf if self.bound is None else self.bound))
-            if not beyond.any():
+            over_limit = free & (np.abs(law) > (np.inf if self.bound is None else self.bound))
+            if not over_limit.any():
                 break
             assert self.bound is not None
-            free &= ~beyond
-            known[beyond] = (np.sign(law) * self.bound)[beyond]
+            free &= ~over_limit
+            known[over_limit] = (np.sign(law) * self.bound)[over_limit]
         self.move(n, np.where(free, law, known), a)
 
     def push(self, n: int, known: Array, free: Array, state: TissueState) -> tuple[Array, Array]:

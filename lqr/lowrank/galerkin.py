@@ -44,7 +44,8 @@ class Space:
 
     def grown(self, plant: Plant, columns: Array) -> Space:
         """With the parts of more columns that are new: M-orthogonal to V, which is M-orthonormal. Collective."""
-        comm, size = plant.comm, _m_norms(plant, columns)
+        comm = plant.comm
+        size = np.sqrt(total(comm, np.einsum("ij,ij->j", columns, plant.mass(columns))))
         columns = columns / np.where(size > 0, size, 1.0)
         M_columns = columns
         for _ in range(2):  # a small part is orthogonal to rounding only after it is scaled to 1
@@ -89,10 +90,6 @@ def _normalising(gram: Array) -> Array:
     sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
     keep = sizes > max(NEW**2, ROUNDING * float(sizes.max(initial=0.0)))
     return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
-
-
-def _m_norms(plant: Plant, columns: Array) -> Array:
-    return np.sqrt(total(plant.comm, np.einsum("ij,ij->j", columns, plant.mass(columns))))
 
 
 def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:

@@ -170,12 +170,8 @@ def _corrected(space: StateSpace, X: Array) -> Array | None:
     return None
 
 
-def ordered_poles(plant: Plant, small: ModalSubspace, solution: SmallSolution) -> np.ndarray:
-    """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost. Collective."""
-    return on_root(plant.comm, lambda: _ordered(plant, small, solution.gain))
-
-
 def _ordered(plant: Plant, small: ModalSubspace, gain: Array) -> np.ndarray:
+    """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost."""
     poles, vectors = np.linalg.eig(np.linalg.solve(small.space.E, small.space.A - small.space.B @ gain))
     kinetic = np.real(np.einsum("ij,ij->j", vectors.conj(), small.space.E @ vectors))
     s, r = plant.n_s, small.order
@@ -235,7 +231,8 @@ def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     if plant.two_way:
         M_Phi = M_Phi - plant.G @ np.linalg.solve(plant.M_s, total(plant.comm, plant.G.T @ Phi))
     gain = filtered_gain(plant, small, solution, M_Phi)
-    return ModalStart(small, solution, gain, ordered_poles(plant, small, solution))
+    poles = on_root(plant.comm, lambda: _ordered(plant, small, solution.gain))
+    return ModalStart(small, solution, gain, poles)
 
 
 def _light(small: ModalSubspace) -> bool:

@@ -51,14 +51,6 @@ def _manifest(folder: Path) -> Path:
     return folder / "newton.json"
 
 
-def _pack(name: str, right: Right) -> dict[str, Array]:
-    return {f"{name}_hand": right.hand, f"{name}_rows": right.rows}
-
-
-def _unpack(name: str, data: dict[str, Array]) -> Right:
-    return Right(data[f"{name}_hand"], data[f"{name}_rows"])
-
-
 def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> None:
     """Write everything a resumed run needs. Collective. Raises CheckpointError: the folder cannot be written."""
     keys = sorted(set.intersection(*map(set, state.history))) if state.history else []  # the last of a sweep has more
@@ -73,7 +65,8 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> No
         "appended": np.array(sweep.Z.appended),
         "history_keys": np.array(keys, dtype=str),
         "history": np.array([[entry[key] for key in keys] for entry in state.history]),
-        **_pack("sweep", sweep.state),
+        "sweep_hand": sweep.state.hand,
+        "sweep_rows": sweep.state.rows,
     }
     if state.factor is not None:
         U, signs = state.factor
@@ -131,6 +124,6 @@ def _restore(plant: Plant, state: Iteration, data: dict[str, Array], tol: float)
     Z.count, Z.compressed_to = Z.hand.shape[1], int(data["compressed_to"])
     Z.appended = int(data["appended"])
     Z.widths = [int(width) for width in data["widths"]]
-    sweep = Sweep(_unpack("sweep", data), Z, steps, first)
+    sweep = Sweep(Right(data["sweep_hand"], data["sweep_rows"]), Z, steps, first)
     state.gain = sweep.gain
     return sweep

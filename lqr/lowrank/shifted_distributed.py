@@ -95,15 +95,9 @@ class DistributedTissue:
         self.factors += 1
 
     def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
-        """Local rows of S(p)^{-1} F, (n_local, k). Collective.
+        """See :class:`softgrasp.lqr.lowrank.shifted.ShiftedTissue`; nothing is made ahead. Collective.
 
-        Args:
-            p: shift; 0 gives K_ee^{-1}.
-            F: local rows.
-            ahead: not used.
-
-        Raises:
-            SolverError: the factorisation or the solve fails.
+        Raises SolverError: the factorisation or the solve fails.
         """
         p = complex(p)
         begin = time.perf_counter()

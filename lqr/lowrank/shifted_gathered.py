@@ -132,15 +132,9 @@ class GatheredTissue:
             self.ahead.free(box)
 
     def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
-        """Local rows of S(p)^{-1} F, (n_local, k); complex even where p is real. Collective.
+        """See :class:`softgrasp.lqr.lowrank.shifted.ShiftedTissue`; other ranks or threads factor ahead. Collective.
 
-        Args:
-            p: shift; 0 gives K_ee^{-1}.
-            F: local rows.
-            ahead: shifts that will probably come next, for the other ranks or threads.
-
-        Raises:
-            SolverError: a pivot vanishes.
+        Complex even where p is real. Raises SolverError: a pivot vanishes.
         """
         p = complex(p)
         begin = time.perf_counter()

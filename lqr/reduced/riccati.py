@@ -34,37 +34,22 @@ class ReducedRiccati:
 
 @dataclass(frozen=True)
 class GainReport:
-    """A reduced gain against the optimal one, on the full plant.
+    """A reduced gain against the optimal one, on the full plant."""
 
-    Attributes:
-        method: key of the basis.
-        N: order of the reduced equation.
-        error_P: ||P - P_hat||_F / ||P||_F in the paper's coordinates.
-        error_K: ||K - K_hat||_F / ||K||_F in the paper's coordinates.
-        cost_excess: J(K_hat) / J(K) - 1 from the scene's start on the full plant.
-        abscissa_full: largest real part of the full closed loop [1/s].
-        time_are: seconds of one solution of the reduced equation, for who measures it; else nan.
-        reason: why there is no gain; empty when there is one.
-        certified: the sign of the abscissa is certain, see :class:`softgrasp.lqr.spectrum.modal_loop.LoopQuality`.
-        sampled: the loop from tick to tick, where its instants are known.
-        gain: K_hat; None where there is none.
-        cost_excess_at_most: proved bound on the excess, see :mod:`softgrasp.lqr.loop.gap`; nan where it was not asked
-        for. matrices: of the reduced equation; None where they are not kept.
-    """
-
-    method: str
-    N: int
+    method: str  # key of the basis
+    N: int  # order of the reduced equation
+    # ||P - P_hat||_F / ||P||_F and ||K - K_hat||_F / ||K||_F in the paper's coordinates
     error_P: float  # noqa: N815
     error_K: float  # noqa: N815
-    cost_excess: float
-    abscissa_full: float
-    time_are: float = float("nan")
-    reason: str = ""
-    certified: bool = True
-    sampled: SampledRadius | None = None
-    gain: Gain | None = None
-    cost_excess_at_most: float = float("nan")
-    matrices: ReducedMatrices | None = None
+    cost_excess: float  # J(K_hat) / J(K) - 1 from the scene's start on the full plant
+    abscissa_full: float  # largest real part of the full closed loop [1/s]
+    time_are: float = float("nan")  # seconds of one solution of the reduced equation, for who measures it
+    reason: str = ""  # why there is no gain; empty when there is one
+    certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
+    sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
+    gain: Gain | None = None  # K_hat; None where there is none
+    cost_excess_at_most: float = float("nan")  # proved bound, see softgrasp.lqr.loop.gap; nan where not asked for
+    matrices: ReducedMatrices | None = None  # of the reduced equation; None where they are not kept
 
     @property
     def stable(self) -> bool:

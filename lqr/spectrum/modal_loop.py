@@ -67,11 +67,9 @@ class ModalLoop:
         self.problem, self.comm = problem, problem.layout.comm
         n_e = problem.layout.n_e
         self.complete = n_e <= (ALL_MODES if modes is None else min(modes, DENSE_LIMIT))
-        self.Phi, self.massed, plant = (
-            _all(problem) if self.complete else _lowest(problem, min(modes or SOME_MODES, n_e))
-        )
-        self.plant = plant
-        space = plant.space
+        parts = _all(problem) if self.complete else _lowest(problem, min(modes or SOME_MODES, n_e))
+        self.Phi, self.massed, self.plant = parts
+        space = self.plant.space
         solved = np.linalg.solve(space.E, np.hstack([space.A, space.B]))
         self.A, self.B = solved[:, : len(space.A)], solved[:, len(space.A) :]
 
@@ -138,11 +136,7 @@ def _all(problem: RiccatiProblem) -> tuple[Array, Array, ModalPlant]:
 def _lowest(problem: RiccatiProblem, k: int) -> tuple[Array, Array, ModalPlant]:
     comm = problem.layout.comm
     omega, Phi, massed = modes_of_plant(problem, k)
-    parts = (
-        modal_damping(problem, Phi),
-        modal_inputs(problem, Phi),
-        total(comm, problem.C_z.T @ Phi),
-    )
+    parts = modal_damping(problem, Phi), modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     return Phi, massed, modal_plant(problem, omega, Phi, massed, parts)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -203,7 +204,8 @@ class SampledLoop:
         tail = Tail(self.problem, K, self.lowest)
         n_s, M_s, omega = self.problem.layout.n_s, self.problem.M_s, tail.omega
         K_z, K_v, force = tail.parts
-        s, v, z, w = (slice(a, b) for a, b in _bounds(n_s, len(omega)))
+        ends = np.cumsum([0, n_s, n_s, len(omega), len(omega)]).tolist()
+        s, v, z, w = (slice(a, b) for a, b in pairwise(ends))
         twice = tail.alpha + tail.beta * omega**2
         A = np.zeros((2 * (n_s + len(omega)),) * 2)
         B = np.zeros((len(A), n_s))
@@ -218,10 +220,6 @@ class SampledLoop:
 
     def _radius(self, parts: _Parts, law: Sampling) -> SampledRadius:
         return on_root(self.comm, lambda: _judge(parts, law))
-
-
-def _bounds(n_s: int, k: int) -> tuple[tuple[int, int], ...]:
-    return (0, n_s), (n_s, 2 * n_s), (2 * n_s, 2 * n_s + k), (2 * n_s + k, 2 * (n_s + k))
 
 
 def _judge(parts: _Parts, law: Sampling) -> SampledRadius:

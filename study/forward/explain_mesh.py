@@ -52,10 +52,9 @@ def mesh_report(model: Model) -> MeshReport:
     graded = refine is not None and refine.grading != "off"
     edges = graded and tissue.dimension == 3 and not by_lines(scene)
     order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
-    judged, _ = judge(model, 0.0, False)
-    if judged is None:
-        return MeshReport(kinds, order, graded, None, None, None, None)
-    return MeshReport(kinds, order, graded, judged.estimate, judged.bound, judged.time_error, judged.shift)
+    error = judge(model, 0.0, False)[0]
+    values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
+    return MeshReport(kinds, order, graded, *values)
 
 
 def mesh_lines(report: MeshReport, dimension: int) -> list[str]:

@@ -73,21 +73,21 @@ def run_simulate(
                 list_files(console, files)
             raise
     fields = frames.close()
-    judged, unknown = accuracy.judge(model, run.seconds["steps"], certify)
-    warnings = [*run_warnings(model, run, frames.most[1:]), *accuracy.warnings(judged), *unknown]
+    mesh_error, unknown = accuracy.judge(model, run.seconds["steps"], certify)
+    warnings = [*run_warnings(model, run, frames.most[1:]), *accuracy.warnings(mesh_error), *unknown]
     result = simulate_result(model, run, warnings)
-    rows = [*result.rows(), *accuracy.rows(judged)]
+    rows = [*result.rows(), *accuracy.rows(mesh_error)]
 
     def page() -> Page:
         drawn = frames.draw(out, run)
-        if pictures and judged is not None:
-            drawn += accuracy.draw(out / "mesh_error.png", run, judged)
+        if pictures and mesh_error is not None:
+            drawn += accuracy.draw(out / "mesh_error.png", run, mesh_error)
         sections = _sections(result, rows, drawn)
-        told = [*result.summary(), *accuracy.summary(judged)]
+        told = [*result.summary(), *accuracy.summary(mesh_error)]
         tables = {"trajectory.csv": result.trajectory()}
         return Page(scene.name, told, sections, tables, [*fields, *drawn])
 
-    numbers = result.to_json() | accuracy.keys(judged, run)
+    numbers = result.to_json() | accuracy.keys(mesh_error, run)
     console.print(pairs(rows))
     show_warnings(console, warnings)
     list_files(console, session.write(scene, numbers, page))

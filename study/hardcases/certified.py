@@ -38,7 +38,7 @@ TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
-class Asked:
+class Question:
     """One question to a certified model."""
 
     case: str  # in words
@@ -52,21 +52,21 @@ class Asked:
 
 
 QUESTIONS = (
-    Asked("a parameter between those of the training"),
-    Asked("ten times faster", motion=("motion.duration=0.3",), refuse=True),
-    Asked("another direction than trained", motion=("motion.target=[3.0, -5.0]",), refuse=True),
-    Asked("lambda / mu = 100", at=(5000.0, 50.0)),
-    Asked("lambda / mu = 1e4", at=(5e5, 50.0)),
-    Asked("lambda < 0", at=(-20.0, 50.0)),
-    Asked("mu a tenth of the least trained", at=(30.0, 2.0), refuse=True),
-    Asked("a layer 1e4 times as stiff", scene=(KV, CONTRAST)),
-    Asked("viscosity with omega beta dt > 10", scene=("effects.damping={kind='kelvin-voigt', beta=5.0}",)),
-    Asked("no damping, 300 s", scene=(), motion=("time={steps=30000, end=300.0}",), refuse=True),
-    Asked("start in equilibrium under gravity", scene=(KV, *SAG)),
-    Asked("hand driven by a force, coupled both ways", scene=(KV, "effects.reaction=true", "motion.drive='force'")),
-    Asked("a hand that does not move", motion=("motion={profile='hold', drive='motion'}",)),
-    Asked("one mode", k=1),
-    Asked("one basis, k2 = k", k=36),
+    Question("a parameter between those of the training"),
+    Question("ten times faster", motion=("motion.duration=0.3",), refuse=True),
+    Question("another direction than trained", motion=("motion.target=[3.0, -5.0]",), refuse=True),
+    Question("lambda / mu = 100", at=(5000.0, 50.0)),
+    Question("lambda / mu = 1e4", at=(5e5, 50.0)),
+    Question("lambda < 0", at=(-20.0, 50.0)),
+    Question("mu a tenth of the least trained", at=(30.0, 2.0), refuse=True),
+    Question("a layer 1e4 times as stiff", scene=(KV, CONTRAST)),
+    Question("viscosity with omega beta dt > 10", scene=("effects.damping={kind='kelvin-voigt', beta=5.0}",)),
+    Question("no damping, 300 s", scene=(), motion=("time={steps=30000, end=300.0}",), refuse=True),
+    Question("start in equilibrium under gravity", scene=(KV, *SAG)),
+    Question("hand driven by a force, coupled both ways", scene=(KV, "effects.reaction=true", "motion.drive='force'")),
+    Question("a hand that does not move", motion=("motion={profile='hold', drive='motion'}",)),
+    Question("one mode", k=1),
+    Question("one basis, k2 = k", k=36),
 )
 
 
@@ -125,18 +125,18 @@ def share(error: Array, bound: Array) -> float:
     return float(np.max(error[shown] / np.maximum(bound[shown], np.finfo(float).tiny), initial=0.0))
 
 
-def asked_row(i: int, asked: Asked) -> HardCase:
+def question_row(i: int, q: Question) -> HardCase:
     """One question: the bound against the truth, and the difference of two bases taken for the error."""
-    model, certified = trained(asked.scene, asked.k, asked.k2)
-    question = make("paper_forward", *MESH, *asked.scene, *asked.motion) if asked.motion else model
-    drive, materials = scene_drive(question.scene, model.system.M_hand, 1), certified.materials(*asked.at)
+    model, certified = trained(q.scene, q.k, q.k2)
+    question = make("paper_forward", *MESH, *q.scene, *q.motion) if q.motion else model
+    drive, materials = scene_drive(question.scene, model.system.M_hand, 1), certified.materials(*q.at)
     run = certified.run(materials, drive, allow=True)
     c = run.certificate
-    system, snapshots = full(question, *asked.at)
+    system, snapshots = full(question, *q.at)
     error = true_error(system, snapshots, certified, run, model.system.two_way and drive.hand is None)
 
     def answer() -> float:
-        if asked.refuse:
+        if q.refuse:
             certified.run(materials, drive)
         return share(error, c.energy.values)
 
@@ -148,9 +148,9 @@ def asked_row(i: int, asked: Asked) -> HardCase:
     if c.estimate is not None:
         plain = textbook(share, error, c.estimate.values)
     reason = "a bound holds at every step"
-    if asked.refuse:
+    if q.refuse:
         reason = f"the bound {c.reduction:.2g} is above the tolerance {TOLERANCE:g}"
-    return HardCase(asked.case, i + 1, ours, plain, None if asked.refuse else 1.0, reason)
+    return HardCase(q.case, i + 1, ours, plain, None if q.refuse else 1.0, reason)
 
 
 GREEDY = (
@@ -207,9 +207,9 @@ def file_rows(first: int) -> Iterator[HardCase]:
 
 def certified_rows(quick: bool) -> Iterator[HardCase]:
     """All questions, then files."""
-    for i, asked in enumerate(QUESTIONS):
+    for i, q in enumerate(QUESTIONS):
         if not quick or i in (0, 1, 3, 12, 14):
-            yield asked_row(i, asked)
+            yield question_row(i, q)
     for i, (case, grid, tolerance) in enumerate(GREEDY[:1] if quick else GREEDY):
         yield greedy_row(len(QUESTIONS) + 1 + i, case, grid, tolerance)
     yield from file_rows(len(QUESTIONS) + len(GREEDY) + 1)
@@ -234,8 +234,8 @@ def residual_rows(quick: bool) -> Iterator[HardCase]:
         small = 10.0**power
         c = np.concatenate([[small, 0.0], -squares, np.ones(4)])
 
-        def off(found: float, exact: float = small * length) -> float:
-            return abs(found / exact - 1)
+        def off(norm: float, exact: float = small * length) -> float:
+            return abs(norm / exact - 1)
 
         ours = here(off, float(np.linalg.norm(T @ c)))
         plain = textbook(off, float(np.sqrt(np.maximum(c @ gram @ c, 0.0))))
