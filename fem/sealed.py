@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softgrasp.fem.errors import CheckpointError
 from softgrasp.fem.petsc import Array
@@ -31,6 +32,15 @@ class _Hashed(io.RawIOBase):
     def write(self, data: Any, /) -> int:
         self.sha.update(data)
         return self.file.write(data)
+
+
+def digest(*parts: NDArray[Any] | None) -> str:
+    """SHA-256 of kind, shape and numbers of arrays, 64 hex digits; None counts too."""
+    sha = hashlib.sha256()
+    for part in parts:
+        sha.update(repr(None if part is None else (part.dtype.str, part.shape)).encode())
+        sha.update(b"" if part is None else np.ascontiguousarray(part))
+    return sha.hexdigest()
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> str:

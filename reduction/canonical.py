@@ -41,17 +41,11 @@ MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inh
 
 @dataclass(frozen=True)
 class CanonicalLift:
-    """Local rows that turn a reduced state into velocities: v_z = Y x / scale - W_G v_s.
+    """Local rows that turn a reduced state into velocities: v_z = Y x / scale - W_G v_s."""
 
-    Attributes:
-        L_q: z = L_q x, (n_local, N).
-        Y: M_ee^-1 V_p at the densities of the projection, (n_local, N).
-        W_G: M_ee^-1 G, (n_local, n_s), or None in the relative frame.
-    """
-
-    L_q: Array
-    Y: Array
-    W_G: Array | None
+    L_q: Array  # z = L_q x, (n_local, N)
+    Y: Array  # M_ee^-1 V_p at the densities of the projection, (n_local, N)
+    W_G: Array | None  # M_ee^-1 G, (n_local, n_s), or None in the relative frame
 
 
 def mass_solve(system: BlockSystem, *blocks: Array) -> list[Array]:
@@ -140,28 +134,18 @@ def hand_velocity(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> A
 
 @dataclass(frozen=True)
 class Terms:
-    """Products at one parameter that the equations are put together from.
+    """Products at one parameter that the equations are put together from."""
 
-    Attributes:
-        S_q, S_v: readouts of the hand, (n_s, N).
-        rigid, G_WG: inertia of the tissue moved rigidly, and G' M^-1 G, (n_s, n_s).
-        G_L, G_Lv: G' L_q and G' L_v, (n_s, N).
-        W_tG: W_q' G, (N, n_s).
-        V_Lv: V_p' L_v, (N, N).
-        K: W_q' K L_q, (N, N).
-        energy: Hessian of the tissue's energy relative to the hand, (N, N).
-    """
-
-    S_q: Array
+    S_q: Array  # S_q, S_v: readouts of the hand, (n_s, N)
     S_v: Array
-    rigid: Array
+    rigid: Array  # rigid, G_WG: inertia of the tissue moved rigidly, and G' M^-1 G, (n_s, n_s)
     G_WG: Array
-    G_L: Array
+    G_L: Array  # G_L, G_Lv: G' L_q and G' L_v, (n_s, N)
     G_Lv: Array
-    W_tG: Array
-    V_Lv: Array
-    K: Array
-    energy: Array
+    W_tG: Array  # W_q' G, (N, n_s)
+    V_Lv: Array  # V_p' L_v, (N, N)
+    K: Array  # W_q' K L_q, (N, N)
+    energy: Array  # Hessian of the tissue's energy relative to the hand, (N, N)
 
 
 def _terms(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Terms:

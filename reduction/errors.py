@@ -52,19 +52,14 @@ class ModelErrors:
     error_energy: float
 
 
-def full_energy(system: BlockSystem, snapshots: Snapshots) -> Array:
-    """(z' K_ee z + v_z' M_ee v_z) / 2 of every snapshot [J], (m,), on every rank. Collective."""
-    n, m = system.layout.n_local, snapshots.Z.shape[1]
-    x, y = system.K_ee.createVecs()
-    local = np.zeros(m)
-    for rows, A in ((slice(0, n), system.K_ee), (slice(n, 2 * n), system.M_ee)):
-        for j in range(m):
-            x.array_w[:] = snapshots.Z[rows, j]
-            A.mult(x, y)
-            local[j] += np.dot(snapshots.Z[rows, j], y.array_r) / 2
-    x.destroy()
-    y.destroy()
-    return total(system.layout.comm, local)
+def full_energy(system: BlockSystem, Z: Array) -> Array:
+    """(z' K_ee z + v_z' M_ee v_z) / 2 of columns [z; v_z], local rows [J], (m,), on every rank. Collective."""
+    halves = ((slice(0, system.layout.n_local), system.K_ee), (slice(system.layout.n_local, None), system.M_ee))
+    parts = [
+        sum((Z[rows, b] * times_columns(A, Z[rows, b])).sum(axis=0) for rows, A in halves)
+        for b in column_blocks(Z.shape[1])
+    ]
+    return total(system.layout.comm, np.concatenate(parts) / 2)
 
 
 def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array, v_s: Array) -> Array:
@@ -114,21 +109,13 @@ def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: Block
 
 @dataclass(frozen=True)
 class Span:
-    """Snapshots in the columns of one orthonormal basis, X = Q C + rest.
+    """Snapshots in the columns of one orthonormal basis, X = Q C + rest."""
 
-    Attributes:
-        comm: ranks that share the rows.
-        Q: local rows (rows, k).
-        C: (k, m), on every rank.
-        rest: |X - Q C|_F^2.
-        square: |X|_F^2.
-    """
-
-    comm: MPI.Intracomm
-    Q: Array
-    C: Array
-    rest: float
-    square: float
+    comm: MPI.Intracomm  # ranks that share the rows
+    Q: Array  # local rows (rows, k)
+    C: Array  # (k, m), on every rank
+    rest: float  # |X - Q C|_F^2
+    square: float  # |X|_F^2
 
     def inside(self, V: Array) -> Array:
         """R = Q'V for columns V, local rows, that lie in the span. Collective.
@@ -185,20 +172,13 @@ def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of one model, or of a whole family of nested ones, against one full run.
+    """Errors of one model, or of a whole family of nested ones, against one full run."""
 
-    Attributes:
-        model, small: the largest model of the family, at the parameter of the snapshots.
-        system: of the full run.
-        snapshots: of the full run.
-        energy: :func:`full_energy` of the snapshots.
-    """
-
-    model: ReducedModel
+    model: ReducedModel  # model, small: the largest model of the family, at the parameter of the snapshots
     small: SmallModel
-    system: BlockSystem
-    snapshots: Snapshots
-    energy: Array
+    system: BlockSystem  # of the full run
+    snapshots: Snapshots  # of the full run
+    energy: Array  # :func:`full_energy` of the snapshots
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
 
     def span(self, view: View) -> Span:

@@ -19,12 +19,6 @@ from softgrasp.reduction.bases.basis import ReductionError
 class LTI:
     """E x' = A x + B u, y = C x: deviations from a state of rest, so that gravity drops out.
 
-    Attributes:
-        E, A: (N, N).
-        B: input of the force and torque u on the hand, (N, n_s).
-        C: (p, N).
-        states, inputs, outputs: names with units, "tip_x [m]".
-
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
     >>> system = sg.reduce(model, sg.simulate(model), "craig_bampton", N=12).lti()
@@ -32,11 +26,11 @@ class LTI:
     (('force_x [N]', 'force_y [N]'), (1, 2, 2))
     """
 
-    E: Array
+    E: Array  # E, A: (N, N)
     A: Array
-    B: Array
-    C: Array
-    states: tuple[str, ...]
+    B: Array  # input of the force and torque u on the hand, (N, n_s)
+    C: Array  # (p, N)
+    states: tuple[str, ...]  # states, inputs, outputs: names with units, "tip_x [m]"
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 

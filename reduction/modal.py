@@ -44,21 +44,15 @@ def rotation(angle: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Coordinates:
-    """x = X w, with what is known of a step in w.
+class StepCoordinates:
+    """x = X w, with what is known of a step in w."""
 
-    Attributes:
-        X, X_inverse: x = X w and w = X_inverse x.
-        omega: frequencies of the pairs of modes that follow each other from ``first`` on.
-        first: number of the first mode.
-        still: number of coordinates after the modes that nothing moves; the modes then move each other alone. None when
-            other coordinates may move the modes.
-    """
-
-    X: Array
+    X: Array  # X, X_inverse: x = X w and w = X_inverse x
     X_inverse: Array
-    omega: Array
-    first: int = 0
+    omega: Array  # frequencies of the pairs of modes that follow each other from ``first`` on
+    first: int = 0  # number of the first mode
+    # number of coordinates after the modes that nothing moves; the modes then move each other alone. None when other
+    # coordinates may move the modes.
     still: int | None = None
 
     def fix(self, P: Array, angle: Array, often: bool) -> None:
@@ -77,19 +71,14 @@ class Coordinates:
 
 @dataclass(frozen=True)
 class Modal:
-    """Steps of w = [pairs; still; free], mode by mode.
+    """Steps of w = [pairs; still; free], mode by mode."""
 
-    Attributes:
-        angle: of a step, one a pair (m,).
-        load: of the inputs and of a constant 1 to dt g / (1 - i omega dt / 2), real and imaginary rows by turns,
-            (2 m, i + 1) for i inputs.
-        rest: the same to dt g of all other coordinates, (still + free, i + 1).
-        pull: what pairs and still ones do to the free ones in a step, w_f += pull (w_n + w_{n+1}), (free, 2 m + still).
-    """
-
-    angle: Array
+    angle: Array  # of a step, one a pair (m,)
+    # of the inputs and of a constant 1 to dt g / (1 - i omega dt / 2), real and imaginary rows by turns, (2 m, i + 1)
+    # for i inputs
     load: Array
-    rest: Array
+    rest: Array  # the same to dt g of all other coordinates, (still + free, i + 1)
+    # what pairs and still ones do to the free ones in a step, w_f += pull (w_n + w_{n+1}), (free, 2 m + still)
     pull: Array
 
     def march(self, inputs: Array, start: Array) -> Array:
@@ -121,7 +110,7 @@ def turns(angle: Array, steps: int) -> Array:
     return np.asarray((coarse[:, None] * fine).reshape(-1, len(angle))[: steps + 1])
 
 
-def modal_of(at: Coordinates, E: Array, A: Array, loads: Array, dt: float) -> Modal | None:
+def modal_of(at: StepCoordinates, E: Array, A: Array, loads: Array, dt: float) -> Modal | None:
     """The steps of E x' = A x + loads [u; 1] mode by mode; None where the modes do not move by themselves."""
     if at.still is None or at.first:
         return None

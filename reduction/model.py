@@ -37,34 +37,22 @@ def singular(X: Array) -> bool:
 
 @dataclass(frozen=True)
 class Lift:
-    """Rows that turn reduced states into tissue states relative to the hand; the only distributed part of a model.
+    """Rows that turn reduced states into tissue states relative to the hand; the only distributed part of a model."""
 
-    Attributes:
-        layout: sizes and ownership.
-        L_q: z = L_q x, local rows (n_local, N).
-        L_v: v_z = L_v x / scale [- W_G v_s], local rows (n_local, N).
-        W_G: M_ee^-1 G, local rows (n_local, n_s), in canonical coordinates of the absolute frame; else None.
-    """
-
-    layout: BlockLayout
-    L_q: Array
-    L_v: Array
+    layout: BlockLayout  # sizes and ownership
+    L_q: Array  # z = L_q x, local rows (n_local, N)
+    L_v: Array  # v_z = L_v x / scale [- W_G v_s], local rows (n_local, N)
+    # M_ee^-1 G, local rows (n_local, n_s), in canonical coordinates of the absolute frame; else None
     W_G: Array | None = None
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """y = C_z x + C_s q_s, the scene's outputs [m].
+    """y = C_z x + C_s q_s, the scene's outputs [m]."""
 
-    Attributes:
-        C_z: part of the tissue relative to the hand, (p, N).
-        C_s: rigid part, (p, n_s).
-        names: one per component.
-    """
-
-    C_z: Array
-    C_s: Array
-    names: tuple[str, ...] = ()
+    C_z: Array  # part of the tissue relative to the hand, (p, N)
+    C_s: Array  # rigid part, (p, n_s)
+    names: tuple[str, ...] = ()  # one per component
 
 
 @dataclass(frozen=True)

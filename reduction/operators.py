@@ -15,25 +15,15 @@ Parts = dict[str, Array]
 
 @dataclass(frozen=True)
 class Parameters:
-    """Everything online assembly depends on.
+    """Everything online assembly depends on."""
 
-    Attributes:
-        materials: one per layer.
-        alpha: mass-proportional damping [1/s].
-        damped: damping terms exist.
-        in_space: alpha drags the rigid motion too.
-        hand_weight: gravity acts on the hand's own mass.
-        two_way: the hand feels the tissue.
-        scale: rho / rho of the projection, common to all layers (canonical models).
-    """
-
-    materials: tuple[LayerMaterial, ...]
-    alpha: float = 0.0
-    damped: bool = False
-    in_space: bool = False
-    hand_weight: bool = False
-    two_way: bool = False
-    scale: float = 1.0
+    materials: tuple[LayerMaterial, ...]  # one per layer
+    alpha: float = 0.0  # mass-proportional damping [1/s]
+    damped: bool = False  # damping terms exist
+    in_space: bool = False  # alpha drags the rigid motion too
+    hand_weight: bool = False  # gravity acts on the hand's own mass
+    two_way: bool = False  # the hand feels the tissue
+    scale: float = 1.0  # rho / rho of the projection, common to all layers (canonical models)
 
     def _sum(self, weights: list[float], stack: Array) -> Array:
         # one product of a vector with a reshaped stack: an order of magnitude faster than a loop for small matrices
@@ -56,23 +46,15 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Operators:
-    """E x' = A x + B u + F g of dimension N, its hand and its energies.
+    """E x' = A x + B u + F g of dimension N, its hand and its energies."""
 
-    Attributes:
-        E, A: (N, N).
-        B: input of the force u on the hand, (N, n_s).
-        F: input of the acceleration of free fall g, (N, n_s).
-        S_q, S_v: q_s = S_q x and v_s = S_v x, (n_s, N).
-        energy: x' energy x / 2 is the tissue's energy (z' K z + v_z' M v_z) / 2 [J].
-        total: the same with the kinetic energy of the hand; two-way also that of the tissue's rigid motion, which
-            makes it the Hamiltonian.
-    """
-
-    E: Array
+    E: Array  # E, A: (N, N)
     A: Array
-    B: Array
-    F: Array
-    S_q: Array
+    B: Array  # input of the force u on the hand, (N, n_s)
+    F: Array  # input of the acceleration of free fall g, (N, n_s)
+    S_q: Array  # S_q, S_v: q_s = S_q x and v_s = S_v x, (n_s, N)
     S_v: Array
-    energy: Array
+    energy: Array  # x' energy x / 2 is the tissue's energy (z' K z + v_z' M v_z) / 2 [J]
+    # the same with the kinetic energy of the hand; two-way also that of the tissue's rigid motion, which makes it the
+    # Hamiltonian
     total: Array

@@ -4,47 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.petsc import total
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.canonical import canonical_parts
 from softgrasp.reduction.galerkin import galerkin_parts, relative_rows
 from softgrasp.reduction.model import Lift, Outputs, ReducedModel
 
-
-class OutputLike(Protocol):
-    """What an output needs to be projected; :class:`softgrasp.fem.model.outputs.Output` has it."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """One label per component."""
-
-    @property
-    def size(self) -> int:
-        """Number of components."""
-
-    @property
-    def dofs(self) -> np.ndarray:
-        """Local tissue dofs that enter, (k, size)."""
-
-    @property
-    def weight(self) -> float:
-        """Every listed dof enters with this factor."""
-
-    @property
-    def C_s(self) -> Array:
-        """Rigid part, (size, n_s)."""
+if TYPE_CHECKING:
+    from softgrasp.fem.model.outputs import Output
 
 
 def project(
     basis: Basis,
     system: BlockSystem,
-    outputs: Sequence[OutputLike] = (),
+    outputs: Sequence[Output] = (),
     scene_hash: str = "",
 ) -> ReducedModel:
     """Reduced model E x' = A x + B u + F g, y = C_z x + C_s q_s of a basis V of shape (2n, N). Collective.
@@ -102,7 +81,7 @@ def project(
     )
 
 
-def project_outputs(outputs: Sequence[OutputLike], lift: Lift) -> Outputs:
+def project_outputs(outputs: Sequence[Output], lift: Lift) -> Outputs:
     """C_z = C_e L_q on every rank, with the rigid parts. Collective."""
     n_s, N = lift.layout.n_s, lift.L_q.shape[1]
     rows = [o.weight * lift.L_q[o.dofs].sum(axis=0) for o in outputs]

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.modal import Coordinates, Modal, modal_of
+from softgrasp.reduction.modal import Modal, StepCoordinates, modal_of
 from softgrasp.reduction.model import ModelError, SmallModel
 from softgrasp.reduction.spectrum import NULL_TOLERANCE, balanced, energy_factor, is_skew, skew_modes
 
@@ -29,25 +29,16 @@ class Propagator:
     """One step in energy coordinates, w_{n+1} = matrix [w_n; u_n; 1], and b of them at once.
 
     A conservative model also has ``modal``, which runs without either; they are then made when they are first used.
-
-    Attributes:
-        model: what it steps.
-        dt: step [s].
-        at: coordinates, x = X w.
-        E, A: of the equations that are stepped, all of the model or those of its tissue.
-        loads: [input of u, constant load], (N or the tissue's own coordinates, m + 1).
-        driven: the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step.
-        modal: the same mode by mode, for conservative models.
     """
 
-    model: SmallModel
-    dt: float
-    at: Coordinates
-    E: Array
+    model: SmallModel  # what it steps
+    dt: float  # step [s]
+    at: StepCoordinates  # coordinates, x = X w
+    E: Array  # E, A: of the equations that are stepped, all of the model or those of its tissue
     A: Array
-    loads: Array
-    driven: bool = False
-    modal: Modal | None = None
+    loads: Array  # [input of u, constant load], (N or the tissue's own coordinates, m + 1)
+    driven: bool = False  # the hand is prescribed: w holds the tissue only, and the inputs are the hand's in a step
+    modal: Modal | None = None  # the same mode by mode, for conservative models
 
     @property
     def X(self) -> Array:
@@ -106,7 +97,7 @@ class Propagator:
         return P
 
 
-def _coordinates(model: SmallModel, driven: bool) -> Coordinates:
+def _coordinates(model: SmallModel, driven: bool) -> StepCoordinates:
     """Energy coordinates: of the tissue alone where the hand is driven, else of the whole state."""
     apart, k, N = model.fixed_solid and (driven or not model.two_way), 2 * model.n_s, model.N
     whole = None if apart or not model.structured else _whole(model)
@@ -117,17 +108,17 @@ def _coordinates(model: SmallModel, driven: bool) -> Coordinates:
         return tissue
     X, X_inverse = np.eye(N), np.eye(N)
     if tissue is None:
-        return Coordinates(X, X_inverse, np.zeros(0))
+        return StepCoordinates(X, X_inverse, np.zeros(0))
     X[k:, k:], X_inverse[k:, k:] = tissue.X, tissue.X_inverse
-    return Coordinates(X, X_inverse, tissue.omega, k)
+    return StepCoordinates(X, X_inverse, tissue.omega, k)
 
 
-def _tissue(model: SmallModel, apart: bool) -> Coordinates:
+def _tissue(model: SmallModel, apart: bool) -> StepCoordinates:
     """Coordinates of the tissue beside the hand's own; ``apart`` if no hand moves with it, so that it has modes."""
     op, block = model.operators, slice(2 * model.n_s, model.N)
     E, A, L = op.E[block, block], op.A[block, block], energy_factor(op.energy[block, block])
     if L is None:
-        return Coordinates(np.eye(len(A)), np.eye(len(A)), np.zeros(0))
+        return StepCoordinates(np.eye(len(A)), np.eye(len(A)), np.zeros(0))
     U, omega = np.eye(len(L)), np.zeros(0)
     still = None
     if model.structured and apart:
@@ -135,10 +126,10 @@ def _tissue(model: SmallModel, apart: bool) -> Coordinates:
         if is_skew(S):
             U, omega = skew_modes((S - S.T) / 2)
             still = len(L) - 2 * len(omega)
-    return Coordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega, 0, still)
+    return StepCoordinates(np.linalg.solve(L.T, U), U.T @ L.T, omega, 0, still)
 
 
-def _whole(model: SmallModel) -> Coordinates | None:
+def _whole(model: SmallModel) -> StepCoordinates | None:
     """Coordinates w = [modes; still; free] of a conservative model with its hand inside, H = |modes, still|^2 / 2.
 
     H is semidefinite: displacements of the free hand cost nothing. With H = y'y / 2, y = R x and y' = R E^-1 A R^+ y, a
@@ -158,7 +149,7 @@ def _whole(model: SmallModel) -> Coordinates | None:
         return None
     U, omega = skew_modes((S - S.T) / 2)
     X, X_inverse = np.hstack([R_plus @ U, V_0 / D[:, None]]), np.vstack([U.T @ R, V_0.T * D])
-    return Coordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
+    return StepCoordinates(X, X_inverse, omega, 0, len(root) - 2 * len(omega))
 
 
 def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator:

@@ -52,7 +52,7 @@ class FullRun:
     @cached_property
     def energy(self) -> Array:
         """Tissue energy (z' K z + v_z' M v_z) / 2 of every snapshot, (m,) [J]. Collective at the first use."""
-        return full_energy(self.model.system, self.snapshots)
+        return full_energy(self.model.system, self.snapshots.Z)
 
     @cached_property
     def force(self) -> Array:

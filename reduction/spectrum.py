@@ -23,19 +23,12 @@ SKEW_TOLERANCE = 1e-8  # a conservative block is skew in energy coordinates; the
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Eigenvalues that decide on stability.
+    """Eigenvalues that decide on stability."""
 
-    Attributes:
-        eigenvalues: of E x' = A x without the zeros of the free hand, complex [1/s].
-        abscissa: largest real part [1/s]; exactly 0 for a conservative block.
-        zeros: number of eigenvalues set apart.
-        tolerance: growth rate [1/s] up to which the model counts as stable.
-    """
-
-    eigenvalues: np.ndarray
-    abscissa: float
-    zeros: int
-    tolerance: float
+    eigenvalues: np.ndarray  # of E x' = A x without the zeros of the free hand, complex [1/s]
+    abscissa: float  # largest real part [1/s]; exactly 0 for a conservative block
+    zeros: int  # number of eigenvalues set apart
+    tolerance: float  # growth rate [1/s] up to which the model counts as stable
 
     @property
     def stable(self) -> bool:

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
 
 from softgrasp.fem.mesh.arrays import MeshArrays, Sets
+from softgrasp.fem.sealed import digest
 
 
 def mesh_digest(arrays: MeshArrays) -> str:
     """SHA-256 of coordinates, cells, tags and sets, 64 hex digits."""
-    digest = hashlib.sha256()
-    for array in (arrays.points, arrays.cells, arrays.cell_tags, arrays.facets, arrays.facet_tags):
-        if array is None:
-            digest.update(b"none")
-            continue
-        digest.update(repr((array.dtype.str, array.shape)).encode())
-        digest.update(np.ascontiguousarray(array))
-    for sets in (arrays.cell_sets, arrays.facet_sets):
-        digest.update(_text(sets).encode())
-    return digest.hexdigest()
+    sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (arrays.cell_sets, arrays.facet_sets)]
+    return digest(arrays.points, arrays.cells, arrays.cell_tags, arrays.facets, arrays.facet_tags, *sets)
 
 
 def _text(sets: Sets) -> str:

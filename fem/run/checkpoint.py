@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,7 +14,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.sealed import AGAIN, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
+from softgrasp.fem.sealed import AGAIN, digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 
 FORMAT = 4
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
@@ -170,8 +169,7 @@ def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) ->
 
 def _numbering(layout: BlockLayout) -> Array:
     """SHA-256 of this rank's nodes in their order, 32 numbers."""
-    digest = hashlib.sha256(np.ascontiguousarray(layout.nodes)).digest()
-    return np.frombuffer(digest, dtype=np.uint8).astype(np.float64)
+    return np.frombuffer(bytes.fromhex(digest(layout.nodes)), dtype=np.uint8).astype(np.float64)
 
 
 def _numbers_hash(scene: Scene) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.sealed import read_arrays, read_manifest, remove_others, write_arrays, write_manifest
+from softgrasp.fem.sealed import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 from softgrasp.lqr.lowrank.adi import SHARE, Columns, Sweep
 from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.plant import Plant
@@ -35,16 +34,11 @@ class Iteration:
 
 def fingerprint(plant: Plant) -> str:
     """Digest of the problem that this rank sees, to refuse a foreign restart file."""
-    digest = hashlib.sha256(repr((plant.comm.size, plant.layout.n_e, plant.two_way, plant.drag_es)).encode())
-    for A in (plant.system.M_ee, plant.system.K_ee):
-        digest.update(np.ascontiguousarray(A.getValuesCSR()[2]))
     damping = plant.system.damping
-    digest.update(repr((damping.alpha, damping.beta)).encode())
-    digest.update(b"" if damping.matrix is None else np.ascontiguousarray(damping.matrix.getValuesCSR()[2]))
-    for array in (plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G):
-        digest.update(np.ascontiguousarray(array))
-    digest.update(b"" if plant.B_z is None else np.ascontiguousarray(plant.B_z))
-    return digest.hexdigest()
+    numbers = (plant.comm.size, plant.layout.n_e, plant.two_way, plant.drag_es, damping.alpha, damping.beta)
+    matrices = (plant.system.M_ee, plant.system.K_ee, damping.matrix)
+    entries = [None if A is None else A.getValuesCSR()[2] for A in matrices]
+    return digest(np.array(numbers), *entries, plant.C_s, plant.C_z, plant.B, plant.M_s, plant.G, plant.B_z)
 
 
 def _manifest(folder: Path) -> Path:

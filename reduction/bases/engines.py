@@ -39,23 +39,14 @@ SVD_TOLERANCE = 1e-13
 
 @dataclass(frozen=True)
 class Factor:
-    """scale * Q R = X up to rounding (or its best approximation of rank r when ``partial``).
+    """scale * Q R = X up to rounding (or its best approximation of rank r when ``partial``)."""
 
-    Attributes:
-        Q: local rows (n_local, r), orthonormal columns over all ranks.
-        R: (r, c), the same bits on every rank.
-        scale: power of two that keeps squares of R from under- and overflow.
-        floor: singular values below ``floor * sigma_1`` are noise.
-        partial: only the leading singular triplets were computed.
-        square: sum of all sigma^2 of X / scale, also of those that are not in R.
-    """
-
-    Q: Array
-    R: Array
-    scale: float
-    floor: float
-    partial: bool
-    square: float
+    Q: Array  # local rows (n_local, r), orthonormal columns over all ranks
+    R: Array  # (r, c), the same bits on every rank
+    scale: float  # power of two that keeps squares of R from under- and overflow
+    floor: float  # singular values below ``floor * sigma_1`` are noise
+    partial: bool  # only the leading singular triplets were computed
+    square: float  # sum of all sigma^2 of X / scale, also of those that are not in R
 
 
 def magnitude(comm: MPI.Intracomm, *blocks: Array) -> float:

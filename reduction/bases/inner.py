@@ -68,17 +68,11 @@ def weights(system: BlockSystem, inner: InnerName) -> tuple[Weight, Weight] | No
 
 @dataclass(frozen=True)
 class Rows:
-    """How some row blocks are stacked on a rank: hand rows of every half (rank 0 only), then tissue rows.
+    """How some row blocks are stacked on a rank: hand rows of every half (rank 0 only), then tissue rows."""
 
-    Attributes:
-        layout: sizes and ownership.
-        halves: 1 for displacements or momenta alone, 2 for both.
-        hand: whether the hand's rows take part.
-    """
-
-    layout: BlockLayout
-    halves: int
-    hand: bool
+    layout: BlockLayout  # sizes and ownership
+    halves: int  # 1 for displacements or momenta alone, 2 for both
+    hand: bool  # whether the hand's rows take part
 
     @property
     def top(self) -> int:

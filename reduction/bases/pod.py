@@ -21,27 +21,16 @@ Halves = list[tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class Request:
-    """What a builder of parts gets.
+    """What a builder of parts gets."""
 
-    Attributes:
-        states: system and snapshots.
-        blocks: the snapshots in the coordinates and the frame of the method.
-        hand: whether the hand's rows take part in the decomposition.
-        coordinates: "qv" or "qp".
-        inner: inner product.
-        engine: engine of the tall factorisation.
-        count: largest N asked for, None when only shares of energy are.
-        share: smallest share of sum sigma^2 that may be dropped, None when only N are given.
-    """
-
-    states: States
-    blocks: Blocks
-    hand: bool
-    coordinates: Coordinates
-    inner: InnerName
-    engine: EngineName
-    count: int | None
-    share: float | None
+    states: States  # system and snapshots
+    blocks: Blocks  # the snapshots in the coordinates and the frame of the method
+    hand: bool  # whether the hand's rows take part in the decomposition
+    coordinates: Coordinates  # "qv" or "qp"
+    inner: InnerName  # inner product
+    engine: EngineName  # engine of the tall factorisation
+    count: int | None  # largest N asked for, None when only shares of energy are
+    share: float | None  # smallest share of sum sigma^2 that may be dropped, None when only N are given
 
     @property
     def k(self) -> int | None:

@@ -28,28 +28,17 @@ from softgrasp.reduction.bases.truncation import Columns, Part
 
 @dataclass(frozen=True)
 class Canonical:
-    """Snapshots q~ = Q L^-T C_q and y~ = Q L^-T C_y in the columns of one A-orthonormal basis.
+    """Snapshots q~ = Q L^-T C_q and y~ = Q L^-T C_y in the columns of one A-orthonormal basis."""
 
-    Attributes:
-        rows: how one half is stacked.
-        by: the weight A, or None.
-        factor: Q and R = [R_q, R_y].
-        inverse: L^-T, or None.
-        C_q, C_y: small coordinates, (r, m), on every rank.
-        rate: c.
-        scale: power of two taken out of the snapshots.
-        lift: whether V_p needs the factor A (canonical coordinates).
-    """
-
-    rows: Rows
-    by: Weight | None
-    factor: Factor
-    inverse: Array | None
-    C_q: Array
+    rows: Rows  # how one half is stacked
+    by: Weight | None  # the weight A, or None
+    factor: Factor  # Q and R = [R_q, R_y]
+    inverse: Array | None  # L^-T, or None
+    C_q: Array  # C_q, C_y: small coordinates, (r, m), on every rank
     C_y: Array
-    rate: float
-    scale: float
-    lift: bool
+    rate: float  # c
+    scale: float  # power of two taken out of the snapshots
+    lift: bool  # whether V_p needs the factor A (canonical coordinates)
 
     def vectors(self, C: Array) -> Array:
         """Q L^-T C, local rows."""

@@ -21,33 +21,21 @@ from softgrasp.reduction.bases.truncation import PAPER_ENERGY, Columns, Part, Tr
 
 @dataclass(frozen=True)
 class Method:
-    """One basis of the registry.
+    """One basis of the registry."""
 
-    Attributes:
-        key: name in scenes and results.
-        title: one line for tables and figures.
-        paper: what the paper calls it, None for those beyond it.
-        preserving: the reduced model keeps the Hamiltonian or the second-order structure.
-        build: makes the parts from the snapshots.
-        coordinates, frame, structure: of the basis, see :class:`softgrasp.reduction.bases.basis.Basis`.
-        fixed: the hand's unit columns are kept apart from the decomposition.
-        pairs: units are pairs of columns, so N is even.
-        snapshots: whether it needs any.
-        inner: inner product it is built in unless another is asked for.
-    """
-
-    key: str
-    title: str
-    paper: str | None
-    preserving: bool
-    build: Callable[[Request], tuple[Part, ...]]
+    key: str  # name in scenes and results
+    title: str  # one line for tables and figures
+    paper: str | None  # what the paper calls it, None for those beyond it
+    preserving: bool  # the reduced model keeps the Hamiltonian or the second-order structure
+    build: Callable[[Request], tuple[Part, ...]]  # makes the parts from the snapshots
+    # coordinates, frame, structure: of the basis, see :class:`softgrasp.reduction.bases.basis.Basis`
     coordinates: Coordinates
     frame: Frame
     structure: Structure
-    fixed: bool
-    pairs: bool
-    snapshots: bool = True
-    inner: InnerName = "euclidean"
+    fixed: bool  # the hand's unit columns are kept apart from the decomposition
+    pairs: bool  # units are pairs of columns, so N is even
+    snapshots: bool = True  # whether it needs any
+    inner: InnerName = "euclidean"  # inner product it is built in unless another is asked for
 
     @property
     def short_title(self) -> str:

@@ -28,19 +28,12 @@ class BasisError(ReductionError):
 
 @dataclass(frozen=True)
 class Blocks:
-    """Snapshot columns in the rows of :class:`softgrasp.reduction.bases.basis.Basis`.
+    """Snapshot columns in the rows of :class:`softgrasp.reduction.bases.basis.Basis`."""
 
-    Attributes:
-        s_q: hand displacement, (n_s, m), on every rank [m, rad].
-        s_p: hand velocity, or momentum in canonical coordinates, (n_s, m), on every rank.
-        e_q: tissue displacement, local rows (n_local, m) [m].
-        e_p: tissue velocity [m/s] or momentum [kg m/s], local rows (n_local, m).
-    """
-
-    s_q: Array
-    s_p: Array
-    e_q: Array
-    e_p: Array
+    s_q: Array  # hand displacement, (n_s, m), on every rank [m, rad]
+    s_p: Array  # hand velocity, or momentum in canonical coordinates, (n_s, m), on every rank
+    e_q: Array  # tissue displacement, local rows (n_local, m) [m]
+    e_p: Array  # tissue velocity [m/s] or momentum [kg m/s], local rows (n_local, m)
 
 
 @dataclass(frozen=True)
@@ -49,14 +42,10 @@ class States:
 
     Each run comes with the system that it was made with, because momenta need its mass. Craig-Bampton bases use the
     system alone, so ``runs`` may be empty.
-
-    Attributes:
-        system: operators that the inner products use.
-        runs: pairs of system and snapshots, all on one layout.
     """
 
-    system: BlockSystem
-    runs: tuple[tuple[BlockSystem, Snapshots], ...] = ()
+    system: BlockSystem  # operators that the inner products use
+    runs: tuple[tuple[BlockSystem, Snapshots], ...] = ()  # pairs of system and snapshots, all on one layout
 
     @property
     def layout(self) -> BlockLayout:

@@ -29,39 +29,25 @@ class Columns:
 
 @dataclass(frozen=True)
 class Part:
-    """One ordered family of units, each of one column or of a symplectic pair.
+    """One ordered family of units, each of one column or of a symplectic pair."""
 
-    Attributes:
-        title: what it spans, for messages.
-        sigma: importance of the units over ``scale``, descending (singular values).
-        total: sum of all sigma^2, also of those that were not computed.
-        rank: number of units that are more than noise.
-        columns: makes the leading k units; one set of columns per half of the pair. Collective.
-        scale: power of two taken out of sigma, so that squares neither overflow nor vanish.
-        rate: weight c between displacement and momentum, see `reduction/bases/inner.py`.
-    """
-
-    title: str
-    sigma: Array
-    total: float
-    rank: int
+    title: str  # what it spans, for messages
+    sigma: Array  # importance of the units over ``scale``, descending (singular values)
+    total: float  # sum of all sigma^2, also of those that were not computed
+    rank: int  # number of units that are more than noise
+    # makes the leading k units; one set of columns per half of the pair. Collective.
     columns: Callable[[int], tuple[Columns, ...]]
-    scale: float = 1.0
-    rate: float = 1.0
+    scale: float = 1.0  # power of two taken out of sigma, so that squares neither overflow nor vanish
+    rate: float = 1.0  # weight c between displacement and momentum, see `reduction/bases/inner.py`
 
 
 @dataclass(frozen=True)
 class Truncation:
-    """Exactly one of the three says how many vectors are taken.
+    """Exactly one of the three says how many vectors are taken."""
 
-    Attributes:
-        N: dimension of the whole basis, with the hand's columns.
-        energy: share of sum sigma^2 to keep at least in every part, 0 < energy < 1.
-        tol: relative projection error sqrt(sum of dropped sigma^2 / total) to reach in every part, 0 < tol < 1.
-    """
-
-    N: int | None = None
-    energy: float | None = None
+    N: int | None = None  # dimension of the whole basis, with the hand's columns
+    energy: float | None = None  # share of sum sigma^2 to keep at least in every part, 0 < energy < 1
+    # relative projection error sqrt(sum of dropped sigma^2 / total) to reach in every part, 0 < tol < 1
     tol: float | None = None
 
     def __post_init__(self) -> None:

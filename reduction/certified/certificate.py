@@ -28,17 +28,11 @@ class ToleranceError(SoftgraspError):
 
 @dataclass(frozen=True)
 class Bound:
-    """Error of a run at every step.
+    """Error of a run at every step."""
 
-    Attributes:
-        values: at every step, (steps + 1,) or one column for each component.
-        size: largest value of the reduced solution itself, in the same norm.
-        kind: "proof": not exceeded; "estimate": about so large.
-    """
-
-    values: Array = field(repr=False)
-    size: float
-    kind: Kind
+    values: Array = field(repr=False)  # at every step, (steps + 1,) or one column for each component
+    size: float  # largest value of the reduced solution itself, in the same norm
+    kind: Kind  # "proof": not exceeded; "estimate": about so large
 
     @property
     def largest(self) -> Array:
@@ -58,15 +52,10 @@ class Bound:
 
 @dataclass(frozen=True)
 class MeshNumber:
-    """What the mesh leaves in the deformation of the outputs, estimated offline; no bound.
+    """What the mesh leaves in the deformation of the outputs, estimated offline; no bound."""
 
-    Attributes:
-        places: (lambda, mu) of the first layer where it was estimated [Pa].
-        estimates: relative error there [1].
-    """
-
-    places: tuple[tuple[float, float], ...]
-    estimates: tuple[float, ...]
+    places: tuple[tuple[float, float], ...]  # (lambda, mu) of the first layer where it was estimated [Pa]
+    estimates: tuple[float, ...]  # relative error there [1]
 
     @property
     def largest(self) -> float:

@@ -20,38 +20,23 @@ STALLED, GAIN = 3, 0.99  # rounds without the largest bound falling below this s
 
 @dataclass(frozen=True)
 class Round:
-    """One step of the greedy.
+    """One step of the greedy."""
 
-    Attributes:
-        at: number of the point that was trained.
-        k: modes afterwards.
-        bound: largest relative bound on the grid afterwards.
-        worst: number of the point that has it.
-        evaluations: bounds computed so far.
-        seconds: since the start, resumed runs without the pause.
-    """
-
-    at: int
-    k: int
-    bound: float
-    worst: int
-    evaluations: int
-    seconds: float
+    at: int  # number of the point that was trained
+    k: int  # modes afterwards
+    bound: float  # largest relative bound on the grid afterwards
+    worst: int  # number of the point that has it
+    evaluations: int  # bounds computed so far
+    seconds: float  # since the start, resumed runs without the pause
 
 
 @dataclass(frozen=True)
 class Greedy:
-    """State of a greedy after some rounds; enough to go on from, together with the basis.
+    """State of a greedy after some rounds; enough to go on from, together with the basis."""
 
-    Attributes:
-        rounds: so far.
-        known: last known bound of every point, infinite where there is none, (points,).
-        reason: why it stopped; empty while it goes on.
-    """
-
-    rounds: tuple[Round, ...]
-    known: Array
-    reason: str = ""
+    rounds: tuple[Round, ...]  # so far
+    known: Array  # last known bound of every point, infinite where there is none, (points,)
+    reason: str = ""  # why it stopped; empty while it goes on
 
     @property
     def reached(self) -> bool:

@@ -26,21 +26,13 @@ SLOW = 0.3  # angle of a mode in a step below which smoothing its residual gains
 
 @dataclass(frozen=True)
 class Drive:
-    """What moves the hand: tables of its motion at the steps, or of the force on it at their middles.
+    """What moves the hand: tables of its motion at the steps, or of the force on it at their middles."""
 
-    Attributes:
-        dt: step [s].
-        hand: q_s and v_s, (steps + 1, n_s) each [m, rad; m/s, rad/s].
-        force: u, (steps, n_s) [N, N m].
-        start: "rest", or "equilibrium" under gravity.
-        finer: the same motion at a step some times smaller, for the error of the step.
-    """
-
-    dt: float
-    hand: tuple[Array, Array] | None = None
-    force: Array | None = None
-    start: Literal["rest", "equilibrium"] = "rest"
-    finer: Drive | None = None
+    dt: float  # step [s]
+    hand: tuple[Array, Array] | None = None  # q_s and v_s, (steps + 1, n_s) each [m, rad; m/s, rad/s]
+    force: Array | None = None  # u, (steps, n_s) [N, N m]
+    start: Literal["rest", "equilibrium"] = "rest"  # "rest", or "equilibrium" under gravity
+    finer: Drive | None = None  # the same motion at a step some times smaller, for the error of the step
 
     @property
     def steps(self) -> int:
@@ -56,40 +48,26 @@ class Drive:
 
 @dataclass(frozen=True)
 class Residual:
-    """What the static bound takes of a run, see :func:`softgrasp.reduction.certified.bounds.static_bound`.
+    """What the static bound takes of a run, see :func:`softgrasp.reduction.certified.bounds.static_bound`."""
 
-    Attributes:
-        nodes: T r^ in K^-1 at the steps, (w, steps + 1).
-        rest: |r - mean r^|_{M^-1}, (steps,).
-        inexact: drift (steps,), gap (steps + 1,) and start, where the kinematics are not exact.
-    """
-
-    nodes: Array
-    rest: Array
+    nodes: Array  # T r^ in K^-1 at the steps, (w, steps + 1)
+    rest: Array  # |r - mean r^|_{M^-1}, (steps,)
+    # drift (steps,), gap (steps + 1,) and start, where the kinematics are not exact
     inexact: tuple[Array, Array, float] | None = None
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One run of one basis.
+    """One run of one basis."""
 
-    Attributes:
-        q_s, v_s: hand, (steps + 1, n_s).
-        outputs: (steps + 1, p) [m, rad].
-        size: largest energy norm.
-        residual: None where it was not asked for.
-        modes, w: modes, and states (k, 2, steps + 1) in them; or
-        x: states (steps + 1, N).
-    """
-
-    q_s: Array
+    q_s: Array  # q_s, v_s: hand, (steps + 1, n_s)
     v_s: Array
-    outputs: Array
-    size: float
-    residual: Residual | None
-    modes: Modes | None = None
+    outputs: Array  # (steps + 1, p) [m, rad]
+    size: float  # largest energy norm
+    residual: Residual | None  # None where it was not asked for
+    modes: Modes | None = None  # modes, w: modes, and states (k, 2, steps + 1) in them; or
     w: Array | None = None
-    x: Array | None = None
+    x: Array | None = None  # states (steps + 1, N)
 
     def states(self, dt: float) -> Array:
         """States x = [q_s, v_s, a, b], (steps + 1, N)."""

@@ -24,21 +24,13 @@ STEPS = 24  # of a block: near the root of usual numbers of steps
 
 @dataclass(frozen=True)
 class Modes:
-    """Modes of the reduced pair at one parameter.
+    """Modes of the reduced pair at one parameter."""
 
-    Attributes:
-        omega: (k,) [1/s].
-        X: (k, k), X' M X = 1.
-        inverse: X^-1 = X' M.
-        g: X'G, (k, n_s).
-        alpha, beta: damping [1/s, s].
-    """
-
-    omega: Array
-    X: Array
-    inverse: Array
-    g: Array
-    alpha: float
+    omega: Array  # (k,) [1/s]
+    X: Array  # (k, k), X' M X = 1
+    inverse: Array  # X^-1 = X' M
+    g: Array  # X'G, (k, n_s)
+    alpha: float  # alpha, beta: damping [1/s, s]
     beta: float
 
     @property

@@ -33,25 +33,16 @@ MARGIN = 1.01  # of the largest frequency, which the iteration meets from below
 
 @dataclass(frozen=True)
 class ResidualNorms:
-    """Triangles of the columns [G_1 of every layer; M_1 phi, K_mu phi, K_lambda phi of every layer, mode by mode].
+    """Triangles of the columns [G_1 of every layer; M_1 phi, K_mu phi, K_lambda phi of every layer, mode by mode]."""
 
-    Attributes:
-        static: in K_r^-1, (rows, L n_s + 3 L k).
-        mass: in M_r^-1, alike.
-        reference: materials of K_r and M_r.
-        n_s: degrees of freedom of the hand.
-        dimension: of space.
-        omega: lowest and (a bound on the) highest frequency at the reference [1/s].
-        shape: triangle of the modes in K_r, and of [modes, those of the velocity] in M_r, for models whose kinematics
-            are not exact; else None.
-    """
-
-    static: Array
-    mass: Array
-    reference: tuple[LayerMaterial, ...]
-    n_s: int
-    dimension: int
-    omega: tuple[float, float]
+    static: Array  # in K_r^-1, (rows, L n_s + 3 L k)
+    mass: Array  # in M_r^-1, alike
+    reference: tuple[LayerMaterial, ...]  # materials of K_r and M_r
+    n_s: int  # degrees of freedom of the hand
+    dimension: int  # of space
+    omega: tuple[float, float]  # lowest and (a bound on the) highest frequency at the reference [1/s]
+    # triangle of the modes in K_r, and of [modes, those of the velocity] in M_r, for models whose kinematics are not
+    # exact; else None
     shape: tuple[Array, Array] | None = None
 
     @property

@@ -25,6 +25,7 @@ from softgrasp.reduction.certified.model import Box, CertifiedModel
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_model, scene_drive
+from softgrasp.reduction.errors import full_energy
 from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
 
 COLUMNS = 200  # states of a full run that its modes are taken from
@@ -367,16 +368,8 @@ def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
         steps, hand = full.snapshots.steps, 2 * layout.n_s
         a, b = np.split(run.trajectory.x[steps, hand:].T, 2)
         d = full.snapshots.Z - np.vstack([modes @ a, modes @ b])
-        error = np.sqrt(2 * tissue_energy(full.model.system, d).max())
+        error = np.sqrt(2 * full_energy(full.model.system, d).max())
         estimate = run.certificate.estimate
         errors.append(error / np.sqrt(2 * full.energy.max()))
         factors.append(error / float(estimate.largest) if estimate is not None else np.nan)
     return Validation(n, float(max(factors)), float(max(errors)), float(1 - 0.05 ** (1 / n)))
-
-
-def tissue_energy(system: Any, Z: Array) -> Array:
-    """(z'Kz + v'Mv) / 2 of columns [z; v], local rows. Collective."""
-    n = system.layout.n_local
-    local = (Z[:n] * times_columns(system.K_ee, Z[:n])).sum(axis=0)
-    local += (Z[n:] * times_columns(system.M_ee, Z[n:])).sum(axis=0)
-    return total(system.layout.comm, local) / 2

@@ -14,7 +14,7 @@ from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.files import STRAIN, read_lift, write_model
 from softgrasp.reduction.model import Lift, Outputs
 from softgrasp.reduction.strain.cells import Cells
-from softgrasp.reduction.strain.model import Box, StrainModel
+from softgrasp.reduction.strain.model import StrainModel, TrainedBox
 
 KEYS = ("cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "seconds")
 ARRAYS = {
@@ -52,7 +52,7 @@ def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | Non
         cells=Cells(law=data.pop("law"), **read["cells"]),
         materials=tuple(LayerMaterial(**m) for m in data.pop("materials")),
         outputs=Outputs(**read["outputs"], names=tuple(data.pop("names"))),
-        box=Box(**read["box"]),
+        box=TrainedBox(**read["box"]),
         gravity=file["gravity"][()] if "gravity" in file else None,
         layout=layout,
         Phi=None if layout is None else np.asarray(read_lift(file, layout).L_q),

@@ -23,25 +23,15 @@ LANES = 8  # points that `stepper.c` takes at a time
 
 @dataclass(frozen=True)
 class Cells:
-    """Points of some cells in reduced coordinates.
+    """Points of some cells in reduced coordinates."""
 
-    Attributes:
-        law: of the material.
-        B: grad z = B_q a, (k, d, d, q).
-        weight: xi vol [m^d], (q,).
-        xi: of its cell, (q,).
-        layer: of the material, (q,).
-        cell: number of the cell among those of this rank, or of the body once they are gathered, (q,).
-        centre: of the cell [m], (q, d).
-    """
-
-    law: LawName
-    B: Array
-    weight: Array
-    xi: Array
-    layer: np.ndarray
-    cell: np.ndarray
-    centre: Array
+    law: LawName  # of the material
+    B: Array  # grad z = B_q a, (k, d, d, q)
+    weight: Array  # xi vol [m^d], (q,)
+    xi: Array  # of its cell, (q,)
+    layer: np.ndarray  # of the material, (q,)
+    cell: np.ndarray  # number of the cell among those of this rank, or of the body once they are gathered, (q,)
+    centre: Array  # of the cell [m], (q, d)
 
     @property
     def count(self) -> int:

@@ -47,20 +47,13 @@ class Products:
 
 @dataclass(frozen=True)
 class Reference:
-    """A full run in terms of a basis.
+    """A full run in terms of a basis."""
 
-    Attributes:
-        full: the run.
-        flat, stiff: z in the products I and K_ee.
-        mass: v in M_ee, so that its ``gram`` is I.
-        a: Phi' M Z, the coordinates of every snapshot, (m, k).
-    """
-
-    full: FullRun
-    flat: Products
+    full: FullRun  # the run
+    flat: Products  # flat, stiff: z in the products I and K_ee
     stiff: Products
-    mass: Products
-    a: Array
+    mass: Products  # v in M_ee, so that its ``gram`` is I
+    a: Array  # Phi' M Z, the coordinates of every snapshot, (m, k)
 
     def missed(self, a: Array, v: Array) -> Array:
         """[missed, whole] squares of z, v and the energy norm for states (steps + 1, k), (3, 2).

@@ -20,7 +20,7 @@ from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.strain.cells import Cells, Potential
-from softgrasp.reduction.strain.stepper import Problem, march
+from softgrasp.reduction.strain.stepper import StrainProblem, march
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
@@ -29,7 +29,7 @@ LOAD_STEPS, NEWTON_STEPS = 10, 30  # on the way to an equilibrium
 
 
 @dataclass(frozen=True)
-class Box:
+class TrainedBox:
     """What a model was trained on.
 
     Attributes:
@@ -84,7 +84,7 @@ class StrainRun(ReducedTrajectory):
         engine: "C" or "NumPy".
     """
 
-    problem: Problem = field(repr=False)
+    problem: StrainProblem = field(repr=False)
     load: Array = field(repr=False)
     evaluations: float
     restarts: int
@@ -125,19 +125,12 @@ def coordinates(run: ReducedTrajectory) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class SmallStrainModel:
-    """A model at one parameter and one time step, everything made that a run needs.
+    """A model at one parameter and one time step, everything made that a run needs."""
 
-    Attributes:
-        model: it comes from.
-        problem: potential, damping, tangent at rest, step.
-        gravity: acceleration of free fall, (n_s,).
-        outside: runs outside of the training box are allowed.
-    """
-
-    model: StrainModel
-    problem: Problem
-    gravity: Array
-    outside: bool = False
+    model: StrainModel  # it comes from
+    problem: StrainProblem  # potential, damping, tangent at rest, step
+    gravity: Array  # acceleration of free fall, (n_s,)
+    outside: bool = False  # runs outside of the training box are allowed
 
     def equilibrium(self) -> Array:
         """The a with dW_r/da = G g, by Newton's method under growing load, (k,).
@@ -228,7 +221,7 @@ class StrainModel:
     G: Array
     materials: tuple[LayerMaterial, ...]
     outputs: Outputs
-    box: Box
+    box: TrainedBox
     cells_full: int
     alpha: float = 0.0
     in_space: bool = False
@@ -284,7 +277,7 @@ class StrainModel:
         g = np.zeros(self.G.shape[1]) if own is None else own
         K = [m.mu * a + m.lam * b for m, a, b in zip(materials, self.K_mu, self.K_lambda, strict=True)]
         D = self.alpha * np.eye(self.k) + sum(m.beta * each for m, each in zip(materials, K, strict=True))
-        return SmallStrainModel(self, Problem(Potential(self.cells, materials), D, sum(K), dt), g, outside)
+        return SmallStrainModel(self, StrainProblem(Potential(self.cells, materials), D, sum(K), dt), g, outside)
 
     def displacement(self, a: Array) -> Array:
         """Deformation z = Phi a, local rows (n_local, m), of coordinates (m, k).

@@ -20,17 +20,11 @@ LEAST_TAU = 1e-6  # normal equations lose half of the digits, so that a smaller 
 
 @dataclass(frozen=True)
 class Weights:
-    """Answer of :func:`nnls`.
+    """Answer of :func:`nnls`."""
 
-    Attributes:
-        x: weights >= 0, most of them zero, (n,).
-        residual: |G x - b| / |b|.
-        rounds: columns that were added one after the other.
-    """
-
-    x: Array
-    residual: float
-    rounds: int
+    x: Array  # weights >= 0, most of them zero, (n,)
+    residual: float  # |G x - b| / |b|
+    rounds: int  # columns that were added one after the other
 
     @property
     def support(self) -> np.ndarray:

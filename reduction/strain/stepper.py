@@ -41,20 +41,13 @@ GROWTH = 4.0  # of the residual, above which a correction is refused
 
 
 @dataclass(frozen=True)
-class Problem:
-    """One reduced model at one parameter and one step.
+class StrainProblem:
+    """One reduced model at one parameter and one step."""
 
-    Attributes:
-        potential: W_r and its discrete gradient.
-        D: damping, (k, k) [1/s].
-        K: tangent at rest, (k, k) [1/s^2]: the first inverse is (S + K)^-1.
-        dt: step [s].
-    """
-
-    potential: Potential
-    D: Array
-    K: Array
-    dt: float
+    potential: Potential  # W_r and its discrete gradient
+    D: Array  # damping, (k, k) [1/s]
+    K: Array  # tangent at rest, (k, k) [1/s^2]: the first inverse is (S + K)^-1
+    dt: float  # step [s]
 
     @property
     def S(self) -> Array:
@@ -65,23 +58,16 @@ class Problem:
 
 @dataclass(frozen=True)
 class March:
-    """What a run of the stepper returns.
+    """What a run of the stepper returns."""
 
-    Attributes:
-        a, v: coordinates and rates, (steps + 1, k).
-        evaluations: of the force, in the mean of a step.
-        restarts: fresh tangents.
-        engine: "C" or "NumPy".
-    """
-
-    a: Array
+    a: Array  # a, v: coordinates and rates, (steps + 1, k)
     v: Array
-    evaluations: float
-    restarts: int
-    engine: str
+    evaluations: float  # of the force, in the mean of a step
+    restarts: int  # fresh tangents
+    engine: str  # "C" or "NumPy"
 
 
-def march(problem: Problem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
+def march(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
     """All steps under loads l (steps, k). Not collective but where the potential is distributed.
 
     Args:
@@ -110,7 +96,7 @@ def march(problem: Problem, load: Array, a0: Array, v0: Array, tol: float, engin
     return March(A, V, counts[0] / max(steps, 1), counts[1], "NumPy" if library is None else "C")
 
 
-def _sentence(problem: Problem, step: int, point: int) -> str:
+def _sentence(problem: StrainProblem, step: int, point: int) -> str:
     cells = problem.potential.cells
     where = ""
     if 0 <= point < len(cells.weight):
@@ -122,7 +108,7 @@ def _sentence(problem: Problem, step: int, point: int) -> str:
     )
 
 
-def _march_c(library: Any, problem: Problem, load: Array, tol: float, J: Array, A: Array, V: Array) -> Any:
+def _march_c(library: Any, problem: StrainProblem, load: Array, tol: float, J: Array, A: Array, V: Array) -> Any:
     ffi, lib = library
     packed = problem.potential.packed
     counts = ffi.new("long[3]")
@@ -144,7 +130,7 @@ def _march_c(library: Any, problem: Problem, load: Array, tol: float, J: Array, 
 class _March:
     """The steps of `stepper.c` in NumPy, line by line."""
 
-    def __init__(self, problem: Problem, tol: float, J: Array) -> None:
+    def __init__(self, problem: StrainProblem, tol: float, J: Array) -> None:
         self.potential, self.S, self.s, self.tol, self.J = problem.potential, problem.S, 2 / problem.dt, tol, J
         self.h = np.zeros(len(J))
         self.scale, self.floor, self.counts = 0.0, problem.potential.rounding, [0, 0, -1]

@@ -32,6 +32,7 @@ from softgrasp.reduction.bases.inner import Rows, Weight
 from softgrasp.reduction.bases.pod import pod_part
 from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.bases.truncation import Columns
+from softgrasp.reduction.galerkin import symmetric
 from softgrasp.reduction.model import Lift, ModelError
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.parameters import thinned
@@ -39,7 +40,7 @@ from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.compare import Reference, StrainErrors, errors_of, reference_of
-from softgrasp.reduction.strain.model import Box, SmallStrainModel, StrainModel, StrainRun, coordinates
+from softgrasp.reduction.strain.model import SmallStrainModel, StrainModel, StrainRun, TrainedBox, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
 
 SNAPSHOTS = 400  # behind a basis, of all runs together
@@ -50,25 +51,15 @@ TAUS = (1e-4, 3e-2)  # least and largest tau chosen from the error of the model 
 
 @dataclass
 class Training:
-    """Full runs of one scene, at several materials or motions, and what models of every size share.
+    """Full runs of one scene, at several materials or motions, and what models of every size share."""
 
-    Attributes:
-        model: the scene.
-        runs: full runs to train on.
-        Phi: largest basis, local rows (n_local, k).
-        cells: all cells of this rank.
-        offset: number of this rank's first cell.
-        references: the runs in terms of the basis.
-        seconds: spent on the basis.
-    """
-
-    model: Model
-    runs: tuple[FullRun, ...]
-    Phi: Array
-    cells: Cells
-    offset: int
-    references: tuple[Reference, ...]
-    seconds: float = 0.0
+    model: Model  # the scene
+    runs: tuple[FullRun, ...]  # full runs to train on
+    Phi: Array  # largest basis, local rows (n_local, k)
+    cells: Cells  # all cells of this rank
+    offset: int  # number of this rank's first cell
+    references: tuple[Reference, ...]  # the runs in terms of the basis
+    seconds: float = 0.0  # spent on the basis
     _galerkin: dict[int, tuple[StrainRun, ...]] = field(default_factory=dict)
     _spent: dict[int, dict[str, float]] = field(default_factory=dict)
 
@@ -78,7 +69,7 @@ class Training:
         system, Phi = self.model.system, self.Phi
         comm, layout = system.layout.comm, system.layout
         K_mu, K_lambda = (
-            np.stack([_symmetric(total(comm, Phi.T @ times_columns(A, Phi))) for A in matrices])
+            np.stack([symmetric(total(comm, Phi.T @ times_columns(A, Phi))) for A in matrices])
             for matrices in ([x.K_mu.ee for x in system.layers], [x.K_lambda.ee for x in system.layers])
         )
         outputs = project_outputs(make_outputs(self.model.scene, system), Lift(layout, Phi, Phi))
@@ -89,7 +80,7 @@ class Training:
             system.damping.in_space, system.gravity, layout=layout, Phi=Phi, scene_hash=scene_hash(self.model.scene),
         )  # fmt: skip
 
-    def _box(self) -> Box:
+    def _box(self) -> TrainedBox:
         materials = [run.model.system.materials for run in self.runs]
         lam, mu = (np.array([[getattr(m, key) for m in each] for each in materials]) for key in ("lam", "mu"))
         g = self.model.system.gravity
@@ -98,7 +89,7 @@ class Training:
         reach = np.max([np.abs(r.a).max(axis=0) for r in self.references], axis=0)
         ends = [np.stack([x.min(axis=0), x.max(axis=0)], axis=1) for x in (lam, mu)]
         load = np.stack([np.minimum(least, 0.0), np.maximum(most, 0.0)], axis=1)
-        return Box(ends[0], ends[1], load, reach)
+        return TrainedBox(ends[0], ends[1], load, reach)
 
     def leading(self, k: int) -> StrainModel:
         """The model of k displacements on all cells."""
@@ -297,7 +288,3 @@ def gathered(comm: MPI.Intracomm, cells: Cells, offset: int) -> Cells:
     }
     B = np.ascontiguousarray(np.concatenate([p.B for p in parts], axis=-1))
     return Cells(cells.law, B, **rows)
-
-
-def _symmetric(X: Array) -> Array:
-    return np.asarray((X + X.T) / 2)

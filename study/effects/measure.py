@@ -7,8 +7,7 @@ PETSc counts the operations of a step, and every matrix, vector and array that a
 from __future__ import annotations
 
 import gc
-import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -21,6 +20,7 @@ from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.sealed import digest
 from softgrasp.study.effects.objects import STEPS, counting
 from softgrasp.study.effects.switch import changed
 from softgrasp.study.shell.timing import interleave, medians
@@ -107,15 +107,6 @@ def bare_output(scene: Scene) -> Scene:
 # --- hashes and memory
 
 
-def digest(comm: MPI.Intracomm, parts: Iterable[Array]) -> str:
-    """SHA-256 of arrays on all ranks, in the order of the ranks, 64 hex digits. Collective."""
-    local = hashlib.sha256()
-    for part in parts:
-        local.update(str(part.shape).encode())
-        local.update(np.ascontiguousarray(part).tobytes())
-    return hashlib.sha256(b"".join(comm.allgather(local.digest()))).hexdigest()
-
-
 def fingerprint(model: Model, run: Run) -> dict[str, str]:
     """Hash of pattern and values of every operator that the steps use, and of the hand's part. Collective."""
     system, comm = model.system, model.system.layout.comm
@@ -125,7 +116,7 @@ def fingerprint(model: Model, run: Run) -> dict[str, str]:
     arrays: dict[str, list[Array]] = {name: list(A.getValuesCSR()) for name, A in matrices.items()}
     arrays |= {name: [getattr(system, name)] for name in ("T", "G", "M_hand", "M_rigid")}
     arrays["hand"] = [getattr(run.drive, name) for name in ("c", "lhs", "Y") if hasattr(run.drive, name)]
-    return {name: digest(comm, parts) for name, parts in arrays.items()}
+    return {name: "".join(comm.allgather(digest(*parts))) for name, parts in arrays.items()}
 
 
 def matrix_memory(A: PETSc.Mat) -> float:

@@ -12,7 +12,7 @@ from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_linear
-from softgrasp.study.reduce.result import COMPARED, LARGER, Box, BoxErrors, BoxPoint, Sweep, TestedModel, nearest
+from softgrasp.study.reduce.result import COMPARED, LARGER, BoxErrors, BoxPoint, BoxTests, Sweep, TestedModel, nearest
 from softgrasp.study.reduce.sweep import bases_of
 
 METHODS_TESTED = 4
@@ -57,7 +57,7 @@ def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]
     return tuple(errors)
 
 
-def measure_box(full: FullRun, sweeps: Sequence[Sweep], progress: Callable[[int, int], None] | None = None) -> Box:
+def measure_box(full: FullRun, sweeps: Sequence[Sweep], progress: Callable[[int, int], None] | None = None) -> BoxTests:
     """Train, and test over the box. Collective.
 
     Raises:
@@ -67,7 +67,7 @@ def measure_box(full: FullRun, sweeps: Sequence[Sweep], progress: Callable[[int,
     scene = full.model
     reason = outside(scene) or ("" if best_methods(sweeps) else "no method has a stable model")
     if reason:
-        return Box(none=reason)
+        return BoxTests(none=reason)
     first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
     models = box_models(full, sweeps, training_states(full, training) if training else None)
     trained_at = ((first.lam, first.mu), *training)
@@ -77,7 +77,7 @@ def measure_box(full: FullRun, sweeps: Sequence[Sweep], progress: Callable[[int,
             progress(k, len(grid))
         trained = any(np.allclose((lam, mu), place) for place in trained_at)
         points.append(BoxPoint(lam, mu, trained, errors_at(run_at(scene, lam, mu), models)))
-    return Box(
+    return BoxTests(
         models=tuple(models),
         points=tuple(points),
         summary=summary(models, errors_at(full, models), points, len(trained_at)),

@@ -30,8 +30,8 @@ from softgrasp.reduction.certified.trainer import (
 )
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
-from softgrasp.study.forward.result import simulate_result
 from softgrasp.study.reduce.certify_check import BoxCheck, check_box
+from softgrasp.study.reduce.result import head_of
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.page import Section
@@ -41,7 +41,6 @@ from softgrasp.study.shell.timing import median_seconds
 
 FILE = "certified.h5"
 REPEATS = 7  # behind the median time of a query
-KEPT = ("scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver")
 
 CAPTIONS = {
     "certified_box.png": "Relative error of the deformation over the box, in the energy norm: the proved bound, the "
@@ -154,7 +153,7 @@ def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | No
     first, comm = model.system.materials[0], model.system.layout.comm
     with watch.stage("full"):
         full = run_at(model, first.lam, first.mu)
-    whole = simulate_result(model, full.trajectory).to_json()
+    head, _ = head_of(model, full.trajectory)
     run = certified.run(allow=True)
     assert certified.drive is not None
     query = median_seconds(comm, lambda: certified.run(allow=True), REPEATS)
@@ -171,10 +170,7 @@ def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | No
         "sentence": certificate.sentence(),
         "reasons": certificate.reasons,
     }
-    result = {
-        "command": "reduce",
-        **{key: whole[key] for key in KEPT},
-        "reduction": model.scene.reduction.model_dump(mode="json"),
+    result = head | {
         "certified": {
             "k": certified.k,
             "N": certified.coarse.N,

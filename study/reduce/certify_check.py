@@ -9,7 +9,7 @@ import numpy as np
 
 from softgrasp.fem.model.build import Model
 from softgrasp.reduction.certified.model import CertifiedModel
-from softgrasp.reduction.certified.trainer import tissue_energy
+from softgrasp.reduction.errors import full_energy
 from softgrasp.reduction.parameters import run_at
 from softgrasp.reduction.replay import FullRun
 from softgrasp.study.shell.timing import median_seconds, timed
@@ -23,20 +23,13 @@ REPEATS = 5  # behind the median time of a query
 
 @dataclass(frozen=True)
 class Tested:
-    """One size at one parameter; errors relative to the largest energy norm of the full run.
+    """One size at one parameter; errors relative to the largest energy norm of the full run."""
 
-    Attributes:
-        lam, mu: [Pa].
-        truth: against the full run.
-        bound: proved.
-        estimate: difference of the two bases; nan with one.
-    """
-
-    lam: float
+    lam: float  # lam, mu: [Pa]
     mu: float
-    truth: float
-    bound: float
-    estimate: float
+    truth: float  # against the full run
+    bound: float  # proved
+    estimate: float  # difference of the two bases; nan with one
 
     @property
     def effectivity(self) -> float:
@@ -46,20 +39,13 @@ class Tested:
 
 @dataclass(frozen=True)
 class Size:
-    """A certified model of k modes at all tests.
+    """A certified model of k modes at all tests."""
 
-    Attributes:
-        k, k2: modes of the answer, and of the basis that certifies it.
-        N: dimension of the answer.
-        query: median seconds of an answer with its certificate.
-        tested: one a parameter.
-    """
-
-    k: int
+    k: int  # k, k2: modes of the answer, and of the basis that certifies it
     k2: int
-    N: int
-    query: float
-    tested: tuple[Tested, ...]
+    N: int  # dimension of the answer
+    query: float  # median seconds of an answer with its certificate
+    tested: tuple[Tested, ...]  # one a parameter
 
     def largest(self, key: str) -> float:
         """Over the tests."""
@@ -68,17 +54,11 @@ class Size:
 
 @dataclass(frozen=True)
 class BoxCheck:
-    """A certified model and smaller ones of its basis over the box.
+    """A certified model and smaller ones of its basis over the box."""
 
-    Attributes:
-        own: the model as it was built.
-        sizes: in the order of k, ``own`` among them.
-        full: median seconds of a full run with its factor.
-    """
-
-    own: Size
-    sizes: tuple[Size, ...]
-    full: float
+    own: Size  # the model as it was built
+    sizes: tuple[Size, ...]  # in the order of k, ``own`` among them
+    full: float  # median seconds of a full run with its factor
 
 
 def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
@@ -109,7 +89,7 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
             answer = part.run(full.model.system.materials, drive, allow=True)
             a, b = np.split(answer.trajectory.x[steps, hand:].T, 2)
             off = full.snapshots.Z - np.vstack([Phi[:, : part.k] @ a, Phi[:, : part.k] @ b])
-            error = float(np.sqrt(2 * tissue_energy(full.model.system, off).max()))
+            error = float(np.sqrt(2 * full_energy(full.model.system, off).max()))
             c = answer.certificate
             estimate = float("nan") if c.estimate is None else float(c.estimate.largest) / size
             tests.append(Tested(lam, mu, error / size, float(c.energy.largest) / size, estimate))

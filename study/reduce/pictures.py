@@ -42,40 +42,25 @@ MANY_VERTICES = 200_000  # above, no pictures of the body
 
 @dataclass(frozen=True)
 class View:
-    """One reduced model for the eye.
+    """One reduced model for the eye."""
 
-    Attributes:
-        title: method and N.
-        stable: of the model.
-        error: of its deformation.
-        states: vertex displacements of its run at the frames, (k, n, d) [m].
-    """
-
-    title: str
-    stable: bool
-    error: float
-    states: Array
+    title: str  # method and N
+    stable: bool  # of the model
+    error: float  # of its deformation
+    states: Array  # vertex displacements of its run at the frames, (k, n, d) [m]
 
 
 @dataclass(frozen=True)
 class Views:
-    """What the pictures need, on rank 0.
+    """What the pictures need, on rank 0."""
 
-    Attributes:
-        picture: the body.
-        times: of the frames, (k,) [s].
-        table: the hand, columns time and q_s, (steps + 1, 1 + n_s) [s, m, rad].
-        full: vertex displacements of the full run at the frames, (k, n, d) [m].
-        reduced: models to compare.
-        modes: title and vertex displacements (k, n, d) of the first modes of some methods, largest entry 1; whether
-            they are absolute displacements, that take the hand along.
-    """
-
-    picture: PictureMesh
-    times: Array
-    table: Array
-    full: Array
-    reduced: tuple[View, ...]
+    picture: PictureMesh  # the body
+    times: Array  # of the frames, (k,) [s]
+    table: Array  # the hand, columns time and q_s, (steps + 1, 1 + n_s) [s, m, rad]
+    full: Array  # vertex displacements of the full run at the frames, (k, n, d) [m]
+    reduced: tuple[View, ...]  # models to compare
+    # title and vertex displacements (k, n, d) of the first modes of some methods, largest entry 1; whether they are
+    # absolute displacements, that take the hand along
     modes: tuple[tuple[str, Array, bool], ...]
 
 

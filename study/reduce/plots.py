@@ -117,7 +117,7 @@ def _errors_axis(
         _crosses(ax, s, N, key, colour)
         ends.append((float(N[-1]), float(values[-1]), s.method.short_title, colour))
     ax.set_ylabel(label)
-    _log_axis(ax)
+    log_axis(ax)
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=STEPS))
     return ends
 
@@ -151,7 +151,7 @@ def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[P
                 named[s.method.key] = Line2D([], [], label=s.method.short_title, **mark)
             ax.axvline(full * unit, **FULL)
             ax.set_xscale("log")
-            _log_axis(ax)
+            log_axis(ax)
             ax.set_ylabel(QUANTITIES[0][1])
             few_ticks(ax.xaxis)
         axes[0].set_xlabel("online time of a run [ms]")
@@ -210,9 +210,10 @@ def _values(points: Sequence[Point], key: str) -> np.ndarray:
     return np.where(np.isfinite(values), np.minimum(values, TOP), TOP)
 
 
-def _log_axis(ax: Any) -> None:
+def log_axis(ax: Any, top: float | None = 1.6 * TOP) -> None:
+    """A logarithmic axis of errors, a line at every power of ten."""
     ax.set_yscale("log")
-    ax.set_ylim(top=1.6 * TOP)
+    ax.set_ylim(top=top)
     ax.yaxis.set_major_locator(LogLocator(numticks=12))
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.grid(axis="y", color="#e6e6e6", lw=0.5, zorder=0)

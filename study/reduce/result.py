@@ -4,90 +4,68 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.bases.registry import Method
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.replay import FullRun
+from softgrasp.study.forward.result import simulate_result
 
 COMPARED = 14  # N at which methods are compared: the paper's
+KEPT = ("scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver")
 LARGER = 30  # N of the second model that is tested at other parameters
 
 
 @dataclass(frozen=True)
 class Point:
-    """One basis at one N; errors are relative, times in seconds, the abscissa in 1/s. Unstable runs may overflow.
+    """One basis at one N; errors are relative, times in seconds, the abscissa in 1/s. Unstable runs may overflow."""
 
-    Attributes:
-        N: columns of V, the hand's included.
-        N_tissue: columns without the hand's own, which bases with fixed solid modes have.
-        split: of N_tissue over the parts of the decomposition: displacement and velocity of componentwise POD.
-        error_deformation: |X - X_r|_F / |X|_F of X = [z, v_z], after removing the rigid motion of the hand: the measure
-            that tables, pictures and the best method go by.
-        error: the same of X = [q_s, v_s, q_e, v_e], for every basis the paper's error [SBRH21].
-        error_canonical: the same of X = [q_s, p_s, q_e, p_e].
-        error_energy: largest error of the tissue's energy over its largest value.
-        projection_error_deformation, projection_error: the floors that the basis sets to the first two.
-        time_offline: basis and projection; one factorisation of the snapshots serves all N.
-        time_setup: what a new parameter costs before its run: small matrices, test of stability, propagator.
-        time_online: a whole run.
-        spectral_abscissa: largest real part of an eigenvalue.
-        stable: no growing mode.
-    """
-
-    N: int
-    N_tissue: int
+    N: int  # columns of V, the hand's included
+    N_tissue: int  # columns without the hand's own, which bases with fixed solid modes have
+    # of N_tissue over the parts of the decomposition: displacement and velocity of componentwise POD
     split: tuple[int, ...]
+    # |X - X_r|_F / |X|_F of X = [z, v_z], after removing the rigid motion of the hand: the measure that tables,
+    # pictures and the best method go by
     error_deformation: float
-    error: float
-    error_canonical: float
-    error_energy: float
+    error: float  # the same of X = [q_s, v_s, q_e, v_e], for every basis the paper's error [SBRH21]
+    error_canonical: float  # the same of X = [q_s, p_s, q_e, p_e]
+    error_energy: float  # largest error of the tissue's energy over its largest value
+    # projection_error_deformation, projection_error: the floors that the basis sets to the first two
     projection_error_deformation: float
     projection_error: float
-    time_offline: float
-    time_setup: float
-    time_online: float
-    spectral_abscissa: float
-    stable: bool
+    time_offline: float  # basis and projection; one factorisation of the snapshots serves all N
+    time_setup: float  # what a new parameter costs before its run: small matrices, test of stability, propagator
+    time_online: float  # a whole run
+    spectral_abscissa: float  # largest real part of an eigenvalue
+    stable: bool  # no growing mode
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """One method at all its N.
+    """One method at all its N."""
 
-    Attributes:
-        method: which.
-        points: one for every N.
-        models: some of them by the number of their point, see :func:`kept_points`. All would fill the memory.
-        sigma: singular values of every part of the decomposition.
-        refused: N in the scene that this basis cannot have, each with its reason.
-        N_energy: N that keeps the scene's share of the energy; None without snapshots.
-        inner: inner product of the bases.
-    """
-
-    method: Method
-    points: tuple[Point, ...]
+    method: Method  # which
+    points: tuple[Point, ...]  # one for every N
+    # some of them by the number of their point, see :func:`kept_points`. All would fill the memory.
     models: dict[int, ReducedModel]
-    sigma: tuple[np.ndarray, ...]
+    sigma: tuple[np.ndarray, ...]  # singular values of every part of the decomposition
+    # N in the scene that this basis cannot have, each with its reason
     refused: dict[int, str] = field(default_factory=dict)
-    N_energy: int | None = None
-    inner: str = ""
+    N_energy: int | None = None  # N that keeps the scene's share of the energy; None without snapshots
+    inner: str = ""  # inner product of the bases
 
 
 @dataclass(frozen=True)
 class TestedModel:
-    """One reduced model that is tested at other parameters.
+    """One reduced model that is tested at other parameters."""
 
-    Attributes:
-        method: of its basis.
-        several: whether runs at several parameters trained it.
-        model: itself.
-    """
-
-    method: Method
-    several: bool
-    model: ReducedModel
+    method: Method  # of its basis
+    several: bool  # whether runs at several parameters trained it
+    model: ReducedModel  # itself
 
     @property
     def family(self) -> tuple[str, bool]:
@@ -97,58 +75,37 @@ class TestedModel:
 
 @dataclass(frozen=True)
 class BoxPoint:
-    """One parameter with the deformation error of every model there.
+    """One parameter with the deformation error of every model there."""
 
-    Attributes:
-        lam, mu: of the first layer [Pa].
-        trained: a run at this parameter trained some of the bases, so that it is no test.
-        errors: one for each model.
-    """
-
-    lam: float
+    lam: float  # lam, mu: of the first layer [Pa]
     mu: float
-    trained: bool
-    errors: tuple[float, ...]
+    trained: bool  # a run at this parameter trained some of the bases, so that it is no test
+    errors: tuple[float, ...]  # one for each model
 
 
 @dataclass(frozen=True)
 class BoxErrors:
-    """Deformation errors of one model: at the scene's own parameter, and over those that trained no basis.
+    """Deformation errors of one model: at the scene's own parameter, and over those that trained no basis."""
 
-    Attributes:
-        method: key.
-        N: its dimension.
-        runs: full runs that trained it.
-        own, median, largest: errors.
-    """
-
-    method: str
-    N: int
-    runs: int
-    own: float
+    method: str  # key
+    N: int  # its dimension
+    runs: int  # full runs that trained it
+    own: float  # own, median, largest: errors
     median: float
     largest: float
 
 
 @dataclass(frozen=True)
-class Box:
-    """All tests at other parameters.
+class BoxTests:
+    """All tests at other parameters."""
 
-    Attributes:
-        models: tested.
-        points: errors over the box.
-        summary: one for each model.
-        trained_at: [lambda, mu] of the runs that trained the models with ``several``, the scene's own first [Pa].
-        ranges: of lambda and mu [Pa].
-        none: why there are no tests; empty when there are.
-    """
-
-    models: tuple[TestedModel, ...] = ()
-    points: tuple[BoxPoint, ...] = ()
-    summary: tuple[BoxErrors, ...] = ()
+    models: tuple[TestedModel, ...] = ()  # tested
+    points: tuple[BoxPoint, ...] = ()  # errors over the box
+    summary: tuple[BoxErrors, ...] = ()  # one for each model
+    # [lambda, mu] of the runs that trained the models with ``several``, the scene's own first [Pa]
     trained_at: tuple[tuple[float, float], ...] = ()
-    ranges: tuple[Sequence[float], Sequence[float]] = ((), ())
-    none: str = ""
+    ranges: tuple[Sequence[float], Sequence[float]] = ((), ())  # of lambda and mu [Pa]
+    none: str = ""  # why there are no tests; empty when there are
 
 
 @dataclass(frozen=True)
@@ -158,56 +115,51 @@ class FullTimes:
     steps: float
     factor: float
 
+    def against(self, offline: float, setup: float, online: float) -> tuple[float, float, float | None]:
+        """Steps over a run of the same reduced model, factor and steps over a new parameter, runs until offline pays.
+
+        The last is None where the reduced model is not faster.
+        """
+        whole, new = self.factor + self.steps, setup + online
+        return self.steps / online, whole / new, offline / (whole - new) if whole > new else None
+
 
 @dataclass(frozen=True)
 class Speed:
-    """One method against the full model at the stable N nearest to the one compared.
+    """One method against the full model at the stable N nearest to the one compared."""
 
-    Attributes:
-        method, title: which.
-        N: columns of V.
-        N_tissue: those without the hand's own.
-        stable: no model is otherwise; False when the method has no stable one.
-        time_offline, time_setup, time_online: [s].
-        speedup_same_model: full steps over a reduced run of the same model again, both with everything prefactored.
-        speedup_new_parameter: full factorisation and steps over reduced set-up and run.
-        break_even_runs: time_offline / (full run - reduced run) at new parameters; None when the reduced is not faster.
-    """
-
-    method: str
+    method: str  # method, title: which
     title: str
-    N: int
-    N_tissue: int
-    stable: bool
-    time_offline: float
+    N: int  # columns of V
+    N_tissue: int  # those without the hand's own
+    stable: bool  # no model is otherwise; False when the method has no stable one
+    time_offline: float  # time_offline, time_setup, time_online: [s]
     time_setup: float
     time_online: float
-    speedup_same_model: float
-    speedup_new_parameter: float
+    speedup_same_model: float  # full steps over a reduced run of the same model again, both with everything prefactored
+    speedup_new_parameter: float  # full factorisation and steps over reduced set-up and run
+    # time_offline / (full run - reduced run) at new parameters; None when the reduced is not faster
     break_even_runs: float | None
 
 
 @dataclass(frozen=True)
 class ReductionStudy:
-    """All that ``softgrasp reduce`` measures.
+    """All that ``softgrasp reduce`` measures."""
 
-    Attributes:
-        full: the full run.
-        sweeps: every method.
-        times: of the full model.
-        speeds: every method with a model against the full model.
-        box: errors at other parameters.
-        findings: what the numbers show, in sentences.
-        speed_notes: what the times are measured against.
-    """
+    full: FullRun  # the full run
+    sweeps: tuple[Sweep, ...]  # every method
+    times: FullTimes  # of the full model
+    speeds: tuple[Speed, ...]  # every method with a model against the full model
+    box: BoxTests  # errors at other parameters
+    findings: tuple[str, ...]  # what the numbers show, in sentences
+    speed_notes: tuple[str, ...]  # what the times are measured against
 
-    full: FullRun
-    sweeps: tuple[Sweep, ...]
-    times: FullTimes
-    speeds: tuple[Speed, ...]
-    box: Box
-    findings: tuple[str, ...]
-    speed_notes: tuple[str, ...]
+
+def head_of(model: Model, run: Trajectory) -> tuple[dict[str, Any], dict[str, Any]]:
+    """First keys of ``result.json``, and the seconds of a full run. Collective."""
+    whole = simulate_result(model, run).to_json()
+    options = model.scene.reduction.model_dump(mode="json")
+    return {"command": "reduce", **{key: whole[key] for key in KEPT}, "reduction": options}, whole["time"]
 
 
 def nearest(points: Sequence[Point], N: int = COMPARED, stable: bool = True) -> int | None:

@@ -12,15 +12,13 @@ from rich.progress import MofNCompleteColumn, Progress
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
-from softgrasp.reduction.replay import full_run
-from softgrasp.study.forward.result import simulate_result
 from softgrasp.study.reduce.box import measure_box
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.page import sections
-from softgrasp.study.reduce.result import Box, ReductionStudy, Sweep, best
+from softgrasp.study.reduce.result import BoxTests, ReductionStudy, Sweep, best, head_of
 from softgrasp.study.reduce.sweep import chosen_methods, sweep
 from softgrasp.study.reduce.tables import (
     N_NOTE,
@@ -34,7 +32,7 @@ from softgrasp.study.reduce.tables import (
     summary,
     time_table,
 )
-from softgrasp.study.reduce.times import full_times, speed_notes, speed_of
+from softgrasp.study.reduce.times import measured_run, speed_notes, speed_of
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
@@ -134,9 +132,7 @@ def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopw
         bar.update(task, completed=run.reached)
 
     with watch.stage("full"):
-        run = simulate(model, RunOptions(progress=stepped))
-        full = full_run(model, run)
-        times = full_times(model, run)
+        full, times = measured_run(model, stepped)
     bar.remove_task(task)
     size = len(scene.reduction.N)
     task = bar.add_task("bases", total=size * len(names))
@@ -173,14 +169,8 @@ def save_models(out: Path, sweeps: Sequence[Sweep]) -> list[Path]:
 def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
     model = study.full.model
-    whole = simulate_result(model, study.full.trajectory).to_json()
-    kept = (
-        "scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver",
-    )  # fmt: skip
-    result = {
-        "command": "reduce",
-        **{key: whole[key] for key in kept},
-        "reduction": model.scene.reduction.model_dump(mode="json"),
+    head, seconds = head_of(model, study.full.trajectory)
+    result = head | {
         "N_means": N_NOTE,
         "methods": {s.method.key: [asdict(p) for p in s.points] for s in study.sweeps},
         "about": {s.method.key: _about(s) for s in study.sweeps},
@@ -189,7 +179,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
         "speed_notes": study.speed_notes,
         "box": _box_result(study.box),
         "time": {
-            **{key: whole["time"][key] for key in ("mesh", "assembly", "factor", "steps", "per_step")},
+            **{key: seconds[key] for key in ("mesh", "assembly", "factor", "steps", "per_step")},
             "full_steps_median": study.times.steps,
             "full_factor_median": study.times.factor,
             **watch.seconds,
@@ -210,7 +200,7 @@ def _about(s: Sweep) -> dict[str, Any]:
     }
 
 
-def _box_result(box: Box) -> dict[str, Any]:
+def _box_result(box: BoxTests) -> dict[str, Any]:
     models = [{"method": m.method.key, "N": m.model.N, "several": m.several} for m in box.models]
     return {
         "reason_for_none": box.none,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from softgrasp.study.reduce.strain_measure import CELLS_AT
-from softgrasp.study.reduce.strain_result import Family, StrainStudy, speed_up
+from softgrasp.study.reduce.strain_result import Family, StrainStudy
+from softgrasp.study.reduce.tables import TIMES, time_cells
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import Table
 
@@ -60,19 +60,12 @@ def cell_table(study: StrainStudy) -> Table:
 
 def time_table(study: StrainStudy) -> Table:
     """Seconds and speed-ups, costs counted whole."""
-    header = ("runs", "N", "cells", "run [ms]", "new [ms]", "offline [s]", "x again", "x new", "break-even")
-    rows = []
-    for f in study.families:
-        for p in f.points:
-            again, new, runs = speed_up(p, study.times)
-            even = "never" if runs is None else str(math.ceil(runs))
-            times = (
-                f"{1e3 * p.time_online:.2f}",
-                f"{1e3 * (p.time_setup + p.time_online):.2f}",
-                f"{p.time_offline:.2f}",
-            )
-            rows.append((f.runs, p.N, p.cells, *times, f"{again:.0f}", f"{new:.0f}", even))
-    return Table(header, rows, "Times")
+    rows = [
+        (f.runs, p.N, p.cells, *time_cells(p.time_offline, p.time_setup, p.time_online, study.speed_up(p)))
+        for f in study.families
+        for p in f.points
+    ]
+    return Table(("runs", "N", "cells", *TIMES), rows, "Times")
 
 
 def test_table(family: Family) -> Table:
@@ -126,7 +119,7 @@ def sentences(study: StrainStudy) -> list[str]:
 def summary(study: StrainStudy) -> list[str]:
     """What came out, in three sentences."""
     p, f = min(((p, f) for f in study.families for p in f.points), key=lambda pair: pair[0].error_own)
-    again, new, _ = speed_up(p, study.times)
+    again, new, _ = study.speed_up(p)
     return [
         f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
         f"The most accurate reduced model, {TITLES[f.key]}, is {p.error_own:.2%} off with N = {p.N} columns and "

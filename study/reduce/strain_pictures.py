@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LogNorm
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.reduction.strain.model import StrainModel
@@ -29,6 +28,7 @@ from softgrasp.study.pictures.style import (
     paper_style,
     save,
 )  # fmt: skip
+from softgrasp.study.reduce.plots import FULL, log_axis
 from softgrasp.study.reduce.strain_measure import CELLS_AT
 from softgrasp.study.reduce.strain_page import TITLES
 from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy
@@ -58,11 +58,9 @@ def figure_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
                     _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {TITLES[f.key]}")
                     right.axhline(points[0].error_galerkin, ls=":", color=colour)
         for ax, label in ((left, "$N$"), (right, "sampled cells")):
-            ax.axhline(study.linear, color="#888888", lw=0.9, ls=(0, (4, 3)))
-            ax.set(yscale="log", xlabel=label)
-            ax.yaxis.set_major_locator(LogLocator(numticks=12))
-            ax.yaxis.set_minor_formatter(NullFormatter())
-            ax.grid(axis="y", color="#e6e6e6", lw=0.5)
+            ax.axhline(study.linear, **FULL)
+            ax.set_xlabel(label)
+            log_axis(ax, None)
             ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2, labelspacing=0.25)
         at = {"xy": (0.99, study.linear), "xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
         right.annotate("linear elasticity", **at, fontsize=6.5)

@@ -10,15 +10,13 @@ from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Stopwatch
-from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
-from softgrasp.reduction.replay import full_run
-from softgrasp.study.forward.result import simulate_result
+from softgrasp.study.reduce.result import head_of
 from softgrasp.study.reduce.strain_measure import measure_strain
 from softgrasp.study.reduce.strain_page import cell_table, error_table, sections, sentences, summary, time_table
-from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy, speed_up
-from softgrasp.study.reduce.times import full_times
+from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy
+from softgrasp.study.reduce.times import measured_run
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
@@ -43,9 +41,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
             bar.update(task, description=what, completed=done, total=of)
 
         with watch.stage("full"):
-            run = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
-            full = full_run(model, run)
-            times = full_times(model, run)
+            full, times = measured_run(model, lambda run: say("full run", run.reached, run.steps))
         with watch.stage("reduced"):
             study = measure_strain(model, full, times, say)
     last = study.families[-1]
@@ -79,15 +75,11 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
 def strain_result(study: StrainStudy, watch: Stopwatch) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
     model = study.full.model
-    whole = simulate_result(model, study.full.trajectory).to_json()
-    kept = (
-        "scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver",
-    )  # fmt: skip
+    head, _ = head_of(model, study.full.trajectory)
     families = {}
     for f in study.families:
-        speeds = [
-            dict(zip(("again", "new", "break_even_runs"), speed_up(p, study.times), strict=True)) for p in f.points
-        ]
+        names = ("again", "new", "break_even_runs")
+        speeds = [dict(zip(names, study.speed_up(p), strict=True)) for p in f.points]
         families[f.key] = {
             "runs": f.runs,
             "box": {key: np.asarray(value).tolist() for key, value in asdict(f.box).items()},
@@ -96,10 +88,7 @@ def strain_result(study: StrainStudy, watch: Stopwatch) -> dict[str, Any]:
             "held_out": [asdict(t) for t in f.tests],
             "refused": f.refused,
         }
-    result = {
-        "command": "reduce",
-        **{key: whole[key] for key in kept},
-        "reduction": model.scene.reduction.model_dump(mode="json"),
+    result = head | {
         "finite_strain": families,
         "error_linear": study.linear,
         "reason_for_none": study.none,

@@ -9,11 +9,12 @@ from dataclasses import astuple, fields
 import numpy as np
 
 from softgrasp.reduction.bases.registry import METHODS
-from softgrasp.study.reduce.result import COMPARED, Box, Point, ReductionStudy, Speed, Sweep, nearest
+from softgrasp.study.reduce.result import COMPARED, BoxTests, Point, ReductionStudy, Speed, Sweep, nearest
 from softgrasp.study.report.tables import Table
 
 LEVELS = (1e-1, 1e-2, 1e-3)  # of the error of the deformation, for which the least N is named
 LEVEL_NAMES = tuple(f"{level:.0e}".replace("e-0", "e-") for level in LEVELS)
+TIMES = ("run [ms]", "new [ms]", "offline [s]", "x again", "x new", "break-even")
 N_NOTE = (
     "N counts all columns of V for every method, as in the paper, also the hand's own 2 n_s of bases with fixed solid "
     "modes. V_e: those without the hand's (N_tissue), for componentwise POD displacements + velocities."
@@ -111,26 +112,26 @@ def summary(study: ReductionStudy) -> list[str]:
     return [*told, f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried."]
 
 
+def time_cells(
+    offline: float, setup: float, online: float, speeds: tuple[float, float, float | None]
+) -> tuple[str, ...]:
+    """Below :data:`TIMES`: seconds, and speed-ups with the runs until offline has paid."""
+    again, new, runs = speeds
+    seconds = (f"{1e3 * online:.2f}", f"{1e3 * (setup + online):.2f}", f"{offline:.2f}")
+    return *seconds, short(again, 3), short(new, 3), "never" if runs is None else str(math.ceil(runs))
+
+
 def time_table(speeds: Sequence[Speed], narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
-    header = ("method", "N", "run [ms]", "new [ms]", "offline [s]", "x again", "x new", "break-even")
-    rows = [
-        (
-            METHODS[s.method].short_title if narrow else s.title,
-            str(s.N) if s.stable else f"{s.N} !",
-            f"{1e3 * s.time_online:.2f}",
-            f"{1e3 * (s.time_setup + s.time_online):.2f}",
-            f"{s.time_offline:.2f}",
-            short(s.speedup_same_model, 3),
-            short(s.speedup_new_parameter, 3),
-            "never" if s.break_even_runs is None else str(math.ceil(s.break_even_runs)),
-        )
-        for s in speeds
-    ]
-    return Table(header, rows, "Times")
+    rows = []
+    for s in speeds:
+        title, size = METHODS[s.method].short_title if narrow else s.title, str(s.N) if s.stable else f"{s.N} !"
+        pays = (s.speedup_same_model, s.speedup_new_parameter, s.break_even_runs)
+        rows.append((title, size, *time_cells(s.time_offline, s.time_setup, s.time_online, pays)))
+    return Table(("method", "N", *TIMES), rows, "Times")
 
 
-def box_table(box: Box, narrow: bool = False) -> Table:
+def box_table(box: BoxTests, narrow: bool = False) -> Table:
     """Errors at other parameters, trained by one run or by several."""
     methods = {m.method.key: m.method for m in box.models}
     titles = {key: m.short_title if narrow else m.title for key, m in methods.items()}
@@ -140,7 +141,7 @@ def box_table(box: Box, narrow: bool = False) -> Table:
     return Table(("method", "N", "runs", "own", "median", "largest"), rows, "Other parameters")
 
 
-def box_note(box: Box) -> str:
+def box_note(box: BoxTests) -> str:
     """What the table of other parameters shows."""
     tests, (lam, mu) = sum(not p.trained for p in box.points), box.ranges
     text = (
@@ -155,7 +156,7 @@ def box_note(box: Box) -> str:
     )
 
 
-def box_point_tables(box: Box) -> list[tuple[int, Table]]:
+def box_point_tables(box: BoxTests) -> list[tuple[int, Table]]:
     """For each N every parameter, with a column for each basis."""
     tables = []
     for N in sorted({m.model.N for m in box.models}):

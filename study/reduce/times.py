@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.study.reduce.result import FullTimes, Speed, Sweep, nearest
 
 FULL_REPEATS = 3  # behind the median of the full run
@@ -17,15 +18,15 @@ PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 
 LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 
 
-def full_times(model: Model, first: Trajectory) -> FullTimes:
-    """Median seconds of the full run, of several when it is short. Collective."""
+def measured_run(model: Model, progress: Callable[[Run], None]) -> tuple[FullRun, FullTimes]:
+    """The full run, and its seconds in the median of several when it is short. Collective."""
+    first = simulate(model, RunOptions(progress=progress))
     comm, runs = model.system.layout.comm, [first]
     repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
     runs += [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
-    return FullTimes(
-        statistics.median(steps_seconds(run) for run in runs),
-        statistics.median(run.seconds["factor"] for run in runs),
-    )
+    factors = [run.seconds["factor"] for run in runs]
+    times = FullTimes(statistics.median(map(steps_seconds, runs)), statistics.median(factors))
+    return full_run(model, first), times
 
 
 def steps_seconds(run: Trajectory) -> float:
@@ -41,7 +42,7 @@ def speed_of(sweep: Sweep, full: FullTimes) -> Speed | None:
     if i is None:
         return None
     p = sweep.points[i]
-    whole, new = full.factor + full.steps, p.time_setup + p.time_online
+    again, new, runs = full.against(p.time_offline, p.time_setup, p.time_online)
     return Speed(
         method=sweep.method.key,
         title=sweep.method.title,
@@ -51,9 +52,9 @@ def speed_of(sweep: Sweep, full: FullTimes) -> Speed | None:
         time_offline=p.time_offline,
         time_setup=p.time_setup,
         time_online=p.time_online,
-        speedup_same_model=full.steps / p.time_online,
-        speedup_new_parameter=whole / new,
-        break_even_runs=p.time_offline / (whole - new) if whole > new else None,
+        speedup_same_model=again,
+        speedup_new_parameter=new,
+        break_even_runs=runs,
     )
 
 

@@ -43,7 +43,7 @@ def test_errors_against_dense_matrices(comm: MPI.Intracomm, whole: bool) -> None
     T, G = gather_rows(layout, system.T), gather_rows(layout, system.G)
     M = gather_matrix(layout, system.M_ee)
     z, v = np.split(gather_states(layout, snapshots.Z), 2)
-    energy = full_energy(system, snapshots)
+    energy = full_energy(system, snapshots.Z)
 
     def views(z: Array, v: Array, q_s: Array, v_s: Array) -> list[Array]:
         absolute = np.concatenate([q_s, z + T @ q_s, v_s, v + T @ v_s])
@@ -81,7 +81,7 @@ def test_a_model_outside_the_family_is_refused(comm: MPI.Intracomm) -> None:
     snapshots = simulate(model).snapshots
     basis = symplectic_basis(model.system.layout, 3, "relative", True)
     rom, other = reduced(model, basis), reduced(model, replace(basis, V_q=basis.V_p, V_p=basis.V_q))
-    comparison = Comparison(rom, rom.at(), model.system, snapshots, full_energy(model.system, snapshots))
+    comparison = Comparison(rom, rom.at(), model.system, snapshots, full_energy(model.system, snapshots.Z))
     with pytest.raises(ModelError, match="shows more"):
         comparison.floor("deformation", other, other.at())
 
@@ -91,7 +91,7 @@ def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
     snapshots: Any = simulate(model).snapshots
     rom = reduced(model, whole_basis(model.system.layout, "qp", "absolute", True))
     small = rom.at()
-    comparison = Comparison(rom, small, model.system, snapshots, full_energy(model.system, snapshots))
+    comparison = Comparison(rom, small, model.system, snapshots, full_energy(model.system, snapshots.Z))
     errors = comparison.errors(rom, small, run(small, step_of(model), force_of(model)))
     # rounding of 30 steps in other coordinates
     assert max(errors.error, errors.error_canonical, errors.error_deformation, errors.error_energy) < 1e-9

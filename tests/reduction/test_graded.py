@@ -15,8 +15,6 @@ from softgrasp.reduction.errors import row_weights
 from softgrasp.reduction.reduce import errors, reduce, replay
 from tests.helpers.models import make_scene
 
-pytestmark = pytest.mark.ranks
-
 GRADED = {"order": 2, "refine": {"tolerance": 0.02, "passes": 0}}
 
 

@@ -22,8 +22,6 @@ from softgrasp.reduction.propagator import march, propagator
 from tests.helpers.models import Array, close, make_scene
 from tests.helpers.reduced import DAMPED, KINDS, TINY, model_of, reduced, small_of, step_of, symplectic_basis, wiggle
 
-pytestmark = pytest.mark.ranks
-
 FALL = {"effects": {"gravity": {"g": [1.0, -9.0]}}}
 CANONICAL = [kind for kind in KINDS if kind[0] == "qp"]
 

@@ -32,8 +32,6 @@ from tests.helpers.snapshots import (
     snapshot_rows,
 )
 
-pytestmark = pytest.mark.ranks
-
 # --- structure of all bases
 
 

@@ -17,8 +17,6 @@ from tests.helpers.snapshots import (
     root_of,
 )
 
-pytestmark = pytest.mark.ranks
-
 
 @pytest.mark.parametrize("inner", INNERS)
 @pytest.mark.parametrize("key", ["global_pod", "pod_fixed", "global_pod_relative", "pod_fixed_relative"])

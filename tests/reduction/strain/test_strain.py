@@ -22,9 +22,9 @@ from softgrasp.reduction.files import seal
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.strain import stepper
 from softgrasp.reduction.strain.cells import Cells, Potential
-from softgrasp.reduction.strain.model import Box, StrainModel
+from softgrasp.reduction.strain.model import StrainModel, TrainedBox
 from softgrasp.reduction.strain.nnls import nnls
-from softgrasp.reduction.strain.stepper import March, Problem, march
+from softgrasp.reduction.strain.stepper import March, StrainProblem, march
 
 pytestmark = pytest.mark.serial
 LAYERS = (LayerMaterial(50.0, 50.0, 1.0), LayerMaterial(80.0, 20.0, 1.0))
@@ -39,20 +39,20 @@ def cells_of(law: LawName, d: int, k: int = 4, q: int = 11) -> Cells:
     return Cells(law, B, weight, np.ones(q), rng.integers(0, 2, q), np.arange(q), rng.random((q, d)))
 
 
-def problem_of(law: LawName, d: int, dt: float = 0.01, beta: float = 0.0) -> Problem:
+def problem_of(law: LawName, d: int, dt: float = 0.01, beta: float = 0.0) -> StrainProblem:
     potential = Potential(cells_of(law, d), LAYERS)
     K = potential.tangent(np.zeros(potential.k))
-    return Problem(potential, beta * K, K, dt)
+    return StrainProblem(potential, beta * K, K, dt)
 
 
-def loads(problem: Problem, steps: int, size: float = 100.0) -> Array:
+def loads(problem: StrainProblem, steps: int, size: float = 100.0) -> Array:
     """A push that ends at half time, at the midpoints."""
     x = (np.arange(steps) + 0.5) / steps
     shape = np.random.default_rng(7).standard_normal(problem.potential.k)
     return size * np.outer(np.where(x < 0.5, np.sin(2 * np.pi * x) ** 2, 0.0), shape)
 
 
-def run(problem: Problem, load: Array, tol: float = 1e-11, engine: str = "NumPy") -> March:
+def run(problem: StrainProblem, load: Array, tol: float = 1e-11, engine: str = "NumPy") -> March:
     return march(problem, load, np.zeros(load.shape[1]), np.zeros(load.shape[1]), tol, engine)
 
 
@@ -230,7 +230,7 @@ def test_without_a_compiler_numpy_steps_and_says_so(monkeypatch: pytest.MonkeyPa
 def model_of() -> StrainModel:
     cells = cells_of("neo-hooke", 2)
     ones = np.ones(2)
-    box = Box(
+    box = TrainedBox(
         lam=np.outer([50.0, 80.0], [0.8, 1.2]),
         mu=np.outer([50.0, 20.0], [0.8, 1.2]),
         load=np.outer(ones, [-2.0, 2.0]),
