@@ -67,11 +67,11 @@ def summary(sweep: Sweep, rows: Sequence[Row]) -> list[str]:
 
 def run_sweep(
     path: Path,
-    axes: list[str],
     out: Path,
     overrides: list[str],
     console: Console,
     *,
+    axes: list[str],
     reduced: int | None = None,
     each: int = 1,
     quiet: bool = False,

@@ -41,7 +41,7 @@ def test_a_sweep_says_its_values_or_its_form() -> None:
 @pytest.mark.ranks(2)
 def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     axes = ["tissue.material.mu=20:500:3", "time.steps=60,80"]
-    result = run_sweep(SCENE, axes, mpi_tmp_path, SMALL[:1], QUIET, quiet=True, pictures=False)
+    result = run_sweep(SCENE, mpi_tmp_path, SMALL[:1], QUIET, axes=axes, quiet=True, pictures=False)
     assert len(result["points"]) == 6
     for row in result["points"]:
         mu, steps = row["tissue.material.mu"], row["time.steps"]
@@ -53,14 +53,15 @@ def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeyp
         assert row["tip_x end [m]"] == pytest.approx(run.outputs[-1, 0], rel=1e-9)
         assert row["tip_x lag [m]"] == pytest.approx(np.abs(run.outputs - run.outputs_rigid)[:, 0].max(), rel=1e-9)
     together = run_sweep(
-        SCENE, ["tissue.material.mu=20:500:3"], mpi_tmp_path / "each", [*SMALL[:1], "time.steps=60"], QUIET,
+        SCENE, mpi_tmp_path / "each", [*SMALL[:1], "time.steps=60"], QUIET, axes=axes[:1],
         each=MPI.COMM_WORLD.size, quiet=True, pictures=False,
     )  # fmt: skip
     for alone, row in zip(result["points"][::2], together["points"], strict=True):
         assert row["tip_x lag [m]"] == pytest.approx(alone["tip_x lag [m]"], rel=1e-9)  # rounding, as above
     monkeypatch.setattr(sweep_module.Runner, "row", lambda *_: pytest.fail("it was there already"))
     assert (
-        run_sweep(SCENE, axes, mpi_tmp_path, SMALL[:1], QUIET, quiet=True, pictures=False)["points"] == result["points"]
+        run_sweep(SCENE, mpi_tmp_path, SMALL[:1], QUIET, axes=axes, quiet=True, pictures=False)["points"]
+        == result["points"]
     )
 
 
@@ -68,9 +69,9 @@ def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeyp
 def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path: Path) -> None:
     axes = ["tissue.material.mu=40,-1,60"]
     with pytest.raises(SceneError, match="must be > 0"):
-        run_sweep(SCENE, axes, tmp_path, SMALL, QUIET, quiet=True, reduced=20)
+        run_sweep(SCENE, tmp_path, SMALL, QUIET, axes=axes, quiet=True, reduced=20)
     axes = ["tissue.material.mu=40:60:3"]
-    result = run_sweep(SCENE, axes, tmp_path, SMALL, QUIET, quiet=True, reduced=20)
+    result = run_sweep(SCENE, tmp_path, SMALL, QUIET, axes=axes, quiet=True, reduced=20)
     first, middle, last = result["points"]
     assert middle["error"] is None
     for row in (first, last):
@@ -78,7 +79,7 @@ def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path:
         assert 0 < row["error"] < 0.05
         assert row["tip_x end [m]"] == pytest.approx(full.outputs[-1, 0], abs=0.05 * np.abs(full.outputs[:, 0]).max())
     assert (tmp_path / "sweep.png").stat().st_size > 5000
-    failed = run_sweep(SCENE, ["output.memory=1e3,1e-9"], tmp_path / "b", SMALL, QUIET, quiet=True, pictures=False)
+    failed = run_sweep(SCENE, tmp_path / "b", SMALL, QUIET, axes=["output.memory=1e3,1e-9"], quiet=True, pictures=False)
     assert "reason" not in failed["points"][0]
     assert "reason" in failed["points"][1]
 
