@@ -371,7 +371,7 @@ def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     x = picture.points + u
     if len(picture.cells) <= MANY_CELLS:
         look: dict[str, Any] = {"cmap": colour_map(), "norm": shot.norm, "rasterized": True, "zorder": 2}
-        body = TriMesh(Triangulation(*x.T, picture.cells), array=shot.values(u, q), **look)
+        body = TriMesh(Triangulation(x[:, 0], x[:, 1], picture.cells), array=shot.values(u, q), **look)
         ax.add_collection(body, autolim=False)
     ax.add_collection(segments(x[shot.edges], edgecolors=OUTLINE, linewidths=0.5, zorder=3), autolim=False)
     hand = _moved(picture, shot.hand, q)
