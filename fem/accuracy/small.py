@@ -34,26 +34,18 @@ Solve = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Small:
-    """M xi'' + D xi' + K xi = G c, z = V xi, of a model; small arrays on every rank.
+    """M xi'' + D xi' + K xi = G c, z = V xi, of a model; small arrays on every rank."""
 
-    Attributes:
-        V: basis, local rows (n_local, N), with V' K V = 1.
-        M, D: projected mass and damping (N, N).
-        G: coupling (N, n_s).
-        C: outputs of the tissue against the hand (p, N).
-        C_s: their rigid part (p, n_s).
-        X: static solutions K_ee^-1 [G, C'], local rows (n_local, n_s + p); columns of outputs that are none are zero.
-        model: whose it is.
-    """
-
-    V: Array
+    V: Array  # basis, local rows (n_local, N), with V' K V = 1
+    # M, D: projected mass and damping (N, N)
     M: Array
     D: Array
-    G: Array
-    C: Array
-    C_s: Array
+    G: Array  # coupling (N, n_s)
+    C: Array  # outputs of the tissue against the hand (p, N)
+    C_s: Array  # their rigid part (p, n_s)
+    # static solutions K_ee^-1 [G, C'], local rows (n_local, n_s + p); columns of outputs that are none are zero
     X: Array
-    model: Model
+    model: Model  # whose it is
 
     @property
     def modes(self) -> tuple[Array, Array]:
@@ -133,19 +125,12 @@ def small_model(model: Model, solve: Solve, blocks: int = BLOCKS) -> Small:
 
 @dataclass(frozen=True)
 class SmallRun:
-    """A run of a small model.
+    """A run of a small model."""
 
-    Attributes:
-        deformation: outputs against the hand, (steps + 1, p).
-        rigid: their rigid part, (steps + 1, p).
-        loads: c of each step, (steps, n_s).
-        accelerations: xi'' at the middle of each step, (steps, N).
-    """
-
-    deformation: Array
-    rigid: Array
-    loads: Array
-    accelerations: Array
+    deformation: Array  # outputs against the hand, (steps + 1, p)
+    rigid: Array  # their rigid part, (steps + 1, p)
+    loads: Array  # c of each step, (steps, n_s)
+    accelerations: Array  # xi'' at the middle of each step, (steps, N)
 
 
 def run_small(small: Small, steps: int | None = None) -> SmallRun:

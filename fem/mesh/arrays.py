@@ -21,28 +21,15 @@ Sets = dict[int | str, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class MeshArrays:
-    """A simplex mesh in arrays, before distribution.
+    """A simplex mesh in arrays, before distribution."""
 
-    Attributes:
-        points: shape (n_points, d) [m].
-        cells: shape (n_cells, d + 1).
-        cell_tags: one integer a cell, or None.
-        facets: tagged facets, shape (n_facets, d).
-        facet_tags: one integer a tagged facet, or None.
-        part_tags: number of the facet-connected part of each cell, or None if there is one part only.
-        parts: what is known of these parts, or None.
-        facet_sets: marks in ``facet_tags`` of each tag number and named set.
-        cell_sets: marks in ``cell_tags`` of each tag number and named set.
-        notes: warnings, one sentence each.
-    """
-
-    points: Floats
-    cells: Integers
-    cell_tags: Tags | None
-    facets: Integers
-    facet_tags: Tags | None
-    part_tags: Tags | None
-    parts: Parts | None
-    facet_sets: Sets
-    cell_sets: Sets
-    notes: tuple[str, ...] = ()
+    points: Floats  # shape (n_points, d) [m]
+    cells: Integers  # shape (n_cells, d + 1)
+    cell_tags: Tags | None  # one integer a cell, or None
+    facets: Integers  # tagged facets, shape (n_facets, d)
+    facet_tags: Tags | None  # one integer a tagged facet, or None
+    part_tags: Tags | None  # number of the facet-connected part of each cell, or None if there is one part only
+    parts: Parts | None  # what is known of these parts, or None
+    facet_sets: Sets  # marks in ``facet_tags`` of each tag number and named set
+    cell_sets: Sets  # marks in ``cell_tags`` of each tag number and named set
+    notes: tuple[str, ...] = ()  # warnings, one sentence each

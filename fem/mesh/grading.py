@@ -24,21 +24,13 @@ SAMPLES = 400
 
 @dataclass(frozen=True)
 class SizeField:
-    """h(r) = max(floor, h0 min(1, r / R)^(1 - mu)) at the distance r from the nearest end.
+    """h(r) = max(floor, h0 min(1, r / R)^(1 - mu)) at the distance r from the nearest end."""
 
-    Attributes:
-        ends: the singular ends.
-        h0: size far from them [m].
-        radius: R [m].
-        mu: grading [1]; 1 is uniform.
-        floor: smallest size [m].
-    """
-
-    ends: Ends
-    h0: float
-    radius: float
-    mu: float
-    floor: float
+    ends: Ends  # the singular ends
+    h0: float  # size far from them [m]
+    radius: float  # R [m]
+    mu: float  # grading [1]; 1 is uniform
+    floor: float  # smallest size [m]
 
     def __call__(self, x: Floats) -> Floats:
         """Size at points (n, d), (n,) [m]."""

@@ -27,15 +27,10 @@ CLOSE = 0.1  # of the side: a line through a point of an output keeps this dista
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of a box.
+    """One axis of a box."""
 
-    Attributes:
-        cuts: coordinates that a line must meet, the sides first and last [m].
-        ends: those of them where the contact zone ends [m].
-    """
-
-    cuts: tuple[float, ...]
-    ends: tuple[float, ...]
+    cuts: tuple[float, ...]  # coordinates that a line must meet, the sides first and last [m]
+    ends: tuple[float, ...]  # those of them where the contact zone ends [m]
 
 
 def box_axes(scene: Scene) -> tuple[Axis, ...]:

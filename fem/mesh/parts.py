@@ -22,22 +22,14 @@ class Parts:
     """The parts of a mesh that hang together through facets; small, replicated on all ranks.
 
     Parts of one group share nodes, but no facet: they may turn about each other.
-
-    Attributes:
-        cells: number of cells of each part, shape (n_parts,).
-        middles: mean of the cell midpoints of each part, shape (n_parts, d) [m].
-        radii: largest distance of a node from the middle, shape (n_parts,) [m].
-        groups: number of the group of each part, shape (n_parts,).
-        points: nodes that several parts share, shape (n_shared, d) [m].
-        joints: rows (shared node, part), sorted, shape (n, 2).
     """
 
-    cells: Integers
-    middles: Floats
-    radii: Floats
-    groups: Integers
-    points: Floats
-    joints: Integers
+    cells: Integers  # number of cells of each part, shape (n_parts,)
+    middles: Floats  # mean of the cell midpoints of each part, shape (n_parts, d) [m]
+    radii: Floats  # largest distance of a node from the middle, shape (n_parts,) [m]
+    groups: Integers  # number of the group of each part, shape (n_parts,)
+    points: Floats  # nodes that several parts share, shape (n_shared, d) [m]
+    joints: Integers  # rows (shared node, part), sorted, shape (n, 2)
 
 
 def find_parts(

@@ -21,17 +21,11 @@ SEAM = 1e-4  # of the shortest edge: above coordinates of 6 digits, far below an
 
 @dataclass(frozen=True)
 class Facets:
-    """The facets of all cells, sorted so that equal ones are neighbours.
+    """The facets of all cells, sorted so that equal ones are neighbours."""
 
-    Attributes:
-        nodes: sorted nodes of each facet, shape ((d + 1) n_cells, d).
-        cells: the cell of each facet.
-        same: whether a facet equals the next one, shape ((d + 1) n_cells - 1,).
-    """
-
-    nodes: Integers
-    cells: Integers
-    same: npt.NDArray[np.bool_]
+    nodes: Integers  # sorted nodes of each facet, shape ((d + 1) n_cells, d)
+    cells: Integers  # the cell of each facet
+    same: npt.NDArray[np.bool_]  # whether a facet equals the next one, shape ((d + 1) n_cells - 1,)
 
     @property
     def outer(self) -> npt.NDArray[np.bool_]:

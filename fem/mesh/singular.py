@@ -25,19 +25,12 @@ STRAIGHT = 1e-6  # [rad]; angles of a flat boundary are off by rounding only
 
 @dataclass(frozen=True)
 class Ends:
-    """Singular points (2D) or edges (3D) of a body.
+    """Singular points (2D) or edges (3D) of a body."""
 
-    Attributes:
-        at: coordinates of the points, (n, 1, 2), or of both ends of the edges, (n, 2, 3) [m].
-        angle: angle of the body there, (n,) [rad].
-        alpha: real part of the exponent, (n,) [1]; 1/2 is assumed at ends of layers, where both materials decide.
-        kind: what the end is, n words.
-    """
-
-    at: Floats
-    angle: Floats
-    alpha: Floats
-    kind: tuple[Kind, ...]
+    at: Floats  # coordinates of the points, (n, 1, 2), or of both ends of the edges, (n, 2, 3) [m]
+    angle: Floats  # angle of the body there, (n,) [rad]
+    alpha: Floats  # real part of the exponent, (n,) [1]; 1/2 is assumed at ends of layers, where both materials decide
+    kind: tuple[Kind, ...]  # what the end is, n words
 
     def distance(self, x: Floats) -> Floats:
         """Distance of points (n, d) from the nearest end [m], inf if there is none."""

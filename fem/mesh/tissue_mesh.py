@@ -13,20 +13,13 @@ from softgrasp.fem.mesh.parts import Parts
 
 @dataclass(frozen=True)
 class Whole:
-    """A simplex mesh on one rank with what its cells and facets carry.
+    """A simplex mesh on one rank with what its cells and facets carry."""
 
-    Attributes:
-        mesh: on MPI.COMM_SELF.
-        source: its name, for messages.
-        cells: marks by name, one a cell: "tags", "layers".
-        facets: marks by name: "tags", "contact".
-        facet_sets, cell_sets: see :class:`TissueMesh`.
-    """
-
-    mesh: dolfinx.mesh.Mesh
-    source: str
-    cells: dict[str, npt.NDArray[np.int32]]
-    facets: dict[str, dolfinx.mesh.MeshTags]
+    mesh: dolfinx.mesh.Mesh  # on MPI.COMM_SELF
+    source: str  # its name, for messages
+    cells: dict[str, npt.NDArray[np.int32]]  # marks by name, one a cell: "tags", "layers"
+    facets: dict[str, dolfinx.mesh.MeshTags]  # marks by name: "tags", "contact"
+    # facet_sets, cell_sets: see TissueMesh
     facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
     cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
 
@@ -55,39 +48,27 @@ class Whole:
 
 @dataclass(frozen=True)
 class TissueMesh:
-    """A mesh of linear triangles or tetrahedra and what is known of it.
+    """A mesh of linear triangles or tetrahedra and what is known of it."""
 
-    Attributes:
-        mesh: distributed mesh; the topological dimension equals the geometric one.
-        dimension: 2 or 3.
-        facet_tags: integer marks of boundary facets, or None.
-        cell_tags: integer marks of cells (layers), or None.
-        source: "structured" or the name of the mesh file, for messages.
-        part_tags: number of the part of each cell, parts hanging together through facets; None if it is one.
-        parts: what is known of these parts, or None.
-        facet_sets: marks in ``facet_tags`` of each tag number and named set of the file, on all ranks.
-        cell_sets: marks in ``cell_tags`` of each tag number and named set of the file, on all ranks.
-        notes: warnings about the file, one sentence each, on all ranks.
-        digest: SHA-256 of what was read from the file, on all ranks; empty without one.
-        contact: facets of the contact zone that a refined mesh inherits; None: they are selected on this mesh.
-        layers: number of the layer of each cell that a refined mesh inherits, -1 for none; None likewise.
-        whole: a bisected mesh on rank 0, to bisect it further; None elsewhere and on other meshes.
-    """
-
-    mesh: dolfinx.mesh.Mesh
-    dimension: int
-    facet_tags: dolfinx.mesh.MeshTags | None
-    cell_tags: dolfinx.mesh.MeshTags | None
-    source: str
+    mesh: dolfinx.mesh.Mesh  # distributed mesh; the topological dimension equals the geometric one
+    dimension: int  # 2 or 3
+    facet_tags: dolfinx.mesh.MeshTags | None  # integer marks of boundary facets, or None
+    cell_tags: dolfinx.mesh.MeshTags | None  # integer marks of cells (layers), or None
+    source: str  # "structured" or the name of the mesh file, for messages
+    # number of the part of each cell, parts hanging together through facets; None if it is one
     part_tags: dolfinx.mesh.MeshTags | None = None
-    parts: Parts | None = None
+    parts: Parts | None = None  # what is known of these parts, or None
+    # marks in ``facet_tags`` of each tag number and named set of the file, on all ranks
     facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    # marks in ``cell_tags`` of each tag number and named set of the file, on all ranks
     cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    digest: str = ""
+    notes: tuple[str, ...] = ()  # warnings about the file, one sentence each, on all ranks
+    digest: str = ""  # SHA-256 of what was read from the file, on all ranks; empty without one
+    # facets of the contact zone that a refined mesh inherits; None: they are selected on this mesh
     contact: dolfinx.mesh.MeshTags | None = None
+    # number of the layer of each cell that a refined mesh inherits, -1 for none; None likewise
     layers: dolfinx.mesh.MeshTags | None = None
-    whole: Whole | None = None
+    whole: Whole | None = None  # a bisected mesh on rank 0, to bisect it further; None elsewhere and on other meshes
 
 
 def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:

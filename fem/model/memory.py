@@ -21,6 +21,8 @@ CELL_BYTES = {(2, 1): 1600.0, (2, 2): 9000.0, (2, 3): 25000.0, (3, 1): 2350.0, (
               (2, 4): 56000.0, (3, 4): 460000.0}  # fmt: skip
 LAYER_BYTES = {(2, 1): 600.0, (2, 2): 3900.0, (2, 3): 10800.0, (3, 1): 900.0, (3, 2): 13000.0, (3, 3): 60000.0,
                (2, 4): 24000.0, (3, 4): 180000.0}  # fmt: skip
+# Gradients, tangent and law of finite strain on each rank that holds the whole tissue; cubic ones by points and nodes.
+STRAIN_BYTES = {(2, 1): 1650.0, (2, 2): 12000.0, (2, 3): 40000.0, (3, 1): 5200.0, (3, 2): 97000.0, (3, 3): 420000.0}
 NODES = {
     (2, 1): 1 / 2,
     (2, 2): 2.0,
@@ -86,8 +88,9 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
     # times; q, v, a, c, pulls and temporaries of the hand's table; outputs, their sum and their rigid share: measured
     # 194 byte a step for n_s = d = 2
     row = 8.0 * (2 + 7 * n_s + 4 * outputs)
+    strain = copies * STRAIN_BYTES.get(kind, 0.0) if scene.effects.finite_strain is not None else 0.0
     return Need(
-        mesh=cells * (CELL_BYTES[kind] + len(scene.tissue.layers) * LAYER_BYTES[kind]),
+        mesh=cells * (CELL_BYTES[kind] + len(scene.tissue.layers) * LAYER_BYTES[kind] + strain),
         factor=factor_bytes(name, n_e, d, copies),
         tables=row * scene.time.steps if run else 0.0,
     )

@@ -37,7 +37,7 @@ class RestartState:
         hand_q, hand_v: hand so far, shape (n + 1, n_s).
         outputs: this rank's share of the outputs so far, shape (n + 1, components).
         snapshots: stored columns.
-        loads, pulls: what the work of the loads needs, shapes (n, n_s) and (n + 1, n_s).
+        loads, pulls: what the work of the loads needs, shapes (n, n_s) and (n + 1, n_s or 2 n_s).
         energies: dissipated, at the start, largest [J].
         residual_first: relative residual of the first solve.
         forces: on the hand so far, shape (n, n_s); None where the motion is prescribed.

@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.errors import SceneError, SolverError
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import HandTable
 from softgrasp.fem.system import BlockSystem
 
@@ -165,7 +165,8 @@ class ForceDrive:
         c0 = self.alpha * v - self.g
         pull = -midpoint.s * total(layout.comm, self.system.G.T @ state.array[layout.n_local :])
         a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
-        midpoint.solve_midpoint(-(self.kappa * a + c0), self.kappa * self.theta * self.inverse)
+        feel = Feel(self.kappa * self.theta * self.inverse, midpoint.G, np.array(midpoint.s**2 / self.theta))
+        midpoint.solve_midpoint(-(self.kappa * a + c0), feel)
         self.c[n] = midpoint.c
         self._move(n, -(midpoint.c + c0) / self.kappa)
 
@@ -185,17 +186,19 @@ def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float
 
     Args:
         system: operators, two-way.
-        pulls: G' w of each step, (steps, n_s).
+        pulls: G' w of each step, (steps, n_s), w = (z_1 - z_0) / 2; or beside it that with (v_0 + v_1) / 2s, which
+            differs where a step is divided, (steps, 2 n_s).
         v: velocity of the hand, (steps + 1, n_s).
         c: load of each step, -(a - g + alpha v_mid), (steps, n_s).
         dt: step [s].
     """
     s = 2 / dt
     turn = np.where(np.arange(len(pulls) + 1) % 2 == 0, 1.0, -1.0)[:, None]
-    rates = np.zeros_like(v)
-    rates[1:] = -turn[1:] * np.cumsum(turn[:-1] * (2 * s * pulls), axis=0)
+    rates, n_s = np.zeros_like(v), v.shape[1]
+    work, speed = pulls[:, :n_s], pulls[:, -n_s:]
+    rates[1:] = -turn[1:] * np.cumsum(turn[:-1] * (2 * s * speed), axis=0)
     alpha = system.damping.alpha if system.damping.in_space else 0.0
-    tissue = s * (s * pulls - rates[:-1]) + alpha * s * pulls
+    tissue = s * (s * speed - rates[:-1]) + alpha * s * work
     u = np.diff(v, axis=0) / dt @ system.M_hand.T - c @ system.M_rigid.T + tissue
     if system.hand_weight and system.gravity is not None:
         u -= system.M_hand @ system.gravity

@@ -7,7 +7,8 @@ With w = z_mid - z_n, s = 2/dt, pi = M v and the force f_alg of `softgrasp.fem.s
 
 the linear step with one more load, -(f_alg - K z_mid). The energy W + v'pi/2 changes by the work 2 c'G'w of the load,
 less what D dissipates, and by 2 w'R; so a step ends with a bit of a correction that makes w'R = 0 to first order.
-A step that does not converge is taken in 2, 4, .. 16 parts under the same load.
+A step that does not converge is taken in 2, 4, .. 16 parts under the same load, that of the whole step where the hand
+or feedback feels it.
 """
 
 from __future__ import annotations
@@ -15,40 +16,21 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, total
-from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
-from softgrasp.fem.solve.solvers import Reproducible, SolverName
+from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState
 from softgrasp.fem.strain.body import Body
-from softgrasp.fem.strain.newton import Counts, QuasiNewton, Root
+from softgrasp.fem.strain.newton import Counts, NewtonFigures, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
 from softgrasp.fem.system import BlockSystem
 
 PARTS = 16  # most of a step
 KEPT = 2  # steps that the first guess is extrapolated from
-
-
-@dataclass(frozen=True)
-class NewtonFigures:
-    """How the steps of a run converged.
-
-    Attributes:
-        mean, max: iterations of a step [1].
-        factors: tangents factored after the linear one.
-        min_det: smallest det F at the end of any step.
-        divided: steps taken in parts.
-    """
-
-    mean: float
-    max: int
-    factors: int
-    min_det: float
-    divided: int
+Begin = tuple[PETSc.Vec, Array, Array, float]  # z, s pi and v / s on the rows held, and what is dissipated
 
 
 class FiniteStrainMidpoint(TissueMidpoint):
@@ -60,27 +42,24 @@ class FiniteStrainMidpoint(TissueMidpoint):
         price: about how many iterations cost as much as a tangent and its factor, from sizes: the same in every run.
     """
 
-    def __init__(
-        self,
-        system: BlockSystem,
-        dt: float,
-        solver: SolverName,
-        rtol: float = 1e-10,
-        reproducible: Reproducible = "auto",
-    ) -> None:
-        points, s = system.points, 2 / dt
+    def _parts(self) -> tuple[PETSc.Mat, ...]:
+        inertia = self.system.M_ee.copy()
+        inertia.scale(self.s * self.s)
+        return (inertia, viscosity(self.system, self.s)) if self.system.damping.active else (inertia,)
+
+    def _prepare(self) -> None:
+        """Points, vectors and iteration. Collective."""
+        system, points = self.system, self.system.points
         assert points is not None
-        inertia = system.M_ee.copy()
-        inertia.scale(s * s)
-        parts = (inertia, viscosity(system, s)) if system.damping.active else (inertia,)
-        super().__init__(system, dt, solver, rtol, reproducible, parts)
         self.comm: MPI.Intracomm = system.layout.comm
         self.dot: Callable[[Array, Array], float] = np.dot
         if self.comm.size > 1 and not self.held.whole:
             self.dot = lambda a, b: self.over_ranks(float(np.dot(a, b)))
         if self.held.whole:
             points = whole_points(points, self.comm, self.held.enter(np.arange(system.layout.n_e)))
-        self.body, self.tol = Body(points, system.materials), points.tol
+        self.body, self.tol = Body(points, system.materials, None if self.held.whole else system.K_ee), points.tol
+        if not self.comm.allreduce(self.body.kernel is not None, MPI.LAND):
+            self.body.kernel = None  # ranks that hold all rows compute the same bits
         self.inertia, self.drag = (*self.held.parts, None)[:2]
         for part in self.held.parts:
             part.convert("aij")
@@ -91,16 +70,17 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.past: deque[Array] = deque(maxlen=KEPT)
         self.tangent_at: Array | None = None
         self.counts, self.price = Counts(), self._price()
-        self.parts, self.jump, self.C = 1, None, None
+        self.parts, self.jump, self.feel = 1, None, None
         self.load = self.right = np.zeros_like(self.r_array)
         self.last = 0.0
         self._propagate = self._carry_on
 
     parts: int  # into which the step in work is divided
     jump: Array | None  # of the velocity over a divided step
-    C: Array | None  # load added per N'w
-    N: Array
-    felt: Array
+    rate: Array  # (v_0 + v_1) / 2s of a divided step, on the rows held
+    feel: Feel | None
+    felt: Array  # p of feel
+    now: TissueState  # where the step in work begins
 
     def _price(self) -> float:
         if self.solver.name == "cg":
@@ -108,8 +88,11 @@ class FiniteStrainMidpoint(TissueMidpoint):
         nz = self.solver.ksp.getPC().getFactorMatrix().getInfo()["nz_used"]
         return float(np.clip(nz / (4 * self.system.layout.n_e), 8, 100))
 
-    def _pulled(self, w: Array) -> Array:
-        pull = self.N.T @ w
+    def _all(self, fine: bool) -> bool:
+        return fine if self.held.whole else bool(self.comm.allreduce(fine, MPI.LAND))
+
+    def _pulled(self, N: Array, w: Array) -> Array:
+        pull = N.T @ w
         return pull if self.held.whole else total(self.comm, pull)
 
     # ---- the state
@@ -133,6 +116,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def join(self, state: TissueState) -> None:
         """Take a state over whose r is set. Collective."""
+        self.now = state
         if self.held.whole:
             self.z.array_w[:] = self.held.gather(state.z.array_r)
         self._arrive(self._held_z(state), check=True)
@@ -188,18 +172,17 @@ class FiniteStrainMidpoint(TissueMidpoint):
         """Columns on the owned rows, (n_local, m), as they are held. Collective."""
         return np.asfortranarray(self.held.gather(N))
 
-    def solve_midpoint(self, c: Array, C: Array | None = None, N: Array | None = None) -> None:
-        """Solve R(w) = 0 under the load G (c + C N'w); ``self.c`` is c + C N'w then, ``felt`` is N'w. Collective.
+    def solve_midpoint(self, c: Array, feel: Feel | None = None) -> None:
+        """Solve R(w) = 0 under the load G (c + C p); ``self.c`` is c + C p then, ``felt`` is p. Collective.
 
         Args:
             c: load, (n_s,).
-            C: what hand and feedback add as the tissue moves, (n_s, m); None where they do not feel it.
-            N: from :meth:`hold`, (rows held, m); None is G.
+            feel: what hand and feedback add as the tissue moves; None where they do not feel it.
 
         Raises:
             SolverError: no convergence, not even in parts of the step; the message names the cell with the smallest J.
         """
-        self.C, self.N, self.jump, counts = C, self.G if N is None else N, None, self.counts
+        self.feel, self.jump, counts = feel, None, self.counts
         self.load = self.G @ c
         self.right = self.r_array + self.load
         counts.scale = max(counts.scale, math.sqrt(self.dot(self.right, self.right)))
@@ -208,16 +191,17 @@ class FiniteStrainMidpoint(TissueMidpoint):
             self._renew(self.at.array_r + guess) or self._renew(self.at.array_r)
         root = self._find(guess)
         if root.spent < 0:
-            root = self._divided()
+            root = self._divided(c)
+        elif feel is not None:
+            self.felt = self._pulled(feel.N, root.x)
+            c = c + feel.C @ self.felt
+        if self.jump is None:
+            self.c = c
         self.w.array_w[:] = root.x
         counts.first = root.spent if counts.first < 0 else counts.first
         counts.spent += max(root.spent - counts.first, 0)
         counts.iterations, counts.steps = counts.iterations + root.spent, counts.steps + 1
         counts.most = max(counts.most, root.spent)
-        self.c = c
-        if C is not None:
-            self.felt = self._pulled(root.x)
-            self.c = c + C @ self.felt
 
     def _guess(self) -> Array:
         past = self.past
@@ -241,8 +225,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         n = self.parts  # s is n times as large in a part of a step
         self.trial.stateIncrease()
         self.trial_array[:] = w
-        fine = self.body.step(self.begin, self.trial, self.f)
-        if not (fine if self.held.whole else self.comm.allreduce(fine, MPI.LAND)):
+        if not self._all(self.body.step(self.begin, self.trial, self.f)):
             return w, np.inf
         self.inertia.mult(self.trial, self.y)
         R: Array = self.f_array - self.right
@@ -250,8 +233,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if self.drag is not None:
             self.drag.mult(self.trial, self.y)
             R += n * self.y_array
-        if self.C is not None:
-            R -= self.G @ (self.C @ self._pulled(w))
+        if self.feel is not None:
+            R -= self.G @ (self.feel.C @ self._pulled(self.feel.N, w))
         return R, math.sqrt(self.dot(R, R))
 
     def _apply(self, q: Array) -> Array:
@@ -260,9 +243,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.trial.stateIncrease()
         self._solve(self.trial, self.solved)
         x: Array = np.array(self.solved_array)
-        if self.C is not None:
-            seen = self.C @ self._pulled(self.Y)
-            x += self.Y @ np.linalg.solve(np.eye(len(seen)) - seen, self.C @ self._pulled(x))
+        if self.feel is not None:
+            C, N, _ = self.feel
+            seen = C @ self._pulled(N, self.Y)
+            x += self.Y @ np.linalg.solve(np.eye(len(seen)) - seen, C @ self._pulled(N, x))
         return x
 
     def _renew_from(self, w: Array) -> bool:
@@ -271,6 +255,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def _renew(self, z: Array) -> bool:
         """Factor K(z) + s D + s^2 M; whether that worked. Collective."""
         self.trial.array_w[:] = z
+        if not self._all(self.body.sound(self.trial)):
+            return False
         S = self.body.tangent(self.trial)
         S.axpy(float(self.parts**2), self.inertia, SAME)
         if self.drag is not None:
@@ -282,64 +268,95 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if not self.solver.renew(S):
             return False
         if hasattr(self, "Y"):
-            C, self.C = self.C, None
+            feel, self.feel = self.feel, None
             self.Y = np.column_stack([self._apply(g) for g in self.G.T])
-            self.C = C
+            self.feel = feel
         return True
 
     # ---- parts of a step
 
-    def _divided(self) -> Root:
-        """The step in 2 to 16 parts under the same load: its w, and the jump of the velocity. Collective.
+    def _divided(self, c: Array) -> Root:
+        """The step in 2 to 16 parts under one load, ``self.c``; sets ``jump``, ``rate`` and ``felt``. Collective.
 
         Raises:
-            SolverError: no number of parts converges, or a hand that feels the tissue would need them.
+            SolverError: no number of parts converges.
         """
-        at, r, lost = self.at, self.r_array.copy(), self.dissipated
-        while not self.system.two_way and self.parts < PARTS:
+        feel, self.feel, at = self.feel, None, self.at
+        begin = at, self.r_array.copy(), self.held.gather(self.now.v.array_r) / self.s, self.dissipated
+        while self.parts < PARTS:
             self.parts *= 2
-            self.at = at.copy()
-            root = self._taken()
-            self.at.destroy()
-            self.at, self.begin = at, self.body.start(at)
-            if root.spent >= 0:
-                self.parts, self.past = 1, deque(maxlen=KEPT)
-                self.counts.divided += 1
-                self._renew(at.array_r + root.x)
-                return root
-            self.r.array_w[:], self.dissipated, self.jump = r, lost, None
-        reason = "the hand feels the tissue, so that no step is divided" if self.parts == 1 else "16 parts did not help"
+            root = self._taken(c, begin) if feel is None else self._balanced(c, feel, begin)
+            if root is None:
+                continue
+            self.parts, self.past = 1, deque(maxlen=KEPT)
+            self.counts.divided += 1
+            self._renew(at.array_r + root.x) or self._renew(at.array_r)
+            return root
         self.parts = 1
         J, place = self.body.lowest(self.body.J, None if self.held.whole else self.comm)
         raise SolverError(
-            f"finite strain ({self.body.law.name}): no convergence ({reason}); in the cell at {place} the last trial "
-            f"has det F = {J:.3g}: take more time.steps, a finer mesh or a gentler motion"
+            f"finite strain ({self.body.law.name}): no convergence (16 parts of the step did not help); in the cell at "
+            f"{place} the last trial has det F = {J:.3g}: take more time.steps, a finer mesh or a gentler motion"
         )
 
-    def _taken(self) -> Root:
-        """All parts of a step, each with a tangent of its own; count < 0 where one of them fails. Collective."""
-        w, jump, count = np.zeros_like(self.r_array), np.zeros_like(self.r_array), 0
-        for _ in range(self.parts):
-            self.begin, self.right = self.body.start(self.at), self.parts * self.r_array + self.load
-            self._renew(self.at.array_r.copy())
-            root = self._find(np.zeros_like(w))
-            if root.spent < 0:
-                return root
-            self.w.array_w[:] = root.x
-            self._add_momentum()
-            self.at.axpy(2.0, self.w)
-            w, jump, count = w + root.x, 2 * self.s * self.parts * root.x - jump, count + root.spent
-        self.jump = jump
-        return root._replace(x=w, spent=count)
+    def _balanced(self, c: Array, feel: Feel, begin: Begin) -> Root | None:
+        """The parts under the load that they make hand and feedback take, Powell's hybrid method. Collective."""
+        root: Root | None = None
+
+        def miss(load: Array) -> Array:
+            nonlocal root
+            root = self._taken(np.array(load), begin)  # MINPACK hands over its own memory
+            if root is None:
+                raise ArithmeticError
+            w = self._pulled(feel.N, root.x)
+            self.felt = w + feel.speed * (self._pulled(feel.N, self.rate) - w)
+            return np.asarray(load - c - feel.C @ self.felt)
+
+        from scipy.optimize import root as solve  # few runs need it
+
+        try:
+            load = solve(miss, c, options={"xtol": 1e-13, "eps": 1e-6}).x
+            fine = np.abs(miss(load)).max() <= 10 * self.tol * max(np.abs(load).max(), np.abs(c).max())
+        except ArithmeticError:
+            return None
+        return root if fine else None
+
+    def _taken(self, load: Array, begin: Begin) -> Root | None:
+        """All parts of a step, each with a tangent of its own; None where one of them fails. Collective."""
+        at, r, v, self.dissipated = begin
+        self.r.array_w[:], self.c, self.load = r, load, self.G @ load
+        w, jump, count, self.at = np.zeros_like(r), np.zeros_like(r), 0, at.copy()
+        try:
+            for _ in range(self.parts):
+                self.begin, self.right = self.body.start(self.at), self.parts * self.r_array + self.load
+                if not self._renew(self.at.array_r.copy()):
+                    return None
+                root = self._find(np.zeros_like(w))
+                if root.spent < 0:
+                    return None
+                self.w.array_w[:] = root.x
+                self._add_momentum()
+                self.at.axpy(2.0, self.w)
+                w, jump, count = w + root.x, 2 * self.s * self.parts * root.x - jump, count + root.spent
+            self.jump, self.rate = jump, v + jump / (2 * self.s)
+            return root._replace(x=w, spent=count)
+        finally:
+            self.at.destroy()
+            self.at, self.begin = at, self.body.start(at)
 
     # ---- the end of a step
 
     def advance(self, old: TissueState, new: TissueState) -> None:
         """Write z_{n+1}, v_{n+1} into ``new`` (may be ``old``) and carry momentum and law on. Collective."""
-        v = None if self.jump is None else old.v.array_r + self.jump[self.rows]
+        self.now, v = new, None if self.jump is None else old.v.array_r + self.jump[self.rows]
         super().advance(old, new)
         if v is not None:
             new.v.array_w[:] = v
+
+    def pull(self) -> Array:
+        """G'w with w = (z_1 - z_0) / 2, and with (v_0 + v_1) / 2s, over the rows held, (2 n_s,)."""
+        work = super().pull()
+        return np.concatenate([work, work if self.jump is None else self.G.T @ self.rate])
 
     def _carry_on(self, z: PETSc.Vec) -> None:
         if self.jump is None:
@@ -362,16 +379,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
         self.body.destroy()
-        for item in (
-            self.body.points.B if self.held.whole else None,
-            *self.held.parts,
-            self.trial,
-            self.f,
-            self.y,
-            self.solved,
-        ):
-            if item is not None:
-                item.destroy()
+        mine = (*self.held.parts, self.trial, self.f, self.y, self.solved)
+        for item in (*mine, *([self.body.points.B] if self.held.whole else [])):
+            item.destroy()
         super().destroy()
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, 
 from softgrasp.fem.system import BlockSystem
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.finite_strain import NewtonFigures
+    from softgrasp.fem.strain.newton import NewtonFigures
 
 
 def make_midpoint(
@@ -76,6 +76,17 @@ def state_on(array: Array, system: BlockSystem) -> TissueState:
     )
 
 
+class Feel(NamedTuple):
+    """What a hand that feels the tissue, or feedback, adds to the load G c of a step: G C p with p = N'w.
+
+    Where a step is divided, w is (z_1 - z_0) / 2 in the share 1 - speed of each column, (v_0 + v_1) / 2s in the rest.
+    """
+
+    C: Array  # (n_s, m)
+    N: Array  # on the rows held, (rows, m)
+    speed: Array  # (m,)
+
+
 class TissueMidpoint:
     """The tissue half of the step, for a load known at the midpoint.
 
@@ -89,7 +100,6 @@ class TissueMidpoint:
         solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
-        parts: further matrices to hold, consumed.
 
     Attributes:
         held: operators on the rows held.
@@ -108,11 +118,10 @@ class TissueMidpoint:
         solver: SolverName,
         rtol: float = 1e-10,
         reproducible: Reproducible = "auto",
-        parts: tuple[PETSc.Mat, ...] = (),
     ) -> None:
         self.system, self.dt, self.s = system, dt, 2 / dt
         whole, ordered = factor_on_every_rank(system.layout, solver, reproducible), solver == "cholesky"
-        self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered, parts)
+        self.held = held_operators(system, midpoint_matrix(system, dt), whole, ordered, self._parts())
         self.G, self.rows = self.held.G, self.held.rows
         self.K2 = self.held.K
         self.K2.scale(-2.0)
@@ -131,7 +140,16 @@ class TissueMidpoint:
             self._move = self._move_whole
         self.x_array: Array = self.x.array_w
         self._pick = self._picker()
-        damping = system.damping
+        self.dissipated = 0.0
+        self._prepare()
+
+    def _parts(self) -> tuple[PETSc.Mat, ...]:
+        """Further matrices to hold. Collective."""
+        return ()
+
+    def _prepare(self) -> None:
+        """Choose what ends a step. Collective."""
+        damping = self.system.damping
         self.alpha, self.beta = damping.alpha, damping.beta
         self.a = 2 * self.s / (self.s + self.alpha)
         self.b = self.a * (1 + self.s * self.beta) / 2
@@ -142,7 +160,6 @@ class TissueMidpoint:
             self.k_old = self.k.duplicate()
             self.k_old_array = self.k_old.array_r
             self._propagate = self._proportional
-        self.dissipated = 0.0
 
     def _picker(self) -> Callable[[], object]:
         """What copies the owned rows of w to x."""
@@ -201,12 +218,12 @@ class TissueMidpoint:
     def _held_z(self, state: TissueState) -> PETSc.Vec:
         return self.z if self.held.whole else state.z
 
-    def solve_midpoint(self, c: Array, C: Array | None = None, N: Array | None = None) -> None:
+    def solve_midpoint(self, c: Array, feel: Feel | None = None) -> None:
         """Solve S w = h + G c, once a step. Collective.
 
         Args:
             c: load, (n_s,); kept, not copied: leave it as it is until the next solve.
-            C, N: of finite strain only.
+            feel: of finite strain only.
         """
         np.add(self.pending, c, out=self.added_array)
         self.coupling.multAdd(self.added, self.r_here, self.r_here)

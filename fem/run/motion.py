@@ -20,17 +20,11 @@ from softgrasp.fem.scene.text import read_table
 
 @dataclass(frozen=True)
 class HandTable:
-    """Hand trajectory on the time grid.
+    """Hand trajectory on the time grid."""
 
-    Attributes:
-        q: positions [m, rad], shape (steps + 1, n_s).
-        v: velocities, shape (steps + 1, n_s).
-        a: mean acceleration of each step, (v_{n+1} - v_n) / dt, shape (steps, n_s).
-    """
-
-    q: Array
-    v: Array
-    a: Array
+    q: Array  # positions [m, rad], shape (steps + 1, n_s)
+    v: Array  # velocities, shape (steps + 1, n_s)
+    a: Array  # mean acceleration of each step, (v_{n+1} - v_n) / dt, shape (steps, n_s)
 
 
 def quintic(t: Array, duration: float) -> tuple[Array, Array, Array]:

@@ -87,7 +87,7 @@ class Run(Stepped):
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
         self.points, self.regions = self._recorders()
         self.drive: Drive = self._make_drive(force)
-        self.pulls = np.zeros((self.steps + 1, system.layout.n_s))
+        self.pulls = np.zeros((self.steps + 1, len(midpoint.pull())))
         self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
         self.initial_energy = self.peak_energy = 0.0
         self.residual_first = self.residual_last = 0.0
@@ -185,7 +185,7 @@ class Run(Stepped):
     def balance(self) -> tuple[float, float]:
         """Work sum_n 2 c_n'G'w_n of the loads and energy dissipated since the start [J]. Collective."""
         n = self.reached
-        work = 2 * float(np.einsum("ij,ij", self.drive.c[:n], self.pulls[1 : n + 1]))
+        work = 2 * float(np.einsum("ij,ij", self.drive.c[:n], self.pulls[1 : n + 1, : self.layout.n_s]))
         return self.midpoint.over_ranks(work), self.midpoint.over_ranks(self.midpoint.dissipated)
 
     def drift(self) -> float:

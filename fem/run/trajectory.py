@@ -10,7 +10,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.finite_strain import NewtonFigures
+    from softgrasp.fem.strain.newton import NewtonFigures
 
 
 @dataclass(frozen=True)

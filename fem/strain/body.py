@@ -7,7 +7,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc
-from softgrasp.fem.strain.arrays import double_dot
+from softgrasp.fem.strain.arrays import double_dot, volume_change
+from softgrasp.fem.strain.force import Kernel, compiled
 from softgrasp.fem.strain.laws import Start, green, stretches
 from softgrasp.fem.strain.points import Points
 from softgrasp.fem.system import LayerMaterial
@@ -19,21 +20,26 @@ class Body:
     Args:
         points: of this rank, or all of them.
         materials: one per layer.
+        pattern: of the tangents; None: that of B'AB, which on some ranks has fewer columns of other ranks than K_ee.
 
     Attributes:
         rounding: what rounding in the stress mu F leaves of a force [N], in the norm of all rows.
     """
 
-    def __init__(self, points: Points, materials: tuple[LayerMaterial, ...]) -> None:
+    def __init__(self, points: Points, materials: tuple[LayerMaterial, ...], pattern: PETSc.Mat | None = None) -> None:
         self.points, self.law = points, points.laws
         self.lam, self.mu = points.lame(materials)
         d, Q = points.d, len(points.vol)
         self.shape = (d, d, Q)
         self.h = points.B.createVecLeft()
         self.H: Array = self.h.array_w.reshape(self.shape)  # overwritten by every product
-        self.K: PETSc.Mat | None = None
+        self.pattern = pattern if points.B.comm.size > 1 else None
         self.A: PETSc.Mat | None = None
+        self.product: PETSc.Mat | None = None
+        self.K: PETSc.Mat | None = None
         self.rounding = self._rounding()
+        code = compiled() if points.B.comm.size == 1 else None
+        self.kernel = None if code is None else Kernel(points, self.lam, self.mu, code)
 
     def _rounding(self) -> float:
         size, force = abs_copy(self.points.B), self.points.B.createVecRight()
@@ -58,12 +64,22 @@ class Body:
         """F = B' (vol P(B z)) [N]. Collective."""
         self._collect(self.law.stress(self.gradient(z), self.lam, self.mu), f)
 
+    def sound(self, z: PETSc.Vec) -> bool:
+        """Whether the law has a tangent at z in the points of this rank. Collective."""
+        return not self.law.barrier or bool(volume_change(self.gradient(z)).min(initial=0.0) > -1)
+
     def start(self, z: PETSc.Vec) -> Start:
-        """The law at the start of a step. Collective."""
-        return self.law.start(self.gradient(z))
+        """The law at the start of a step; valid until the next call. Collective."""
+        return self.law.start(self.gradient(z)) if self.kernel is None else self.kernel.start(z.array_r)
 
     def step(self, start: Start, w: PETSc.Vec, f: PETSc.Vec) -> bool:
-        """Force f [N] of the discrete gradient from z to z + 2 w; whether the rank has a stress. Collective."""
+        """Force f [N] of the discrete gradient from z to z + 2 w, ``start`` the last; whether the rank has a stress.
+
+        Collective.
+        """
+        if self.kernel is not None:
+            self.J = self.kernel.J
+            return self.kernel.force(w.array_r, f.array_w)
         P, self.J = self.law.step(start, self.gradient(w), self.lam, self.mu)
         self._collect(P if P is not None else self.H, f)  # all ranks take part in the product
         return P is not None
@@ -101,11 +117,11 @@ class Body:
 
     def _least_stretch(self, start: Start, comm: MPI.Intracomm | None) -> tuple[float, str]:
         """Smallest principal stretch; it is above the limit where E is small."""
-        E, limit = green(start.extra), self.law.least_stretch
+        E, limit = green(start.H), self.law.least_stretch
         values = np.ones(self.shape[2])
         doubtful = double_dot(E, E) > (1 - limit**2) ** 2 / 4
         if doubtful.any():
-            values[doubtful] = stretches(start.extra[:, :, doubtful])
+            values[doubtful] = stretches(start.H[:, :, doubtful])
         return self.lowest(values, comm)
 
     def _collect(self, P: Array, f: PETSc.Vec) -> None:
@@ -114,7 +130,7 @@ class Body:
         self.points.B.multTranspose(self.h, f)
 
     def tangent(self, z: PETSc.Vec) -> PETSc.Mat:
-        """K(z) = B' (vol A) B with the pattern of K_ee; the next call overwrites it. Collective."""
+        """K(z) = B' (vol A) B with the pattern asked for; the next call overwrites it. Collective."""
         d, Q = self.points.d, self.shape[2]
         moduli = self.law.tangent(self.gradient(z), self.lam, self.mu)
         moduli *= self.points.vol
@@ -127,16 +143,21 @@ class Body:
             sizes = self.h.getSizes()
             csr = (self.indptr, self.columns, values)
             self.A = PETSc.Mat().createAIJ((sizes, sizes), csr=csr, comm=self.h.comm)
-            self.K = self.A.ptap(self.points.B)
+            self.product = self.A.ptap(self.points.B)
+            self.K = None if self.pattern is None else self.pattern.duplicate(copy=False)
         else:
             self.A.setValuesCSR(self.indptr, self.columns, values)
             self.A.assemble()
-            self.A.ptap(self.points.B, self.K)
+            self.A.ptap(self.points.B, self.product)
+        if self.K is None:
+            return self.product
+        self.K.zeroEntries()
+        self.K.axpy(1.0, self.product, PETSc.Mat.Structure.SUBSET)
         return self.K
 
     def destroy(self) -> None:
         """Free PETSc's objects; the points are not the body's own. Collective."""
-        for item in (self.h, self.A, self.K):
+        for item in (self.h, self.A, self.product, self.K):
             if item is not None:
                 item.destroy()
 

@@ -36,14 +36,14 @@ class Start:
     """A law at the start of a step.
 
     Attributes:
-        F: I + H_0, (d, d, Q).
+        H: H_0, (d, d, Q).
         j: J_0 - 1, (Q,).
-        extra: ln J_0, (Q,); St. Venant-Kirchhoff: H_0 itself, (d, d, Q).
+        log: ln J_0, (Q,); of no use to St. Venant-Kirchhoff.
     """
 
-    F: Array
+    H: Array
     j: Array
-    extra: Array
+    log: Array
 
 
 class Law(ABC):
@@ -71,9 +71,11 @@ class Law(ABC):
     def tangent(self, H: Array, lam: Array, mu: Array) -> Array:
         """A = dP/dF [Pa], (d, d, d, d, Q) with A[i, J, k, L] = dP_iJ/dF_kL."""
 
-    @abstractmethod
     def start(self, H: Array) -> Start:
         """What :meth:`step` needs of H_0."""
+        j = volume_change(H)
+        with np.errstate(invalid="ignore", divide="ignore"):  # an inverted start is refused by its J
+            return Start(H.copy(), j, np.log1p(j))
 
     @abstractmethod
     def step(self, start: Start, half: Array, lam: Array, mu: Array) -> tuple[Array | None, Array]:
@@ -107,15 +109,9 @@ class Volumetric(Law):
                     A[i, :, k, :] += p * _turned(F, i, k)
         return A
 
-    def start(self, H: Array) -> Start:
-        """See :class:`Law`."""
-        j = volume_change(H)
-        with np.errstate(invalid="ignore", divide="ignore"):  # an inverted start is refused by its J
-            return Start(identity(H), j, np.log1p(j))
-
     def step(self, start: Start, half: Array, lam: Array, mu: Array) -> tuple[Array | None, Array]:
         """See :class:`Law`."""
-        F = start.F + half
+        F = identity(start.H + half)
         C = cofactor(F)
         if len(half) == 3:
             C += cofactor(half) / 3
@@ -164,7 +160,7 @@ class NeoHooke(Volumetric):
     def quotient(self, log: Array, start: Start, dj: Array, dl: Array, lam: Array, mu: Array) -> Array:
         """See :class:`Volumetric`."""
         dl *= 0.5
-        dl += start.extra
+        dl += start.log
         dl *= lam
         dl -= mu
         dl *= log
@@ -215,15 +211,11 @@ class StVenantKirchhoff(Law):
         A += lam * F[:, :, None, None] * F
         return np.asarray(A + np.einsum("ik,JLq->iJkLq", one, S))
 
-    def start(self, H: Array) -> Start:
-        """See :class:`Law`."""
-        return Start(identity(H), volume_change(H), H.copy())
-
     def step(self, start: Start, half: Array, lam: Array, mu: Array) -> tuple[Array | None, Array]:
         """See :class:`Law`."""
-        end = start.extra + 2 * half
-        E = (green(start.extra) + green(end)) / 2
-        return _push(start.F + half, second_stress(E, lam, mu)), 1 + volume_change(end)
+        end = start.H + 2 * half
+        E = (green(start.H) + green(end)) / 2
+        return _push(identity(start.H + half), second_stress(E, lam, mu)), 1 + volume_change(end)
 
 
 def green(H: Array) -> Array:

@@ -48,6 +48,24 @@ class Counts:
     scale: float = 0.0
 
 
+@dataclass(frozen=True)
+class NewtonFigures:
+    """How the steps of a run converged.
+
+    Attributes:
+        mean, max: iterations of a step [1].
+        factors: tangents factored after the linear one.
+        min_det: smallest det F at the end of any step.
+        divided: steps taken in parts.
+    """
+
+    mean: float
+    max: int
+    factors: int
+    min_det: float
+    divided: int
+
+
 class QuasiNewton:
     """Iterations that share their pairs (dx, dr, 1/dx'dr), as the steps of a run do.
 

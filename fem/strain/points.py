@@ -24,28 +24,19 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Points:
-    """The points of this rank's cells.
+    """The points of this rank's cells."""
 
-    Attributes:
-        B: gradient, rows distributed as the points and columns as the tissue; of the rank's d^2 Q rows the row
-            (i d + j) Q + q gives H_ij = dz_i/dX_j in its point q, so that H is an array (d, d, Q).
-        vol: weight of each point [m^d, in 2D times the thickness], (Q,); they sum to the volume of the rank's cells.
-        layer: number of the material of each point, (Q,).
-        cell: global number of the cell of each point, (Q,).
-        X: place of each point at rest [m], (Q, d).
-        d: space dimension.
-        law: name of the material's law.
-        tol: relative tolerance of the equations of a step [1].
-    """
-
+    # gradient, rows distributed as the points and columns as the tissue; of the rank's d^2 Q rows the row (i d + j) Q +
+    # q gives H_ij = dz_i/dX_j in its point q, so that H is an array (d, d, Q)
     B: PETSc.Mat
+    # weight of each point [m^d, in 2D times the thickness], (Q,); they sum to the volume of the rank's cells
     vol: Array
-    layer: Ints
-    cell: Ints
-    X: Array
-    d: int
-    law: LawName
-    tol: float
+    layer: Ints  # number of the material of each point, (Q,)
+    cell: Ints  # global number of the cell of each point, (Q,)
+    X: Array  # place of each point at rest [m], (Q, d)
+    d: int  # space dimension
+    law: LawName  # name of the material's law
+    tol: float  # relative tolerance of the equations of a step [1]
 
     @property
     def laws(self) -> Law:

@@ -28,11 +28,9 @@ def linearised(model: Model) -> Model:
         return model
     if system.gravity is None:
         return replace(model, system=replace(system, points=None))
-    body, z = Body(system.points, system.materials), system.K_ee.createVecRight()
+    body, z = Body(system.points, system.materials, system.K_ee), system.K_ee.createVecRight()
     z.array_w[:] = equilibrium(system)
-    K = system.K_ee.duplicate(copy=False)  # a product's own pattern may have fewer columns of other ranks than M_ee's
-    K.zeroEntries()
-    K.axpy(1.0, body.tangent(z), PETSc.Mat.Structure.SUBSET)
+    K = body.tangent(z).copy()
     K.setOption(PETSc.Mat.Option.SPD, True)
     body.destroy()
     z.destroy()

@@ -1,6 +1,7 @@
 """Feedback on a plant of finite strain: the law becomes part of the equation of the tissue's step.
 
-With w = z_mid - z_n, p = [N'w; G'w], N = K_z + s K_v and F = dt^2/4 K_q + dt/2 K_v the law at the midpoint is
+With w = z_mid - z_n, p = [K_z'w; s K_v'w; G'w], N'w the sum of the first two and F = dt^2/4 K_q + dt/2 K_v the law at
+the midpoint is
 
     u = u_bar + K_q (q + dt/2 v - q_bar) + K_v v + K_z'(z - z_bar) + F a + N'w,
 
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import TissueState
+from softgrasp.fem.run.midpoint import Feel, TissueState
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
 
@@ -35,13 +36,14 @@ class FiniteDrive:
         self.plant, self.gain, self.bound = plant, gain, bound
         self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
         self.inertia = system.M_hand + (plant.kappa * system.M_rigid if system.two_way else 0.0)
-        N = np.zeros_like(system.G)
+        K_z = K_v = np.zeros_like(system.G)
         self.offset, self.F = np.zeros(n_s), np.zeros((n_s, n_s))
         if gain is not None and target is not None:
-            self.K_q, self.K_v, N = gain.K_s[:, :n_s], gain.K_s[:, n_s:], gain.K_z + plant.s * gain.K_v
+            self.K_q, self.K_v, K_z, K_v = gain.K_s[:, :n_s], gain.K_s[:, n_s:], gain.K_z, plant.s * gain.K_v
             self.F = dt**2 / 4 * self.K_q + dt / 2 * self.K_v
             self.offset = target.u - self.K_q @ target.state.q_s - total(plant.comm, gain.K_z.T @ target.state.z)
-        self.N = plant.midpoint.hold(np.hstack([N, system.G]))
+        self.N = plant.midpoint.hold(np.hstack([K_z, K_v, system.G]))
+        self.speed = np.repeat([0.0, 1.0, plant.s**2 / plant.theta], n_s)
 
     def solve(self, n: int, state: TissueState) -> None:
         """One step under the law. Collective."""
@@ -64,16 +66,17 @@ class FiniteDrive:
         """The step with u = known, where ``free`` with the part F a + N'w of the law; a and the law. Collective."""
         plant, system, n_s = self.plant, self.plant.system, len(known)
         c_0 = plant.alpha * self.v[n] - plant.g
-        right, C = known + plant.weight, np.zeros((n_s, 2 * n_s))
-        C[:, :n_s] = np.diag(free)
+        right, C = known + plant.weight, np.zeros((n_s, 3 * n_s))
+        C[:, :n_s] = C[:, n_s : 2 * n_s] = np.diag(free)
         if system.two_way:
             right = right - system.M_rigid @ c_0
             right += plant.s * total(plant.comm, system.G.T @ state.array[system.layout.n_local :])
-            C[:, n_s:] = -plant.theta * np.eye(n_s)
+            C[:, 2 * n_s :] = -plant.theta * np.eye(n_s)
         inverse = np.linalg.inv(self.inertia - free[:, None] * self.F)
-        plant.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), -plant.kappa * inverse @ C, self.N)
+        feel = Feel(-plant.kappa * inverse @ C, self.N, self.speed)
+        plant.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feel)
         a = -(plant.midpoint.c + c_0) / plant.kappa
-        return a, known + self.F @ a + plant.midpoint.felt[:n_s]
+        return a, known + self.F @ a + plant.midpoint.felt[:n_s] + plant.midpoint.felt[n_s : 2 * n_s]
 
     def move(self, n: int, u: Array, a: Array) -> None:
         """Midpoint rule of the hand."""

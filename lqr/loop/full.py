@@ -28,7 +28,7 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.finite_strain import NewtonFigures
+    from softgrasp.fem.strain.newton import NewtonFigures
 
 CHUNKS = 50  # segments of a run without frames: progress, and the check that the numbers are finite
 

@@ -5,22 +5,12 @@
 
 solved by Broyden's method [Broyden65] on a k x k inverse, with the discrete gradient f_alg, 2 w' f_alg =
 W_r(a_{n+1}) - W_r(a_n), so that |v|^2 / 2 + W_r changes by the work 2 w'l less the loss 2 s w'D w, to the tolerance of
-the solve. `stepper.c` takes whole runs; it is compiled when it is first needed, once for a machine, into a cache folder
-(`$XDG_CACHE_HOME/softgrasp`). Without a compiler NumPy takes the same steps, about thirty times slower, and says so.
+the solve. `stepper.c` takes whole runs; without a compiler NumPy takes the same steps, about thirty times slower, and
+says so.
 """
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import os
-import platform
-import shutil
-import subprocess
-import sys
-import tempfile
-import warnings
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,10 +19,10 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.strain.compiled import library
 from softgrasp.reduction.strain.cells import Potential
 
 SOURCE = Path(__file__).with_name("stepper.c")
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 DECLARATION = """int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight,
   const double *lam, const double *mu, const double *S, double s, const double *load, int steps, double tol,
   double floor, double *J, double *A, double *V, long *counts);"""
@@ -202,56 +192,6 @@ class _March:
         return True
 
 
-@functools.cache
 def compiled() -> Any:
     """(ffi, library) of `stepper.c`, or None with a warning where it cannot be compiled."""
-    try:
-        from cffi import FFI  # it comes with FFCx, not with every online machine
-
-        path = _library()
-        ffi = FFI()
-        ffi.cdef(DECLARATION)
-        return ffi, ffi.dlopen(str(path))
-    except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
-        reason = (str(getattr(error, "stderr", "") or "") or str(error)).strip().splitlines()[:1]
-        warnings.warn(
-            f"reduced runs at finite strain step in NumPy, about thirty times slower, for want of a compiled stepper "
-            f"({''.join(reason)}); install cffi and a C compiler, or name one in CC",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-        return None
-
-
-def _library() -> Path:
-    """The shared library in the cache folder, made there unless it is there; its name says source and machine."""
-    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
-        raise OSError("there is no C compiler")
-    key = hashlib.sha256("\0".join((SOURCE.read_text(), compiler, *FLAGS, _processor())).encode()).hexdigest()[:20]
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "softgrasp"
-    with suppress(OSError):
-        root.mkdir(parents=True, exist_ok=True)
-    if not os.access(root, os.W_OK):
-        root = Path(tempfile.mkdtemp(prefix="softgrasp-"))  # of this process alone
-    path = root / f"stepper-{key}.so"
-    if not path.exists():
-        # several ranks may compile at once: each its own file, and the last one stays
-        handle, name = tempfile.mkstemp(dir=root, suffix=".so")
-        os.close(handle)
-        command = [*compiler.split(), *FLAGS, str(SOURCE), "-o", name, "-lm"]
-        try:
-            subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
-            os.replace(name, path)
-        finally:
-            Path(name).unlink(missing_ok=True)
-    return path
-
-
-def _processor() -> str:
-    """What -march=native depends on: a home folder may serve several kinds of machine."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line for line in lines if line.startswith(("flags", "Features")))
-    except (OSError, StopIteration):
-        return f"{sys.platform} {platform.machine()} {platform.processor()}"
+    return library(SOURCE, DECLARATION, "reduced runs at finite strain step in NumPy, about thirty times slower")

@@ -28,6 +28,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, PETSc, times_columns, to_scipy
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
+from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.solve.solvers import SolverName
 from softgrasp.lqr.dense.modal import DenseRiccati
@@ -69,6 +70,7 @@ whole: the same with MUMPS' whole factor on every rank (first) or a spread one (
 REPEATED_LIMIT.
 product: K_ee times many columns on one rank by fem.petsc.times_columns (first), or by SciPy's CSR product or PETSc's
 matMult (second), CPU seconds; fem.petsc.BLOCK_ENTRIES.
+finite: CPU seconds of a run of paper_forward, linear (first) and at finite strain (second); at most ten times as many.
 
 Keep the machine quiet. A fast look: --switches batch,start --repeats 3."""
 
@@ -249,6 +251,26 @@ def cpu_seconds(call: Callable[[], Any]) -> float:
     return (time.process_time() - begin) / CALLS
 
 
+def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+    """Whole runs with linear elasticity and with finite strain, CPU seconds. One rank."""
+
+    def run_of(changes: list[str]) -> Callable[[], float]:
+        model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm=comm)
+
+        def seconds() -> float:
+            begin = time.process_time()
+            simulate(model)
+            return time.process_time() - begin
+
+        return seconds
+
+    for nx in (15, 60):
+        cells = f"tissue.cells=[{nx}, {2 * nx}]"
+        samples = interleave({"off": run_of([cells]), "on": run_of([cells, "effects.finite_strain={}"])}, repeats)
+        seconds = [float(statistics.median(samples[key])) for key in ("off", "on")]
+        yield Row("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, *seconds)
+
+
 def _two(
     comm: MPI.Intracomm,
     model: Any,
@@ -290,8 +312,9 @@ SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
     "step": step_and_set_up,
     "whole": whole,
     "product": product,
+    "finite": finite,
 }
-SERIAL = ("batch", "start", "dense", "product")
+SERIAL = ("batch", "start", "dense", "product", "finite")
 
 
 def measure(switch: str, repeats: int, large: bool) -> dict[str, Any]:

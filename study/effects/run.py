@@ -23,7 +23,7 @@ from softgrasp.study.effects.elements import judge_elements
 from softgrasp.study.effects.judge import find, quartiles, shows
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, count_objects, measure_builds, measure_steps
 from softgrasp.study.effects.page import compose, show
-from softgrasp.study.effects.result import Company, EffectsStudy
+from softgrasp.study.effects.result import Change, Company, EffectsStudy
 from softgrasp.study.effects.switch import Switch, scales_of, switches
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
@@ -71,12 +71,15 @@ def study_effects(
         changes[s.name] = runs.alone(s.name)
         tick()
     needed = frozenset(s.name for s in tried if shows(s, changes[s.name], explanation.effects[s.name], scene))
-    # with other effects on trial a run of finite strain may leave its law: it is judged in the scene as it is
+    # with other effects on trial a run of finite strain is dear and may leave its law: no pairs with it
     apart = {s.name for s in tried if s.name == "finite_strain" and not s.on}
     joint = tuple(name for name in changes if name not in apart)
     together = judge_together(runs, joint, needed - apart, scene.study.tolerance)
-    together.company.update({name: Company(*changes[name], (), False, 0.0, False) for name in apart})
-    together = replace(together, on=(*together.on, *sorted(apart & needed)))
+    for name in apart:
+        company = _beside(runs, name, changes[name], frozenset(together.on))
+        together.company[name] = company
+        if name in needed or company.partners:
+            together = replace(together, on=(*together.on, name))
     elements = judge_elements(runs.models[on], runs.first, scene.study.tolerance)
     done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
@@ -111,6 +114,19 @@ def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
     except SolverError as error:
         return replace(s, other=None, reason=f"the run with it fails ({error})")
     return s
+
+
+def _beside(runs: Experiments, name: str, alone: tuple[Change, float | None], on: frozenset[str]) -> Company:
+    """Finite strain on trial beside all advised effects, one run more; alone where it fails there. Collective."""
+    if on == runs.on or "rotation" in on:
+        return Company(*alone)
+    try:
+        change = runs.change(on, on | {name})
+    except SolverError:
+        return Company(*alone)
+    if alone[0].outputs <= runs.scene.study.tolerance < change.outputs:
+        return Company(change, alone[1], tuple(sorted(on ^ runs.on)), False, change.outputs)
+    return Company(change, alone[1])
 
 
 def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:

@@ -105,7 +105,7 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
         texts.append(
             f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
             f"body at t = {t:.3g} s, at most {steep.largest:.2g}: linear elasticity assumes small strains and "
-            f"rotations, and is off by about {linear_error(steep.rms):.2g} of the deformation here"
+            f"rotations, and is off by about {linear_error(steep.rms, d):.2g} of the deformation here"
             + ("." if scene.effects.rotation else "; set effects.finite_strain.law = 'neo-hooke'.")
         )
     texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))

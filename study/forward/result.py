@@ -19,7 +19,7 @@ from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.report.tables import Table
 
 if TYPE_CHECKING:
-    from softgrasp.fem.run.finite_strain import NewtonFigures
+    from softgrasp.fem.strain.newton import NewtonFigures
 
 
 @dataclass(frozen=True)

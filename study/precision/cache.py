@@ -94,21 +94,14 @@ def _value(kind: Any, value: Any) -> Any:
 
 @dataclass
 class Guard:
-    """Says between two points whether to go on, and how far the study is.
+    """Says between two points whether to go on, and how far the study is."""
 
-    Attributes:
-        comm: ranks.
-        progress: called with the name of the point that comes and the share of points done.
-        count: points in all, as far as they are known.
-        done: of them.
-        stop: filled by the first Ctrl-C.
-    """
-
-    comm: MPI.Intracomm
+    comm: MPI.Intracomm  # ranks
+    # called with the name of the point that comes and the share of points done
     progress: Callable[[str, float], None] | None = None
-    count: int = 1
-    done: int = 0
-    stop: list[bool] = field(default_factory=list)
+    count: int = 1  # points in all, as far as they are known
+    done: int = 0  # of them
+    stop: list[bool] = field(default_factory=list)  # filled by the first Ctrl-C
 
     def next(self, label: str) -> None:
         """Before a point. Collective.

@@ -14,22 +14,15 @@ GAIN = 0.01  # of the error: what a slower point must gain to be on the front
 
 @dataclass(frozen=True)
 class Slope:
-    """error ~ factor * x^power, fitted by least squares in logarithms.
+    """error ~ factor * x^power, fitted by least squares in logarithms."""
 
-    Attributes:
-        question, series: of the points.
-        against: what x is.
-        power: exponent.
-        count: points behind it.
-        expected: exponent of the theory, where there is one.
-    """
-
+    # question, series: of the points
     question: str
     series: str
-    against: str
-    power: float
-    count: int
-    expected: float | None = None
+    against: str  # what x is
+    power: float  # exponent
+    count: int  # points behind it
+    expected: float | None = None  # exponent of the theory, where there is one
 
 
 def seconds_of(point: WorkPoint) -> float:

@@ -19,16 +19,11 @@ from softgrasp.study.report.tables import Table
 
 @dataclass(frozen=True)
 class Answer:
-    """What is known at one parameter.
+    """What is known at one parameter."""
 
-    Attributes:
-        materials: one per layer.
-        certificate: of the reduced run.
-        run: the reduced run, the full one instead of it, or None when the error is above the tolerance.
-    """
-
-    materials: Materials
-    certificate: Certificate
+    materials: Materials  # one per layer
+    certificate: Certificate  # of the reduced run
+    # the reduced run, the full one instead of it, or None when the error is above the tolerance
     run: ReducedTrajectory | Trajectory | None
 
     @property

@@ -16,19 +16,12 @@ Rows = tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
 
 @dataclass(frozen=True)
 class Equation:
-    """The equation of one scene, each row a left and a right side.
+    """The equation of one scene, each row a left and a right side."""
 
-    Attributes:
-        blocks: rows of the paper's block system in q_s, q_e, as (name, left terms, right terms).
-        stepped: the same in z, as it is solved.
-        where: definitions of the symbols that occur.
-        feedback: the optimal control of the plant.
-    """
-
-    blocks: Rows
-    stepped: Rows
-    where: tuple[str, ...]
-    feedback: Rows = ()
+    blocks: Rows  # rows of the paper's block system in q_s, q_e, as (name, left terms, right terms)
+    stepped: Rows  # the same in z, as it is solved
+    where: tuple[str, ...]  # definitions of the symbols that occur
+    feedback: Rows = ()  # the optimal control of the plant
 
 
 def equation(scene: Scene) -> Equation:

@@ -44,25 +44,15 @@ SHOWN, MOST_ROWS = 8, 14  # rows of a longer table that stand unfolded
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a page; whatever is given is shown in the order of the attributes.
+    """One part of a page; whatever is given is shown in the order of the attributes."""
 
-    Attributes:
-        title: heading; empty for none.
-        text: paragraphs, parted by empty lines.
-        code: text shown as it is; under the heading Equation it is set as one, see `equation_text`.
-        header: names of the columns; without it two columns are label and value.
-        rows: a table; every row as long as the header. Numbers are shown with four digits.
-        figures: (picture file, caption); the files are embedded.
-        best: rows of a long table that stand unfolded; the first ones if there are none.
-    """
-
-    title: str
-    text: str = ""
-    code: str = ""
-    header: Sequence[str] = ()
-    rows: Sequence[Sequence[Any]] = ()
-    figures: Sequence[tuple[Path, str]] = ()
-    best: Sequence[int] = ()
+    title: str  # heading; empty for none
+    text: str = ""  # paragraphs, parted by empty lines
+    code: str = ""  # text shown as it is; under the heading Equation it is set as one, see `equation_text`
+    header: Sequence[str] = ()  # names of the columns; without it two columns are label and value
+    rows: Sequence[Sequence[Any]] = ()  # a table; every row as long as the header. Numbers are shown with four digits.
+    figures: Sequence[tuple[Path, str]] = ()  # (picture file, caption); the files are embedded
+    best: Sequence[int] = ()  # rows of a long table that stand unfolded; the first ones if there are none
 
 
 def equation_text(rows: Equation) -> str:

@@ -18,19 +18,14 @@ from softgrasp.study.report.page import NUMBERS, Section, shown
 
 @dataclass(frozen=True)
 class Table:
-    """Columns with their rows.
+    """Columns with their rows."""
 
-    Attributes:
-        header: names of the columns, units in brackets: "step [s]".
-        rows: cells, as many in each row as there are columns; None is an empty cell. Numbers are shown with four
-            digits and written in full.
-        title: heading.
-        best: rows that stand unfolded on a page where the table is long; the first ones if there are none.
-    """
-
-    header: tuple[str, ...]
+    header: tuple[str, ...]  # names of the columns, units in brackets: "step [s]"
+    # cells, as many in each row as there are columns; None is an empty cell. Numbers are shown with four digits and
+    # written in full.
     rows: Sequence[Sequence[Any]]
-    title: str = ""
+    title: str = ""  # heading
+    # rows that stand unfolded on a page where the table is long; the first ones if there are none
     best: Sequence[int] = ()
 
     def __post_init__(self) -> None:

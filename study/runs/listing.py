@@ -65,16 +65,11 @@ def flat(data: Any, at: str = "") -> Iterator[tuple[str, Any]]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two runs beside each other.
+    """Two runs beside each other."""
 
-    Attributes:
-        keys: keys of the scene that differ.
-        numbers: numbers of result.json that differ, with B / A - 1.
-        traces: times, labels and columns of both trajectories; None unless both have one.
-    """
-
-    keys: Table
-    numbers: Table
+    keys: Table  # keys of the scene that differ
+    numbers: Table  # numbers of result.json that differ, with B / A - 1
+    # times, labels and columns of both trajectories; None unless both have one
     traces: tuple[list[str], np.ndarray, np.ndarray] | None
 
 

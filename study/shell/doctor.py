@@ -34,19 +34,12 @@ INSTALL = "Install the solver stack with `pip install 'softgrasp[solver]'` or lo
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the diagnosis.
+    """One line of the diagnosis."""
 
-    Attributes:
-        name: what was looked at.
-        ok: whether it will work.
-        value: what was found.
-        cure: one sentence on what to do; empty when ok.
-    """
-
-    name: str
-    ok: bool
-    value: str
-    cure: str = ""
+    name: str  # what was looked at
+    ok: bool  # whether it will work
+    value: str  # what was found
+    cure: str = ""  # one sentence on what to do; empty when ok
 
 
 def check_python() -> Check:

@@ -12,6 +12,7 @@ from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.model import memory
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import check_memory, free_bytes, need, simplices
+from softgrasp.fem.strain.body import Body
 from tests.helpers.models import CUBE, make_scene
 
 GIB = 2.0**30
@@ -90,3 +91,18 @@ def test_a_container_limits_what_is_free(monkeypatch: pytest.MonkeyPatch, tmp_pa
     (tmp_path / "memory.max").write_text("max\n")
     assert free_bytes(make_scene()) > 2e6
     assert free_bytes(make_scene(output={"memory": 2.0})) == 2 * GIB
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_finite_strain_counts_its_matrices(order: int) -> None:
+    """B, B'AB, A and the pass over the points are a good part of what it adds, and no more than that."""
+    tissue = {"cells": [16, 32], "order": order}
+    model = build(make_scene(tissue=tissue, effects={"finite_strain": {}}), comm=MPI.COMM_SELF)
+    system, cells = model.system, simplices([16, 32])
+    assert system.points is not None
+    body = Body(system.points, system.materials)
+    body.tangent(system.K_ee.createVecRight())
+    matrices = (body.points.B, body.A, body.K, body.product)
+    held = 12 * sum(A.getInfo()["nz_used"] for A in matrices if A is not None)  # a number and a column each
+    with_it, without = (need(s, 2, cells, MPI.COMM_SELF, True).mesh for s in (model.scene, make_scene(tissue=tissue)))
+    assert 0.2 < held / (with_it - without) < 1

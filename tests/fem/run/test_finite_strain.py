@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import Interrupted, SolverError
 from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.petsc import total
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.statics import equilibrium
@@ -154,13 +155,30 @@ def test_stopped_run_goes_on_bit_by_bit(tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.mark.ranks
-def test_step_that_does_not_converge_is_divided() -> None:
-    """Ten steps of more than a period under a violent motion; the energy balance holds over the parts too."""
-    model = finite(time={"steps": 6}, motion={"target": [6.0, 3.0], "duration": 1.5})
-    run = simulate(model)
+@pytest.mark.parametrize("way", ["led", "led, two-way", "pushed"])
+def test_step_that_does_not_converge_is_divided(way: str) -> None:
+    """Steps of more than a period under a violent motion; balances of energy and momentum hold over the parts too."""
+    effects: dict[str, Any] = {
+        "reaction": way != "led",
+        "damping": {"kind": "rayleigh", "alpha": 0.1, "beta": 0.0, "drag": "space"},
+    }
+    if way == "led":
+        effects = {}
+    model = finite(time={"steps": 6}, motion={"target": [6.0, 3.0], "duration": 1.5}, effects=effects)
+    force = (lambda n, t, q, v: 12 * wave(n, t, q, v)) if way == "pushed" else None
+    run = simulate(model, force=force)
     assert run.newton is not None
     assert run.newton.divided > 0
     assert run.energy_drift < 1e-9
+    if way != "led":
+        system, dt = model.system, model.scene.time_end / 6
+        n = system.layout.n_local
+        moved, speed = (total(system.layout.comm, system.G.T @ part) for part in (run.final[:n], run.final[n:]))
+        momentum = (system.M_hand + system.M_rigid) @ run.v_s[-1] + speed
+        way_of_hand = (run.v_s[1:] + run.v_s[:-1]).sum(axis=0) / 2 * dt
+        lost = 0.1 * (system.M_rigid @ way_of_hand + moved)  # alpha times what the whole tissue moved
+        assert run.force is not None
+        assert np.allclose(momentum + lost, run.force.sum(axis=0) * dt, rtol=1e-8)
 
 
 @pytest.mark.ranks

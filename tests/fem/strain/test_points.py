@@ -14,7 +14,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.points import make_points
-from softgrasp.fem.petsc import PETSc, to_scipy, total
+from softgrasp.fem.petsc import SAME, PETSc, to_scipy, total
 from softgrasp.fem.strain.arrays import volume_change
 from softgrasp.fem.strain.body import Body
 from softgrasp.fem.strain.points import whole_points
@@ -89,7 +89,7 @@ def test_force_is_ffcx_s_and_tangent_its_derivative(changes: dict[str, Any], ord
     model = model_of(changes, order, law)
     system, comm = model.system, model.system.layout.comm
     assert system.points is not None
-    body = Body(system.points, system.materials)
+    body = Body(system.points, system.materials, system.K_ee)
     volume = np.prod(model.scene.tissue.size) * model.scene.tissue.thickness  # type: ignore[arg-type]
     assert system.points.vol.min() > 0
     assert total(comm, np.array([system.points.vol.sum()]))[0] == pytest.approx(volume, rel=1e-13)
@@ -98,6 +98,9 @@ def test_force_is_ffcx_s_and_tangent_its_derivative(changes: dict[str, Any], ord
     assert np.array_equal(ours.indptr, linear.indptr)
     assert np.array_equal(ours.indices, linear.indices)
     assert abs(ours - linear).max() <= 1e-13 * abs(linear).max()
+    K.axpy(1.0, system.M_ee, SAME)  # as steps do: PETSc adds columns of other ranks by their place, not their number
+    both = linear + to_scipy(system.M_ee)
+    assert abs(to_scipy(K) - both).max() <= 1e-13 * abs(both).max()
     z = bent(model)
     assert volume_change(body.gradient(vector(model, z))).min(initial=0.0) > -0.7
     f = vector(model, z)
@@ -182,6 +185,33 @@ def test_layers_have_their_materials_and_all_points_stand_on_every_rank() -> Non
     result = np.empty_like(every)
     result[order] = g.array_r
     assert close(result[layout.start : layout.start + layout.n_local], f.array_r) < 1e-13
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("changes", "order", "law"), BODIES)
+def test_compiled_force_is_numpy_s(changes: dict[str, Any], order: int, law: str) -> None:
+    """One pass over the nodes against products with B: rounding of the sums, also where layers and a tail differ."""
+    layers = {} if changes is CUBE else {k: {n: x for n, x in v.items() if n != "beta"} for k, v in LAYERS.items()}
+    model = model_of(changes, order, law, tissue={"layers": layers})
+    body, plain = (Body(model.system.points, model.system.materials) for _ in range(2))  # type: ignore[arg-type]
+    if body.kernel is None:
+        pytest.skip("no C compiler")
+    plain.kernel = None
+    z, w = vector(model, bent(model)), vector(model, bent(model, 0.01)[::-1].copy())
+    f, g = z.duplicate(), z.duplicate()
+
+    def gaps() -> list[float]:
+        ours, numpy = body.start(z), plain.start(z)
+        fine = body.step(ours, w, f), plain.step(numpy, w, g)
+        assert fine[0] == fine[1] == (plain.J.min() > 0 or law == "stvk")
+        pairs = [(ours.H, numpy.H), (ours.j, numpy.j), (body.J, plain.J)]
+        pairs += [(f.array_r, g.array_r)] * fine[0] + [(ours.log, numpy.log)] * (law != "stvk")
+        return [close(a, b) for a, b in pairs]
+
+    assert max(gaps()) < 1e-13
+    w.scale(60.0)  # folds cells
+    assert max(gaps()) < 1e-13
+    assert plain.J.min() < 0
 
 
 @pytest.mark.serial

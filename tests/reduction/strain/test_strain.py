@@ -14,6 +14,7 @@ import scipy.optimize
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.strain.compiled import library
 from softgrasp.fem.strain.laws import LAWS, LawName
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.archive import load, save
@@ -215,7 +216,7 @@ def test_a_run_that_folds_names_step_time_and_cell(engine: str) -> None:
 def test_without_a_compiler_numpy_steps_and_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    stepper.compiled.cache_clear()
+    library.cache_clear()
     try:
         problem = problem_of("neo-hooke", 2)
         with pytest.warns(RuntimeWarning, match="NumPy, about thirty times slower"):
@@ -224,7 +225,7 @@ def test_without_a_compiler_numpy_steps_and_says_so(monkeypatch: pytest.MonkeyPa
             run(problem, loads(problem, 5), engine="C")
         assert list(tmp_path.rglob("*.so")) == []  # nothing half-written
     finally:
-        stepper.compiled.cache_clear()
+        library.cache_clear()
 
 
 def model_of() -> StrainModel:

@@ -16,6 +16,7 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.effects import EFFECTS
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import PETSc
@@ -32,8 +33,8 @@ from softgrasp.study.effects.measure import (
     objects_of,
 )
 from softgrasp.study.effects.objects import counting, difference, read_table
-from softgrasp.study.effects.result import EffectsStudy, Finding
-from softgrasp.study.effects.run import run_effects, show, study_effects
+from softgrasp.study.effects.result import Change, EffectsStudy, Finding
+from softgrasp.study.effects.run import _beside, run_effects, show, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
@@ -158,6 +159,31 @@ def test_damping_for_control_is_not_called_wasted(comm: MPI.Intracomm) -> None:
 
 
 # --- several switches at once
+
+
+class Trial:
+    """Runs in which finite strain shows beside gravity by ``size``, or fails."""
+
+    def __init__(self, size: float | None) -> None:
+        self.on, self.size, self.asked = frozenset[str](), size, [Names()]
+        self.scene = make_scene()
+
+    def change(self, a: Names, b: Names) -> Change:
+        self.asked.append(b)
+        if self.size is None:
+            raise SolverError("folded")
+        return Change(self.size, self.size, self.size)
+
+
+@pytest.mark.parametrize(("size", "expected"), [(0.5, ("gravity",)), (1e-9, ()), (None, ())])
+def test_finite_strain_is_judged_beside_the_advised_effects_in_one_run(size: float | None, expected: Any) -> None:
+    alone, name, runs = (Change(1e-6, 1e-6, 1e-6), None), "finite_strain", Trial(size)
+    found = _beside(runs, name, alone, frozenset({"gravity"}))  # type: ignore[arg-type]
+    assert runs.asked[1:] == [frozenset({"gravity", name})]
+    assert found.partners == expected
+    assert found.change.outputs == (1e-6 if size is None else size)
+    assert _beside(runs, name, alone, frozenset({"rotation"})).change is alone[0]  # type: ignore[arg-type]
+    assert len(runs.asked) == 2
 
 
 def largest_change(comm: MPI.Intracomm, *tables: dict[str, Any]) -> float:

@@ -1,0 +1,75 @@
+"""C beside this package, compiled when it is first needed, once for a machine, into $XDG_CACHE_HOME/softgrasp."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+LAWS = Path(__file__).parent  # of law.h, which every source includes
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+
+
+@functools.cache
+def library(source: Path, declaration: str, otherwise: str) -> Any:
+    """(ffi, library) of a source, or None with a warning, what is done ``otherwise``, where it cannot be compiled."""
+    try:
+        from cffi import FFI  # it comes with FFCx, not with every online machine
+
+        path = _shared(source)
+        ffi = FFI()
+        ffi.cdef(declaration)
+        return ffi, ffi.dlopen(str(path))
+    except (ImportError, OSError, RuntimeError, subprocess.SubprocessError) as error:
+        reason = (str(getattr(error, "stderr", "") or "") or str(error)).strip().splitlines()[:1]
+        warnings.warn(
+            f"{otherwise}, for want of compiled code ({''.join(reason)}); install cffi and a C compiler, or name one "
+            "in CC",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return None
+
+
+def _shared(source: Path) -> Path:
+    """The shared library in the cache folder, made there unless it is there; its name says source and machine."""
+    compiler = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise OSError("there is no C compiler")
+    texts = source.read_text(), (LAWS / "law.h").read_text(), compiler, *FLAGS, _processor()
+    key = hashlib.sha256("\0".join(texts).encode()).hexdigest()[:20]
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "softgrasp"
+    with suppress(OSError):
+        root.mkdir(parents=True, exist_ok=True)
+    if not os.access(root, os.W_OK):
+        root = Path(tempfile.mkdtemp(prefix="softgrasp-"))  # of this process alone
+    path = root / f"{source.stem}-{key}.so"
+    if not path.exists():
+        # several ranks may compile at once: each its own file, and the last one stays
+        handle, name = tempfile.mkstemp(dir=root, suffix=".so")
+        os.close(handle)
+        command = [*compiler.split(), *FLAGS, f"-I{LAWS}", str(source), "-o", name, "-lm"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+            os.replace(name, path)
+        finally:
+            Path(name).unlink(missing_ok=True)
+    return path
+
+
+def _processor() -> str:
+    """What -march=native depends on: a home folder may serve several kinds of machine."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        return f"{sys.platform} {platform.machine()} {platform.processor()}"
