@@ -13,10 +13,9 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
-from matplotlib.collections import LineCollection, PathCollection, PolyCollection, TriMesh
+from matplotlib.collections import LineCollection, PolyCollection, TriMesh
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.path import Path as Curve
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
@@ -31,6 +30,7 @@ from softgrasp.study.pictures.shapes import (
     hand_polygons,
     hands_at,
     interfaces,
+    moved,
     overlap,
     seen,
     shadow,
@@ -48,6 +48,7 @@ from softgrasp.study.pictures.style import (
     length_unit,
     paper_style,
     save,
+    segments,
 )
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
@@ -107,9 +108,9 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
     polygons, grip = hand_polygons(picture) if picture.dimension == 2 else ([], contact_centre(picture))
     path = grip + table[:, 1:] @ np.vstack([picture.rigid(unit, grip[None, :]) for unit in np.eye(picture.n_s)])
     boxes = [_box(picture.points + u) for u in states] + [_box(path)]
-    boxes += [_box(np.vstack(_moved(picture, polygons, q))) for q in hands if polygons]
+    boxes += [_box(np.vstack(moved(picture, polygons, q))) for q in hands if polygons]
     if aim is not None:
-        boxes += [_box(p) for p in _moved(picture, [picture.points, *polygons], aim)]
+        boxes += [_box(p) for p in moved(picture, [picture.points, *polygons], aim)]
     low, high = _box(np.vstack(boxes))
     lines = [] if aim is None else _outline(picture, picture.points + picture.rigid(aim))
     edges = np.vstack([picture.facets, interfaces(picture)]) if picture.dimension == 2 else np.zeros((0, 2), dtype=int)
@@ -164,7 +165,7 @@ def draw_scene(ax: Any, shot: Shot, states: Array, times: Array | None, hands: A
         else:
             _draw_3d(ax, shot, u, q)
         if times is not None:
-            whole = np.vstack([picture.points + u, *_moved(picture, shot.hand, q)])
+            whole = np.vstack([picture.points + u, *moved(picture, shot.hand, q)])
             _caption(ax, shot, _box(seen(whole)), _time(times[i]))
 
 
@@ -352,20 +353,6 @@ def _outline(picture: PictureMesh, x: Array) -> list[Array]:
     return shadow(seen(x), picture.facets)
 
 
-def segments(ends: Array, **look: Any) -> PathCollection:
-    """Many short lines, each (2, 2) [m], as one artist."""
-    codes = np.tile(np.array([Curve.MOVETO, Curve.LINETO], dtype=Curve.code_type), len(ends))
-    return PathCollection([Curve(ends.reshape(-1, 2), codes)], facecolors="none", **look)
-
-
-def _moved(picture: PictureMesh, polygons: list[Array], q: Array) -> list[Array]:
-    """Polygons that move with the hand."""
-    if not polygons:
-        return []
-    start = np.vstack(polygons)
-    return np.split(start + picture.rigid(q, start), np.cumsum([len(p) for p in polygons[:-1]]))
-
-
 def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     picture = shot.picture
     x = picture.points + u
@@ -374,7 +361,7 @@ def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
         body = TriMesh(Triangulation(x[:, 0], x[:, 1], picture.cells), array=shot.values(u, q), **look)
         ax.add_collection(body, autolim=False)
     ax.add_collection(segments(x[shot.edges], edgecolors=OUTLINE, linewidths=0.5, zorder=3), autolim=False)
-    hand = _moved(picture, shot.hand, q)
+    hand = moved(picture, shot.hand, q)
     ax.add_collection(PolyCollection(hand, facecolors=HAND, edgecolors=HAND, linewidths=0.3, zorder=4), autolim=False)
 
 

@@ -134,6 +134,14 @@ def hand_polygons(picture: PictureMesh) -> tuple[list[Array], Array]:
     return polygons, grip
 
 
+def moved(picture: PictureMesh, polygons: list[Array], q: Array) -> list[Array]:
+    """Polygons that move with the hand."""
+    if not polygons:
+        return []
+    start = np.vstack(polygons)
+    return np.split(start + picture.rigid(q, start), np.cumsum([len(p) for p in polygons[:-1]]))
+
+
 def _offset(x: Array, facets: Any, thick: float) -> tuple[Array, Array]:
     """Outward unit normals of 2D facets, and the vertices moved outward: a pad of even thickness fits between."""
     along = x[facets[:, 1]] - x[facets[:, 0]]

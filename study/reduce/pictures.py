@@ -18,9 +18,9 @@ from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.reduction.replay import FullRun, replay_linear
 from softgrasp.study.pictures.animation import Film, write_gif
-from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, segments
+from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow, speed_up
-from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
+from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save, segments
 from softgrasp.study.reduce.plots import (
     figure_errors,
     figure_further_errors,
