@@ -53,7 +53,7 @@ pictures: demo ## make the README's pictures again
 	cp out/paper_forward-reduce/errors.png docs/reduce_errors.png
 	$(BIN)/softgrasp control paper_lqr
 	cp out/paper_lqr-control/errors.png docs/control_errors.png
-	$(BIN)/softgrasp study paper_forward --tolerance 1e-2
+	$(BIN)/softgrasp study paper_forward --question forward
 	cp out/paper_forward-study/work_forward.png docs/study_forward.png
 	$(BIN)/softgrasp effects franka_muscle
 	cp out/franka_muscle-effects/effects.png docs/effects.png

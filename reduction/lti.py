@@ -91,7 +91,6 @@ def make_lti(E: Array, A: Array, B: Array, C: Array, labels: Sequence[str], hand
     """The system with names made from what its outputs are called.
 
     Args:
-        E, A, B, C: as above.
         labels: of the outputs, "tip_x"; y_1.. where their number does not fit.
         hand_first: the first 2 n_s states are q_s and v_s.
     """

@@ -156,7 +156,6 @@ def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator
     """Precompute a step of size dt. Online; not collective.
 
     Args:
-        model: the small model.
         dt: step [s].
         driven: the hand follows a table instead of a force; needs fixed solid modes. The inputs of a step are then
             [mean q_s, mean v_s, mean a_s].

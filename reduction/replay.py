@@ -144,9 +144,7 @@ def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[
     """Propagator, and keywords of :func:`softgrasp.reduction.online.run`, that repeat a full run. Collective.
 
     Args:
-        rom: reduced model.
         small: the same at the materials of the run that is to be made.
-        full: run to repeat.
 
     Raises:
         ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.

@@ -87,7 +87,6 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
     singular values say: a displacement without its velocity cannot move.
 
     Args:
-        parts: families of units.
         width: columns of one unit.
         N: dimension of the whole basis.
         hand: columns that the hand takes.

@@ -181,9 +181,6 @@ def modal_residual(
     coefficients a step instead of 2 k + n_s; the triangles are brought to that size once a parameter.
 
     Args:
-        norms: of the basis.
-        materials: of the run.
-        m: modes there.
         y: (k, steps + 1).
         c: (n_s, steps).
         c_0: at a start in equilibrium, (n_s,); else None.

@@ -61,7 +61,6 @@ def march(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol: float,
     """All steps under loads l (steps, k). Not collective but where the potential is distributed.
 
     Args:
-        problem: what is stepped.
         load: l_n at the step midpoints.
         a0, v0: start, (k,).
         tol: |residual| over the largest |h| seen; rounding of the force is enough in any case.

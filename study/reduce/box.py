@@ -92,7 +92,6 @@ def summary(
     """Error at the scene's own parameter, and median and largest over the parameters that trained no basis.
 
     Args:
-        models: tested.
         own: errors at the scene's own parameter.
         points: errors over the box.
         runs: that trained the models with ``several``.

@@ -256,7 +256,7 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
             f"{np.median(ratios):.3g} times as large in the median, {max(ratios):.3g} at most."
         )
     if query > full:
-        lines.append("A query takes longer than a full run here: the model is worth it on a finer mesh only.")
+        lines.append("A query takes longer than a full run here: the model pays on a finer mesh only.")
     return lines
 
 

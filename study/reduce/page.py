@@ -40,12 +40,7 @@ CAPTIONS = {
 
 
 def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
-    """Parts of the page. Rank 0 only.
-
-    Args:
-        study: the result.
-        files: figures that are drawn.
-    """
+    """Parts of the page. Rank 0 only."""
     energy, drawn = study.full.model.scene.reduction.energy, {file.name: file for file in files}
     text = (
         f"{N_NOTE}\n\n{error_note(energy)} Each method is built from the snapshots of one run and repeats it, driven "

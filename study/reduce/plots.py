@@ -123,13 +123,7 @@ def _errors_axis(
 
 
 def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[Path, ...]:
-    """Error of the deformation against online time, and against offline plus online time, with the Pareto front.
-
-    Args:
-        sweeps: methods.
-        full: seconds of the steps of a full run.
-        out_png: name of the picture.
-    """
+    """Error of the deformation against online and offline plus online time, with the Pareto front; ``full`` [s]."""
     look, key = looks(sweeps), QUANTITIES[0][0]
     with paper_style():
         figure, axes = plt.subplots(2, 1, figsize=(COLUMN + 0.9, 5.6), layout="constrained")

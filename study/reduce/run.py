@@ -116,8 +116,6 @@ def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopw
     """Full run, every method, errors over the box. Collective.
 
     Args:
-        model: the scene.
-        names: methods.
         bar: shows what is done.
         watch: takes the seconds of "full", "sweep" and "box".
 

@@ -82,8 +82,6 @@ def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = 
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
     Args:
-        model: which.
-        full: the full run.
         comparison: of the largest model of the family; None prepares one for this model alone.
 
     Raises:

@@ -40,11 +40,11 @@ Empty = Annotated[
 ]
 
 
-def _pdf(wanted: bool) -> bool:
+def _pdf(pdf: bool) -> bool:
     from softgrasp.study.pictures import PDF
 
-    PDF.set(wanted)
-    return wanted
+    PDF.set(pdf)
+    return pdf
 
 
 Pdf = Annotated[bool, typer.Option("--pdf", help="write figures as PDF too", callback=_pdf)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import timeit
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,7 +164,7 @@ def test_a_file_brings_the_lift_back_on_any_rank_count(trained: Training, tmp_pa
     assert read.Phi is not None
     np.testing.assert_array_equal(read.Phi, rom.Phi)
     online = load(path)
-    with pytest.raises(ModelError, match="no lift"):
+    with pytest.raises(ModelError, match="no basis on the mesh"):
         online.displacement(np.zeros((1, 5)))
 
 
@@ -199,9 +200,14 @@ def test_the_paper_scene_meets_what_was_asked_for() -> None:
     for N, most, cells in ((14, 1e-2, 25), (24, 2e-3, 75)):
         rom = single.reduce(N)
         run = replay_strain(rom, own)
-        assert errors_strain(rom, run, model, own).z <= most
+        assert said(f"own run, N = {N}, {rom.cells.count} cells", errors_strain(rom, run, own).z) <= most
         assert rom.cells.count <= cells
         assert said("drift of its energy", run.energy_drift) <= 1e-8
+        if N == 14 and run.engine == "C":
+            small = rom.at(own.dt)
+            seconds = min(timeit.repeat(lambda small=small: small.run(own.hand), number=1, repeat=31))
+            said("seconds of 600 steps (goal on a quiet machine: 3e-3)", seconds)
+            assert said("times faster than the full run", own.trajectory.seconds["steps"] / seconds) >= 80
     corners = train(model, [run_at(model, lam, mu) for lam in (40.0, 120.0) for mu in (40.0, 120.0)], 24).reduce(24)
     for place in ((50.0, 50.0), (70.0, 45.0), (45.0, 70.0), (110.0, 50.0), (100.0, 100.0)):
         test = run_at(model, *place)

@@ -297,7 +297,7 @@ def test_command_writes_what_design_promises(mpi_tmp_path: Path, small: FullRun)
             assert (mpi_tmp_path / f"{name}.png").stat().st_size > 5000, name
         assert (mpi_tmp_path / "compare.gif").stat().st_size > 5000
         if MPI.COMM_WORLD.size == 1 and find_chromium():
-            assert look(mpi_tmp_path / "report.html", figures=7) == []
+            assert look(mpi_tmp_path / "report.html", figures=8) == []
         for words in ("PSD complex SVD, fixed solid modes", "Break-even mesh", "N counts all columns of V", "x new"):
             assert words in text
         for sentence in saved["findings"]:
