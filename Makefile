@@ -7,7 +7,7 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check lint bench paper pictures docs clean
+.PHONY: help env demo paper_forward paper_accurate test check lint bench paper pictures docs clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -18,9 +18,11 @@ $(STAMP): pyproject.toml tools/make-env
 	@sh tools/make-env .venv
 	@touch $@
 
-demo: $(STAMP) ## run the paper's forward scene, and the same on an accurate mesh, into out/
-	@$(BIN)/softgrasp simulate paper_forward
-	@$(BIN)/softgrasp simulate paper_accurate
+demo: $(STAMP) ## run the paper's forward scene, and at the same time the same on an accurate mesh, into out/
+	@$(MAKE) --no-print-directory -j2 --output-sync=target paper_forward paper_accurate
+
+paper_forward paper_accurate:
+	@$(BIN)/softgrasp simulate $@
 
 lint: $(STAMP) ## ruff, mypy and the import contracts
 	$(BIN)/ruff check
@@ -51,7 +53,7 @@ pictures: demo ## make the README's pictures again
 	cp out/paper_forward-reduce/errors.png docs/reduce_errors.png
 	$(BIN)/softgrasp control paper_lqr
 	cp out/paper_lqr-control/errors.png docs/control_errors.png
-	$(BIN)/softgrasp study paper_forward --tolerance 1e-2
+	$(BIN)/softgrasp study paper_forward --question forward
 	cp out/paper_forward-study/work_forward.png docs/study_forward.png
 	$(BIN)/softgrasp effects franka_muscle
 	cp out/franka_muscle-effects/effects.png docs/effects.png

@@ -98,7 +98,7 @@ def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: Block
     """V with V Y = what the model shows for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
 
     Raises:
-        ModelError: the model holds no lift.
+        ModelError: the model holds no basis on the mesh.
     """
     N, n_s = model.N, small.n_s
     width = N + 2 * n_s
@@ -184,7 +184,7 @@ class Comparison:
         """Snapshots in what the largest model shows; factored at the first call. Collective.
 
         Raises:
-            ModelError: the model holds no lift.
+            ModelError: the model holds no basis on the mesh.
         """
         if view not in self._spans:
             V = shown_rows(view, self.model, self.small, self.system)

@@ -133,7 +133,7 @@ def read_lift(file: h5py.File, layout: BlockLayout) -> Lift:
     """Rows of this rank, found by the coordinates of its nodes."""
     path, d = file.filename, layout.dimension
     if "lift" not in file:
-        raise ModelError(f"{path} holds no lift; load it without a layout, or reduce the scene again")
+        raise ModelError(f"{path} holds no basis on the mesh; load it without a layout, or reduce the scene again")
     nodes = file["lift/nodes"][()]
     if nodes.shape != (layout.n_e // d, d):
         raise ModelError(

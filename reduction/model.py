@@ -294,7 +294,7 @@ class ReducedModel:
         """
         lift = self.lift
         if lift is None:
-            raise ModelError("the model holds no lift; load it with the layout of its mesh", self.name)
+            raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh", self.name)
         z, v_z = lift.L_q @ x, lift.L_v @ x
         if small.scale != 1.0:
             v_z /= small.scale

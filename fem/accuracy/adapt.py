@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # Estimate over tolerance that is let pass. Estimates are 0.5 to 1 of the error: where they lie is known after a pass,
 # when the corrected outputs of the new mesh tell the error of the old one.
-ACCEPTED, SEEN, MOST_ACCEPTED = 0.5, 0.65, 0.8  # unseen; least and most after a pass: what was seen on shipped scenes
+ACCEPTED, SEEN, MOST_ACCEPTED = 0.45, 0.65, 0.8  # unseen; least and most after a pass: what was seen on shipped scenes
 GUESSED = 0.7  # what a pass aims at, at least: too many cells cost more than another pass
 LINE_TRIES, LINE_STEP = 12, 0.7  # the number of lines grows with a small power of the tolerance
 

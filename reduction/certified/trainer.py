@@ -197,9 +197,9 @@ class Trainer:
 
     def bounds_at(self, many: Sequence[Materials], model: CertifiedModel) -> list[float]:
         """The same at any materials and for any model; the ranks share the work. Collective."""
-        mine, values = many[self.comm.rank :: self.comm.size], np.zeros(len(many))
-        for drive in self.drives if mine else ():
-            own = np.array([run.certificate.reduction for run in model.run_batch(mine, drive)])
+        local, values = many[self.comm.rank :: self.comm.size], np.zeros(len(many))
+        for drive in self.drives if local else ():
+            own = np.array([run.certificate.reduction for run in model.run_batch(local, drive)])
             share = values[self.comm.rank :: self.comm.size]
             np.maximum(share, own, out=share)
         parts = self.comm.allgather(values[self.comm.rank :: self.comm.size])

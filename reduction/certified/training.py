@@ -98,7 +98,7 @@ def certified_any(model: Model, rom: ReducedModel, **about: Any) -> CertifiedMod
     Canonical models and those without structure tie velocities to displacements loosely: their bound is larger.
 
     Raises:
-        ModelError: the model holds no lift, or its basis has no certificate.
+        ModelError: the model holds no basis on the mesh, or its basis has no certificate.
     """
     columns = slice(2 * model.system.layout.n_s, None)
     assert rom.lift is not None

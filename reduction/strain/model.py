@@ -286,5 +286,5 @@ class StrainModel:
             ModelError: the model was loaded without its lift.
         """
         if self.Phi is None:
-            raise ModelError("the model holds no lift; load it with the layout of its mesh")
+            raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh")
         return np.asarray(self.Phi @ a.T)

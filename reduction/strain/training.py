@@ -276,7 +276,7 @@ def _replay(small: SmallStrainModel, full: FullRun, engine: str = "") -> StrainR
 def errors_strain(rom: StrainModel, reduced_run: ReducedTrajectory, full: FullRun) -> StrainErrors:
     """Errors of deformation, velocity, energy norm, see :func:`softgrasp.reduction.reduce.errors`. Collective."""
     if rom.Phi is None:
-        raise ModelError("the model holds no lift; load it with the layout of its mesh")
+        raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh")
     return reference_of(full, rom.Phi).errors(*coordinates(reduced_run))
 
 

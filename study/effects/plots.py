@@ -15,6 +15,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from softgrasp.study.effects.result import Change, Cost, Finding
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, OUTLINE, STEPS, WIDTH, paper_style, save
 
+MANY = 1.0  # added share of a cost from which the axis is logarithmic beyond 10 %
 COLOURS = {"needed": GREEN, "optional": BLUE, "wasted": ORANGE}
 BAND = "#e4e4e4"
 ROUNDING = 1e-15  # a smaller change is drawn as none
@@ -106,7 +107,12 @@ def _costs(ax: Any, marks: Sequence[Tried], rows: Any, noise: tuple[float, float
             mark.label, (1.02, row), xycoords=("axes fraction", "data"), va="center", color=colour, weight="bold"
         )
     ax.axvline(0.0, color=HAND, lw=0.7, zorder=1)
-    ax.xaxis.set_major_locator(MaxNLocator(6, steps=STEPS))
+    if max(max(cost.step_relative, cost.memory_relative) for _, _, cost in marks) > MANY:
+        ax.set_xscale("symlog", linthresh=10.0)
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.tick_params(axis="x", labelsize=6)
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(6, steps=STEPS))
     ax.margins(x=0.08)
     ax.set_xlabel("added cost [%]")
     grey: dict[str, Any] = {"color": OUTLINE, "ls": "none", "mew": 1.3}

@@ -247,7 +247,7 @@ def residual_rows(quick: bool) -> Iterator[HardCase]:
 FAMILIES = (
     Family("certified", "Reduced models outside their training", "case", "true error / bound",
            "difference of two bases as bound",
-           "A proved bound holds where the training says nothing, and refuses what it cannot vouch for; the difference "
+           "A proved bound holds where the training says nothing, and refuses what it cannot prove; the difference "
            "of two bases is an estimate, which may be too small.", certified_rows, axis="listed"),
     Family("residual", "Norms of small residuals", "residual / its terms", "relative error of the norm", "Gram matrix",
            "A Gram matrix squares the columns and stalls at 1e-8 of them; a triangle follows the residual down to "

@@ -61,7 +61,7 @@ def judge(command: list[str], patience: float, healthy: float, sentence: str) ->
     if status is None:
         return Outcome(float("inf"), f"hangs, still waiting after {patience:g} times a healthy run")
     if status == 0:
-        return Outcome(None, "status 0, nobody noticed")
+        return Outcome(None, "status 0, the fault goes unnoticed")
     if sentence not in output:
         return Outcome(None, f"ended without saying '{sentence}'")
     said = next((line.strip() for line in output.splitlines() if sentence and sentence in line), f"status {status}")
@@ -73,7 +73,7 @@ def rank_rows(quick: bool) -> Iterator[HardCase]:
     if any(variable in os.environ for variable in IN_MPI_JOB):
         return  # an MPI job cannot start another one
     healthy = healthy_seconds()
-    reason = "nobody waits for the rank that is gone: sooner than a healthy run, times what other work may slow it down"
+    reason = "all ranks must end sooner than a healthy run, times what other work may slow it down"
     for i, fault in enumerate(["disk"] if quick else list(FAULTS)):
         text, sentence, same = FAULTS[fault]
         with tempfile.TemporaryDirectory() as folder:

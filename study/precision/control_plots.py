@@ -9,36 +9,24 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.study.control.plots import LOOKS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, UNSTABLE, WIDTH, paper_style, save
-from softgrasp.study.precision.captions import PAPER_ARE, PAPER_N, PAPER_SMALL
 from softgrasp.study.precision.fit import error_of, series_of, usable
-from softgrasp.study.precision.plots import LINE, axes_log, band_handle, draw_front, front_handle
+from softgrasp.study.precision.plots import LINE, axes_log, draw_band, draw_front, front_handle
 from softgrasp.study.precision.points import LoopPoint, ReducedRiccatiPoint, RiccatiPoint
 from softgrasp.study.precision.riccati import TITLES
+from softgrasp.study.precision.tables import PAPER_ARE, PAPER_N, PAPER_SMALL
 
 METHOD_LOOK = {"newton_adi": (BLUE, "o"), "radi": (ORANGE, "s"), "galerkin": (GREEN, "^"), "dense": (HAND, "D")}
 GAIN_COLOURS = (HAND, ORANGE, BLUE, GREEN, PURPLE)
-BAND: dict[str, Any] = {"color": "#bbbbbb", "alpha": 0.35, "zorder": 0, "lw": 0}
 TOP, LOW = 1.0, 1e-13  # errors and excess costs above are on the edge, below are rounding
-NEAR = 1e-2  # of the lowest point: a reference that is better still is not drawn, the text tells its error
 TICK = 1e-3  # [s], of a robot's control loop
 EDGE: dict[str, Any] = {"clip_on": False, "in_layout": False}
 Value = Callable[[ReducedRiccatiPoint], float]
-
-
-def _band(ax: Any, error: float | None) -> bool:
-    """Grey below the error of the reference, where it is near the points; whether it was drawn."""
-    low, high = ax.get_ylim()
-    if error is None or not error > NEAR * low:
-        return False
-    ax.axhspan(1e-300, error, **BAND)
-    ax.set_ylim(min(low, 0.3 * error), high)
-    return True
 
 
 def figure_riccati(points: Sequence[RiccatiPoint], error: float | None, paper: bool, out_png: Path) -> tuple[Path, ...]:
@@ -64,15 +52,14 @@ def figure_riccati(points: Sequence[RiccatiPoint], error: float | None, paper: b
             if paper:
                 ax.axvline(PAPER_ARE, **LINE)
             axes_log(ax, "time of the solution [s]", label)
-        band = _band(axes[0], error)
+        band = draw_band(axes[0], error)
         handles = [
             Line2D([], [], color=c, marker=m, ms=3.4, lw=0.7, label=TITLES[n])
             for n, (c, m) in METHOD_LOOK.items()
             if any(p.series == n for p in good)
         ]
         handles.append(front_handle())
-        if band:
-            handles.append(band_handle())
+        handles += band
         if paper:
             handles.append(Line2D([], [], label=f"paper, {PAPER_ARE} s (no error given)", **LINE))
         figure.legend(handles=handles, loc="outside upper center", ncols=4)
@@ -130,14 +117,9 @@ def _basis_lines(row: Any, line: Sequence[ReducedRiccatiPoint], value: Value, lo
 
 
 def _against_order(ax: Any, label: str) -> None:
-    ax.set_yscale("log")
-    ax.set_xlabel("$N$")
-    ax.set_ylabel(label)
-    ax.yaxis.set_major_locator(LogLocator(numticks=10))
-    ax.yaxis.set_minor_formatter(NullFormatter())
+    axes_log(ax, "$N$", label)
+    ax.set_xscale("linear")
     ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    ax.grid(color="#e6e6e6", lw=0.5)
-    ax.set_axisbelow(True)
 
 
 def _reduced_handles(points: Sequence[ReducedRiccatiPoint], paper: bool) -> list[Line2D]:
@@ -188,8 +170,7 @@ def figure_loop(points: Sequence[LoopPoint], error: float | None, out_png: Path)
         axes_log(ax, "time of a run [s]", "relative error of the deformation")
         axes_log(order, "time steps", "error in time")
         _steps_axes(step, list(lines))
-        if _band(ax, error):
-            handles.append(band_handle())
+        handles += draw_band(ax, error)
         handles.append(front_handle())
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
         return save(figure, out_png)

@@ -9,11 +9,21 @@ from softgrasp.fem.mesh.singular import Ends, expected_order
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.full import FullRuns
-from softgrasp.study.precision.meshes import GOALS, ORDERS, POINT_WORK, even_meshes, few_steps
 from softgrasp.study.precision.points import ForwardPoint
+from softgrasp.study.precision.probe import TimedRun, errors_of
 from softgrasp.study.precision.result import Question, Truth
-from softgrasp.study.precision.series import TimedRun, errors_of
-from softgrasp.study.precision.settings import LEAST_STEPS, Setting, least_steps, own_setting, scene_setting
+from softgrasp.study.precision.settings import (
+    GOALS,
+    LEAST_STEPS,
+    ORDERS,
+    POINT_WORK,
+    Setting,
+    even_meshes,
+    few_steps,
+    least_steps,
+    own_setting,
+    scene_setting,
+)
 
 SHARES = (2.0, 1.0, 0.5, 0.25, 0.125)  # of the scene's steps
 CG_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
@@ -55,13 +65,11 @@ def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | N
     """
     error, displacement = errors_of(run.series, truth.series)
     change = None if finest is None else errors_of(run.series, finest.series)[0]
-    names = ("n_e", "states", "steps", "dt", "mesh", "assembly", "factor", "per_step", "p50", "p99", "max")
+    names = ("n_e", "states", "dt", "mesh", "assembly", "factor", "per_step", "p50", "p99", "max")
     return ForwardPoint(
-        setting.mesh if setting.solver == "auto" else "solver", setting.label, run.seconds, error, cells=setting.cells,
-        order=setting.order, solver=setting.solver, rtol=setting.rtol if setting.solver == "cg" else None,
-        refine=setting.refine, error_deformation=error, error_displacement=displacement,
-        error_range=truth.range_of(error), error_time=change,
-        **{name: getattr(run, name) for name in names},
+        setting.mesh if setting.solver == "auto" else "solver", setting.label, run.seconds, error,
+        error_displacement=displacement, error_range=truth.range_of(error), error_time=change,
+        **setting.told, **{name: getattr(run, name) for name in names},
     )  # fmt: skip
 
 

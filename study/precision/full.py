@@ -14,8 +14,7 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.cache import Cache, Guard
-from softgrasp.study.precision.probe import Places, run_probed
-from softgrasp.study.precision.series import TimedRun
+from softgrasp.study.precision.probe import Places, TimedRun, run_probed
 from softgrasp.study.precision.settings import Setting, own_setting, variant
 from softgrasp.study.shell.timing import medians
 

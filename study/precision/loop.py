@@ -11,6 +11,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 import scipy.linalg
@@ -34,8 +35,7 @@ from softgrasp.study.control.result import TITLES
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import LoopPoint
 from softgrasp.study.precision.result import LoopReference, Question
-from softgrasp.study.precision.riccati import ControlRuns
-from softgrasp.study.precision.riccati_reduced import A_PRIORI
+from softgrasp.study.precision.riccati import A_PRIORI, ControlRuns
 from softgrasp.study.precision.settings import LEAST_STEPS
 
 SHARES = (16.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # of the scene's steps
@@ -114,43 +114,34 @@ class LoopSweep:
         self.runs, self.layout = runs, runs.layout
         self.scene, self.cache = runs.scene, runs.cache
         self.counts = step_counts(SHARES, self.scene.time.steps, self.layout.n_e, LOOP_WORK[self.layout.dimension])
-        self._exact: dict[Feedback, Array] = {}
-        self._families: dict[str, BasisFamily] = {}
-        self._gains: dict[Feedback, Gain] = {}
-        self._reference: LoopReference | None = None
+        self.gain, self.family, self._finest = cache(self._gain), cache(self._family), cache(self._exact)
 
-    def gain(self, what: Feedback) -> Gain:
+    def _gain(self, what: Feedback) -> Gain:
         """The gain as blocks."""
-        if what not in self._gains:
-            if not what.basis:
-                self._gains[what] = self.runs.design.gain
-            else:
-                self._gains[what] = reduce_riccati(self.runs.problem, self.family(what.basis).at(what.N)).gain
-        return self._gains[what]
+        if not what.basis:
+            return self.runs.design.gain
+        return reduce_riccati(self.runs.problem, self.family(what.basis).at(what.N)).gain
 
-    def family(self, name: str) -> BasisFamily:
+    def _family(self, name: str) -> BasisFamily:
         """Bases of one method."""
-        if name not in self._families:
-            self._families[name] = make_family(name, self.runs.problem, self.runs.design.solution.factor)
-        return self._families[name]
+        return make_family(name, self.runs.problem, self.runs.design.solution.factor)
+
+    def _exact(self, what: Feedback) -> Array:
+        return exact_outputs(self.runs, self.runs.design.judge.loop, self.gain(what), self.counts[0])
 
     # --- reference
 
     def exact(self, what: Feedback, steps: int) -> Array:
         """:func:`exact_outputs` of a gain at the instants of a grid, (steps + 1, 2 p)."""
-        most = self.counts[0]
-        if what not in self._exact:
-            self._exact[what] = exact_outputs(self.runs, self.runs.design.judge.loop, self.gain(what), most)
-        return self._exact[what][:: most // steps]
+        return self._finest(what)[:: self.counts[0] // steps]
 
+    @cached_property
     def reference(self) -> LoopReference:
         """Error estimate of the reference, cost and what is to come at the end, from the cache when they are there.
 
         Raises:
             ControlError: no output moves against the hand.
         """
-        if self._reference is not None:
-            return self._reference
         if not self.layout.comm.allreduce(bool(np.any(self.runs.problem.C_z)), MPI.LOR):
             raise ControlError("no output moves against the hand, so that there is no deformation whose error counts")
 
@@ -166,8 +157,7 @@ class LoopSweep:
             return [LoopReference(error, modes, loop.complete, design.judge.optimal, rest)]
 
         self.runs.guard.next("closed loop, reference")
-        self._reference = self.cache.get("loop", {"reference": self.counts}, LoopReference, measure)[0]
-        return self._reference
+        return self.cache.get("loop", {"reference": self.counts}, LoopReference, measure)[0]
 
     # --- controllers
 
@@ -255,7 +245,7 @@ class LoopSweep:
 
     def _point(self, what: LoopSetting, steps: int, stable: bool) -> LoopPoint:
         """Errors, cost and seconds of one controller and step."""
-        reference, infinite = self.reference(), float("inf")
+        reference, infinite = self.reference, float("inf")
         lost = LoopPoint(
             what.label, f"{what.label}, {steps} steps", infinite, infinite, False, steps=steps,
             dt=self.scene.time_end / steps, basis=what.gain.basis, N=what.gain.N, held=what.held,
@@ -330,7 +320,7 @@ def ask_loop(runs: ControlRuns) -> Question:
         ControlError: no output moves against the hand.
     """
     loops = LoopSweep(runs)
-    reference = loops.reference()
+    reference = loops.reference
     points = [p for what in loops.controllers() for p in loops.points(what)]
     return Question(tuple(points), tuple(loop_slopes(points)), reference)
 

@@ -12,7 +12,6 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.study.precision.answer import seconds_text
-from softgrasp.study.precision.captions import CAPTIONS, paper_of, reference_text
 from softgrasp.study.precision.control_plots import figure_loop, figure_reduced_riccati, figure_riccati
 from softgrasp.study.precision.plots import figure_budget, figure_forward, figure_reduced, figure_series
 from softgrasp.study.precision.points import (
@@ -26,9 +25,18 @@ from softgrasp.study.precision.points import (
     Request,
     RiccatiPoint,
 )
+from softgrasp.study.precision.probe import TimedRun
 from softgrasp.study.precision.result import LoopReference, RiccatiReference, WorkStudy
-from softgrasp.study.precision.series import TimedRun
-from softgrasp.study.precision.tables import budget_table, front_of, points_table, question_table, slope_table
+from softgrasp.study.precision.tables import (
+    CAPTIONS,
+    budget_table,
+    front_of,
+    paper_of,
+    points_table,
+    question_table,
+    reference_text,
+    slope_table,
+)
 from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.files import to_json
@@ -74,9 +82,8 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
         title = f"{study.scene.name}: accuracy against time"
         return Page(title, summary(study), sections, {"points.csv": points_table(study)}, figures, request.options)
 
-    files = session.write(study.scene, result, page)
     show(session.console, study, commands)
-    list_files(session.console, files)
+    list_files(session.console, session.write(study.scene, result, page))
     comm.Barrier()
     return result
 

@@ -23,6 +23,7 @@ from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s"), 3: (GREEN, "^")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))
 FRONT: dict[str, Any] = {"color": HAND, "lw": 1.6, "alpha": 0.35, "zorder": 1}
+NEAR = 1e-2  # of the lowest point: a reference that is better still is not drawn, the text tells its error
 THIN: dict[str, Any] = {"lw": 0.6, "alpha": 0.6, "zorder": 2}
 LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
 
@@ -66,9 +67,14 @@ def front_handle() -> Line2D:
     return Line2D([], [], marker="o", ms=7, mfc="none", label="Pareto front", **FRONT)
 
 
-def band_handle() -> Line2D:
-    """Of the grey band below the error of the reference, for a legend."""
-    return Line2D([], [], color="#bbbbbb", lw=5, alpha=0.5, label="error of the reference")
+def draw_band(ax: Any, error: float | None) -> list[Line2D]:
+    """Grey below the error of the reference, where it is near the points; its handle for a legend."""
+    low, high = ax.get_ylim()
+    if error is None or not error > NEAR * low:
+        return []
+    ax.axhspan(1e-300, error, color="#bbbbbb", alpha=0.35, zorder=0, lw=0)
+    ax.set_ylim(min(low, 0.3 * error), high)
+    return [Line2D([], [], color="#bbbbbb", lw=5, alpha=0.5, label="error of the reference")]
 
 
 def figure_forward(
@@ -106,11 +112,7 @@ def figure_forward(
         if paper:
             ax.axvline(PAPER_FULL, **LINE)
             handles.append(Line2D([], [], label=f"paper, {PAPER_FULL} s (no error given)", **LINE))
-        if truth_error > 0:
-            ax.axhspan(ax.get_ylim()[0] * 1e-6, truth_error, color="#bbbbbb", alpha=0.35, zorder=0, lw=0)
-            low = min([p.error for p in good if p.error > 0], default=truth_error)
-            ax.set_ylim(bottom=min(0.5 * truth_error, 0.5 * low))
-            handles.append(band_handle())
+        handles += draw_band(ax, truth_error)
         figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=6.5)
         _orders(space, time, good, slopes)
         return save(figure, out_png)

@@ -89,9 +89,8 @@ class RunPoint(WorkPoint):
     """A run of the full model, or of a reduced one that was made of it.
 
     Attributes:
-        error_deformation, error_displacement: largest error of the outputs against the hand, and of the outputs, over
-            the largest value.
-        error_range: between what the error of the deformation lies, given that of the reference.
+        error_displacement: largest error of the outputs over the largest one; ``error`` is that against the hand.
+        error_range: between what ``error`` lies, given that of the reference.
         p50, p99, max: quantiles of the seconds of a step; inf for an unstable model.
         cells, order, steps, solver, rtol, refine: of the full model, see :class:`Setting`.
     """
@@ -102,7 +101,6 @@ class RunPoint(WorkPoint):
     solver: str
     rtol: float | None
     refine: Refine
-    error_deformation: float
     error_displacement: float
     error_range: tuple[float, float]
     p50: float

@@ -29,8 +29,8 @@ from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
+from softgrasp.study.precision.probe import Series, TimedRun, errors_of
 from softgrasp.study.precision.result import Question, Truth
-from softgrasp.study.precision.series import Series, TimedRun, errors_of
 from softgrasp.study.precision.settings import Setting, own_setting
 from softgrasp.study.reduce.result import Point
 from softgrasp.study.reduce.sweep import bases_of, chosen_methods, measure
@@ -116,10 +116,8 @@ class ReducedRuns:
         label, setting = f"{METHODS[name].title}, N = {model.N}, {self.setting.label}", self.setting
         own = ("error", "error_deformation", "times", "values")
         return ReducedPoint(
-            name, label, model.time_online, error, model.stable and finite, method=name, cells=setting.cells,
-            order=setting.order, steps=setting.steps, solver=setting.solver, rtol=None, refine=setting.refine,
-            mesh=setting.mesh,
-            error_deformation=error, error_displacement=displacement, error_range=self.truth.range_of(error),
+            name, label, model.time_online, error, model.stable and finite, method=name, mesh=setting.mesh,
+            error_displacement=displacement, error_range=self.truth.range_of(error), **setting.told,
             error_full=model.error, error_full_deformation=model.error_deformation,
             error_outputs_full=errors_of(series, full.series)[0] if finite else float("inf"), scratch=scratch,
             **{k: v for k, v in vars(model).items() if k not in own},

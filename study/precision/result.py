@@ -9,7 +9,7 @@ from typing import Any
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
-from softgrasp.study.precision.series import Series, TimedRun
+from softgrasp.study.precision.probe import Series, TimedRun
 from softgrasp.study.precision.settings import Setting
 from softgrasp.study.report.files import to_json
 
@@ -170,7 +170,7 @@ class Choice:
     def to_dict(self, command: str) -> dict[str, Any]:
         """For JSON, with the whole command that runs it again."""
         row, names = self.point.to_row(), (
-            "error_deformation", "error_displacement", "error_range", "p50", "p99", "max", "scratch", "per_step",
+            "error_displacement", "error_range", "p50", "p99", "max", "scratch", "per_step",
             "error_outputs_full", "error_full",
         )  # fmt: skip
         return {
@@ -223,7 +223,7 @@ class Part:
         name: of the source.
         error: that it leaves [1].
         share: of the sum of all parts [1].
-        wasted: whole digits below a tenth of the largest part, which nobody sees.
+        wasted: whole digits below a tenth of the largest part, which the largest part hides.
         halved_by: setting that halves it; empty where none that was tried does.
         cost: time of that setting over the time now [1]; None without one.
     """

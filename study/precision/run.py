@@ -20,18 +20,16 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
-from softgrasp.study.precision.balance import companion, error_budget
 from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
 from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RiccatiPoint, RunPoint
-from softgrasp.study.precision.predict import Predictor
+from softgrasp.study.precision.predict import Predictor, companion, error_budget
 from softgrasp.study.precision.probe import find_places
 from softgrasp.study.precision.reduced import ask_bases, ask_reduced
 from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
-from softgrasp.study.precision.riccati import ControlRuns, ask_riccati, settings_of
-from softgrasp.study.precision.riccati_reduced import ask_reduced_riccati
+from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of
 from softgrasp.study.precision.settings import own_setting, variant
 from softgrasp.study.precision.truth import LADDER, make_truth
 from softgrasp.study.reduce.sweep import chosen_methods

@@ -22,10 +22,9 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.full import FullRuns
-from softgrasp.study.precision.meshes import contraction, edges, few_steps, fits
+from softgrasp.study.precision.probe import Series, TimedRun, largest
 from softgrasp.study.precision.result import Truth
-from softgrasp.study.precision.series import Series, TimedRun, largest
-from softgrasp.study.precision.settings import Setting
+from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits
 
 ORDER = {2: 3, 3: 2}  # of the elements, by dimension
 LADDER = tuple(round(a * 10.0**-k, 12) for k in range(1, 7) for a in (3.0, 1.0))  # tolerances of the meshes

@@ -114,10 +114,9 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         title, told = f"{scene.name}: certified reduced model", sentences(certified, result)[:3]
         return Page(title, told, sections(certified, result, drawn), tables, [*drawn, file])
 
-    files = session.write(scene, result, page)
     for sentence in sentences(certified, result):
         console.print(sentence, markup=False)
-    list_files(console, files)
+    list_files(console, session.write(scene, result, page))
     return result
 
 
@@ -257,7 +256,7 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
             f"{np.median(ratios):.3g} times as large in the median, {max(ratios):.3g} at most."
         )
     if query > full:
-        lines.append("A query takes longer than a full run here: the model is worth it on a finer mesh only.")
+        lines.append("A query takes longer than a full run here: the model pays on a finer mesh only.")
     return lines
 
 

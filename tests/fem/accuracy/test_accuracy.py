@@ -25,8 +25,6 @@ from softgrasp.fem.solve.modes import lowest_modes
 from tests.fem.mesh.test_refined import fingerprint, l_scene
 from tests.helpers.models import CUBE, LAYERS, _k_lambda, _k_mu, _mass, held_by_paper, make_scene
 
-pytestmark = pytest.mark.ranks
-
 TIP = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0], "name": "tip"}]}}
 DAMPED = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
 WEIGHT = {"effects": {"gravity": {"g": [0.0, -9.81]}}, "time": {"start": "equilibrium"}}
@@ -163,6 +161,7 @@ def test_time_error_is_that_of_the_steps(comm: MPI.Intracomm) -> None:
     assert estimate(coarse).time_error == pytest.approx(true, rel=0.15)
 
 
+@pytest.mark.ranks
 def test_cells_share_the_difference_of_the_energies(comm: MPI.Intracomm) -> None:
     """sum_T k_T(e_i, e_j) = x'_i K' x'_j - x_i K x_j for static solutions on nested spaces."""
     model = build(make_scene(LAYERED, TIP), comm=comm)
@@ -202,6 +201,7 @@ def test_orders_of_graded_and_even_meshes(comm: MPI.Intracomm, order: int, least
     assert order_of(graded) >= least, graded
 
 
+@pytest.mark.ranks
 def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
     scene = with_refine(make_scene(TIP, {"time": {"steps": 300}}), 1, 5e-2)
     model, alone = (build_to_tolerance(scene, c) for c in (comm, MPI.COMM_SELF))
@@ -210,6 +210,7 @@ def test_passes_refine_the_same_cells_on_any_ranks(comm: MPI.Intracomm) -> None:
     assert fingerprint(model.space.mesh) == fingerprint(alone.space.mesh)
 
 
+@pytest.mark.serial
 def test_cubic_elements_are_those_of_scikit_fem() -> None:
     """Frequencies on one mesh: the same space, whatever its nodes."""
     scene = make_scene({"tissue": {"order": 3, "cells": [2, 4]}})
@@ -243,7 +244,7 @@ def test_lines_of_a_box_against_even_ones(comm: MPI.Intracomm) -> None:
         return (small.C @ small.G)[:3]  # the tip, against translations and rotations; V' K V = 1
 
     fine = statics("tissue.cells=[9,9,18]", "tissue.refine={}")
-    even, lines = (statics("tissue.cells=[6,6,12]", *more) for more in ([], ["tissue.refine={}"]))
+    even, lines = (statics("tissue.cells=[6,6,12]", *more) for more in (["tissue.refine=false"], ["tissue.refine={}"]))
     errors = [float(np.linalg.norm(part - fine) / np.linalg.norm(fine)) for part in (even, lines)]
     assert errors[0] > 0.03
     assert errors[1] <= 0.02, errors
@@ -253,7 +254,7 @@ EVEN = ["tissue.refine=false", "tissue.order=1"]
 FINE = {
     "franka_muscle": ["tissue.order=3", "tissue.refine={tolerance=1e-4}"],
     "layers_2d": ["tissue.order=3", "tissue.refine={tolerance=1e-4}"],
-    "block_3d": ["tissue.cells=[8,6,10]"],
+    "block_3d": ["tissue.cells=[10,6,14]"],
     "pillow_3d": ["tissue.refine={tolerance=5e-3,passes=0}"],
 }
 
@@ -266,7 +267,7 @@ FINE = {
         ("franka_muscle", EVEN, 0.2),
         ("layers_2d", [], 2e-3),
         ("layers_2d", EVEN, 0.05),
-        ("block_3d", [], 5e-3),
+        ("block_3d", [], 6e-3),
         ("block_3d", [*EVEN, "tissue.cells=[8,8,16]"], 0.5),
         ("pillow_3d", [], 5e-3),
     ],

@@ -16,8 +16,6 @@ from softgrasp.fem.mesh.file import read_mesh
 from softgrasp.fem.mesh.foreign import read_foreign
 from tests.fem.mesh.test_mesh import COMM, WIDE, grid, volume
 
-pytestmark = pytest.mark.ranks
-
 
 def save(path: Path, keep: int | None = None) -> Path:
     """Two hundred tetrahedra, or the first bytes of their file; written on rank 0."""

@@ -21,8 +21,6 @@ from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.scene.tissue import Contact
 
-pytestmark = pytest.mark.ranks
-
 COMM = MPI.COMM_WORLD
 PILLOW = Path(__file__).parents[3] / "demos" / "scenes" / "meshes" / "pillow_small.msh"
 WIDE = 1e-12  # sums of a few hundred positive terms of order one: round-off is below 1e-13
@@ -96,6 +94,7 @@ def write(path: Path, points: np.ndarray, cells: np.ndarray, facets: np.ndarray 
     return path
 
 
+@pytest.mark.ranks
 def test_paper_mesh_has_992_degrees_of_freedom() -> None:
     tissue = structured_mesh(COMM, [1.0, 2.0], [15, 30])
     space = dolfinx.fem.functionspace(tissue.mesh, ("Lagrange", 1, (2,)))
@@ -134,6 +133,7 @@ def test_make_mesh_takes_size_or_file(mpi_tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])
+@pytest.mark.ranks
 def test_file_keeps_volume_and_tags(mpi_tmp_path: Path, dimension: int, suffix: str) -> None:
     points, cells, facets = grid(dimension)
     points = np.vstack([points, np.full((2, dimension), 9.0)])  # unused nodes go
@@ -175,6 +175,7 @@ def test_flat_cell_is_refused_even_with_repair(mpi_tmp_path: Path) -> None:
         read_mesh(COMM, write(mpi_tmp_path / "flat.vtu", points, cells), repair=True)
 
 
+@pytest.mark.serial
 def test_flatness_does_not_depend_on_units() -> None:
     points, cells, _ = grid(3)
     assert check_cells(1e-9 * points, cells, False, "a") is cells
@@ -283,6 +284,7 @@ def test_pillow_mesh_is_readable() -> None:
     assert volume(tissue) == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.serial
 def test_cells_are_found_in_either_version_of_dolfinx() -> None:
     """0.10 has one dofmap, 0.11 a list of them and a warning at the single one."""
     nodes = np.array([[0, 1, 2]], dtype=np.int32)

@@ -27,8 +27,6 @@ from softgrasp.fem.scene.tissue import Contact, Layer
 from tests.fem.mesh.test_mesh import COMM, WIDE, area, grid, volume, zone
 from tests.helpers.models import gather_matrix, node_order
 
-pytestmark = pytest.mark.ranks
-
 Blocks = list[tuple[str, np.ndarray]]
 
 

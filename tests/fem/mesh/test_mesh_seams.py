@@ -16,8 +16,6 @@ from softgrasp.fem.mesh.seams import doubled_nodes, sort_facets
 from softgrasp.fem.model.contact import cells_in, contact_facets, held_check
 from tests.fem.mesh.test_mesh import COMM, WIDE, area, grid, volume, write, zone
 
-pytestmark = pytest.mark.ranks
-
 BOX = {2: 6.0, 3: 10.0}  # boundary of (0,1) x (0,2) (x (0,1)): 2 (1 + 2), and 2 (1 2 + 1 1 + 1 2)
 
 

@@ -28,8 +28,6 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from tests.helpers.models import CUBE, LAYERS, gather_mesh, make_scene
 
-pytestmark = pytest.mark.ranks
-
 ROUND = 1e-12  # sums of some hundred terms of order one
 ROUGH = {"tolerance": 0.05}
 
@@ -65,6 +63,7 @@ def zone_of(tissue: TissueMesh, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     [({}, ROUGH), ({"tissue": {"cells": [5, 7]}}, {"method": "bisect"}), (CUBE, {"method": "bisect"}), (CUBE, {})],
     ids=["tolerance", "given cells", "3D", "lines"],
 )
+@pytest.mark.ranks
 def test_mesh_is_the_same_on_any_ranks(comm: MPI.Intracomm, change: Any, refine: Any) -> None:
     scene = refined(change, **refine)
     together = fingerprint(refined_mesh(comm, scene))
@@ -95,6 +94,7 @@ def test_lines_keep_the_unknowns_of_the_box(comm: MPI.Intracomm) -> None:
     assert np.diff(x)[0] < 0.6 * np.diff(x)[1]  # four cells across, graded from both sides
 
 
+@pytest.mark.ranks
 def test_layers_are_inherited(comm: MPI.Intracomm) -> None:
     damping = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
     scene = refined({"tissue": {"layers": LAYERS}}, damping, **ROUGH)
@@ -109,6 +109,7 @@ def test_layers_are_inherited(comm: MPI.Intracomm) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.ranks
 def test_tags_survive_four_bisections(comm: MPI.Intracomm, dimension: int) -> None:
     """Area of the tagged side and volume of the tagged half stay; the mesh stays conforming."""
     size = [1.0, 2.0, 1.0][:dimension]
@@ -190,6 +191,7 @@ def test_energy_is_kept_on_graded_meshes(comm: MPI.Intracomm, refine: Any) -> No
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.serial
 def test_unknowns_are_counted_before_they_are_made(order: int) -> None:
     scene = refined({"tissue": {"order": order}}, tolerance=0.1)
     model = build(scene, comm=MPI.COMM_SELF)

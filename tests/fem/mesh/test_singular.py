@@ -10,7 +10,7 @@ import pytest
 from softgrasp.fem.mesh.grading import STEEPEST, SizeField, graded_line
 from softgrasp.fem.mesh.singular import Ends, exponent, singular_ends
 
-pytestmark = pytest.mark.ranks
+pytestmark = pytest.mark.serial  # numpy only
 
 
 def grid(counts: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

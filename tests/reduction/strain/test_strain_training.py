@@ -164,7 +164,7 @@ def test_a_file_brings_the_lift_back_on_any_rank_count(trained: Training, tmp_pa
     assert read.Phi is not None
     np.testing.assert_array_equal(read.Phi, rom.Phi)
     online = load(path)
-    with pytest.raises(ModelError, match="no lift"):
+    with pytest.raises(ModelError, match="no basis on the mesh"):
         online.displacement(np.zeros((1, 5)))
 
 

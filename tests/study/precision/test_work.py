@@ -26,21 +26,19 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision import full as wp_full
-from softgrasp.study.precision import meshes as wp_meshes
 from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import reduced as wp_reduced
+from softgrasp.study.precision import settings as wp_meshes
 from softgrasp.study.precision import truth as wp_truth
 from softgrasp.study.precision.answer import advice, parse_budget, parse_tolerance
-from softgrasp.study.precision.balance import balanced
 from softgrasp.study.precision.fit import interpolate, pareto, power_law
 from softgrasp.study.precision.forward import step_counts
-from softgrasp.study.precision.meshes import even_meshes, fitted
 from softgrasp.study.precision.points import Request, WorkPoint
-from softgrasp.study.precision.probe import find_places, run_probed
+from softgrasp.study.precision.predict import balanced
+from softgrasp.study.precision.probe import find_places, largest, run_probed
 from softgrasp.study.precision.result import Part, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
-from softgrasp.study.precision.series import largest
-from softgrasp.study.precision.settings import Setting, least_steps, variant
+from softgrasp.study.precision.settings import Setting, even_meshes, fitted, least_steps, variant
 from softgrasp.study.reduce.run import run_reduce
 from tests.helpers.browser import look
 from tests.helpers.models import Array, graded_model, make_scene, rough_save, write_scene
@@ -312,7 +310,7 @@ def test_killed_command_goes_on_to_the_same_table(comm: MPI.Intracomm, result: d
     """The real command, with the limits of these tests, is killed in the middle, without a chance to clean up."""
     file, cache = write_scene(comm, tmp_path, make_scene(SMALL)), tmp_path / "cache"
     limits = f"m.POINT_WORK[2], m.GOALS[2], t.FINEST[2], t.WORK[2] = {WORK}, {GOALS}, {FINEST}, {2 * WORK}"
-    rooms = "from softgrasp.study.precision import meshes as m, truth as t"
+    rooms = "from softgrasp.study.precision import settings as m, truth as t"
     code = f"{rooms}; {limits}; from softgrasp.study.cli import main; main()"
     command = [sys.executable, "-c", code, "study", str(file), "--out", str(tmp_path), "--question", "forward"]
     with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.DEVNULL) as process:

@@ -25,12 +25,11 @@ from softgrasp.study.precision import control_plots as work_control_plots
 from softgrasp.study.precision import loop as wp_loop
 from softgrasp.study.precision import riccati as wp_riccati
 from softgrasp.study.precision.cache import Cache, Guard
-from softgrasp.study.precision.captions import paper_of, reference_text
 from softgrasp.study.precision.loop import step_counts
 from softgrasp.study.precision.points import CONTROL, LoopPoint, ReducedRiccatiPoint, Request, RiccatiPoint
 from softgrasp.study.precision.result import Question, RiccatiReference, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
-from softgrasp.study.precision.tables import question_table
+from softgrasp.study.precision.tables import paper_of, question_table, reference_text
 from tests.helpers.browser import look
 from tests.helpers.models import make_scene, rough_save, write_scene
 

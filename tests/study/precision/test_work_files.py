@@ -17,7 +17,7 @@ from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.riccati import Refusal
 from tests.helpers.models import make_scene
 
-pytestmark = pytest.mark.ranks
+pytestmark = pytest.mark.ranks(2)
 
 
 def mesh_scene(comm: MPI.Intracomm, folder: Path, height: float) -> Scene:

@@ -16,8 +16,8 @@ from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision import forward as wp_forward
 from softgrasp.study.precision import full as wp_full
-from softgrasp.study.precision import meshes as wp_meshes
 from softgrasp.study.precision import reduced as wp_reduced
+from softgrasp.study.precision import settings as wp_meshes
 from softgrasp.study.precision import truth as wp_truth
 from softgrasp.study.precision.points import Request
 from softgrasp.study.precision.probe import find_places, run_probed
