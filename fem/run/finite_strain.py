@@ -24,7 +24,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, total
 from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState
 from softgrasp.fem.strain.body import Body
-from softgrasp.fem.strain.newton import Counts, NewtonFigures, QuasiNewton, Root
+from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
 from softgrasp.fem.system import BlockSystem
 
@@ -66,7 +66,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.trial, self.f, self.y, self.solved = (self.w.duplicate() for _ in range(4))
         vectors = (self.trial, self.f, self.y, self.solved)
         self.trial_array, self.f_array, self.y_array, self.solved_array = (x.array_w for x in vectors)
-        self.newton = QuasiNewton(self._residual, self._apply, self._renew_from, self.dot)
+        pairs = Pairs(self._dots, len(self.w_array))
+        self.newton = QuasiNewton(self._residual, self._apply, lambda w: self._renew(self.at.array_r + w), pairs)
         self.past: deque[Array] = deque(maxlen=KEPT)
         self.tangent_at: Array | None = None
         self.counts, self.price = Counts(), self._price()
@@ -88,12 +89,12 @@ class FiniteStrainMidpoint(TissueMidpoint):
         nz = self.solver.ksp.getPC().getFactorMatrix().getInfo()["nz_used"]
         return float(np.clip(nz / (4 * self.system.layout.n_e), 8, 100))
 
+    def _dots(self, A: Array, x: Array) -> Array:
+        products = A @ x
+        return products if self.held.whole else total(self.comm, products)
+
     def _all(self, fine: bool) -> bool:
         return fine if self.held.whole else bool(self.comm.allreduce(fine, MPI.LAND))
-
-    def _pulled(self, N: Array, w: Array) -> Array:
-        pull = N.T @ w
-        return pull if self.held.whole else total(self.comm, pull)
 
     # ---- the state
 
@@ -143,10 +144,10 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def memory(self) -> dict[str, Array]:
         """What a restart needs beside r and the state: tangent, pairs, last steps, counts; rows as they are held."""
-        pairs = [part for p, q, _ in self.newton.pairs for part in (p, q)]
+        pairs = self.newton.pairs
         tangent = [] if self.tangent_at is None else [self.tangent_at]
-        rows = [self.held.leave(x) for x in (*tangent, *self.past, *pairs)]
-        sizes = [len(tangent), len(self.past), len(self.newton.pairs)]
+        rows = [self.held.leave(x) for x in (*tangent, *self.past, *pairs.dx, *pairs.dr)]
+        sizes = [len(tangent), len(self.past), len(pairs.order), pairs.order[-1] if pairs.order else 0]
         numbers = np.array([*sizes, *vars(self.counts).values()], dtype=float)
         return {"newton_rows": np.array(rows).reshape(len(rows), len(self.r_array)), "newton_numbers": numbers}
 
@@ -154,16 +155,18 @@ class FiniteStrainMidpoint(TissueMidpoint):
         """Take over what :meth:`memory` gave, after :meth:`join`. Collective."""
         if rows is None or numbers is None:
             return
-        tangents, past, pairs = (int(n) for n in numbers[:3])
+        tangents, past, count, newest = (int(n) for n in numbers[:4])
         kept = [self.held.enter(x) for x in rows]
         if tangents:
             self._renew(kept[0])
         self.past = deque(kept[tangents : tangents + past], maxlen=KEPT)
-        self.newton.pairs.clear()
-        for i in range(pairs):
-            p, q = kept[tangents + past + 2 * i :][:2]
-            self.newton.pairs.append((p, q, 1 / self.dot(p, q)))
-        for (name, kind), value in zip(Counts.__annotations__.items(), numbers[3:], strict=True):
+        pairs = self.newton.pairs
+        at = tangents + past
+        pairs.dx[:], pairs.dr[:] = kept[at : at + len(pairs.dx)], kept[at + len(pairs.dx) :]
+        pairs.order = [(newest - i) % len(pairs.dx) for i in reversed(range(count))]
+        for slot in pairs.order:
+            pairs.multiply(slot)
+        for (name, kind), value in zip(Counts.__annotations__.items(), numbers[4:], strict=True):
             setattr(self.counts, name, int(value) if kind == "int" else float(value))
 
     # ---- a step
@@ -193,7 +196,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if root.spent < 0:
             root = self._divided(c)
         elif feel is not None:
-            self.felt = self._pulled(feel.N, root.x)
+            self.felt = self._dots(feel.N.T, root.x)
             c = c + feel.C @ self.felt
         if self.jump is None:
             self.c = c
@@ -212,13 +215,14 @@ class FiniteStrainMidpoint(TissueMidpoint):
         target = max(self.tol * self.parts * self.counts.scale, 4 * self.body.rounding)
         root = self.newton.find(guess, target)
         self.last = root.norm / (self.parts * self.counts.scale) if self.counts.scale > 0 else 0.0
-        slopes = [self.dot(root.x, q) for _, q, _ in self.newton.pairs]
-        if root.spent < 1 or not slopes:
+        pairs = self.newton.pairs
+        if root.spent < 1 or not pairs.order:
             return root
-        i, work = int(np.argmax(np.abs(slopes))), self.dot(root.x, root.R)
+        slopes, work = self._dots(pairs.dr, root.x), self.dot(root.x, root.R)
+        i = int(np.argmax(np.abs(slopes)))  # zero in an empty slot
         if abs(work) > 0.1 * abs(slopes[i]):
             return root
-        return root._replace(x=root.x - work / slopes[i] * self.newton.pairs[i][0])
+        return root._replace(x=root.x - work / slopes[i] * pairs.dx[i])
 
     def _residual(self, w: Array) -> tuple[Array, float]:
         """R(w) and its norm, infinite where the law has no stress. Collective."""
@@ -234,7 +238,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
             self.drag.mult(self.trial, self.y)
             R += n * self.y_array
         if self.feel is not None:
-            R -= self.G @ (self.feel.C @ self._pulled(self.feel.N, w))
+            R -= self.G @ (self.feel.C @ self._dots(self.feel.N.T, w))
         return R, math.sqrt(self.dot(R, R))
 
     def _apply(self, q: Array) -> Array:
@@ -245,12 +249,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
         x: Array = np.array(self.solved_array)
         if self.feel is not None:
             C, N, _ = self.feel
-            seen = C @ self._pulled(N, self.Y)
-            x += self.Y @ np.linalg.solve(np.eye(len(seen)) - seen, C @ self._pulled(N, x))
+            seen = C @ self._dots(N.T, self.Y)
+            x += self.Y @ np.linalg.solve(np.eye(len(seen)) - seen, C @ self._dots(N.T, x))
         return x
-
-    def _renew_from(self, w: Array) -> bool:
-        return self._renew(self.at.array_r + w)
 
     def _renew(self, z: Array) -> bool:
         """Factor K(z) + s D + s^2 M; whether that worked. Collective."""
@@ -308,8 +309,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
             root = self._taken(np.array(load), begin)  # MINPACK hands over its own memory
             if root is None:
                 raise ArithmeticError
-            w = self._pulled(feel.N, root.x)
-            self.felt = w + feel.speed * (self._pulled(feel.N, self.rate) - w)
+            w = self._dots(feel.N.T, root.x)
+            self.felt = w + feel.speed * (self._dots(feel.N.T, self.rate) - w)
             return np.asarray(load - c - feel.C @ self.felt)
 
         from scipy.optimize import root as solve  # few runs need it

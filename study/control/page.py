@@ -9,7 +9,7 @@ import numpy as np
 
 from softgrasp.study.control.result import TITLES, ControlStudy
 from softgrasp.study.control.tables import BOX_HEADER, box_rows, loop_table, reduced_table, summary_rows
-from softgrasp.study.pictures.animation import speed_up
+from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.page import Section
 
