@@ -7,7 +7,7 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check lint bench paper pictures docs clean
+.PHONY: help env demo paper_forward paper_accurate test check lint bench paper pictures docs clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -18,9 +18,11 @@ $(STAMP): pyproject.toml tools/make-env
 	@sh tools/make-env .venv
 	@touch $@
 
-demo: $(STAMP) ## run the paper's forward scene, and the same on an accurate mesh, into out/
-	@$(BIN)/softgrasp simulate paper_forward
-	@$(BIN)/softgrasp simulate paper_accurate
+demo: $(STAMP) ## run the paper's forward scene, and at the same time the same on an accurate mesh, into out/
+	@$(MAKE) --no-print-directory -j2 --output-sync=target paper_forward paper_accurate
+
+paper_forward paper_accurate:
+	@$(BIN)/softgrasp simulate $@
 
 lint: $(STAMP) ## ruff, mypy and the import contracts
 	$(BIN)/ruff check

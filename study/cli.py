@@ -8,8 +8,9 @@ from softgrasp.study.shell.streams import quiet_imports
 quiet_imports()
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,7 +18,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.study.query.command import query
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
-from softgrasp.study.shell.options import Empty, NoPictures, Out, Overrides, Pdf, Quiet, SceneFile, check_folder
+from softgrasp.study.shell.options import Empty, Out, Overrides, Pdf, Pictures, Quiet, SceneFile, check_folder
 
 LIST_WIDTH = 200  # [letters]
 app = typer.Typer(
@@ -111,7 +112,7 @@ def compare(
     a: Annotated[Path, typer.Argument(help="folder of a run")],
     b: Annotated[Path, typer.Argument(help="folder of another run")],
     out: Out = None,
-    no_pictures: NoPictures = False,
+    pictures: Pictures = True,
     empty: Empty = False,
     pdf: Pdf = False,
 ) -> None:
@@ -120,7 +121,7 @@ def compare(
 
     if rank() == 0:
         folder = out or default_folder("compare", Path(f"{a.name}-{b.name}"))
-        run_compare(a, b, folder, console(), pictures=not no_pictures, empty=empty)
+        run_compare(a, b, folder, console(), pictures=pictures, empty=empty)
 
 
 @app.command()
@@ -150,6 +151,12 @@ def explain(
     run_explain(scene, out, set_ or [], console(), empty=empty)
 
 
+def _run(command: Callable[..., Any], scene: Path, out: Path | None, set_: list[str] | None, **options: Any) -> Any:
+    """Run a command on a scene in the folder given or its own; named ``run_NAME``, it is the command NAME."""
+    name = command.__name__.removeprefix("run_")
+    return command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
+
+
 @app.command()
 def simulate(
     scene: SceneFile,
@@ -157,7 +164,7 @@ def simulate(
     set_: Overrides = None,
     quiet: Quiet = False,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
-    no_pictures: NoPictures = False,
+    pictures: Pictures = True,
     until: Annotated[int | None, typer.Option(help="stop after this step and leave a checkpoint", min=1)] = None,
     certify: Annotated[
         bool, typer.Option("--certify", help="estimate the error of mesh and time step, whatever it costs")
@@ -168,18 +175,8 @@ def simulate(
     """Run a scene with the full-order model; also under `mpiexec -n N`."""
     from softgrasp.study.forward.run import run_simulate
 
-    run_simulate(
-        scene,
-        out or default_folder("simulate", scene),
-        set_ or [],
-        console(),
-        quiet=quiet,
-        resume=resume,
-        until=until,
-        pictures=not no_pictures,
-        certify=certify,
-        empty=empty,
-    )
+    more = {"resume": resume, "until": until, "certify": certify}
+    _run(run_simulate, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, **more)
 
 
 @app.command()
@@ -199,25 +196,15 @@ def sweep(
     ] = None,
     ranks_each: Annotated[int, typer.Option(help="ranks of one point under `mpiexec -n N`", min=1)] = 1,
     quiet: Quiet = False,
-    no_pictures: NoPictures = False,
+    pictures: Pictures = True,
     empty: Empty = False,
     pdf: Pdf = False,
 ) -> None:
     """Simulate a scene at many values of its keys; resumes; `mpiexec -n N` runs N points at a time."""
     from softgrasp.study.runs.run import run_sweep
 
-    run_sweep(
-        scene,
-        axes,
-        out or default_folder("sweep", scene),
-        set_ or [],
-        console(),
-        reduced=reduced,
-        each=ranks_each,
-        quiet=quiet,
-        pictures=not no_pictures,
-        empty=empty,
-    )
+    more = {"axes": axes, "reduced": reduced, "each": ranks_each}
+    _run(run_sweep, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, **more)
 
 
 @app.command()
@@ -243,7 +230,7 @@ def reduce(
     out: Out = None,
     set_: Overrides = None,
     quiet: Quiet = False,
-    no_pictures: NoPictures = False,
+    pictures: Pictures = True,
     empty: Empty = False,
     pdf: Pdf = False,
     tolerance: Annotated[
@@ -256,10 +243,7 @@ def reduce(
     from softgrasp.study.reduce.run import run_reduce
 
     accuracy = None if tolerance is None else parse_tolerance(tolerance)
-    out = out or default_folder("reduce", scene)
-    run_reduce(
-        scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty, tolerance=accuracy
-    )
+    _run(run_reduce, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, tolerance=accuracy)
 
 
 app.command()(query)
@@ -271,7 +255,7 @@ def control(
     out: Out = None,
     set_: Overrides = None,
     quiet: Quiet = False,
-    no_pictures: NoPictures = False,
+    pictures: Pictures = True,
     gain_only: Annotated[
         bool, typer.Option("--gain-only", help="only the Riccati equation and the controllers: no loop, no pictures")
     ] = False,
@@ -281,10 +265,7 @@ def control(
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
     from softgrasp.study.control.run import run_control
 
-    out = out or default_folder("control", scene)
-    run_control(
-        scene, out, set_ or [], console(), quiet=quiet, pictures=not no_pictures, empty=empty, gain_only=gain_only
-    )
+    _run(run_control, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, gain_only=gain_only)
 
 
 @app.command()
@@ -315,17 +296,8 @@ def study(
 
     limit = None if budget is None else parse_budget(budget)
     accuracy = None if tolerance is None else parse_tolerance(tolerance)
-    run_study(
-        scene,
-        out or default_folder("study", scene),
-        set_ or [],
-        console(),
-        tolerance=accuracy,
-        budget=limit,
-        questions=question,
-        quiet=quiet,
-        empty=empty,
-    )
+    more = {"tolerance": accuracy, "budget": limit, "questions": question}
+    _run(run_study, scene, out, set_, quiet=quiet, empty=empty, **more)
 
 
 @app.command()
@@ -340,7 +312,7 @@ def effects(
     """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""
     from softgrasp.study.effects.run import run_effects
 
-    run_effects(scene, out or default_folder("effects", scene), set_ or [], console(), quiet=quiet, empty=empty)
+    _run(run_effects, scene, out, set_, quiet=quiet, empty=empty)
 
 
 @app.command()

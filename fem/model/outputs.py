@@ -47,8 +47,10 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     """
     entries = scene.control.outputs if scene.control is not None else []
     if not entries:
-        tip = _node(system, "tip", _farthest(system))
-        return (replace(tip, place=f"node {_coordinates(tip.point)}, the free one farthest from the hand"),)
+        point, count = _farthest(system)
+        which = "the free one" if count == 1 else f"one of the {count} free ones"
+        tip = _node(system, "tip", point)
+        return (replace(tip, place=f"node {_coordinates(tip.point)}, {which} farthest from the hand"),)
     result = []
     for i, output in enumerate(entries):
         name = output.name or f"y{i + 1}"
@@ -137,11 +139,11 @@ def _inside(system: BlockSystem, point: list[float], i: int) -> None:
         )
 
 
-def _farthest(system: BlockSystem) -> Array:
+def _farthest(system: BlockSystem) -> tuple[Array, int]:
+    """The free node farthest from the hand, of several the first by its coordinates, and how many. Collective."""
     layout = system.layout
-    best: tuple[float, tuple[float, ...]] = (1.0, ())
-    if len(layout.nodes):
-        distance = layout.rounded(np.linalg.norm(layout.nodes - layout.reference, axis=1))
-        far = np.flatnonzero(distance == distance.max())
-        best = (-float(distance.max()), min(tuple(layout.rounded(layout.nodes[j]).tolist()) for j in far))
-    return np.asarray(min(layout.comm.allgather(best))[1], dtype=float)
+    distance = layout.rounded(np.linalg.norm(layout.nodes - layout.reference, axis=1))
+    most = max(layout.comm.allgather(float(distance.max(initial=-1.0))))
+    parts = layout.comm.allgather(layout.rounded(layout.nodes[distance == most]).tolist())
+    far = [node for part in parts for node in part]
+    return np.asarray(min(far), dtype=float), len(far)

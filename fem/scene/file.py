@@ -42,6 +42,7 @@ _FORMS = {
     "tissue.size": "size = [0.06, 0.12]",
     "tissue.cells": "cells = [12, 24]",
     "tissue.refine": "refine = { tolerance = 1e-2 }",
+    "contact.sides": 'sides = ["left", "right"]',
     "contact.box": "box = [[0, 0.09], [0.06, 0.12]]",
     "motion.target": "target = [0.3, 0.2]",
     "control.outputs": 'outputs = [{ kind = "node", point = [0.03, 0] }]',
@@ -167,7 +168,8 @@ def _parse(text: str, override: str) -> Any:
     except tomllib.TOMLDecodeError:
         if re.fullmatch(r"[A-Za-z_./~][A-Za-z0-9_./~+-]*", text):  # the shell ate the quotes
             return text
-        raise SceneError(f"--set {override}: '{text}' is not a TOML value; a text is '\"...\"'") from None
+        form = f"write [{text}]" if re.fullmatch(r"[^,\[\]]+(,[^,\[\]]+)+", text) else "a text is '\"...\"'"
+        raise SceneError(f"--set {override}: '{text}' is not a TOML value; {form}") from None
     except ValueError as error:
         raise SceneError(f"--set {override}: it {error}") from None
     if table.keys() != {"value"}:
@@ -200,7 +202,7 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
                 if earlier
                 else f"{dotted} is {_show(value)}; it must {verb} {text}"
             )
-        if kind == "missing" or kind.endswith("_type"):
+        if kind == "missing" or kind.endswith("_type") or kind.startswith("too_"):
             text += next((f"; write {form}" for key, form in _FORMS.items() if f"{dotted}.".startswith(f"{key}.")), "")
         problems[dotted] = (kind == "extra_forbidden", [text])
     ordered = sorted(problems.values(), key=lambda problem: not problem[0])

@@ -25,7 +25,10 @@ def with_bounds[Judged: (GainReport, BoxPoint)](
     plan: LoopPlan,
     notify: Notify | None = None,
 ) -> list[Judged]:
-    """The same with ``cost_excess_at_most`` where the gain is stable, see :mod:`softgrasp.lqr.loop.gap`. Collective.
+    """The same with bounds of the cost where the gain is stable, see :mod:`softgrasp.lqr.loop.gap`. Collective.
+
+    ``cost_excess_proved`` holds for the run to the end of the plan and the optimal feedback after it. What the loop's
+    own way costs after that is an allowance in ``cost_excess_at_most``, at least what the modes kept say of it.
 
     Args:
         problem: the plant.
@@ -41,7 +44,9 @@ def with_bounds[Judged: (GainReport, BoxPoint)](
         every = [*laws.values(), solution.gain]  # the last has the best lower bound of the least cost
         gaps = duality_gaps(problem, every, start, plan.dt, plan.steps, solution.factor, notify)
         for i, gap in zip(laws, gaps[:-1], strict=True):
-            gains[i] = replace(gains[i], cost_excess_at_most=gap.cost_excess_at_most)
+            forever = (1 + gains[i].cost_excess) * gaps[-1].cost / gap.least - 1
+            most = max(gap.cost_excess_at_most, forever)
+            gains[i] = replace(gains[i], cost_excess_at_most=most, cost_excess_proved=gap.cost_excess_proved)
     return gains
 
 

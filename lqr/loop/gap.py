@@ -58,14 +58,18 @@ class DualityGap:
     end: float
 
     @property
-    def cost_excess_at_most(self) -> float:
-        """Bound on J(u) / min J - 1; infinite when the lower bound of min J is not positive.
+    def cost_excess_proved(self) -> float:
+        """Bound on J(u) / min J - 1 of the run and the optimal feedback after it; infinite without a lower bound."""
+        return self._excess(0.0)
 
-        The gap, or the distance to the lower bound with room for what is to come, whichever is less.
-        """
+    @property
+    def cost_excess_at_most(self) -> float:
+        """The same for a loop that goes on with its own gain: with room for what is to come, which is an allowance."""
+        return self._excess(self.to_come * self.cost / self.least if self.least > 0 else 0.0)
+
+    def _excess(self, after: float) -> float:
         if not (self.least > 0 and np.isfinite(self.gap)):
             return float("inf")
-        after = self.to_come * self.cost / self.least
         return min(self.gap, self.cost - self.least + after + ROUNDING * self.cost) / self.least
 
 

@@ -92,6 +92,13 @@ def _normalising(gram: Array) -> Array:
     return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
 
 
+def _root(X: Array) -> Array:
+    """F with F F' = X, without the columns that are rounding."""
+    values, vectors = np.linalg.eigh(X)
+    keep = values > 1e-17 * values[-1]
+    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
+
+
 def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
     """X of a level in the basis of the next: V_old = V_new T, T the columns of S^{-1} that the old basis filled."""
     s, r = 2 * plant.n_s, old.small.order
@@ -113,9 +120,7 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
     ritz, omega, S = space.ritz(plant)
     small = restrict(plant, ritz.V, omega, ritz.M_V)
     solution = solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
-    values, vectors = np.linalg.eigh(solution.X)
-    keep = values > 1e-17 * values[-1]
-    root = vectors[:, keep] * np.sqrt(values[keep])
+    root = on_root(plant.comm, partial(_root, solution.X))
     s, r = 2 * plant.n_s, len(omega)
     q, v = root[s : s + r] / omega[:, None], root[s + r :]
     Z = Block(root[:s], np.vstack([ritz.V @ q, ritz.V @ v]))

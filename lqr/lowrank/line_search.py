@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.lowrank.compress import triangular
 from softgrasp.lqr.plant.block import Block
 
@@ -15,7 +15,7 @@ SHORTEST = 1e-2
 def best_step(comm: MPI.Intracomm, old: tuple[Block, Array], W: Block, change: Block) -> tuple[float, float, float]:
     """Minimise ||(1 - t) R_j + t W W' - t^2 dK'dK||_F over t in (0, 1] [BB98].
 
-    Residual of X_j + t (X_new - X_j), exactly. Collective.
+    Residual of X_j + t (X_new - X_j), exactly. Collective; chosen on one rank.
 
     Args:
         old: (U, signs) with R_j = U diag(signs) U'.
@@ -27,7 +27,11 @@ def best_step(comm: MPI.Intracomm, old: tuple[Block, Array], W: Block, change: B
     """
     U, signs = old
     r = triangular(comm, Block.join([U, W, change]))
-    u, w = U.columns, U.columns + W.columns
+    return on_root(comm, lambda: _least(r, signs, U.columns, U.columns + W.columns))
+
+
+def _least(r: Array, signs: Array, u: int, w: int) -> tuple[float, float, float]:
+    """The same from the triangular factor r of [U, W, dK'], with U in the columns before u and W in those before w."""
     R_old = (r[:, :u] * signs) @ r[:, :u].T
     lyapunov, quadratic = r[:, u:w] @ r[:, u:w].T, r[:, w:] @ r[:, w:].T
     # R(t) = R_old + t (lyapunov - R_old) - t^2 quadratic; ||R(t)||^2 is a quartic

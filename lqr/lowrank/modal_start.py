@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -225,7 +226,7 @@ def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     omega, Phi = plant_modes(plant, min(count, plant.layout.n_e))
     M_Phi = plant.mass(Phi)
     small = restrict(plant, Phi, omega, M_Phi)
-    if modes is None and plant.layout.n_e > MORE_MODES and _light(small):
+    if modes is None and plant.layout.n_e > MORE_MODES and on_root(plant.comm, partial(_light, small)):
         return modal_start(plant, MORE_MODES)
     solution = solve_small(plant, small)
     if plant.two_way:

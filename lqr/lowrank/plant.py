@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from softgrasp.fem.errors import agree
-from softgrasp.fem.petsc import Array, PETSc, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -54,7 +54,9 @@ class Plant:
         self.mass, self.stiff = (partial(times_columns, A) for A in (system.M_ee, system.K_ee))
         viscous = system.damping.matrix
         self.viscous = None if viscous is None else partial(times_columns, viscous)
-        self.scale = float(np.linalg.norm(self.C_s @ self.C_s.T + total(self.comm, self.C_z.T @ self.C_z), 2))
+        seen = self.C_s @ self.C_s.T + total(self.comm, self.C_z.T @ self.C_z)
+        # the same bits on every rank: the solvers stop by residuals over it
+        self.scale = float(on_root(self.comm, partial(np.linalg.norm, seen, 2)))
         if self.scale == 0:
             raise ControlError("the outputs weighted with Q are all zero; give an output and a Q that is not zero")
 

@@ -83,10 +83,9 @@ def radi_step(plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: Shif
     last = time.perf_counter()
     columns, Y, V_B, c = radi_columns(plant, s, V)
     try:
-        root = np.linalg.cholesky((Y + Y.T) / 2)
+        inverse = on_root(plant.comm, lambda: np.linalg.inv(np.linalg.cholesky((Y + Y.T) / 2)))
     except np.linalg.LinAlgError as error:
         raise SolverError(f"radi: the step at the shift {s:.4g} is not definite; use newton_adi") from error
-    inverse = np.linalg.inv(root)
     weight = inverse.T @ inverse
     state.both = state.both.plus(mass_right(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
     state.Z.append(columns.times(inverse.T))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.petsc import Array, times_columns
+from softgrasp.fem.petsc import Array, on_root, times_columns
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
@@ -47,12 +47,16 @@ def residual(problem: RiccatiProblem, Z: Block) -> float:
         U[n_s:h, rank : 2 * rank] = problem.M_s @ b_s + G_b
         U[:n_s, 2 * rank :] = problem.C_s.T
     r = _triangular(comm, U)
-    rates, momenta, seen = r[:, :rank], r[:, rank : 2 * rank], r[:, 2 * rank :]
-    product, pushed = rates @ momenta.T, momenta @ B_Z.T
-    small = product + product.T - pushed @ np.linalg.solve(problem.R, pushed.T) + seen @ problem.Q @ seen.T
-    size = float(np.abs(np.linalg.eigvalsh(small)).max())
-    C = np.linalg.qr(seen, mode="r")
-    return size / (float(np.linalg.norm(C @ problem.Q @ C.T, 2)) or 1.0)
+
+    def relative() -> float:
+        rates, momenta, seen = r[:, :rank], r[:, rank : 2 * rank], r[:, 2 * rank :]
+        product, pushed = rates @ momenta.T, momenta @ B_Z.T
+        small = product + product.T - pushed @ np.linalg.solve(problem.R, pushed.T) + seen @ problem.Q @ seen.T
+        size = float(np.abs(np.linalg.eigvalsh(small)).max())
+        C = np.linalg.qr(seen, mode="r")
+        return size / (float(np.linalg.norm(C @ problem.Q @ C.T, 2)) or 1.0)
+
+    return on_root(comm, relative)
 
 
 def _fill_tissue(problem: RiccatiProblem, Z: Block, top: Array, bottom: Array) -> None:
@@ -76,11 +80,9 @@ def _fill_tissue(problem: RiccatiProblem, Z: Block, top: Array, bottom: Array) -
 
 
 def _triangular(comm: MPI.Intracomm, U: Array) -> Array:
-    """R of the thin QR factorisation of rows spread over the ranks, on every rank. Collective."""
+    """R of the thin QR factorisation of rows spread over the ranks, right on rank 0. Collective."""
     r = np.linalg.qr(U[:ROWS], mode="r")
     for first in range(ROWS, len(U), ROWS):
         r = np.linalg.qr(np.vstack([r, U[first : first + ROWS]]), mode="r")
-    if comm.size == 1:
-        return np.asarray(r)
-    gathered = comm.gather(r)
-    return np.asarray(comm.bcast(None if gathered is None else np.linalg.qr(np.vstack(gathered), mode="r")))
+    gathered = comm.gather(r) if comm.size > 1 else None
+    return np.asarray(r if gathered is None else np.linalg.qr(np.vstack(gathered), mode="r"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
@@ -189,7 +190,7 @@ class ShiftQueue:
         upper = values.imag >= 0
         clipped = self.limits.clip_all(values[upper])
         weights = sizes[upper] * np.abs(clipped)  # from the energy norm to the 2-norm of the residual
-        self.pending += choose_shifts(clipped, weights, BATCH, self.pending)
+        self.pending += on_root(plant.comm, partial(choose_shifts, clipped, weights, BATCH, self.pending))
         self.projections += 1
 
     def next(self) -> tuple[complex, list[complex]]:

@@ -17,7 +17,7 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.reduced.riccati import GainJudge, gain_error, project_plant
+from softgrasp.lqr.reduced.riccati import GainJudge, Verdict, gain_error, project_plant
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.sampled import Sampling
 
@@ -103,12 +103,11 @@ class Retuner:
 
 
 @dataclass(frozen=True)
-class BoxPoint:
+class BoxPoint(Verdict):
     """One setting of the box: errors against the full Riccati solution there.
 
     ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop, and from tick to
-    tick where its instants are known; ``cost_excess_at_most`` is proved, see :mod:`softgrasp.lqr.loop.gap`, nan where
-    it was not asked for.
+    tick where its instants are known; bounds of the cost are those of :func:`softgrasp.lqr.design.bounds.with_bounds`.
     """
 
     materials: Materials
@@ -121,12 +120,7 @@ class BoxPoint:
     sampled: SampledRadius | None = None
     gain: Gain | None = None
     cost_excess_at_most: float = float("nan")
-
-    @property
-    def stable(self) -> bool:
-        """Whether the full closed loop was computed and is stable."""
-        fine = not self.reason and self.certified and self.abscissa_full < 0
-        return fine and (self.sampled is None or self.sampled.stable)
+    cost_excess_proved: float = float("nan")
 
 
 def over_box(

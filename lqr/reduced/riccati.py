@@ -32,8 +32,34 @@ class ReducedRiccati:
     gain: Gain  # K_hat on the full plant
 
 
+class Verdict:
+    """What follows from a judged gain's numbers."""
+
+    reason: str
+    certified: bool
+    abscissa_full: float
+    sampled: SampledRadius | None
+    cost_excess_at_most: float
+
+    @property
+    def stable(self) -> bool:
+        """Whether the full closed loop was computed and is stable. A gain without this mark is never offered."""
+        fine = not self.reason and self.certified and self.abscissa_full < 0
+        return fine and (self.sampled is None or self.sampled.stable)
+
+    @property
+    def unbounded(self) -> str:
+        """Why the cost has no bound; empty where it has one."""
+        if self.reason or np.isfinite(self.cost_excess_at_most):
+            return self.reason and f"there is no gain: {self.reason}"
+        if not self.stable:
+            known = self.certified and (self.sampled is None or self.sampled.certified)
+            return "the full loop is unstable" if known else "the full loop is not certified to be stable"
+        return "no bound was asked for" if np.isnan(self.cost_excess_at_most) else "the cost of the run overflows"
+
+
 @dataclass(frozen=True)
-class GainReport:
+class GainReport(Verdict):
     """A reduced gain against the optimal one, on the full plant."""
 
     method: str  # key of the basis
@@ -48,14 +74,9 @@ class GainReport:
     certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
     sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
     gain: Gain | None = None  # K_hat; None where there is none
-    cost_excess_at_most: float = float("nan")  # proved bound, see softgrasp.lqr.loop.gap; nan where not asked for
+    cost_excess_at_most: float = float("nan")  # bound on the excess; nan where not asked for
+    cost_excess_proved: float = float("nan")  # the part that is proved, see softgrasp.lqr.design.bounds.with_bounds
     matrices: ReducedMatrices | None = None  # of the reduced equation; None where they are not kept
-
-    @property
-    def stable(self) -> bool:
-        """Whether the full closed loop was computed and is stable. A gain without this mark is never offered."""
-        fine = not self.reason and self.certified and self.abscissa_full < 0
-        return fine and (self.sampled is None or self.sampled.stable)
 
 
 def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:

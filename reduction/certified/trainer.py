@@ -207,13 +207,9 @@ class Trainer:
             values[rank :: self.comm.size] = part
         return [float(value) for value in values]
 
-    def checks(self) -> list[Materials]:
-        """Random parameters of the box."""
-        return self.random(RANDOM, SEED)
-
     def add(self, i: int) -> None:
         """Make one of the random parameters a point of the training."""
-        place = self.checks()[i]
+        place = self.random(RANDOM, SEED)[i]
         self.added.append(i)
         self.parameters.append(place)
         self.points.append((place[0].lam, place[0].mu))
@@ -286,10 +282,10 @@ def build_certified(
 
     goal = tolerance if options.certify == "proof" else SHARE * tolerance
     most = max(1, (options.max_N - hand) // 2)
-    state = state or start(count)
+    state, random = state or start(count), trainer.random(RANDOM, SEED)
     while True:
         state = greedy(trainer.train, trainer.bound, state, middle, goal, most, after)
-        bounds = trainer.bounds_at(trainer.checks(), trainer.certified)
+        bounds = trainer.bounds_at(random, trainer.certified)
         worst = int(np.argmax(bounds))
         if not state.reached or bounds[worst] <= goal or len(trainer.added) == ADDED:
             break
@@ -297,7 +293,7 @@ def build_certified(
         last = replace(state.rounds[-1], bound=bounds[worst], worst=len(state.known))
         state = Greedy((*state.rounds[:-1], last), np.append(state.known, bounds[worst]))
     model = replace(trainer.certified, training=history(trainer, state), tolerance=tolerance)
-    many = [*trainer.parameters, *trainer.checks()]
+    many = [*trainer.parameters, *random]
     if options.certify != "proof":
         model = smallest(trainer, model, many, tolerance)
     proved = trainer.bounds_at(many, model)

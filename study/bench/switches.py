@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import itertools
 import operator
-import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -105,18 +103,16 @@ def compare(
     """Time two calls in turn, after one run of each. Collective."""
     for call in calls:
         call()
-    samples = interleave({str(i): partial(timed, comm, call) for i, call in enumerate(calls)}, n)
-    first, second = (float(statistics.median(samples[key])) for key in ("0", "1"))
-    return Row(*names, setting, comm.size, first, second)
+    seconds = medians(interleave({str(i): partial(timed, comm, call) for i, call in enumerate(calls)}, n))
+    return Row(*names, setting, comm.size, seconds["0"], seconds["1"])
 
 
-@contextmanager
-def setting_of(module: ModuleType, name: str, value: float) -> Iterator[None]:
-    """Another value of a module's constant inside."""
+def under(module: ModuleType, name: str, value: float, call: Callable[..., Any], *args: Any) -> Any:
+    """A call with another value of a module's constant."""
     before = getattr(module, name)
     setattr(module, name, value)
     try:
-        yield
+        return call(*args)
     finally:
         setattr(module, name, before)
 
@@ -136,10 +132,7 @@ def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
             for a, b in zip(rng.uniform(30, 500, BATCH), rng.uniform(20, 500, BATCH), strict=True)
         ]
         size = sum(p.block.nbytes for p in many)
-
-        def together(many: list[Any] = many) -> None:
-            with setting_of(softgrasp.reduction.online, "TOGETHER", 2**62):
-                run_batch(many, DT, force)
+        together = partial(under, softgrasp.reduction.online, "TOGETHER", 2**62, run_batch, many, DT, force)
 
         def alone(many: list[Any] = many) -> None:
             for p in many:
@@ -157,13 +150,8 @@ def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     plant = Plant(problem_for(comm, 10, 0.002))
     for k in (15, 16, 30, 60):
         omega, V = plant_modes(plant, k)
-        modal = restrict(plant, V, omega, plant.mass(V))
-
-        def from_all(modal: Any = modal) -> None:
-            with setting_of(softgrasp.lqr.lowrank.modal_start, "FEW_MODES", 2**30):
-                solve_small(plant, modal)
-
-        calls = (lambda modal=modal: solve_small(plant, modal), from_all)
+        solve = partial(solve_small, plant, restrict(plant, V, omega, plant.mass(V)))
+        calls = (solve, partial(under, softgrasp.lqr.lowrank.modal_start, "FEW_MODES", 2**30, solve))
         yield compare(comm, ("start", f"FEW_MODES = {few}"), f"2D, {k} modes", calls, repeats)
 
 
@@ -236,10 +224,9 @@ def product(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
                 yield Row(f"product, {way}", limit, setting, comm.size, seconds["ours"], seconds[way])
 
 
-def by_petsc(A: PETSc.Mat, X: Array) -> Array:
+def by_petsc(A: PETSc.Mat, X: Array) -> Any:
     """A X by PETSc's matMult with all columns at once."""
-    with setting_of(softgrasp.fem.petsc, "BLOCK_COLUMNS", X.shape[1] + 1):
-        return times_columns(A, np.asfortranarray(X))
+    return under(softgrasp.fem.petsc, "BLOCK_COLUMNS", X.shape[1] + 1, times_columns, A, np.asfortranarray(X))
 
 
 def cpu_seconds(call: Callable[[], Any]) -> float:
@@ -266,9 +253,9 @@ def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
 
     for nx in (15, 60):
         cells = f"tissue.cells=[{nx}, {2 * nx}]"
-        samples = interleave({"off": run_of([cells]), "on": run_of([cells, "effects.finite_strain={}"])}, repeats)
-        seconds = [float(statistics.median(samples[key])) for key in ("off", "on")]
-        yield Row("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, *seconds)
+        runs = {"off": run_of([cells]), "on": run_of([cells, "effects.finite_strain={}"])}
+        seconds = medians(interleave(runs, repeats))
+        yield Row("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, seconds["off"], seconds["on"])
 
 
 def _two(

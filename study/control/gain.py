@@ -61,9 +61,8 @@ def run_gain(
         files=saved,
         options=" --gain-only",
     )
-    files = session.write(model.scene, result, lambda: page)
     session.console.print(pairs(rows))
-    list_files(session.console, files)
+    list_files(session.console, session.write(model.scene, result, lambda: page))
     if restart is not None and session.comm.rank == 0:
         shutil.rmtree(restart, ignore_errors=True)
     return result

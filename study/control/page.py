@@ -9,7 +9,7 @@ import numpy as np
 
 from softgrasp.study.control.result import TITLES, ControlStudy
 from softgrasp.study.control.tables import BOX_HEADER, box_rows, loop_table, reduced_table, summary_rows
-from softgrasp.study.pictures.animation import speed_up
+from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation_control import control_text
 from softgrasp.study.report.page import Section
 
@@ -72,12 +72,13 @@ def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Secti
     text = (
         "Each equation is projected on N basis vectors and solved; its gain is judged on the full plant. The bases "
         "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
-        f"The excess cost is J/J* - 1 on the modes kept; the bound beside it is proved for the whole plant by the "
-        f"duality gap of the run to t = {plan.dt * plan.steps:.4g} s, with room for what is to come after it."
+        "The excess cost is J/J* - 1 on the modes kept. The first bound beside it is proved for the whole plant, by "
+        f"the duality gap, for the run to t = {plan.dt * plan.steps:.4g} s and the optimal feedback after it; the "
+        "second makes room for what the gain's own way costs after that time, which is an allowance, not a proof."
     )
+    none = [(f"{TITLES[b.name]}, N = {r.N}", r.unbounded) for b in study.bases for r in b.reports if r.unbounded]
     parts = [reduced_table(study.bases).section(text, figures=figures)]
     refused = [(TITLES[b.name], b.refused) for b in study.bases if b.refused]
-    refused += [(f"{TITLES[b.name]}, N = {r.N}", r.reason) for b in study.bases for r in b.reports if r.reason]
-    if refused:
-        parts.append(Section("Refused", header=("basis", "reason"), rows=refused))
+    parts += [Section("Refused", header=("basis", "reason"), rows=refused)] if refused else []
+    parts += [Section("Without a bound of the cost", header=("gain", "reason"), rows=none)] if none else []
     return [*parts, loop_table(study).section("Full plant, same start, time step and actuation.")]

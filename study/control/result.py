@@ -178,8 +178,8 @@ def gain_result(
 def report_dict(report: GainReport) -> dict[str, Any]:
     """One point of result.json."""
     keys = (
-        "N", "error_P", "error_K", "cost_excess", "cost_excess_at_most", "abscissa_full", "time_are", "stable",
-        "certified", "reason",
+        "N", "error_P", "error_K", "cost_excess", "cost_excess_proved", "cost_excess_at_most", "unbounded",
+        "abscissa_full", "time_are", "stable", "certified", "reason",
     )  # fmt: skip
     return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
 
@@ -190,7 +190,10 @@ def radius_of(report: GainReport | BoxPoint) -> float:
 
 
 def _retuned(r: Retuned) -> dict[str, Any]:
-    keys = ("error_K", "cost_excess", "cost_excess_at_most", "abscissa_full", "stable", "reason")
+    keys = (
+        "error_K", "cost_excess", "cost_excess_proved", "cost_excess_at_most", "unbounded", "abscissa_full", "stable",
+        "reason",
+    )  # fmt: skip
     points = [
         {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "sampled_radius": radius_of(p), "time": p.seconds}
         | {key: getattr(p, key) for key in keys}

@@ -88,12 +88,11 @@ def run_control(
         parts, files = sections(study, seconds, drawn), [*drawn, *fields, *saved]
         return Page(title, summary(study), parts, tables(study), files)
 
-    files = session.write(model.scene, result, page)
     if session.comm.rank == 0:
         show(console, study, seconds)
-        list_files(console, files)
-        if restart is not None:
-            shutil.rmtree(restart, ignore_errors=True)
+    list_files(console, session.write(model.scene, result, page))
+    if session.comm.rank == 0 and restart is not None:
+        shutil.rmtree(restart, ignore_errors=True)
     session.comm.Barrier()
     return result
 

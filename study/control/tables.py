@@ -21,7 +21,7 @@ from softgrasp.study.report.tables import Table
 
 Row = tuple[Any, ...]
 SPECTRUM = ("abscissa [1/s]", "radius a tick")
-EXCESS = ("excess cost", "at most (proved)")
+EXCESS = ("excess cost", "proved to the end", "at most")
 REDUCED_HEADER = ("basis", "N", "error of P", "error of K", *EXCESS, *SPECTRUM, "reduced ARE [ms]", "gain")
 BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", *EXCESS, *SPECTRUM, "re-tuned in [ms]", "gain")
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
@@ -141,12 +141,12 @@ def _matrix(values: Array) -> str:
 
 def _fast(r: Retuned) -> str:
     stable = [p for p in r.points if p.stable]
-    largest, proved = (
+    largest, bound = (
         max((getattr(p, key) for p in stable), default=float("nan")) for key in ("cost_excess", "cost_excess_at_most")
     )
     return (
         f"{TITLES[r.name]}, N = {r.N}: {len(stable)} of {len(r.points)} stable, at most {1e3 * r.slowest:.2g} ms, "
-        f"excess cost up to {largest:.1e}, proved at most {proved:.1e}"
+        f"excess cost up to {largest:.1e}, at most {bound:.1e}"
     )
 
 
@@ -165,13 +165,17 @@ def _cells(gain: GainReport | BoxPoint, *values: float) -> list[float | None]:
     return [None if gain.reason or not np.isfinite(x) else float(x) for x in values]
 
 
+def _excess(gain: GainReport | BoxPoint) -> tuple[float, float, float]:
+    return gain.cost_excess, gain.cost_excess_proved, gain.cost_excess_at_most
+
+
 def reduced_table(bases: Sequence[BasisGains]) -> Table:
     """One row a gain; errors of an unusable gain are shown, its cost is not."""
     rows = [
         (
             TITLES[b.name],
             r.N,
-            *_cells(r, r.error_P, r.error_K, r.cost_excess, r.cost_excess_at_most),
+            *_cells(r, r.error_P, r.error_K, *_excess(r)),
             None if r.reason else r.abscissa_full,
             None if r.sampled is None else radius_of(r),
             None if r.reason else 1e3 * r.time_are,
@@ -205,7 +209,7 @@ def box_rows(r: Retuned) -> list[Row]:
         (
             p.materials[0].lam,
             p.materials[0].mu,
-            *_cells(p, p.error_K, p.cost_excess, p.cost_excess_at_most, p.abscissa_full, radius_of(p), 1e3 * p.seconds),
+            *_cells(p, p.error_K, *_excess(p), p.abscissa_full, radius_of(p), 1e3 * p.seconds),
             _mark(p),
         )
         for p in r.points

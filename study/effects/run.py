@@ -153,8 +153,7 @@ def run_effects(
         study = study_effects(scene, comm, lambda done, work: bar.update(task, completed=done, total=work))
     result = {"command": "effects", **origin(scene, comm.size), **study.to_dict()}
     result |= {"memory_peak_mb": peak_memory_mb(comm), "time": {}}
-    files = session.write(scene, result, lambda: compose(study, scene, session))
     if comm.rank == 0:
         show(study, console)
-        list_files(console, files)
+    list_files(console, session.write(scene, result, lambda: compose(study, scene, session)))
     return result

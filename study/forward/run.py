@@ -18,6 +18,7 @@ from softgrasp.study.forward import accuracy
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
+from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.page import Section, equation_text
 from softgrasp.study.report.tables import pairs
@@ -87,10 +88,9 @@ def run_simulate(
         return Page(scene.name, told, sections, tables, [*fields, *drawn])
 
     numbers = result.to_json() | accuracy.keys(mesh_error, run)
-    files = session.write(scene, numbers, page)
     console.print(pairs(rows))
     show_warnings(console, warnings)
-    list_files(console, files)
+    list_files(console, session.write(scene, numbers, page))
     return numbers
 
 
@@ -105,8 +105,6 @@ def _lost(frames: Frames, run: Run) -> str:
 
 
 def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: list[Path]) -> list[Section]:
-    from softgrasp.study.pictures.animation import speed_up  # brings Matplotlib, which only rank 0 needs
-
     scene = result.scene
     faster = speed_up(np.array([0.0, scene.time_end]))
     move = "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed."

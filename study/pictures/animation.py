@@ -17,10 +17,10 @@ from PIL import Image
 from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, legend, make_axes, make_shot, name_layers
+from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.pictures.style import TARGET, colour_map, paper_style
 
 MOST_FRAMES = 60
-SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them the animation runs slower or faster than the move
 TICKS = 2  # shortest time of a frame [1/100 s]; viewers slow down what is shorter
 MOST_BYTES = 3_000_000
 DPI = 110
@@ -55,22 +55,6 @@ def gif_move(
     return write_gif(_render(shot, frames, times), durations, out_gif, _palette())
 
 
-def speed_up(times: Array) -> float:
-    """How many times faster than the move its animation runs: 1 from 0.3 to 30 s, else steps of 1, 2, 5 [1].
-
-    Longer moves are shown in at most 30 s, shorter ones in at least 1 s.
-    """
-    total = float(times[-1] - times[0])
-    if SHORTEST <= total <= LONGEST or total <= 0.0:
-        return 1.0
-    ratio = total / LONGEST if total > LONGEST else total
-    power = 10.0 ** np.floor(np.log10(ratio) + 1e-9)
-    steps = [m * power for m in (1, 2, 5, 10)]
-    if total > LONGEST:
-        return float(next(m for m in steps if m >= ratio * (1 - 1e-9)))
-    return float(max(m for m in steps if m <= ratio * (1 + 1e-9)))
-
-
 def _timing(times: Array) -> tuple[list[int], list[int]]:
     """Frames to show and how long each but the last [1/100 s]; rounding errors do not add up."""
     chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
@@ -89,21 +73,20 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
     images = []
     fast = speed_up(times)
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
-    note = f" ({fast:g}$\\times$)" if fast != 1 else ""
+    note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
         figure, axes = make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
         ax = axes[0]
         # The longest text first, so that all frames have the size of the first.
-        stamp = ax.set_title(f"$t$ = {times[-1]:.{digits}f} s{note}", pad=3)
+        stamp = ax.set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
-        draw_scene(ax, shot, frames[:1], None, shot.hands[:1])
         film = Film(figure, axes, [stamp])
         for i in range(len(frames)):
             film.clear()
             draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
             name_layers(ax, shot, frames[i], inside=True)  # beside the body they would change sides
-            stamp.set_text(f"$t$ = {times[i]:.{digits}f} s{note}")
+            stamp.set_text(f"t = {times[i]:.{digits}f} s{note}")
             images.append(film.frame())
         plt.close(figure)
     return images
@@ -113,18 +96,16 @@ class Film:
     """Frames of one figure: axes, colour bar and legend are drawn once, what moves over them in every frame.
 
     Args:
-        figure: with its first frame, whose size all frames get.
-        axes: whose collections, lines and texts move.
+        figure: without what moves; all frames get its size.
+        axes: whose lines lie under and over the collections and texts that move.
         others: further artists that change.
     """
 
     def __init__(self, figure: Any, axes: list[Any], others: Sequence[Any] = ()) -> None:
         self.figure, self.axes, self.others = figure, axes, others
         figure.set_dpi(DPI)
-        figure.canvas.draw()
-        _fit(figure, figure.get_tightbbox(figure.canvas.get_renderer()).padded(0.08))
-        self.clear()
-        for artist in others:
+        _fit(figure, figure.get_tightbbox().padded(0.08))
+        for artist in (*others, *(line for ax in axes for line in ax.lines)):
             artist.set_animated(True)  # no part of the background
         figure.canvas.draw()
         self.background = figure.canvas.copy_from_bbox(figure.bbox)
@@ -132,7 +113,7 @@ class Film:
     def clear(self) -> None:
         """Remove what moves."""
         for ax in self.axes:
-            for artist in [*ax.collections, *ax.lines, *ax.texts]:
+            for artist in [*ax.collections, *ax.texts]:
                 artist.remove()
 
     def frame(self) -> Any:

@@ -13,11 +13,12 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection, TriMesh
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
+from matplotlib.tri import Triangulation
 
 from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
@@ -29,6 +30,7 @@ from softgrasp.study.pictures.shapes import (
     hand_polygons,
     hands_at,
     interfaces,
+    moved,
     overlap,
     seen,
     shadow,
@@ -46,6 +48,7 @@ from softgrasp.study.pictures.style import (
     length_unit,
     paper_style,
     save,
+    segments,
 )
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
@@ -68,6 +71,7 @@ class Shot:
         unit: factor and name of the unit of the colours.
         low, high: corners of the scene in the plane of the picture, shape (2,) [m].
         hand: polygons of the hand where it starts, each (corners, d); empty in 3D.
+        edges: outline and interfaces of layers in 2D, shape (m, 2); empty in 3D.
         aim: closed lines around the body at the target in the plane of the picture, each (k, 2) [m].
     """
 
@@ -79,6 +83,7 @@ class Shot:
     low: Array
     high: Array
     hand: list[Array]
+    edges: Any
     aim: list[Array]
 
     def values(self, displacement: Array, q_s: Array) -> Array:
@@ -101,14 +106,15 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
     unit = length_unit(largest)
     norm = mpl.colors.Normalize(0.0, unit[0] * largest)
     polygons, grip = hand_polygons(picture) if picture.dimension == 2 else ([], contact_centre(picture))
-    path = np.vstack([grip + picture.rigid(q, grip[None, :]) for q in table[:, 1:]])
+    path = grip + table[:, 1:] @ np.vstack([picture.rigid(unit, grip[None, :]) for unit in np.eye(picture.n_s)])
     boxes = [_box(picture.points + u) for u in states] + [_box(path)]
-    boxes += [_box(p + picture.rigid(q, p)) for p in polygons for q in hands]
+    boxes += [_box(np.vstack(moved(picture, polygons, q))) for q in hands if polygons]
     if aim is not None:
-        boxes += [_box(p + picture.rigid(aim, p)) for p in (picture.points, *polygons)]
+        boxes += [_box(p) for p in moved(picture, [picture.points, *polygons], aim)]
     low, high = _box(np.vstack(boxes))
     lines = [] if aim is None else _outline(picture, picture.points + picture.rigid(aim))
-    return Shot(picture, hands, path, norm, unit, low, high, polygons, lines)
+    edges = np.vstack([picture.facets, interfaces(picture)]) if picture.dimension == 2 else np.zeros((0, 2), dtype=int)
+    return Shot(picture, hands, path, norm, unit, low, high, polygons, edges, lines)
 
 
 def figure_move(
@@ -151,25 +157,22 @@ def figure_move(
 
 
 def draw_scene(ax: Any, shot: Shot, states: Array, times: Array | None, hands: Array) -> None:
-    """Bodies, hand, path, target and, if given, the times beside the bodies on axes from `make_axes`."""
+    """Bodies, hand and, if given, the times beside the bodies on axes from `make_axes`."""
     picture = shot.picture
-    ax.plot(*seen(shot.path).T, ls=DASHES, color=OUTLINE, lw=0.9, zorder=1)
     for i, (u, q) in enumerate(zip(states, hands, strict=True)):
         if picture.dimension == 2:
             _draw_2d(ax, shot, u, q)
         else:
             _draw_3d(ax, shot, u, q)
         if times is not None:
-            hand = [p + picture.rigid(q, p) for p in shot.hand]
-            _caption(ax, shot, _box(seen(np.vstack([picture.points + u, *hand]))), _time(times[i]))
-    for line in shot.aim:
-        ax.plot(*line.T, ls=DOTS, color=TARGET, lw=1.3, zorder=5)
+            whole = np.vstack([picture.points + u, *moved(picture, shot.hand, q)])
+            _caption(ax, shot, _box(seen(whole)), _time(times[i]))
 
 
 def make_axes(
     shot: Shot, panels: int, *, captions: bool, width: float | None = None, tallest: float | None = None
 ) -> tuple[Any, list[Any]]:
-    """Figure and axes of the right shape for the scene; call within `paper_style`.
+    """Figure and axes of the right shape for the scene, with path and target; call within `paper_style`.
 
     Args:
         shot: the move.
@@ -206,6 +209,9 @@ def make_axes(
         ax = figure.add_axes((x / size[0], y / size[1], w / size[0], h / size[1]))
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.append(ax)
+        ax.plot(*seen(shot.path).T, ls=DASHES, color=OUTLINE, lw=0.9, zorder=1)
+        for line in shot.aim:
+            ax.plot(*line.T, ls=DOTS, color=TARGET, lw=1.3, zorder=5)
         if solid:
             ax.set_axis_off()
             continue
@@ -351,13 +357,11 @@ def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     picture = shot.picture
     x = picture.points + u
     if len(picture.cells) <= MANY_CELLS:
-        ax.tripcolor(
-            x[:, 0], x[:, 1], picture.cells, shot.values(u, q), shading="gouraud", cmap=colour_map(),
-            norm=shot.norm, rasterized=True, zorder=2,
-        )  # fmt: skip
-    lines = np.vstack([picture.facets, interfaces(picture)])
-    ax.add_collection(LineCollection(list(x[lines]), colors=OUTLINE, linewidths=0.5, zorder=3), autolim=False)
-    hand = [p + picture.rigid(q, p) for p in shot.hand]
+        look: dict[str, Any] = {"cmap": colour_map(), "norm": shot.norm, "rasterized": True, "zorder": 2}
+        body = TriMesh(Triangulation(x[:, 0], x[:, 1], picture.cells), array=shot.values(u, q), **look)
+        ax.add_collection(body, autolim=False)
+    ax.add_collection(segments(x[shot.edges], edgecolors=OUTLINE, linewidths=0.5, zorder=3), autolim=False)
+    hand = moved(picture, shot.hand, q)
     ax.add_collection(PolyCollection(hand, facecolors=HAND, edgecolors=HAND, linewidths=0.3, zorder=4), autolim=False)
 
 

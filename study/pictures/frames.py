@@ -162,13 +162,13 @@ class Frames:
 
     def draw(self, directory: Path, run: Trajectory) -> list[Path]:
         """Figures and animation; rank 0 only."""
-        from softgrasp.study.pictures.animation import gif_move
+        if self.picture is None or not self.states:
+            return []
+        from softgrasp.study.pictures.animation import gif_move  # these bring Matplotlib
         from softgrasp.study.pictures.body import figure_move
         from softgrasp.study.pictures.traces import figure_traces
 
         scene = self.model.scene
-        if self.picture is None or not self.states:
-            return []
         table = np.column_stack([run.times, run.q_s])
         target = scene.motion.target
         states = np.stack(self.states)

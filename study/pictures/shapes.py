@@ -14,6 +14,7 @@ from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
 
 ELEVATION, AZIMUTH = 18.0, -58.0  # view of 3D scenes [degree]
+SHORTEST, LONGEST = 0.3, 30.0  # [s], beyond them an animation runs slower or faster than the move
 MARGIN = 0.08  # of a body's smaller side, kept free between two bodies of one picture
 
 
@@ -133,6 +134,14 @@ def hand_polygons(picture: PictureMesh) -> tuple[list[Array], Array]:
     return polygons, grip
 
 
+def moved(picture: PictureMesh, polygons: list[Array], q: Array) -> list[Array]:
+    """Polygons that move with the hand."""
+    if not polygons:
+        return []
+    start = np.vstack(polygons)
+    return np.split(start + picture.rigid(q, start), np.cumsum([len(p) for p in polygons[:-1]]))
+
+
 def _offset(x: Array, facets: Any, thick: float) -> tuple[Array, Array]:
     """Outward unit normals of 2D facets, and the vertices moved outward: a pad of even thickness fits between."""
     along = x[facets[:, 1]] - x[facets[:, 0]]
@@ -238,6 +247,22 @@ def subdivision(n: int) -> Array:
     down = [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i in range(n - 1) for j in range(n - 1 - i)]
     ij = np.array(up + down, dtype=np.float64) / n
     return np.concatenate([1.0 - ij.sum(axis=2, keepdims=True), ij], axis=2)
+
+
+def speed_up(times: Array) -> float:
+    """How many times faster than the move its animation runs: 1 from 0.3 to 30 s, else steps of 1, 2, 5 [1].
+
+    Longer moves are shown in at most 30 s, shorter ones in at least 1 s.
+    """
+    total = float(times[-1] - times[0])
+    if SHORTEST <= total <= LONGEST or total <= 0.0:
+        return 1.0
+    ratio = total / LONGEST if total > LONGEST else total
+    power = 10.0 ** np.floor(np.log10(ratio) + 1e-9)
+    steps = [m * power for m in (1, 2, 5, 10)]
+    if total > LONGEST:
+        return float(next(m for m in steps if m >= ratio * (1 - 1e-9)))
+    return float(max(m for m in steps if m <= ratio * (1 + 1e-9)))
 
 
 def move_steps(steps: int, dt: float, settle: float, count: int = 60) -> list[int]:

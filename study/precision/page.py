@@ -82,9 +82,8 @@ def write_study(session: Session, study: WorkStudy, request: Request) -> dict[st
         title = f"{study.scene.name}: accuracy against time"
         return Page(title, summary(study), sections, {"points.csv": points_table(study)}, figures, request.options)
 
-    files = session.write(study.scene, result, page)
     show(session.console, study, commands)
-    list_files(session.console, files)
+    list_files(session.console, session.write(study.scene, result, page))
     comm.Barrier()
     return result
 
@@ -213,8 +212,8 @@ def _how(study: WorkStudy) -> list[tuple[Any, ...]]:
     rows: list[tuple[Any, ...]] = []
     if study.truth is not None:
         rows += [
-            ("error", "max over the run of |y - y*|, over max |y*|; y the outputs against the hand, the deformation"),
-            ("displacement", "the same of the whole displacements, in which the motion of the hand hides the tissue"),
+            ("deform. error", "max over the run of |y - y*|, over max |y*|; y the outputs against the hand"),
+            ("displ. error", "the same of the whole displacements, where the hand's motion hides the tissue"),
             ("places", "the same points of the body on every mesh, not the nearest nodes"),
             ("time of a run", "mesh, assembly, factor and all steps; slowest rank; medians"),
         ]

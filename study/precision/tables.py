@@ -36,10 +36,12 @@ from softgrasp.study.report.tables import Table
 
 HEADERS: dict[str, tuple[str, ...]] = {
     "forward": (
-        "setting", "unknowns", "error", "displacement", "assembly [s]", "factor [s]", "step [us]", "run [s]", "front",
+        "setting", "unknowns", "deform. error", "displ. error", "assembly [s]", "factor [s]", "step [us]",
+        "run [s]", "front",
     ),
     "reduced": (
-        "setting", "N", "error", "state error", "error with the mesh", "online [s]", "from nothing [s]", "front",
+        "setting", "N", "deform. error", "state error", "deform. error with the mesh", "online [s]",
+        "from nothing [s]", "front",
     ),
     "bases": ("engine", "tolerance", "vectors", "left of the snapshots", "|U'U - I|", "time [s]", "front"),
     "riccati": ("method", "tolerance", "gain error", "residual", "rank", "solves", "time [s]", "front"),
@@ -47,8 +49,8 @@ HEADERS: dict[str, tuple[str, ...]] = {
         "basis", "N", "gain error", "excess cost", "abscissa [1/s]", "equation [ms]", "from nothing [s]", "front",
     ),
     "loop": (
-        "controller", "steps", "error", "displacement", "error in time", "error of the cost", "step [us]", "run [s]",
-        "front",
+        "controller", "steps", "deform. error", "displ. error", "error in time", "error of the cost",
+        "step [us]", "run [s]", "front",
     ),
 }  # fmt: skip
 SERIES_TITLES: dict[str, dict[str, str]] = {

@@ -114,10 +114,9 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         title, told = f"{scene.name}: certified reduced model", sentences(certified, result)[:3]
         return Page(title, told, sections(certified, result, drawn), tables, [*drawn, file])
 
-    files = session.write(scene, result, page)
     for sentence in sentences(certified, result):
         console.print(sentence, markup=False)
-    list_files(console, files)
+    list_files(console, session.write(scene, result, page))
     return result
 
 

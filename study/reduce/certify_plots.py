@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, UNSTABLE, WIDTH, few_ticks, paper_style, save
@@ -116,6 +116,7 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
             left.plot(size.k, np.median(values), "_", color=colour, ms=11, mew=1.8)
         left.set(yscale="log", xlabel="modes $k$ of the answer", ylabel="bound / true error")
         left.set_ylim(bottom=0.9)
+        left.xaxis.set_major_locator(MaxNLocator(integer=True))
         left.axhline(1.0, color="#888888", lw=0.9)
         left.set_title(f"green: the model as built, $k = {check.own.k}$, $k_2 = {check.own.k2}$")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
@@ -128,9 +129,9 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
                        label=label)  # fmt: skip
         right.axvline(1e3 * check.full, color="#888888", lw=1.0, ls="-.", label="full run")
         right.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
-        for time, size in zip(times, check.sizes, strict=True):
-            place = (time, size.largest("bound"))
-            right.annotate(f"$k = {size.k}$", place, xytext=(5, 2), textcoords="offset points", fontsize=6.5)
+        for i, (time, size) in enumerate(zip(times, check.sizes, strict=True)):
+            place, beside = (time, size.largest("bound")), (5, -8 if i % 2 else 2)  # neighbours may stand close
+            right.annotate(f"$k = {size.k}$", place, xytext=beside, textcoords="offset points", fontsize=6.5)
         right.set(xscale="log", yscale="log", xlabel="time of an answer [ms]", ylabel="largest relative error")
         right.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(right.xaxis)

@@ -9,7 +9,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -18,10 +17,10 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.reduction.replay import FullRun, replay_linear
-from softgrasp.study.pictures.animation import Film, speed_up, write_gif
+from softgrasp.study.pictures.animation import Film, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
-from softgrasp.study.pictures.shapes import seen, shadow
-from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save
+from softgrasp.study.pictures.shapes import seen, shadow, speed_up
+from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save, segments
 from softgrasp.study.reduce.plots import (
     figure_errors,
     figure_further_errors,
@@ -180,12 +179,12 @@ def _scaled(shapes: Array, largest: float) -> Array:
     return np.asarray(largest * shapes / lengths[:, None, None])
 
 
-def _outline(picture: PictureMesh, displacement: Array) -> Array | list[Array]:
-    """Lines around the body where it is seen."""
+def _outline(picture: PictureMesh, displacement: Array) -> Array:
+    """Short lines around the body where it is seen, (m, 2, 2) [m]."""
     x = picture.points + displacement
     if picture.dimension == 2:
         return np.asarray(x[picture.facets])
-    return shadow(seen(x), picture.facets)
+    return np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in shadow(seen(x), picture.facets)])
 
 
 def _hands(views: Views) -> Array:
@@ -210,7 +209,7 @@ def _draw(ax: Any, shot: Shot, views: Views, view: View, k: int) -> None:
     """One reduced model at one frame under the outline of the full one."""
     q = _hands(views)[k]
     draw_scene(ax, shot, view.states[k : k + 1], None, q[None])
-    lines = LineCollection(list(_outline(views.picture, views.full[k])), zorder=7, **FULL)
+    lines = segments(_outline(views.picture, views.full[k]), zorder=7, edgecolors=ORANGE, linewidths=1.1)
     ax.add_collection(lines, autolim=False)
 
 

@@ -107,9 +107,8 @@ def run_reduce(
         tables = {"points.csv": point_table(study)}
         return Page(f"{scene.name}: reduced models", summary(study), parts, tables, [*files, *models])
 
-    files = session.write(scene, result, page)
     show(console, study)
-    list_files(console, files)
+    list_files(console, session.write(scene, result, page))
     return result
 
 

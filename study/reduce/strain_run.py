@@ -64,12 +64,11 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         title = f"{scene.name}: reduced models at finite strain, {last.points[0].engine} stepper"
         return Page(title, summary(study), sections(study, files), points, [*files, *models])
 
-    files = session.write(scene, result, page)
     for table in (error_table(study), time_table(study), cell_table(study)):
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))
     for sentence in sentences(study):
         session.console.print(sentence, markup=False)
-    list_files(session.console, files)
+    list_files(session.console, session.write(scene, result, page))
     return result
 
 

@@ -12,7 +12,7 @@ from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.report.origin import origin
-from softgrasp.study.report.page import SHOWN, Section
+from softgrasp.study.report.page import SHOWN, Section, shown
 from softgrasp.study.report.tables import Table
 from softgrasp.study.runs.sweep import METHOD, Row, Sweep, parse_axis, run_sweep_points
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
@@ -21,7 +21,7 @@ UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
 COARSE = 0.1  # error of the deformation above which a reduced sweep is warned of
 LAG = "lag: largest distance of an output from where it would be if the tissue moved rigidly with the hand."
 REDUCED = (
-    f"The model is reduced ({METHOD}) at the scene's own material; error: of the deformation against a full run, "
+    f"The model is reduced ({METHOD}) at the scene's own material; error_deformation: against a full run, "
     "measured at the first and the last point."
 )
 
@@ -32,6 +32,22 @@ def sweep_table(rows: list[Row]) -> Table:
     best = sorted({round(i * (len(rows) - 1) / (SHOWN - 1)) for i in range(SHOWN)})
     header = tuple(UNITS.get(key, key) for key in keys)
     return Table(header, [[row.get(key) for key in keys] for row in rows], best=best)
+
+
+def short_table(rows: list[Row], width: int) -> Table:
+    """The keys by their last words, the lags and the error, as many as a terminal has room for."""
+    hidden = {"reason", *UNITS}
+    names = {
+        key: key if " " in key else key.rsplit(".", 1)[-1]
+        for key in dict.fromkeys(key for row in rows for key in row)
+        if " end " not in key and key not in hidden
+    }
+    while len(names) > 1:
+        cells = {key: [*name.split(), *(shown(row.get(key)) for row in rows)] for key, name in names.items()}
+        if sum(1 + max(map(len, texts)) for texts in cells.values()) <= width:
+            break
+        names.popitem()
+    return Table(tuple(names.values()), [[row.get(key) for key in names] for row in rows])
 
 
 def summary(sweep: Sweep, rows: Sequence[Row]) -> list[str]:
@@ -51,11 +67,11 @@ def summary(sweep: Sweep, rows: Sequence[Row]) -> list[str]:
 
 def run_sweep(
     path: Path,
-    axes: list[str],
     out: Path,
     overrides: list[str],
     console: Console,
     *,
+    axes: list[str],
     reduced: int | None = None,
     each: int = 1,
     quiet: bool = False,
@@ -83,7 +99,7 @@ def run_sweep(
         raise SceneError(f"no point of the sweep could be run; the first: {failed[0]['reason']}")
     table = sweep_table(rows)
     notes = [f"{len(failed)} of {len(rows)} points failed: {failed[0]['reason']}"] if failed else []
-    if (worst := max((row.get("error") or 0.0 for row in rows), default=0.0)) > COARSE:
+    if (worst := max((row.get("error_deformation") or 0.0 for row in rows), default=0.0)) > COARSE:
         notes.append(f"The reduced model is off by {worst:.0%} at an end of the sweep; take more columns, --reduced.")
     result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced, "points": rows, "warnings": notes}
 
@@ -98,9 +114,10 @@ def run_sweep(
         options = "".join(f" {text}" for text in axes) + (f" --reduced {reduced}" if reduced else "")
         return Page(f"{scene.name}: sweep", summary(sweep, rows), parts, {"sweep.csv": table}, files, options)
 
-    files = session.write(scene, result, page)
-    short = sweep_table([{k: v for k, v in row.items() if " end " not in k and k not in UNITS} for row in rows])
+    short = short_table(rows, console.width)
     console.print(short.terminal(wrap=range(len(short.header)), width=console.width))
+    if (left := len(rows[0]) - len(short.header)) > 0:
+        console.print(f"{left} more columns are in sweep.csv")
     show_warnings(console, notes)
-    list_files(console, files)
+    list_files(console, session.write(scene, result, page))
     return result

@@ -136,10 +136,10 @@ class Runner:
             raise SceneError(f"--reduced {N}: the reduced model is affine in tissue.material only; sweep its keys")
         begin = MPI.Wtime()
         small = replay_linear(self.rom, model, self.base)
-        row = {**values, **_outputs(self.base, small.outputs), "seconds": MPI.Wtime() - begin, "error": None}
+        seconds, off = MPI.Wtime() - begin, None
         if judged:
-            row["error"] = float(errors_linear(self.rom, small, full_run(model, simulate(model))).error_deformation)
-        return row
+            off = float(errors_linear(self.rom, small, full_run(model, simulate(model))).error_deformation)
+        return {**values, **_outputs(self.base, small.outputs), "seconds": seconds, "error_deformation": off}
 
 
 def _outputs(run: Trajectory, outputs: np.ndarray) -> Row:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,14 @@ def read_result(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return result if isinstance(result, dict) and "command" in result else {}
+
+
+def remove_files(folder: Path, names: Iterable[str]) -> None:
+    """Remove files of a run before, which its result.json names, where they lie in its folder."""
+    for name in names:
+        file = folder / name
+        if file.is_file() and file.resolve().is_relative_to(folder.resolve()):
+            file.unlink()
 
 
 def claim(out: Path, command: str, scene: str, *, path: Path = Path(), empty: bool = False) -> None:

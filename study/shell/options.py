@@ -49,7 +49,7 @@ def _pdf(pdf: bool) -> bool:
 
 Pdf = Annotated[bool, typer.Option("--pdf", help="write figures as PDF too", callback=_pdf)]
 Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
-NoPictures = Annotated[bool, typer.Option("--no-pictures", help="numbers and fields only")]
+Pictures = Annotated[bool, typer.Option(" /--no-pictures", show_default=False, help="numbers and fields only")]
 
 
 def _scenes(start: str) -> list[str]:

@@ -23,7 +23,7 @@ from softgrasp.study.report.files import write_json, write_scene
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.folder import claim
+from softgrasp.study.shell.folder import claim, read_result, remove_files
 
 
 @dataclass(frozen=True)
@@ -124,11 +124,14 @@ class Session:
     def write(
         self, scene: Scene, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True
     ) -> list[Path]:
-        """Write result.json, scene.toml, tables and report.html on rank 0. Collective.
+        """Write result.json and scene.toml, then pictures, tables and report.html on rank 0. Collective.
+
+        Files of the run before in this folder that are not written again are removed.
 
         Args:
             scene: as it was run.
-            result: what result.json holds, equal on all ranks; takes ``time.pictures`` and ``time.total`` on rank 0.
+            result: what result.json holds, equal on all ranks. On rank 0 it takes the names of all ``files``, and the
+                times ``total`` and ``pictures``, with the seconds of CPU of this process.
             page: draws and composes the rest; called on rank 0 only, so it must not communicate.
             clock: add the times.
 
@@ -142,12 +145,11 @@ class Session:
         with agree(self.comm):
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
-                drawing = time.perf_counter()
-                content = page()
-                now = time.perf_counter()
-                if clock:
-                    result.setdefault("time", {}).update(pictures=now - drawing, total=now - self.begin)
+                before = read_result(self.out).get("files", [])
                 files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
+                drawing = time.perf_counter(), time.process_time()
+                content = page()
+                now = time.perf_counter(), time.process_time()
                 files += [table.write_csv(self.out / name) for name, table in content.tables.items()]
                 files += content.files
                 files.append(
@@ -165,6 +167,14 @@ class Session:
                         ),
                     )
                 )
+                if clock:
+                    result.setdefault("time", {}).update(
+                        pictures=now[0] - drawing[0], total=time.perf_counter() - self.begin,
+                        pictures_cpu=now[1] - drawing[1], total_cpu=time.process_time(),
+                    )  # fmt: skip
+                result["files"] = [f.relative_to(self.out).as_posix() for f in files if f.is_relative_to(self.out)]
+                write_json(self.out / "result.json", result)
+                remove_files(self.out, set(before) - set(result["files"]))
         return files
 
 

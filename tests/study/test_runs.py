@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from pathlib import Path
 
@@ -14,16 +15,17 @@ from rich.console import Console
 
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.runs import sweep as sweep_module
 from softgrasp.study.runs.listing import compare, run_compare, runs_below
-from softgrasp.study.runs.run import run_sweep
+from softgrasp.study.runs.run import run_sweep, short_table
 from softgrasp.study.runs.start import SCHEMA, materials_table, new_scene
 from softgrasp.study.runs.sweep import parse_axis
 from softgrasp.study.shell.schema import full_schema
 
 SMALL = ["tissue.cells=[3,6]", "time.steps=60"]
-SCENE = sg.shipped_scenes()["paper_forward"]
+SCENE = shipped_scenes()["paper_forward"]
 QUIET = Console(quiet=True)
 
 
@@ -39,7 +41,7 @@ def test_a_sweep_says_its_values_or_its_form() -> None:
 @pytest.mark.ranks(2)
 def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     axes = ["tissue.material.mu=20:500:3", "time.steps=60,80"]
-    result = run_sweep(SCENE, axes, mpi_tmp_path, SMALL[:1], QUIET, quiet=True, pictures=False)
+    result = run_sweep(SCENE, mpi_tmp_path, SMALL[:1], QUIET, axes=axes, quiet=True, pictures=False)
     assert len(result["points"]) == 6
     for row in result["points"]:
         mu, steps = row["tissue.material.mu"], row["time.steps"]
@@ -50,9 +52,16 @@ def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeyp
         # with_materials adds matrices in another order than assembly: rounding, carried by the steps
         assert row["tip_x end [m]"] == pytest.approx(run.outputs[-1, 0], rel=1e-9)
         assert row["tip_x lag [m]"] == pytest.approx(np.abs(run.outputs - run.outputs_rigid)[:, 0].max(), rel=1e-9)
+    together = run_sweep(
+        SCENE, mpi_tmp_path / "each", [*SMALL[:1], "time.steps=60"], QUIET, axes=axes[:1],
+        each=MPI.COMM_WORLD.size, quiet=True, pictures=False,
+    )  # fmt: skip
+    for alone, row in zip(result["points"][::2], together["points"], strict=True):
+        assert row["tip_x lag [m]"] == pytest.approx(alone["tip_x lag [m]"], rel=1e-9)  # rounding, as above
     monkeypatch.setattr(sweep_module.Runner, "row", lambda *_: pytest.fail("it was there already"))
     assert (
-        run_sweep(SCENE, axes, mpi_tmp_path, SMALL[:1], QUIET, quiet=True, pictures=False)["points"] == result["points"]
+        run_sweep(SCENE, mpi_tmp_path, SMALL[:1], QUIET, axes=axes, quiet=True, pictures=False)["points"]
+        == result["points"]
     )
 
 
@@ -60,19 +69,45 @@ def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeyp
 def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path: Path) -> None:
     axes = ["tissue.material.mu=40,-1,60"]
     with pytest.raises(SceneError, match="must be > 0"):
-        run_sweep(SCENE, axes, tmp_path, SMALL, QUIET, quiet=True, reduced=20)
+        run_sweep(SCENE, tmp_path, SMALL, QUIET, axes=axes, quiet=True, reduced=20)
     axes = ["tissue.material.mu=40:60:3"]
-    result = run_sweep(SCENE, axes, tmp_path, SMALL, QUIET, quiet=True, reduced=20)
+    result = run_sweep(SCENE, tmp_path, SMALL, QUIET, axes=axes, quiet=True, reduced=20)
     first, middle, last = result["points"]
-    assert middle["error"] is None
+    assert middle["error_deformation"] is None
     for row in (first, last):
         full = sg.simulate(sg.build("paper_forward", [*SMALL, f"tissue.material.mu={row['tissue.material.mu']}"]))
-        assert 0 < row["error"] < 0.05
+        assert 0 < row["error_deformation"] < 0.05
         assert row["tip_x end [m]"] == pytest.approx(full.outputs[-1, 0], abs=0.05 * np.abs(full.outputs[:, 0]).max())
     assert (tmp_path / "sweep.png").stat().st_size > 5000
-    failed = run_sweep(SCENE, ["output.memory=1e3,1e-9"], tmp_path / "b", SMALL, QUIET, quiet=True, pictures=False)
+    failed = run_sweep(SCENE, tmp_path / "b", SMALL, QUIET, axes=["output.memory=1e3,1e-9"], quiet=True, pictures=False)
     assert "reason" not in failed["points"][0]
     assert "reason" in failed["points"][1]
+
+
+def test_the_table_of_a_sweep_fits_into_a_terminal() -> None:
+    outputs = {f"tip_{x} {what} [m]": 0.123456 for what in ("lag", "end") for x in "xyz"}
+    rows = [{"tissue.material.mu": 20.0, **outputs, "energy_drift": 1.2e-15, "seconds": 1.1e-3}] * 2
+    for width, kept in ((80, 3), (20, 2)):
+        table = short_table(rows, width)
+        assert table.header == ("mu", "tip_x lag [m]", "tip_y lag [m]", "tip_z lag [m]")[: 1 + kept]
+        console = Console(width=width, file=io.StringIO())
+        console.print(table.terminal(wrap=range(1 + kept), width=width))
+        assert "…" not in console.file.getvalue()
+
+
+@pytest.mark.serial
+def test_a_run_removes_what_the_run_before_left(tmp_path: Path) -> None:
+    first = run_simulate(SCENE, tmp_path, SMALL, QUIET, quiet=True, pictures=False)
+    assert {"result.json", "fields.pvd", "report.html"} <= set(first["files"])
+    for name in ("old.csv", "mine.txt", "../outside.txt"):
+        (tmp_path / name).write_text("x")
+    named = first | {"files": [*first["files"], "old.csv", "../outside.txt"]}
+    (tmp_path / "result.json").write_text(json.dumps(named))
+    again = run_simulate(SCENE, tmp_path, [*SMALL, "output.fields='none'"], QUIET, quiet=True, pictures=False)
+    there = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert there == {*again["files"], "mine.txt"}
+    assert (tmp_path / "../outside.txt").exists()
+    assert again["time"]["pictures_cpu"] < again["time"]["total_cpu"]
 
 
 @pytest.mark.serial
@@ -129,4 +164,4 @@ def test_materials_have_sources() -> None:
 def test_the_schema_beside_the_shipped_scenes_is_current() -> None:
     shipped = json.loads((SCENE.parent / SCHEMA).read_text())
     assert shipped == full_schema(), f"write it again: softgrasp schema > demos/scenes/{SCHEMA}"
-    assert all(path.read_text().startswith(f"#:schema ./{SCHEMA}\n") for path in sg.shipped_scenes().values())
+    assert all(path.read_text().startswith(f"#:schema ./{SCHEMA}\n") for path in shipped_scenes().values())

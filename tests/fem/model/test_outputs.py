@@ -37,6 +37,18 @@ def test_the_node_that_is_taken_is_named(comm: MPI.Intracomm, point: list[float]
     assert output.place == place
 
 
+def test_the_free_end_taken_without_outputs_says_what_it_ties_with(comm: MPI.Intracomm) -> None:
+    """Held on its left side, the body is farthest at its lower right corner alone; held on two, at both corners."""
+    places = []
+    for sides in (["left"], ["left", "right"]):
+        scene = make_scene({"contact": {"sides": sides}})
+        places.append(make_outputs(scene, build(scene, comm=comm).system)[0].place)
+    assert places == [
+        "node (1, 0), the free one farthest from the hand",
+        "node (0, 0), one of the 2 free ones farthest from the hand",
+    ]
+
+
 TURN = {"effects": {"rotation": True}, "motion": {"target": [0.3, 0.2, 0.1]}}
 TURN_3D = CUBE | {"effects": {"rotation": True}}
 

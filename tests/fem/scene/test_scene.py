@@ -146,6 +146,8 @@ REFUSED: list[tuple[Path, list[str], str]] = [
         "layers.a.beta needs",
     ),
     (PAPER, ["contact={}"], "contact.sides, box or facet_tag must be given"),
+    (PAPER, ["tissue.cells=4,8"], "'4,8' is not a TOML value; write [4,8]"),
+    (PAPER, ["contact.sides='left'"], 'write sides = ["left", "right"]'),
     (PAPER, ["contact.sides=[lft]"], "--set contact.sides=[lft]: '[lft]' is not a TOML value"),
     (PAPER, ["contact.sides=['lft']"], "contact.sides.0 is \"lft\"; it must be 'x-', 'x+'"),
     (PAPER, ["contact.sides=['front']"], "contact.sides has 'front'; a 2D tissue has no such side"),

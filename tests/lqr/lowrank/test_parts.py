@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import psutil
 import pytest
@@ -14,10 +16,12 @@ from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.modal import relative_space
 from softgrasp.lqr.lowrank.adjoint import closed_adjoint, make_right
 from softgrasp.lqr.lowrank.compress import compress
-from softgrasp.lqr.lowrank.galerkin import frequencies
+from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin, frequencies
 from softgrasp.lqr.lowrank.line_search import best_step, mixed_residual
 from softgrasp.lqr.lowrank.modal_start import modal_start
+from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.shifted import make_shifted
 from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue
 from softgrasp.lqr.lowrank.shifts import ShiftRange, choose_shifts, energy_products, ritz_pairs
@@ -189,6 +193,24 @@ def test_line_search_finds_the_minimum_of_the_dense_residual(comm: MPI.Intracomm
     mixed, weights = mixed_residual((blocks[0], signs), blocks[1], blocks[2], t)
     whole = np.vstack(comm.allgather(mixed.tall))
     assert np.linalg.norm((whole * weights) @ whole.T) == pytest.approx(residual(t))
+
+
+@pytest.mark.parametrize("solver", [NewtonADI(), RADI(), StructuredGalerkin()], ids=lambda s: type(s).__name__)
+def test_what_decides_has_the_same_bits_where_ranks_round_differently(
+    comm: MPI.Intracomm, solver: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A library whose small dense results differ by rounding from rank to rank: other processors, other alignment."""
+    problem = problem_of("two_way")
+    for name in ("norm", "eigvalsh", "cholesky"):
+        call = getattr(np.linalg, name)
+        monkeypatch.setattr(np.linalg, name, lambda *a, call=call, **k: call(*a, **k) * (1 + 1e-15 * comm.rank))
+    whole = np.sum
+    monkeypatch.setattr(np, "sum", lambda *a, **k: whole(*a, **k) * (1 + 1e-15 * comm.rank))
+    solution = solver.solve(problem)
+    U, W, change = (Block(np.zeros((0, 2)), np.random.default_rng(i).standard_normal((4, 2))) for i in range(3))
+    decided = (Plant(problem).scale, solution.residual, *best_step(comm, (U, np.ones(2)), W, change))
+    assert len(set(comm.allgather(decided))) == 1
+    assert len(set(comm.allgather((solution.factor.columns, solution.counts["solves"])))) == 1
 
 
 def test_frequencies_fill_the_range() -> None:

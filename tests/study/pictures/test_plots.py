@@ -15,9 +15,17 @@ from PIL import Image, ImageChops
 
 from softgrasp.fem.columns import OutputColumn
 from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.study.pictures.animation import gif_move, speed_up
+from softgrasp.study.pictures.animation import gif_move
 from softgrasp.study.pictures.body import figure_move
-from softgrasp.study.pictures.shapes import hand_polygons, overlap, pick_instants, seen, shadow, view_direction
+from softgrasp.study.pictures.shapes import (
+    hand_polygons,
+    overlap,
+    pick_instants,
+    seen,
+    shadow,
+    speed_up,
+    view_direction,
+)
 from softgrasp.study.pictures.traces import figure_traces
 from softgrasp.study.report.page import Section, write_report
 from tests.helpers.models import make_scene

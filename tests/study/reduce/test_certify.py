@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
+from softgrasp.reduction.archive import load
 from softgrasp.reduction.certified.archive import load_certified
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.study.reduce.run import run_reduce
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"
@@ -62,12 +65,28 @@ def test_one_that_cannot_be_reached_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.serial
 def test_off_makes_no_residual(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a certificate nothing of it is made or imported by a reduction."""
+    """Without a certificate nothing of it is imported, stands in a model, its file or result.json."""
+    import gc
     import sys
 
+    import h5py
+
+    monkeypatch.setattr("softgrasp.reduction.certified.residual.ResidualSpace.__init__", None)  # cannot be made
     for name in [name for name in sys.modules if name.startswith("softgrasp.reduction.certified")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delitem(sys.modules, "softgrasp.study.reduce.certify", raising=False)
-    options = ["reduction.N=[6]", "reduction.methods=['craig_bampton']", "reduction.train=[]"]
+    gc.collect()
+    before = {id(x) for x in gc.get_objects()}
+    options = ["reduction.N=[14]", "reduction.methods=['craig_bampton']", "reduction.train=[]"]
     run_reduce(PAPER, tmp_path, [*SMALL[:2], *options], Console(quiet=True), quiet=True, pictures=False)
     assert not [name for name in sys.modules if name.startswith("softgrasp.reduction.certified")]
+    new = (type(x) for x in gc.get_objects() if id(x) not in before)
+    assert not [t for t in new if t.__module__.startswith("softgrasp.reduction.certified")]
+    assert {"certified", "tests"}.isdisjoint(json.loads((tmp_path / "result.json").read_text()))
+    (path,) = (tmp_path / "models").glob("*.h5")
+    with h5py.File(path) as file:
+        assert set(file) <= {"parts", "outputs", "gravity", "lift"}
+    model = load(path)
+    # triangles of residuals would have 2 + 3 k = 17 rows
+    assert max(n for part in model.parts.values() for n in part.shape[-2:]) <= model.N == 14
+    assert set(vars(model)) == {f.name for f in fields(ReducedModel)}
