@@ -131,7 +131,7 @@ class ControlStudy:
 def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
     return gain_result(study.design, study.controller, study.tick, study.notes, seconds) | {
-        "reduced": {b.name: [report_dict(r) for r in b.reports] for b in study.bases},
+        "reduced": {b.name: [report_dict(r) | bounds_dict(r) for r in b.reports] for b in study.bases},
         "refused": {b.name: b.refused for b in study.bases if b.refused},
         "retune": [_retuned(r) for r in study.retuned],
         "loop": _loop(study),
@@ -177,11 +177,13 @@ def gain_result(
 
 def report_dict(report: GainReport) -> dict[str, Any]:
     """One point of result.json."""
-    keys = (
-        "N", "error_P", "error_K", "cost_excess", "cost_excess_proved", "cost_excess_at_most", "unbounded",
-        "abscissa_full", "time_are", "stable", "certified", "reason",
-    )  # fmt: skip
+    keys = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
     return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
+
+
+def bounds_dict(report: GainReport | BoxPoint) -> dict[str, Any]:
+    """Bounds on the excess cost, and why there is none."""
+    return {key: getattr(report, key) for key in ("cost_excess_proved", "cost_excess_at_most", "unbounded")}
 
 
 def radius_of(report: GainReport | BoxPoint) -> float:
@@ -190,13 +192,11 @@ def radius_of(report: GainReport | BoxPoint) -> float:
 
 
 def _retuned(r: Retuned) -> dict[str, Any]:
-    keys = (
-        "error_K", "cost_excess", "cost_excess_proved", "cost_excess_at_most", "unbounded", "abscissa_full", "stable",
-        "reason",
-    )  # fmt: skip
+    keys = ("error_K", "cost_excess", "abscissa_full", "stable", "reason")
     points = [
         {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "sampled_radius": radius_of(p), "time": p.seconds}
         | {key: getattr(p, key) for key in keys}
+        | bounds_dict(p)
         for p in r.points
     ]
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}

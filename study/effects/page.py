@@ -214,4 +214,4 @@ def show(study: EffectsStudy, console: Console) -> None:
     for name, proof in proofs.items():
         if not proof.holds:
             lost = [key for key, same in zip(PROOFS, astuple(proof), strict=True) if not same]
-            say(f"{name} is not shown to cost nothing: {', '.join(lost)} differ.")
+            say(f"{name} is not shown to cost nothing: {', '.join(lost)} not the same.")

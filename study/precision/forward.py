@@ -27,6 +27,7 @@ from softgrasp.study.precision.settings import (
 
 SHARES = (2.0, 1.0, 0.5, 0.25, 0.125)  # of the scene's steps
 CG_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
+SLOW_SECONDS = 30.0  # of a run by CG, after which no tighter tolerance is tried
 FINEST = 3  # even meshes, or numbers of steps, behind a slope: coarser ones may not resolve ends or motion
 CLEAR = 2.0  # times the error of the reference, from which on an error has an order
 
@@ -47,9 +48,9 @@ def mesh_series(scene: Scene, d: int) -> list[list[Setting]]:
     return series
 
 
-def solver_settings(scene: Scene) -> list[Setting]:
-    """Every solver on the scene's own mesh and steps."""
-    base = replace(scene_setting(scene), solver="auto")
+def solver_settings(scene: Scene, steps: int | None = None) -> list[Setting]:
+    """Every solver on the scene's own mesh, at its own steps unless others are given."""
+    base = replace(scene_setting(scene), solver="auto", steps=steps or scene.time.steps)
     solvers = [replace(base, solver=name) for name in ("cholesky", "mumps")]
     return solvers + [replace(base, solver="cg", rtol=rtol) for rtol in CG_TOLERANCES]
 
@@ -95,28 +96,33 @@ def orders(scene: Scene, ends: Ends, d: int) -> dict[tuple[int, bool], float]:
 def _points(runs: FullRuns, truth: Truth) -> Iterator[ForwardPoint]:
     """Graded meshes and the scene's own with all numbers of steps, even ones with few. Collective."""
     scene, d = runs.scene, runs.dimension
+    own = own_setting(scene)
     counts = step_counts(scene.time.steps, least_steps(scene))
     for line in mesh_series(scene, d):
         sizes: list[int] = []
         for setting in line:
-            own = setting.group == own_setting(scene).group
+            scenes = setting.group == own.group
             few = runs.run(setting)
             if few.n_e in sizes:  # a tolerance that changes nothing
                 continue
             sizes.append(few.n_e)
-            quick = [n for n in counts if few.n_e * n <= POINT_WORK[d] or (own and n <= scene.time.steps)]
+            quick = [n for n in counts if few.n_e * n <= POINT_WORK[d] or (scenes and n <= scene.time.steps)]
             most = runs.run(replace(setting, steps=quick[0])) if quick and few.steps < quick[0] else few
             yield to_point(replace(setting, steps=most.steps), most, truth)
-            for n in counts if own or setting.refine != "off" else ():
+            for n in counts if scenes or setting.refine != "off" else ():
                 if n < most.steps:
                     fewer = replace(setting, steps=n)
                     yield to_point(fewer, runs.run(fewer), truth, most)
             if few.n_e * few.steps > POINT_WORK[d]:
                 break
-    usual = runs.run(own_setting(scene)).series
-    for setting in solver_settings(scene):
+    n_e = runs.run(own).n_e
+    steps = next((n for n in counts if n <= own.steps and n_e * n <= POINT_WORK[d]), counts[-1])
+    usual = runs.run(replace(own, steps=steps)).series
+    for setting in solver_settings(scene, steps):
         run = runs.run(setting)
         yield replace(to_point(setting, run, truth), error_solver=errors_of(run.series, usual)[0])
+        if setting.solver == "cg" and run.seconds > SLOW_SECONDS:
+            break
 
 
 def on_meshes(points: Sequence[ForwardPoint]) -> dict[str, list[ForwardPoint]]:

@@ -206,7 +206,7 @@ class RiccatiPoint(WorkPoint):
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedRiccatiPoint(WorkPoint):
-    """A reduced gain on the full plant; the attributes not named here are those of ``lqr``'s GainReport.
+    """A reduced gain on the full plant; what is not named here is as in the GainReport of ``lqr``, without its bounds.
 
     Attributes:
         time_lift: seconds to project the equation and to lift its gain.
@@ -220,7 +220,6 @@ class ReducedRiccatiPoint(WorkPoint):
     error_P: float  # noqa: N815
     error_K: float  # noqa: N815
     cost_excess: float
-    cost_excess_at_most: float
     abscissa_full: float
     time_are: float
     stable: bool

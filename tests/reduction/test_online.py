@@ -284,5 +284,5 @@ def test_files_that_do_not_fit_are_refused(comm: MPI.Intracomm, mpi_tmp_path: Pa
         load(bad)
     bare = mpi_tmp_path / f"bare{comm.rank}.h5"
     save(load(path), bare)
-    with pytest.raises(ModelError, match="no lift"):
+    with pytest.raises(ModelError, match="no basis on the mesh"):
         load(bare, model.system.layout)

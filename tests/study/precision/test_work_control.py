@@ -148,8 +148,8 @@ def test_excess_cost_is_what_the_closed_loop_pays(result: dict[str, Any]) -> Non
 def test_unstable_gains_are_marked_and_never_on_the_front() -> None:
     good = ReducedRiccatiPoint(
         "pod", "POD", 1e-3, 1e-2, method="pod", N=8, error_P=1e-2, error_K=1e-2, cost_excess=0.1,
-        cost_excess_at_most=0.2, abscissa_full=-0.4, time_are=1e-3, stable=True, certified=True, reason="",
-        sampled_radius=0.9, time_lift=0.0, time_basis=0.0, scratch=1.0,
+        abscissa_full=-0.4, time_are=1e-3, stable=True,
+        certified=True, reason="", sampled_radius=0.9, time_lift=0.0, time_basis=0.0, scratch=1.0,
     )  # fmt: skip
     bad = replace(good, seconds=1e-4, error=1e-9, ok=False, cost_excess=np.inf, abscissa_full=0.4, stable=False)
     assert [r[-1] for r in question_table("reduced_riccati", [bad, good]).rows] == ["unstable", "*"]
