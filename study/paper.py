@@ -33,8 +33,7 @@ FIGURES = (
     ("forward/move.png", "Figure 2: forward simulation of the coupled problem, full model."),
     (
         "forward/mesh_error.png",
-        "What the mesh of the paper leaves of the deformation: tip against the hand on it, and corrected by the "
-        "estimate.",
+        "The error of the deformation on the paper's mesh: tip against the hand on it, and corrected by the estimate.",
     ),
     ("accurate/mesh_error.png", "The same on the graded mesh of paper_accurate, where both lie on each other."),
     ("reduce/compare.png", "Figure 2: the reduced motion against the full one."),
@@ -96,7 +95,7 @@ def _error(point: dict[str, Any]) -> float:
 
 
 def mesh_rows(forward: dict[str, Any], accurate: dict[str, Any]) -> list[Row]:
-    """What the mesh leaves of the deformation, on the paper's and on the graded one."""
+    """The error of the deformation, on the paper's and on the graded one."""
     here = [
         f"about {percent(error['estimate'])} (bound {percent(error['bound'])}) at n_e = {error['n_e']} in "
         f"{number(result['time']['factor'] + result['time']['steps'], ' s')}"

@@ -366,16 +366,14 @@ def _run_segments(run: Run, ts: Any, options: RunOptions, stop: list[bool]) -> N
     boundaries, frames, checkpoints = _boundaries(run, options)
     if options.frame is not None and run.reached == 0:
         options.frame(run)
-    if run.reached == 0:
-        run.take(ts, 1, check=True)
-        run.store.flush(1)
-        run.residual_first = run.residual_last
     last, chunk = boundaries[-1], 1
     while run.reached < last:
         limit = next(b for b in boundaries if b > run.reached)
         begin, before = time.perf_counter(), run.reached
         goal = min(limit, run.reached + chunk, run.store.limit(run.reached))
-        run.take(ts, goal, check=goal == run.steps)
+        run.take(ts, goal, check=before == 0 or goal == run.steps)
+        if before == 0:
+            run.residual_first = run.residual_last
         pace = (time.perf_counter() - begin) / (run.reached - before)
         run.store.flush(run.reached)
         if run.reached in run.milestones:

@@ -44,7 +44,7 @@ def with_bounds[Judged: (GainReport, BoxPoint)](
         every = [*laws.values(), solution.gain]  # the last has the best lower bound of the least cost
         gaps = duality_gaps(problem, every, start, plan.dt, plan.steps, solution.factor, notify)
         for i, gap in zip(laws, gaps[:-1], strict=True):
-            forever = (1 + gains[i].cost_excess) * gaps[-1].cost / gap.least - 1
+            forever = (1 + gains[i].cost_excess) * gaps[-1].cost / gap.least - 1 if gap.least > 0 else float("inf")
             most = max(gap.cost_excess_at_most, forever)
             gains[i] = replace(gains[i], cost_excess_at_most=most, cost_excess_proved=gap.cost_excess_proved)
     return gains

@@ -31,6 +31,7 @@ class MeshReport:
     ends: tuple[EndReport, ...]  # singular ends by kind and exponent, the strongest first
     order: float  # expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1]
     graded: bool  # whether cells shrink towards the ends
+    first: bool  # whether a run may refine this mesh further
     # estimate, bound: relative error of the deformation [1]; None where the estimate costs more than a second
     estimate: float | None
     bound: float | None
@@ -54,7 +55,8 @@ def mesh_report(model: Model) -> MeshReport:
     order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
     error = judge(model, 0.0, False)[0]
     values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
-    return MeshReport(kinds, order, graded, *values)
+    first = refine is not None and refine.tolerance is not None and refine.passes > 0
+    return MeshReport(kinds, order, graded, first, *values)
 
 
 def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
@@ -71,6 +73,8 @@ def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
         lines.append(
             f"The cells are even: outputs converge with the order {report.order:.2g} in h, whatever tissue.order is."
         )
+    if report.first:
+        lines.append("This is the first mesh: simulate may refine it further, to meet tissue.refine.tolerance.")
     if report.estimate is not None and report.bound is not None and report.time_error is not None:
         lines.append(
             f"The deformation is about {percent(report.estimate)} off on this mesh (bound {percent(report.bound)}) and "

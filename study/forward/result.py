@@ -144,7 +144,8 @@ class Simulation:
             i = int(lag.argmax())
             texts.append(
                 f"The output {run.columns[i].label} leaves the rigid motion of the hand by up to {lag[i]:.3g} "
-                f"{run.columns[i].unit} and by {abs(run.outputs[-1, i] - run.outputs_rigid[-1, i]):.3g} at the end."
+                f"{run.columns[i].unit} and by {abs(run.outputs[-1, i] - run.outputs_rigid[-1, i]):.3g} "
+                f"{run.columns[i].unit} at the end."
             )
         texts.append(
             f"The {run.steps_timed} steps of {sizes.n_e} unknowns took {run.seconds['steps']:.3g} s; the energy "

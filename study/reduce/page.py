@@ -21,7 +21,7 @@ from softgrasp.study.report.page import Section
 
 CAPTIONS = {
     "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
-    "is broken where its model is unstable (crosses). Errors above 1 are drawn at 1.",
+    "is dotted where its model is unstable (crosses). Errors above 1 are drawn at 1.",
     "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
     "errors_state.png": "Further errors of the paper's six methods: of the state [q_s, v_s, q_e, v_e], which is the "
     "paper's, of [q_s, p_s, q_e, p_e], and of the energy of the tissue.",

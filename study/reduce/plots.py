@@ -77,7 +77,7 @@ def further_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
 
 
 def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...]:
-    """Error of the deformation against N; a curve is broken where its model is unstable."""
+    """Error of the deformation against N; a curve is dotted where its model is unstable."""
     look = looks(sweeps)
     with paper_style():
         figure, ax = plt.subplots(figsize=(COLUMN + 1.6, 3.4))
@@ -215,7 +215,7 @@ def log_axis(ax: Any, top: float | None = 1.6 * TOP) -> None:
 
 
 def _crosses(ax: Any, s: Sweep, at: Sequence[float], key: str, colour: str) -> None:
-    """Faint marks of the unstable models, where the curve is broken."""
+    """Faint marks of the unstable models, where the curve is dotted."""
     bad = [i for i, p in enumerate(s.points) if not p.stable]
     ax.plot([at[i] for i in bad], _values(s.points, key)[bad], **CROSS, color=colour, zorder=1)
 
@@ -224,7 +224,7 @@ def _remarks(sweeps: Sequence[Sweep]) -> list[Line2D]:
     """What a legend says of unstable models and of errors beyond the frame, where there are any."""
     entries = []
     if any(not p.stable for s in sweeps for p in s.points):
-        entries.append(Line2D([], [], **CROSS, color=OUTLINE, label="unstable, the curve is broken"))
+        entries.append(Line2D([], [], **CROSS, color=OUTLINE, label="unstable: the curve is dotted"))
     if any(not p.error_deformation <= TOP for s in sweeps for p in s.points):
         entries.append(Line2D([], [], ls="", label=f"above {TOP:g} is drawn at {TOP:g}"))
     return entries

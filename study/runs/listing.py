@@ -117,6 +117,20 @@ def _traces(a: Path, b: Path) -> tuple[list[str], np.ndarray, np.ndarray] | None
     return shared, columns[0], columns[1]
 
 
+def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
+    """How far two trajectories are from each other, in one sentence; nothing where there are not two."""
+    if traces is None:
+        return ""
+    names, a, b = traces
+    if a.shape != b.shape or not np.allclose(a[:, 0], b[:, 0]):
+        return "The trajectories have other time steps; the picture shows both."
+    most: dict[str, float] = {}
+    for name, size in zip(names[1:], np.abs(a - b).max(axis=0)[1:], strict=True):
+        unit = name.rpartition("[")[2].rstrip("]")
+        most[unit] = max(most.get(unit, 0.0), float(size))
+    return f"The trajectories differ by at most {' and '.join(f'{size:.2g} {unit}' for unit, size in most.items())}."
+
+
 def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool = True, empty: bool = False) -> None:
     """Print how two runs differ, and write compare.csv, result.json and a picture. Not collective.
 
@@ -131,6 +145,8 @@ def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool
         console.print(Table(table.header, table.rows[:SHOWN]).terminal(wrap=(0, 1, 2)) if table.rows else none)
     if len(numbers.rows) > SHOWN:
         console.print(f"{len(numbers.rows) - SHOWN} more numbers are in compare.csv")
+    if distance := apart(comparison.traces):
+        console.print(distance)
     result: dict[str, Any] = {"command": "compare", "scene": f"{a.name} {b.name}", "a": str(a), "b": str(b)}
     result |= {"keys": [list(row) for row in keys.rows], "numbers": [list(row) for row in numbers.rows]}
     files = [write_json(out / "result.json", result), numbers.write_csv(out / "compare.csv")]
@@ -154,12 +170,13 @@ def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool
             summary=[
                 f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows), 'number')} of the results differ.",
                 f"{'; '.join(first) or 'The scenes are the same'}.",
+                *([distance] if distance else []),
             ],
             sections=[
                 Section(
                     "", figures=[(file, "A and B, and their difference.") for file in drawn if file.suffix == ".png"]
                 ),
-                keys.section(title="Keys of the scene"),
+                *([keys.section(title="Keys of the scene")] if keys.rows else []),
                 numbers.section(title="Numbers of result.json"),
             ],
             reproduce=command_line("compare", a, [], 1, f" {b}"),

@@ -18,7 +18,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.runs import sweep as sweep_module
-from softgrasp.study.runs.listing import compare, run_compare, runs_below
+from softgrasp.study.runs.listing import apart, compare, run_compare, runs_below
 from softgrasp.study.runs.run import run_sweep, short_table
 from softgrasp.study.runs.start import SCHEMA, materials_table, new_scene
 from softgrasp.study.runs.sweep import parse_axis
@@ -123,6 +123,10 @@ def test_two_runs_are_listed_and_compared(tmp_path: Path) -> None:
     assert numbers["output_final[0]"][:2] == tuple(r["output_final"][0] for r in results)
     assert "n_e" not in numbers
     assert not compare(tmp_path / "a", tmp_path / "a").numbers.rows
+    assert apart(compare(tmp_path / "a", tmp_path / "a").traces) == "The trajectories differ by at most 0 m."
+    assert apart((["t [s]", "x [m]", "turn [rad]"], np.eye(3), np.diag([1.0, 3.0, -1.0]))) == (
+        "The trajectories differ by at most 2 m and 2 rad."
+    )
     run_compare(tmp_path / "a", tmp_path / "b", tmp_path / "c", QUIET)
     assert (tmp_path / "c" / "compare.png").stat().st_size > 5000
     with (tmp_path / "c" / "compare.csv").open(newline="") as file:
