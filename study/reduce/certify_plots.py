@@ -79,8 +79,8 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
         left.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
         left.set(xlabel="modes $k$", ylabel="relative bound")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
-        low = min([*bound[known], tolerance])
-        left.set_ylim(low / 2, max(1.3, 1.3 * float(max(bound[known], default=0.0))))
+        shown = np.maximum([*bound[known], tolerance], LEAST)  # a bound of 0, where nothing moves, has no logarithm
+        left.set_ylim(shown.min() / 2, max(1.3, 1.3 * float(shown.max())))
         few_ticks(left.yaxis)
         left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
         places: dict[tuple[float, float], list[int]] = {}
