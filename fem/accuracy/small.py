@@ -106,7 +106,7 @@ def small_model(model: Model, solve: Solve, blocks: int = BLOCKS) -> Small:
     outputs = make_outputs(model.scene, system)
     C = output_columns(outputs, system.layout.n_local)
     X = solve(np.hstack([system.G, C]))
-    V = KV = np.zeros((len(X), 0))
+    V = K_V = np.zeros((len(X), 0))
     last = X
     for k in range(blocks):
         if k:
@@ -114,14 +114,14 @@ def small_model(model: Model, solve: Solve, blocks: int = BLOCKS) -> Small:
         for _ in range(2):  # once is not enough where blocks are nearly dependent
             K_last = times_columns(system.K_ee, last)
             known = total(comm, V.T @ K_last)
-            last, K_last = last - V @ known, K_last - KV @ known
+            last, K_last = last - V @ known, K_last - K_V @ known
             gram = total(comm, last.T @ K_last)
             scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
             squares, Q = np.linalg.eigh((gram + gram.T) / 2 / np.outer(scale, scale))
             kept = squares > DROPPED
             Q = comm.bcast((Q[:, kept] / np.sqrt(squares[kept])) / scale[:, None])
             last, K_last = last @ Q, K_last @ Q
-        V, KV = np.hstack([V, last]), np.hstack([KV, K_last])
+        V, K_V = np.hstack([V, last]), np.hstack([K_V, K_last])
     damping = system.damping
     M = total(comm, V.T @ times_columns(system.M_ee, V))
     D = damping.alpha * M + damping.beta * np.eye(len(M))
