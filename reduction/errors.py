@@ -37,19 +37,12 @@ VIEWS: tuple[View, ...] = get_args(View)
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """Relative errors of a reduced run against snapshots of the full one, dimensionless.
+    """Relative errors of a reduced run against snapshots of the full one, dimensionless."""
 
-    Attributes:
-        error: |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21].
-        error_canonical: the same of X = [q_s, p_s, q_e, p_e], which canonical bases are built from.
-        error_deformation: the same of [z, v_z], after removing the rigid motion of the hand.
-        error_energy: max_t |H_r - H| / max_t H of the tissue's energy relative to the hand.
-    """
-
-    error: float
-    error_canonical: float
-    error_deformation: float
-    error_energy: float
+    error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21]
+    error_canonical: float  # the same of X = [q_s, p_s, q_e, p_e], which canonical bases are built from
+    error_deformation: float  # the same of [z, v_z], after removing the rigid motion of the hand
+    error_energy: float  # max_t |H_r - H| / max_t H of the tissue's energy relative to the hand
 
 
 def full_energy(system: BlockSystem, Z: Array) -> Array:
@@ -117,11 +110,7 @@ class Span:
     square: float  # |X|_F^2
 
     def inside(self, V: Array) -> Array:
-        """R = Q'V for columns V, local rows, that lie in the span. Collective.
-
-        Raises:
-            ModelError: they do not.
-        """
+        """R = Q'V for columns V, local rows, that lie in the span. Collective. Raises ModelError: they do not."""
         R = total(self.comm, self.Q.T @ V)
         lost = total(self.comm, np.array([((V - self.Q @ R) ** 2).sum(axis=0), (V**2).sum(axis=0)]))
         if (lost[0] > INSIDE**2 * lost[1]).any():

@@ -18,22 +18,15 @@ TOGETHER = 5_000_000
 
 @dataclass(frozen=True)
 class ReducedTrajectory:
-    """What a reduced run returns.
+    """What a reduced run returns."""
 
-    Attributes:
-        times: (steps + 1,) [s].
-        x: reduced states, (steps + 1, N).
-        q_s, v_s: hand, (steps + 1, n_s).
-        outputs: y, (steps + 1, p) [m].
-        output_names: one per component.
-    """
-
-    times: Array
-    x: Array
+    times: Array  # (steps + 1,) [s]
+    x: Array  # reduced states, (steps + 1, N)
+    # q_s, v_s: hand, (steps + 1, n_s)
     q_s: Array
     v_s: Array
-    outputs: Array
-    output_names: tuple[str, ...]
+    outputs: Array  # y, (steps + 1, p) [m]
+    output_names: tuple[str, ...]  # one per component
 
 
 def _check_stable(step: Propagator, allow_unstable: bool) -> None:
@@ -135,11 +128,7 @@ class Stepper:
 
     One product with a prefactored matrix of (N + p) x (N + n_s + 1) a step; nothing is allocated.
 
-    Args:
-        model: small model, or a propagator made beforehand.
-        dt: step [s]; needed with a small model.
-        x0: initial state (N,); None is zero.
-        allow_unstable: step a model with growing modes all the same.
+    Arguments as for :func:`run`.
 
     Raises:
         UnstableModelError: the model is unstable and ``allow_unstable`` is not set.

@@ -27,17 +27,11 @@ REST = 1e-9  # of the largest displacement: a solve for an equilibrium leaves 1e
 
 @dataclass(frozen=True)
 class FullRun:
-    """A full run with its states in memory; made by :func:`full_run`.
+    """A full run with its states in memory; made by :func:`full_run`."""
 
-    Attributes:
-        model: the scene, at the materials of the run.
-        trajectory: hand and outputs.
-        snapshots: states.
-    """
-
-    model: Model
-    trajectory: Trajectory
-    snapshots: Snapshots
+    model: Model  # the scene, at the materials of the run
+    trajectory: Trajectory  # hand and outputs
+    snapshots: Snapshots  # states
 
     @property
     def dt(self) -> float:

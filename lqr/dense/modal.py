@@ -14,9 +14,9 @@ from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_sc
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
 from softgrasp.lqr.dense.care import care as care
-from softgrasp.lqr.dense.poles import check_poles, closed_loop_rates
+from softgrasp.lqr.dense.poles import closed_loop_rates, lost_sentence
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.checks import EPS, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
@@ -128,19 +128,19 @@ def modal_plant(
     """The plant restricted to modes.
 
     Args:
-        problem: weights, hand and flags.
-        omega, Phi, massed: the modes.
         parts: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi.
     """
     D, g, c = parts
     G, B_z = (g, None) if problem.B_z is None else (g[:, :0], g)
-    plain = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
-    n_s = problem.layout.n_s
-    one = np.ones(2 * n_s)
-    S = np.concatenate([one, 1 / omega, np.ones_like(omega)])
-    L = np.concatenate([one, omega, np.ones_like(omega)])
-    space = StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, plain.B, plain.C * S)
-    return ModalPlant(omega, Phi, massed, D, g, c, space)
+    space = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
+    return ModalPlant(omega, Phi, massed, D, g, c, in_energy(space, omega))
+
+
+def in_energy(space: StateSpace, omega: Array) -> StateSpace:
+    """L E S, L A S, B, C S with S = blkdiag(I, 1/omega, I), L = blkdiag(I, omega, I), of [q_s, v_s, eta, eta']."""
+    k = len(omega)
+    L = np.concatenate([np.ones(len(space.E) - 2 * k), omega, np.ones(k)])
+    return StateSpace(L[:, None] * space.E / L, L[:, None] * space.A / L, space.B, space.C / L)
 
 
 def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
@@ -213,14 +213,10 @@ def dense_residual(problem: RiccatiProblem, space: StateSpace, Z: Array) -> floa
 
 @dataclass(frozen=True)
 class DenseRiccati:
-    """Solve the Riccati equation of a small scene in energy-scaled modal coordinates, on rank 0.
+    """Solve the Riccati equation of a small scene in energy-scaled modal coordinates, on rank 0."""
 
-    Attributes:
-        tolerance: bound on the true relative residual in hand-relative coordinates.
-        limit: largest number of states; the work grows with its cube, memory is about 400 byte times its square.
-    """
-
-    tolerance: float = 1e-8
+    tolerance: float = 1e-8  # bound on the true relative residual in hand-relative coordinates
+    # largest number of states; the work grows with its cube, memory is about 400 byte times its square
     limit: int = 2500
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
@@ -248,7 +244,9 @@ class DenseRiccati:
         begin = time.perf_counter()
         check_finite(M=tissue.M, K=tissue.K, D=tissue.D, G=tissue.G, C=tissue.C_z)
         plant = dense_modes(problem, tissue)
-        check_poles(closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c))
+        rates = closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c)
+        if rates.lost.any():
+            raise ControlError(lost_sentence(rates))
         middle = time.perf_counter()
         space = plant.space
         solution = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)

@@ -66,10 +66,6 @@ class ImplicitInput:
     feedback). An input at its limit is fixed there, the others stay implicit: a linear complementarity problem between
     bounds for a few unknowns, whose solution is unique where I - H is a P-matrix (feedback that takes energy out).
     Block pivoting [JP94]: all wrong inputs change sides together, after a few rounds only the last one, which ends.
-
-    Args:
-        H: (inputs, inputs).
-        bound: limits, or None.
     """
 
     max_iterations = 1000

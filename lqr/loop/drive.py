@@ -10,7 +10,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
-from softgrasp.lqr.loop.finite import FiniteDrive
+from softgrasp.lqr.loop.finite import FiniteDrive, move
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
 
@@ -50,7 +50,7 @@ class PlantStep:
         self.finite: FiniteDrive | None = None  # of a pushed hand that feels a tissue of finite strain
 
 
-class Drive(Protocol):
+class LoopDrive(Protocol):
     """Solves one step for hand and tissue; ``q``, ``v`` and ``u`` are the histories."""
 
     q: Array
@@ -71,11 +71,6 @@ class ImplicitDrive:
 
     and a = L^{-1} (u + f) leaves an equation of n_s unknowns: Sherman-Morrison-Woodbury with columns made once, one
     tissue solve and one small reduction a step.
-
-    Args:
-        plant: from :class:`PlantStep`.
-        target: x_bar and u_bar.
-        bound: limits of the input, or None.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
@@ -116,9 +111,7 @@ class HeldDrive:
     """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, if asked for one tick later.
 
     Args:
-        plant: from :class:`PlantStep`.
         target: x_bar and u_bar; u_bar acts until the first command arrives.
-        actuation: rate, delay, limits.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
@@ -153,7 +146,6 @@ class OpenDrive:
     """Input that is given for every step.
 
     Args:
-        plant: from :class:`PlantStep`.
         inputs: u of each step [N, N m], (steps, n_s).
     """
 
@@ -167,7 +159,7 @@ class OpenDrive:
         push(self.plant, self, n, self.u[n], state)
 
 
-def push(plant: PlantStep, drive: Drive, n: int, u: Array, state: TissueState) -> None:
+def push(plant: PlantStep, drive: LoopDrive, n: int, u: Array, state: TissueState) -> None:
     """One step of hand and tissue under an input that is known before it. Collective."""
     midpoint, system, c_0 = plant.midpoint, plant.system, plant.alpha * drive.v[n] - plant.g
     if system.two_way and system.points is not None:
@@ -186,14 +178,7 @@ def push(plant: PlantStep, drive: Drive, n: int, u: Array, state: TissueState) -
     finish(plant, drive, n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
 
 
-def finish(plant: PlantStep, drive: Drive, n: int, u: Array, a: Array) -> None:
+def finish(plant: PlantStep, drive: LoopDrive, n: int, u: Array, a: Array) -> None:
     """Turn S^{-1} h into w for the acceleration a, set load and right-hand side, move the hand."""
     plant.midpoint.accelerate(plant.kappa * a + plant.alpha * drive.v[n] - plant.g)
     move(drive, n, u, a, plant.dt)
-
-
-def move(drive: Drive, n: int, u: Array, a: Array, dt: float) -> None:
-    """Midpoint rule of the hand."""
-    drive.u[n] = u
-    drive.v[n + 1] = drive.v[n] + dt * a
-    drive.q[n + 1] = drive.q[n] + dt * (drive.v[n] + drive.v[n + 1]) / 2

@@ -22,13 +22,7 @@ from softgrasp.lqr.plant.target import Target
 
 
 class FiniteDrive:
-    """u = clip(u_bar + K (x_mid - x_bar)) on a plant of finite strain.
-
-    Args:
-        plant: :class:`softgrasp.lqr.loop.drive.PlantStep`.
-        target: x_bar and u_bar.
-        bound: limits of the input, or None.
-    """
+    """u = clip(u_bar + K (x_mid - x_bar)) on a plant of finite strain."""
 
     def __init__(self, plant: Any, gain: Gain | None, target: Target | None, bound: Array | None, steps: int) -> None:
         system, dt = plant.system, plant.dt
@@ -60,7 +54,7 @@ class FiniteDrive:
             assert self.bound is not None
             free &= ~over_limit
             known[over_limit] = (np.sign(law) * self.bound)[over_limit]
-        self.move(n, np.where(free, law, known), a)
+        move(self, n, np.where(free, law, known), a, self.plant.dt)
 
     def push(self, n: int, known: Array, free: Array, state: TissueState) -> tuple[Array, Array]:
         """The step with u = known, where ``free`` with the part F a + N'w of the law; a and the law. Collective."""
@@ -78,8 +72,8 @@ class FiniteDrive:
         a = -(plant.midpoint.c + c_0) / plant.kappa
         return a, known + self.F @ a + plant.midpoint.felt[:n_s] + plant.midpoint.felt[n_s : 2 * n_s]
 
-    def move(self, n: int, u: Array, a: Array) -> None:
-        """Midpoint rule of the hand."""
-        dt = self.plant.dt
-        self.u[n], self.v[n + 1] = u, self.v[n] + dt * a
-        self.q[n + 1] = self.q[n] + dt * (self.v[n] + self.v[n + 1]) / 2
+
+def move(drive: Any, n: int, u: Array, a: Array, dt: float) -> None:
+    """Midpoint rule of the hand."""
+    drive.u[n], drive.v[n + 1] = u, drive.v[n] + dt * a
+    drive.q[n + 1] = drive.q[n] + dt * (drive.v[n] + drive.v[n + 1]) / 2

@@ -36,10 +36,6 @@ class ReducedLoop:
     x_{n+1} = 2 x_mid - x_n; at the midpoint u = u_0 + K Y u is solved for the few inputs. Not collective: every rank
     may run its own.
 
-    Args:
-        plant: the matrices.
-        dt: time step [s].
-
     Raises:
         ControlError: dt is not positive, or E - dt/2 A is singular.
     """
@@ -74,7 +70,6 @@ class ReducedLoop:
             K: gain, (n_s, N).
             rest: x_bar and u_bar, see :meth:`SmallPlant.rest_at`.
             weights: Q and R of the cost.
-            actuation: sampling, delay, limits.
             start: x(0), default the state of rest with the hand at 0.
 
         Raises:

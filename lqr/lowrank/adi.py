@@ -24,7 +24,7 @@ SHARE = 0.02  # of the tolerance that one compression on the way may use up
 GROWTH = 1e6  # of the residual against its start: the closed loop of the given gain is unstable
 
 
-class Columns:
+class FactorColumns:
     """Z as it grows, in costate form; compressed when it gets wide.
 
     Args:
@@ -85,13 +85,13 @@ class Columns:
 
 
 @dataclass
-class Sweep:
+class AdiSweep:
     """State of one ADI sweep for A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K."""
 
     # [K', W, dK'] with K' of the sweep, the residual factor W, W W' the Lyapunov residual, and dK = B'XE - K of the X
     # found so far
     state: Right
-    Z: Columns  # factor of X
+    Z: FactorColumns  # factor of X
     steps: int = 0  # solves so far
     first: float = 0.0  # ||W_0 W_0'||
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
@@ -122,12 +122,6 @@ class Sweep:
         return self.gain.plus(self.change, np.eye(self.Z.plant.inputs))
 
 
-def start_sweep(plant: Plant, outputs: Right, gain: Right, tol: float) -> Sweep:
-    """W_0 = [C', K']."""
-    state = Right.join([gain, outputs, gain, Right(-gain.hand, -gain.rows)])
-    return Sweep(state, Columns(plant, SHARE * tol * plant.scale))
-
-
 def real_columns(p: complex, q: int) -> tuple[Complex, float]:
     """Coefficients c of the real columns Z = Re(V c) of a shift or its conjugate pair, and g in W <- W + g E'Z_1.
 
@@ -142,7 +136,7 @@ def real_columns(p: complex, q: int) -> tuple[Complex, float]:
     return np.hstack([g * (1 - 1j * d) * one, -1j * g * np.sqrt(d * d + 1) * one]), g
 
 
-def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueue) -> complex:
+def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: AdiSweep, queue: ShiftQueue) -> complex:
     """One solve, two real blocks of columns for a pair. Collective. Returns the shift."""
     begin = time.perf_counter()
     q, m = sweep.q, plant.inputs
@@ -165,7 +159,7 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueu
     return p
 
 
-def sweep_norms(plant: Plant, sweep: Sweep) -> tuple[float, float]:
+def sweep_norms(plant: Plant, sweep: AdiSweep) -> tuple[float, float]:
     """||W W'||_2 of the Lyapunov and ||W W' - dK' dK||_2 of the Riccati residual, dK = K_new - K. Collective.
 
     Raises:

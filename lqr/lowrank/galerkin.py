@@ -26,6 +26,7 @@ from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import shift_range
 from softgrasp.lqr.lowrank.solution import Iterate, make_solution
 from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.operators import normalising
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
@@ -53,7 +54,7 @@ class Space:
                 columns = columns - self.V @ total(comm, self.M_V.T @ columns)
             M_columns = plant.mass(columns)
             gram = total(comm, columns.T @ M_columns)
-            S: Array = on_root(comm, partial(_normalising, gram))
+            S: Array = on_root(comm, partial(normalising, gram, ROUNDING, NEW**2))
             columns, M_columns = columns @ S, M_columns @ S
         more = (columns, M_columns, plant.stiff(columns))
         return Space(*(np.hstack([a, b]) for a, b in zip((self.V, self.M_V, self.K_V), more, strict=True)))
@@ -83,13 +84,6 @@ class Level:
     a: Array
     b: Array
     gain: Block  # K', z-row as it stands
-
-
-def _normalising(gram: Array) -> Array:
-    """S with S'gram S = I on the part of gram that is not rounding."""
-    sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
-    keep = sizes > max(NEW**2, ROUNDING * float(sizes.max(initial=0.0)))
-    return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
 
 
 def _root(X: Array) -> Array:
@@ -169,22 +163,14 @@ class StructuredGalerkin:
     two spaces, or the space holds all of the tissue. The small problem keeps the second-order form and the energy, so
     it is stable whenever the tissue is damped. The residual of such a solution is large although the gain is right; it
     is reported, not judged.
-
-    Attributes:
-        tol: bound on the relative change of the gain between the last two spaces, see :func:`gain_change`.
-        max_iterations: bound on the number of spaces.
-        modes: number of modes.
-        per_step: responses added at a time.
-        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
-        progress: called on every rank after each space with the history entry.
     """
 
-    tol: float = 1e-6
-    max_iterations: int = 24
-    modes: int = MODES
-    per_step: int = 2
-    tissue: str = "auto"
-    progress: Progress | None = None
+    tol: float = 1e-6  # bound on the relative change of the gain between the last two spaces, see gain_change
+    max_iterations: int = 24  # bound on the number of spaces
+    modes: int = MODES  # number of modes
+    per_step: int = 2  # responses added at a time
+    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
+    progress: Progress | None = None  # called on every rank after each space with the history entry
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
         """Grow the space until the gain settles. Collective. The problem is not changed.

@@ -10,7 +10,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root
-from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, Columns, Progress
+from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, FactorColumns, Progress
 from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, make_right, mass_right
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.lowrank.modal_start import modal_start
@@ -28,7 +28,7 @@ class RadiState:
     """W with Res(X_k) = W W', K_k' and Z."""
 
     both: Right  # [K', W], (B'X_k E)' and the residual factor with p columns
-    Z: Columns  # X_k = Z Z'
+    Z: FactorColumns  # X_k = Z Z'
     solves: int = 0  # tissue solves done
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
@@ -102,18 +102,12 @@ class RADI:
     Each step is one solve (A - B K + s E)'V = W with the p columns of the residual factor, Res(X_k) = W W'. No
     stabilising start is needed; the modal problem gives shifts only. X_k grows monotonically to the stabilising
     solution when the plant is stabilisable and detectable.
-
-    Attributes:
-        tol: bound on the true relative residual, 2-norm, hand-relative coordinates.
-        max_iterations: bound on the solves.
-        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
-        progress: called on every rank after each solve with the history entry.
     """
 
-    tol: float = 1e-10
-    max_iterations: int = 1500
-    tissue: str = "auto"
-    progress: Progress | None = None
+    tol: float = 1e-10  # bound on the true relative residual, 2-norm, hand-relative coordinates
+    max_iterations: int = 1500  # bound on the solves
+    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
+    progress: Progress | None = None  # called on every rank after each solve with the history entry
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
         """Run to the tolerance. Collective. The problem is not changed.
@@ -131,7 +125,7 @@ class RADI:
         try:
             W = make_right(plant, tissue, plant.outputs())
             gain = Right(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.rows), plant.inputs)))
-            state = RadiState(Right.join([gain, W]), Columns(plant, SHARE * self.tol * plant.scale))
+            state = RadiState(Right.join([gain, W]), FactorColumns(plant, SHARE * self.tol * plant.scale))
             state.seconds["start"] = after_start - begin
             queue = ShiftQueue.start(shift_range(plant, poles), poles)
             self._iterate(plant, tissue, state, queue)

@@ -17,8 +17,8 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.reduced.riccati import GainJudge, Verdict, gain_error, project_plant
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop, SampledRadius
+from softgrasp.lqr.reduced.riccati import NAN, GainJudge, JudgedGain, project_plant
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
 
 Materials = tuple[LayerMaterial, ...]
@@ -103,24 +103,11 @@ class Retuner:
 
 
 @dataclass(frozen=True)
-class BoxPoint(Verdict):
-    """One setting of the box: errors against the full Riccati solution there.
+class RetunedGain(JudgedGain):
+    """The gain at one setting of the box, against the full Riccati solution there."""
 
-    ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop, and from tick to
-    tick where its instants are known; bounds of the cost are those of :func:`softgrasp.lqr.design.bounds.with_bounds`.
-    """
-
-    materials: Materials
-    error_K: float  # noqa: N815
-    cost_excess: float
-    abscissa_full: float
-    seconds: float
-    reason: str = ""
-    certified: bool = True
-    sampled: SampledRadius | None = None
-    gain: Gain | None = None
-    cost_excess_at_most: float = float("nan")
-    cost_excess_proved: float = float("nan")
+    materials: Materials  # of all layers
+    seconds: float = NAN  # of the re-tuning
 
 
 def over_box(
@@ -130,11 +117,10 @@ def over_box(
     start: Block,
     modes: int | None = None,
     law: Sampling | None = None,
-) -> tuple[BoxPoint, ...]:
+) -> tuple[RetunedGain, ...]:
     """Error of the re-tuned gain at every setting of a box. Collective.
 
     Args:
-        retuner: the reduced components.
         settings: materials of all layers, one tuple per point.
         solve: full solver, the reference.
         start: start minus target of hand and tissue, one column.
@@ -148,22 +134,8 @@ def over_box(
         try:
             tuned = on_root(comm, lambda materials=materials: retuner.solve(materials))  # type: ignore[misc]
         except ControlError as error:
-            nan = float("nan")
-            result.append(BoxPoint(materials, nan, nan, nan, nan, str(error)))
+            result.append(RetunedGain(materials, reason=str(error)))
             continue
-        gain = retuner.full_gain(tuned)
-        best = solve(problem)
-        quality = GainJudge(problem, best, start, ModalLoop(problem, modes), law).quality(gain)
-        result.append(
-            BoxPoint(
-                materials,
-                gain_error(problem, best.gain, gain),
-                quality.cost_excess,
-                quality.abscissa,
-                tuned.seconds,
-                certified=quality.certified,
-                sampled=quality.sampled,
-                gain=gain,
-            )
-        )
+        judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
+        result.append(judge.judged(RetunedGain(materials, tuned.seconds), retuner.full_gain(tuned)))
     return tuple(result)

@@ -63,9 +63,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
     """Factor a row-distributed matrix. Collective.
 
     Args:
-        comm: ranks that share the rows.
         X: local rows (n_local, c); read only.
-        engine: see the module.
         k: number of leading triplets that are enough; ``tsqr`` makes all the same.
 
     Raises:
@@ -178,11 +176,18 @@ def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
     return np.asfortranarray(Q_local @ comm.scatter(blocks)), np.asarray(comm.bcast(R))
 
 
-def _triangle(comm: MPI.Intracomm, X: Array) -> Array:
-    """R of X = Q R by QR of row blocks, then of the stacked triangles on rank 0."""
-    R = np.zeros((0, X.shape[1]))
+def triangle(comm: MPI.Intracomm, X: Array, top: Array | None = None) -> Array:
+    """R of X = Q R, without Q, by QR of row blocks, then of the stacked triangles on rank 0. Collective.
+
+    Args:
+        X: local rows (n_local, k).
+        top: rows above those of rank 0, known to every rank.
+    """
+    R = np.zeros((0, X.shape[1])) if top is None or comm.rank else top
     for i in range(0, len(X), BLOCK_ROWS):
         R = np.linalg.qr(np.vstack([R, X[i : i + BLOCK_ROWS]]), mode="r")
+    if comm.size == 1:
+        return R
     parts = comm.gather(R)
     return on_root(comm, lambda: np.linalg.qr(np.vstack(parts or []), mode="r"))
 
@@ -197,7 +202,7 @@ def _gram(comm: MPI.Intracomm, X: Array, k: int | None) -> tuple[Array, Array]:
         keep[k + k // 2 + 10 :] = False  # the last of those kept are not converged by the Rayleigh-Ritz step
     U = X @ (V[:, keep] / s[keep])
     # U is orthonormal to eps (sigma_1 / sigma_r)^2 only; dividing by its triangle keeps the nested spans
-    Q = np.asfortranarray(scipy.linalg.solve_triangular(_triangle(comm, U), U.T, trans="T", check_finite=False).T)
+    Q = np.asfortranarray(scipy.linalg.solve_triangular(triangle(comm, U), U.T, trans="T", check_finite=False).T)
     return Q, total(comm, Q.T @ X)
 
 

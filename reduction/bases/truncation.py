@@ -88,9 +88,7 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
 
     Args:
         width: columns of one unit.
-        N: dimension of the whole basis.
         hand: columns that the hand takes.
-        name: of the basis, for messages.
 
     Returns:
         Units of every part.

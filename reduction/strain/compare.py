@@ -18,17 +18,11 @@ from softgrasp.reduction.replay import FullRun
 
 @dataclass(frozen=True)
 class StrainErrors:
-    """Relative errors over the snapshots of one full run, or of several, dimensionless.
+    """Relative errors over the snapshots of one full run, or of several, dimensionless."""
 
-    Attributes:
-        z: |Z - Phi A|_F / |Z|_F of the deformation.
-        v: |V - Phi A'|_M / |V|_M of its velocity.
-        energy_norm: of (z, v) in (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest.
-    """
-
-    z: float
-    v: float
-    energy_norm: float
+    z: float  # |Z - Phi A|_F / |Z|_F of the deformation
+    v: float  # |V - Phi A'|_M / |V|_M of its velocity
+    energy_norm: float  # of (z, v) in (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest
 
 
 @dataclass(frozen=True)

@@ -30,18 +30,13 @@ LOAD_STEPS, NEWTON_STEPS = 10, 30  # on the way to an equilibrium
 
 @dataclass(frozen=True)
 class TrainedBox:
-    """What a model was trained on.
+    """What a model was trained on."""
 
-    Attributes:
-        lam, mu: least and largest Lamé constant of every layer [Pa], (layers, 2).
-        load: least and largest a_s - g of the hand, by degree of freedom, (n_s, 2) [m/s^2, rad/s^2].
-        reach: largest |a_i| of the training runs, (k,).
-    """
-
+    # lam, mu: least and largest Lamé constant of every layer [Pa], (layers, 2)
     lam: Array
     mu: Array
-    load: Array
-    reach: Array
+    load: Array  # least and largest a_s - g of the hand, by degree of freedom, (n_s, 2) [m/s^2, rad/s^2]
+    reach: Array  # largest |a_i| of the training runs, (k,)
 
     def refuse(self, materials: tuple[LayerMaterial, ...]) -> str:
         """Why materials lie outside; empty inside."""
@@ -75,20 +70,14 @@ class TrainedBox:
 
 @dataclass(frozen=True)
 class StrainRun(ReducedTrajectory):
-    """A reduced run at finite strain, x = [q_s, v_s, a, a'].
+    """A reduced run at finite strain, x = [q_s, v_s, a, a']."""
 
-    Attributes:
-        problem, load: what was stepped.
-        evaluations: of the force, in the mean of a step.
-        restarts: fresh tangents.
-        engine: "C" or "NumPy".
-    """
-
+    # problem, load: what was stepped
     problem: StrainProblem = field(repr=False)
     load: Array = field(repr=False)
-    evaluations: float
-    restarts: int
-    engine: str
+    evaluations: float  # of the force, in the mean of a step
+    restarts: int  # fresh tangents
+    engine: str  # "C" or "NumPy"
 
     @property
     def a(self) -> Array:
@@ -196,43 +185,30 @@ class SmallStrainModel:
 
 @dataclass(frozen=True)
 class StrainModel:
-    """Reduced model of tissue at finite strain for all lambda and mu of its training box.
+    """Reduced model of tissue at finite strain for all lambda and mu of its training box."""
 
-    Attributes:
-        cells: sampled cells, in reduced coordinates.
-        K_mu, K_lambda: linear stiffness of every layer at 1 Pa, (layers, k, k).
-        G: Phi' G at the densities of the projection, (k, n_s).
-        materials: of the projection, one a layer.
-        outputs: y = C_z a + C_s q_s.
-        box: what it was trained on.
-        cells_full: number of cells of the body.
-        alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
-        gravity: acceleration of free fall (n_s,), or None.
-        tau, residual: of the weights, asked for and reached; 0 where no cell is left out.
-        error_galerkin: in z of the model with all cells, over the training runs.
-        layout, Phi: local rows of the lift (n_local, k), or None.
-        scene_hash: of the scene it was made for.
-        seconds: offline, by stage.
-    """
-
-    cells: Cells
+    cells: Cells  # sampled cells, in reduced coordinates
+    # K_mu, K_lambda: linear stiffness of every layer at 1 Pa, (layers, k, k)
     K_mu: Array
     K_lambda: Array
-    G: Array
-    materials: tuple[LayerMaterial, ...]
-    outputs: Outputs
-    box: TrainedBox
-    cells_full: int
+    G: Array  # Phi' G at the densities of the projection, (k, n_s)
+    materials: tuple[LayerMaterial, ...]  # of the projection, one a layer
+    outputs: Outputs  # y = C_z a + C_s q_s
+    box: TrainedBox  # what it was trained on
+    cells_full: int  # number of cells of the body
+    # alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion
     alpha: float = 0.0
     in_space: bool = False
-    gravity: Array | None = None
+    gravity: Array | None = None  # acceleration of free fall (n_s,), or None
+    # tau, residual: of the weights, asked for and reached; 0 where no cell is left out
     tau: float = 0.0
     residual: float = 0.0
-    error_galerkin: float = 0.0
+    error_galerkin: float = 0.0  # in z of the model with all cells, over the training runs
+    # layout, Phi: local rows of the lift (n_local, k), or None
     layout: BlockLayout | None = None
     Phi: Array | None = None
-    scene_hash: str = ""
-    seconds: dict[str, float] = field(default_factory=dict)
+    scene_hash: str = ""  # of the scene it was made for
+    seconds: dict[str, float] = field(default_factory=dict)  # offline, by stage
 
     @property
     def k(self) -> int:

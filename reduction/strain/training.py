@@ -186,11 +186,7 @@ class Training:
 
 
 def displacements(system: BlockSystem, N: int) -> int:
-    """Number k of a model of dimension N = 2 n_s + 2 k.
-
-    Raises:
-        ReductionError: there is none.
-    """
+    """Number k of a model of dimension N = 2 n_s + 2 k. Raises ReductionError: there is none."""
     hand = 2 * system.layout.n_s
     if hand + 2 > N or N % 2:
         raise ReductionError(f"N = {N} does not fit; it must be the {hand} columns of the hand plus an even number")
@@ -257,14 +253,7 @@ def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
 
 
 def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False, engine: str = "") -> StrainRun:
-    """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective.
-
-    Args:
-        rom: which.
-        full: run to repeat, at its own materials.
-        outside: allow what the model was not trained on.
-        engine: see :func:`softgrasp.reduction.strain.stepper.march`.
-    """
+    """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
     return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full, engine)
 
 

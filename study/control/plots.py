@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.orders import BasisGains, fast_order
@@ -29,6 +29,7 @@ from softgrasp.study.pictures.style import (
     SKY,
     UNSTABLE,
     direct_labels,
+    log_axis,
     paper_style,
     save,
 )
@@ -81,13 +82,8 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ..
                 place = {"transform": ax.get_xaxis_transform(), "clip_on": False, "in_layout": False}
                 for look in (_look(s) | {"ls": ""}, CROSS) if edge else ():
                     ax.plot(edge, [1.0] * len(edge), **place, **look)
-            ax.set_yscale("log")
-            ax.set_ylim(top=2.5 * TOP)
-            ax.yaxis.set_major_locator(LogLocator(numticks=12))
-            ax.yaxis.set_minor_formatter(NullFormatter())
+            log_axis(ax, 2.5 * TOP)
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-            ax.grid(axis="y", color="#e6e6e6", lw=0.5)
-            ax.set_axisbelow(True)
             ax.set_ylabel(label)
             ends = [(drawn(s, key), s) for s in ran]
             direct_labels(

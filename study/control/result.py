@@ -20,8 +20,8 @@ from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
 from softgrasp.lqr.plant.target import Target
 from softgrasp.lqr.reduced.bases import A_PRIORI
-from softgrasp.lqr.reduced.retune import BoxPoint
-from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.lqr.reduced.retune import RetunedGain
+from softgrasp.lqr.reduced.riccati import GainReport, JudgedGain
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
@@ -49,7 +49,7 @@ class Retuned:
 
     name: str  # basis
     N: int  # order
-    points: tuple[BoxPoint, ...]  # gains at the settings
+    points: tuple[RetunedGain, ...]  # gains at the settings
 
     @property
     def slowest(self) -> float:
@@ -181,12 +181,12 @@ def report_dict(report: GainReport) -> dict[str, Any]:
     return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
 
 
-def bounds_dict(report: GainReport | BoxPoint) -> dict[str, Any]:
+def bounds_dict(report: JudgedGain) -> dict[str, Any]:
     """Bounds on the excess cost, and why there is none."""
     return {key: getattr(report, key) for key in ("cost_excess_proved", "cost_excess_at_most", "unbounded")}
 
 
-def radius_of(report: GainReport | BoxPoint) -> float:
+def radius_of(report: JudgedGain) -> float:
     """Spectral radius from tick to tick; nan where there is no gain."""
     return float("nan") if report.sampled is None else report.sampled.value
 

@@ -20,7 +20,7 @@ from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import equation
-from softgrasp.study.report.page import Section, equation_text
+from softgrasp.study.report.page import Section, captioned, equation_text
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
 
@@ -108,14 +108,12 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
     scene = result.scene
     faster = speed_up(np.array([0.0, scene.time_end]))
     move = "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed."
-    shown = {path.name: path for path in drawn}
-    figures = [(shown[name], text or move) for name, text in CAPTIONS.items() if name in shown]
     effects = [
         (name, effect.active(scene), *((effect.term, effect.cost) if effect.active(scene) else ("", "")))
         for name, effect in EFFECTS.items()
     ]
     return [
-        Section("", figures=figures),
+        Section("", figures=captioned(drawn, CAPTIONS | {"move.gif": move})),
         Section("Result", rows=numbers),
         *([Section("Warnings", text="\n\n".join(result.warnings))] if result.warnings else []),
         Section("Equation", code=equation_text(equation(scene))),

@@ -17,7 +17,7 @@ from softgrasp.study.reduce.tables import (
     refused_table,
     time_table,
 )
-from softgrasp.study.report.page import Section
+from softgrasp.study.report.page import Section, captioned
 
 CAPTIONS = {
     "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
@@ -41,7 +41,7 @@ CAPTIONS = {
 
 def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
     """Parts of the page. Rank 0 only."""
-    energy, drawn = study.full.model.scene.reduction.energy, {file.name: file for file in files}
+    energy = study.full.model.scene.reduction.energy
     text = (
         f"{N_NOTE}\n\n{error_note(energy)} Each method is built from the snapshots of one run and repeats it, driven "
         f"by the same hand. {inner_note(study.sweeps)}"
@@ -49,7 +49,7 @@ def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
     parts = [
         error_table(study.sweeps, energy).section(text),
         Section("What holds", text="\n\n".join(study.findings)),
-        Section("", figures=[(drawn[name], caption) for name, caption in CAPTIONS.items() if name in drawn]),
+        Section("", figures=captioned(files, CAPTIONS)),
         time_table(study.speeds).section("\n\n".join(study.speed_notes)),
     ]
     refused = refused_table(study.sweeps)

@@ -29,7 +29,7 @@ from softgrasp.study.reduce.plots import (
     further_methods,
     of_paper,
 )
-from softgrasp.study.reduce.result import ReductionStudy, Sweep, nearest
+from softgrasp.study.reduce.result import MethodSweep, ReductionStudy, nearest
 
 MODES = 4  # a method
 FRAMES = 30
@@ -84,7 +84,7 @@ def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
     return files
 
 
-def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
+def compared(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
     """First of the paper's methods and best of all at the N compared."""
     first = [s for s in sweeps if s.method.key in PAPER_METHODS and s.points][:1]
     chosen = [(s, i) for s in first if (i := nearest(s.points, stable=False)) is not None]
@@ -93,11 +93,11 @@ def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     return chosen + [f for f in stable[:1] if f[0] not in first]
 
 
-def _error(chosen: tuple[Sweep, int]) -> float:
+def _error(chosen: tuple[MethodSweep, int]) -> float:
     return chosen[0].points[chosen[1]].error_deformation
 
 
-def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views | None:
+def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> Views | None:
     """Bring to rank 0 what the pictures need; None on other ranks and for very large bodies. Collective."""
     if model.space.mesh.mesh.geometry.index_map().size_global > MANY_VERTICES:
         return None
@@ -123,7 +123,7 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views |
     return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
 
 
-def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
+def modes_of(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
     """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
     fixed = sorted(((s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None), key=_error)
     old = [f for f in fixed if f[0].method.key in PAPER_METHODS][:1]
@@ -132,7 +132,7 @@ def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     return old + new
 
 
-def _modes(model: Model, s: Sweep, i: int) -> Array | None:
+def _modes(model: Model, s: MethodSweep, i: int) -> Array | None:
     """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
     layout = model.system.layout
     lift = s.models[i].lift

@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.study.pictures.style import (
@@ -25,10 +25,11 @@ from softgrasp.study.pictures.style import (
     WIDTH,
     direct_labels,
     few_ticks,
+    log_axis,
     paper_style,
     save,
 )
-from softgrasp.study.reduce.result import Point, Sweep, nearest
+from softgrasp.study.reduce.result import MethodSweep, Point, nearest
 
 TOP = 1.0  # errors above are drawn at the upper edge
 LOWEST = 1e-17  # of a singular value over the first
@@ -58,25 +59,25 @@ QUANTITIES = (
 )
 
 
-def looks(sweeps: Sequence[Sweep]) -> dict[str, tuple[str, str, str]]:
+def looks(sweeps: Sequence[MethodSweep]) -> dict[str, tuple[str, str, str]]:
     """Colour, dashes and marker of every method; those without a place of their own share one colour."""
     others = [s.method.key for s in sweeps if s.method.key not in LOOKS]
     return {**LOOKS, **{key: SPARE[i % len(SPARE)] for i, key in enumerate(others)}}
 
 
-def of_paper(sweeps: Sequence[Sweep]) -> list[Sweep]:
+def of_paper(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
     """The paper's six, as far as they ran."""
     return [s for s in sweeps if s.method.key in PAPER_METHODS and s.points]
 
 
-def further_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
+def further_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
     """The others, after the best of the paper's at the N compared."""
     old = [(s.points[i], s) for s in of_paper(sweeps) if (i := nearest(s.points)) is not None]
     first = min(old, key=lambda f: f[0].error_deformation, default=None)
     return ([] if first is None else [first[1]]) + [s for s in sweeps if s.method.key not in PAPER_METHODS and s.points]
 
 
-def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...]:
+def figure_errors(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...]:
     """Error of the deformation against N; a curve is dotted where its model is unstable."""
     look = looks(sweeps)
     with paper_style():
@@ -90,7 +91,7 @@ def figure_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...]:
         return save(figure, out_png)
 
 
-def figure_further_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...]:
+def figure_further_errors(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...]:
     """State, canonical state and energy, one below the other, as the deformation in :func:`figure_errors`."""
     look = looks(sweeps)
     with paper_style():
@@ -104,7 +105,7 @@ def figure_further_errors(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path,
 
 
 def _errors_axis(
-    ax: Any, sweeps: Sequence[Sweep], look: dict[str, tuple[str, str, str]], key: str, label: str
+    ax: Any, sweeps: Sequence[MethodSweep], look: dict[str, tuple[str, str, str]], key: str, label: str
 ) -> list[tuple[float, float, str, str]]:
     """Curves of one error; the end of each with its name and colour."""
     ends = []
@@ -117,12 +118,12 @@ def _errors_axis(
         _crosses(ax, s, N, key, colour)
         ends.append((float(N[-1]), float(values[-1]), s.method.short_title, colour))
     ax.set_ylabel(label)
-    log_axis(ax)
+    log_axis(ax, 1.6 * TOP)
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=STEPS))
     return ends
 
 
-def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[Path, ...]:
+def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> tuple[Path, ...]:
     """Error of the deformation against online and offline plus online time, with the Pareto front; ``full`` [s]."""
     look, key = looks(sweeps), QUANTITIES[0][0]
     with paper_style():
@@ -145,7 +146,7 @@ def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[P
                 named[s.method.key] = Line2D([], [], label=s.method.short_title, **mark)
             ax.axvline(full * unit, **FULL)
             ax.set_xscale("log")
-            log_axis(ax)
+            log_axis(ax, 1.6 * TOP)
             ax.set_ylabel(QUANTITIES[0][1])
             few_ticks(ax.xaxis)
         axes[0].set_xlabel("online time of a run [ms]")
@@ -159,16 +160,16 @@ def figure_times(sweeps: Sequence[Sweep], full: float, out_png: Path) -> tuple[P
         return save(figure, out_png)
 
 
-def pareto(points: Sequence[tuple[float, float, Sweep]]) -> list[tuple[float, float, Sweep]]:
+def pareto(points: Sequence[tuple[float, float, MethodSweep]]) -> list[tuple[float, float, MethodSweep]]:
     """Those of (time, error, method) that no other beats in both, by time."""
-    front: list[tuple[float, float, Sweep]] = []
+    front: list[tuple[float, float, MethodSweep]] = []
     for point in sorted(points, key=lambda p: p[:2]):
         if not front or point[1] < front[-1][1]:
             front.append(point)
     return front
 
 
-def figure_sigma(sweeps: Sequence[Sweep], out_png: Path) -> tuple[Path, ...] | None:
+def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...] | None:
     """Singular values over the first, a line for each part of a decomposition; PNG and PDF, None without any."""
     look = looks(sweeps)
     groups = [
@@ -204,23 +205,13 @@ def _values(points: Sequence[Point], key: str) -> np.ndarray:
     return np.where(np.isfinite(values), np.minimum(values, TOP), TOP)
 
 
-def log_axis(ax: Any, top: float | None = 1.6 * TOP) -> None:
-    """A logarithmic axis of errors, a line at every power of ten."""
-    ax.set_yscale("log")
-    ax.set_ylim(top=top)
-    ax.yaxis.set_major_locator(LogLocator(numticks=12))
-    ax.yaxis.set_minor_formatter(NullFormatter())
-    ax.grid(axis="y", color="#e6e6e6", lw=0.5, zorder=0)
-    ax.set_axisbelow(True)
-
-
-def _crosses(ax: Any, s: Sweep, at: Sequence[float], key: str, colour: str) -> None:
+def _crosses(ax: Any, s: MethodSweep, at: Sequence[float], key: str, colour: str) -> None:
     """Faint marks of the unstable models, where the curve is dotted."""
     bad = [i for i, p in enumerate(s.points) if not p.stable]
     ax.plot([at[i] for i in bad], _values(s.points, key)[bad], **CROSS, color=colour, zorder=1)
 
 
-def _remarks(sweeps: Sequence[Sweep]) -> list[Line2D]:
+def _remarks(sweeps: Sequence[MethodSweep]) -> list[Line2D]:
     """What a legend says of unstable models and of errors beyond the frame, where there are any."""
     entries = []
     if any(not p.stable for s in sweeps for p in s.points):

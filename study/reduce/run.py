@@ -18,7 +18,7 @@ from softgrasp.reduction.archive import save
 from softgrasp.study.reduce.box import measure_box
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.page import sections
-from softgrasp.study.reduce.result import BoxTests, ReductionStudy, Sweep, best, head_of
+from softgrasp.study.reduce.result import BoxTests, MethodSweep, ReductionStudy, best, head_of
 from softgrasp.study.reduce.sweep import chosen_methods, sweep
 from softgrasp.study.reduce.tables import (
     N_NOTE,
@@ -115,10 +115,6 @@ def run_reduce(
 def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopwatch) -> ReductionStudy:
     """Full run, every method, errors over the box. Collective.
 
-    Args:
-        bar: shows what is done.
-        watch: takes the seconds of "full", "sweep" and "box".
-
     Raises:
         SolverError: a solve failed or a factorisation did.
         ResourceError: the snapshots do not fit.
@@ -134,7 +130,7 @@ def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopw
     bar.remove_task(task)
     size = len(scene.reduction.N)
     task = bar.add_task("bases", total=size * len(names))
-    sweeps: list[Sweep] = []
+    sweeps: list[MethodSweep] = []
     with watch.stage("sweep"):
         for name in names:
 
@@ -153,7 +149,7 @@ def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopw
     return ReductionStudy(full, tuple(sweeps), times, speeds, box, findings(sweeps), notes)
 
 
-def save_models(out: Path, sweeps: Sequence[Sweep]) -> list[Path]:
+def save_models(out: Path, sweeps: Sequence[MethodSweep]) -> list[Path]:
     """Write the best stable model of every method into ``out/models``. Collective."""
     files = []
     for s in sweeps:
@@ -173,7 +169,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
         "methods": {s.method.key: [asdict(p) for p in s.points] for s in study.sweeps},
         "about": {s.method.key: _about(s) for s in study.sweeps},
         "findings": study.findings,
-        "speed": [asdict(speed) for speed in study.speeds],
+        "speed": [speed.to_json() for speed in study.speeds],
         "speed_notes": study.speed_notes,
         "box": _box_result(study.box),
         "time": {
@@ -187,7 +183,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
     return dict(to_json(result))
 
 
-def _about(s: Sweep) -> dict[str, Any]:
+def _about(s: MethodSweep) -> dict[str, Any]:
     return {
         "title": s.method.title,
         "paper": s.method.paper,

@@ -25,10 +25,11 @@ from softgrasp.study.pictures.style import (
     PURPLE,
     WIDTH,
     colour_map,
+    log_axis,
     paper_style,
     save,
 )  # fmt: skip
-from softgrasp.study.reduce.plots import FULL, log_axis
+from softgrasp.study.reduce.plots import FULL
 from softgrasp.study.reduce.strain_measure import CELLS_AT
 from softgrasp.study.reduce.strain_page import TITLES
 from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy

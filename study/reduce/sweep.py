@@ -27,7 +27,7 @@ from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs
-from softgrasp.study.reduce.result import Point, Sweep, kept_points
+from softgrasp.study.reduce.result import MethodSweep, Point, kept_points
 from softgrasp.study.shell.timing import median_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
@@ -38,11 +38,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def chosen_methods(options: Reduction) -> tuple[str, ...]:
-    """Methods of the scene, or the paper's six and further ones.
-
-    Raises:
-        BasisError: a name is unknown.
-    """
+    """Methods of the scene, or the paper's six and further ones. Raises BasisError: a name is unknown."""
     names = tuple(options.methods) or (*PAPER_METHODS, *FURTHER)
     for name in names:
         find_method(name)
@@ -110,12 +106,8 @@ def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = 
     )
 
 
-def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | None = None) -> Sweep:
-    """One method at all its N. Collective.
-
-    Raises:
-        SolverError: a factorisation failed.
-    """
+def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | None = None) -> MethodSweep:
+    """One method at all its N. Collective. Raises SolverError: a factorisation failed."""
     scene, system, method = full.model.scene, full.model.system, METHODS[name]
     states = States(system, ((system, full.snapshots),))
     refused = impossible_sizes(method, system.layout.n_s, options.N)
@@ -136,7 +128,7 @@ def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | Non
             continue
         models[len(points) - 1] = model
         models = {j: models[j] for j in models if j in kept_points(points)}
-    return Sweep(
+    return MethodSweep(
         method=method,
         points=tuple(points),
         models=models,
