@@ -11,16 +11,8 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
+from softgrasp.lqr.lowrank import modal_start
 from softgrasp.lqr.lowrank.adi import Progress
-from softgrasp.lqr.lowrank.modal_start import (
-    MODES,
-    ModalSubspace,
-    SmallSolution,
-    check_damped,
-    plant_modes,
-    restrict,
-    solve_small,
-)
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import shift_range
@@ -77,8 +69,8 @@ class Space:
 class Level:
     """One Galerkin space with its solution."""
 
-    small: ModalSubspace  # the projected plant
-    solution: SmallSolution  # its Riccati equation
+    small: modal_start.ModalSubspace  # the projected plant
+    solution: modal_start.SmallSolution  # its Riccati equation
     Z: Block  # X ~ Z Z', costate form
     # a, b: tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m)
     a: Array
@@ -112,8 +104,8 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
         old: the level before, near the solution.
     """
     ritz, omega, S = space.ritz(plant)
-    small = restrict(plant, ritz.V, omega, ritz.M_V)
-    solution = solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
+    small = modal_start.restrict(plant, ritz.V, omega, ritz.M_V)
+    solution = modal_start.solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
     root = on_root(plant.comm, partial(_root, solution.X))
     s, r = 2 * plant.n_s, len(omega)
     q, v = root[s : s + r] / omega[:, None], root[s + r :]
@@ -167,7 +159,7 @@ class StructuredGalerkin:
 
     tol: float = 1e-6  # bound on the relative change of the gain between the last two spaces, see gain_change
     max_iterations: int = 24  # bound on the number of spaces
-    modes: int = MODES  # number of modes
+    modes: int = modal_start.MODES  # number of modes
     per_step: int = 2  # responses added at a time
     tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
     progress: Progress | None = None  # called on every rank after each space with the history entry
@@ -181,8 +173,8 @@ class StructuredGalerkin:
         """
         begin = time.perf_counter()
         plant = Plant(problem)
-        check_damped(plant)
-        omega, Phi = plant_modes(plant, min(self.modes, plant.layout.n_e))
+        modal_start.check_damped(plant)
+        omega, Phi = modal_start.plant_modes(plant, min(self.modes, plant.layout.n_e))
         space = Space(Phi, plant.mass(Phi), plant.stiff(Phi))
         seconds = {"start": time.perf_counter() - begin}
         history: list[dict[str, float]] = []

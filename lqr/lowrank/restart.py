@@ -118,6 +118,6 @@ def _restore(plant: Plant, state: Iteration, data: dict[str, Array], tol: float)
     Z.count, Z.compressed_to = Z.hand.shape[1], int(data["compressed_to"])
     Z.appended = int(data["appended"])
     Z.widths = [int(width) for width in data["widths"]]
-    sweep = AdiSweep(Right(data["sweep_hand"], data["sweep_rows"]), Z, steps, first)
+    sweep = AdiSweep(Right(data["sweep_hand"], data["sweep_rows"]), Z, steps, first=first)
     state.gain = sweep.gain
     return sweep

@@ -160,8 +160,8 @@ class Training:
                 weights = on_root(comm, partial(nnls, C, c, goal))
                 xi = weights.x[sum(counts[: comm.rank]) :][: counts[comm.rank]]
                 cells = gathered(comm, all_cells.cells.sampled(xi), self.offset)
-            found = replace(all_cells, cells=cells, tau=goal, residual=weights.residual, error_galerkin=error)
-            models.append(replace(found, seconds={"basis": self.seconds, **self._spent[k]}))
+            model = replace(all_cells, cells=cells, tau=goal, residual=weights.residual, error_galerkin=error)
+            models.append(replace(model, seconds={"basis": self.seconds, **self._spent[k]}))
         return models
 
     def _forces(self, k: int) -> Array:

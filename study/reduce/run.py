@@ -15,23 +15,12 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
+from softgrasp.study.reduce import tables
 from softgrasp.study.reduce.box import measure_box
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.page import sections
 from softgrasp.study.reduce.result import BoxTests, MethodSweep, ReductionStudy, best, head_of
 from softgrasp.study.reduce.sweep import chosen_methods, sweep
-from softgrasp.study.reduce.tables import (
-    N_NOTE,
-    box_note,
-    box_table,
-    error_note,
-    error_table,
-    inner_note,
-    point_table,
-    refused_table,
-    summary,
-    time_table,
-)
 from softgrasp.study.reduce.times import measured_run, speed_notes, speed_of
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
@@ -104,8 +93,8 @@ def run_reduce(
     def page() -> Page:
         files = draw(out, study, views) if pictures else []
         parts = sections(study, files)
-        tables = {"points.csv": point_table(study)}
-        return Page(f"{scene.name}: reduced models", summary(study), parts, tables, [*files, *models])
+        points = {"points.csv": tables.point_table(study)}
+        return Page(f"{scene.name}: reduced models", tables.summary(study), parts, points, [*files, *models])
 
     show(console, study)
     list_files(console, session.write(scene, result, page))
@@ -165,7 +154,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
     model = study.full.model
     head, seconds = head_of(model, study.full.trajectory)
     result = head | {
-        "N_means": N_NOTE,
+        "N_means": tables.N_NOTE,
         "methods": {s.method.key: [asdict(p) for p in s.points] for s in study.sweeps},
         "about": {s.method.key: _about(s) for s in study.sweeps},
         "findings": study.findings,
@@ -215,21 +204,23 @@ def _box_result(box: BoxTests) -> dict[str, Any]:
 def show(console: Console, study: ReductionStudy) -> None:
     """Print the tables."""
     energy, box = study.full.model.scene.reduction.energy, study.box
-    _print(console, error_table(study.sweeps, energy, narrow=True))
-    note = f"{error_note(energy)} fixed: with fixed solid modes. {N_NOTE} {inner_note(study.sweeps)}"
+    _print(console, tables.error_table(study.sweeps, energy, narrow=True))
+    note = (
+        f"{tables.error_note(energy)} fixed: with fixed solid modes. {tables.N_NOTE} {tables.inner_note(study.sweeps)}"
+    )
     console.print(note, style="dim", markup=False)
     for sentence in study.findings:
         console.print(sentence, markup=False)
-    for sizes, titles, reason in refused_table(study.sweeps, narrow=True).rows:
+    for sizes, titles, reason in tables.refused_table(study.sweeps, narrow=True).rows:
         console.print(f"N = {sizes} refused for {titles}: {reason}.", markup=False)
-    _print(console, time_table(study.speeds, narrow=True))
+    _print(console, tables.time_table(study.speeds, narrow=True))
     for note in study.speed_notes:
         console.print(note)
     if box.none:
         console.print(f"no errors at other parameters: {box.none}")
     else:
-        console.print(box_note(box), markup=False)
-        _print(console, box_table(box, narrow=True))
+        console.print(tables.box_note(box), markup=False)
+        _print(console, tables.box_table(box, narrow=True))
 
 
 def _print(console: Console, table: Table) -> None:

@@ -11,15 +11,8 @@ from mpi4py import MPI
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.scene.control import Reduction
+from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.bases.registry import (
-    METHODS,
-    PAPER_METHODS,
-    find_method,
-    impossible_sizes,
-    make_bases,
-    possible_sizes,
-)
 from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.errors import Comparison
@@ -39,9 +32,9 @@ Progress = Callable[[str, int, int], None]
 
 def chosen_methods(options: Reduction) -> tuple[str, ...]:
     """Methods of the scene, or the paper's six and further ones. Raises BasisError: a name is unknown."""
-    names = tuple(options.methods) or (*PAPER_METHODS, *FURTHER)
+    names = tuple(options.methods) or (*registry.PAPER_METHODS, *FURTHER)
     for name in names:
-        find_method(name)
+        registry.find_method(name)
     return names
 
 
@@ -52,13 +45,13 @@ def bases_of(
 
     What does not fit is put into ``refused`` by its N, with the reason. Collective.
     """
-    method = METHODS[name]
+    method = registry.METHODS[name]
     inner = None if options.inner == "auto" or not method.snapshots else options.inner
     rule = [Truncation(energy=options.energy)] if method.snapshots else []
     sizes = list(sizes)
     while sizes or rule:
         try:
-            bases = make_bases(name, states, [*sizes, *rule], inner, options.engine)
+            bases = registry.make_bases(name, states, [*sizes, *rule], inner, options.engine)
         except BasisError as error:
             most = error.most
             larger = [N for N in sizes if most is not None and most < N]
@@ -108,10 +101,12 @@ def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = 
 
 def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | None = None) -> MethodSweep:
     """One method at all its N. Collective. Raises SolverError: a factorisation failed."""
-    scene, system, method = full.model.scene, full.model.system, METHODS[name]
+    scene, system, method = full.model.scene, full.model.system, registry.METHODS[name]
     states = States(system, ((system, full.snapshots),))
-    refused = impossible_sizes(method, system.layout.n_s, options.N)
-    bases, kept = bases_of(name, states, possible_sizes(method, system.layout.n_s, options.N), options, refused)
+    refused = registry.impossible_sizes(method, system.layout.n_s, options.N)
+    bases, kept = bases_of(
+        name, states, registry.possible_sizes(method, system.layout.n_s, options.N), options, refused
+    )
     outputs, key = make_outputs(scene, system), scene_hash(scene)
     points: list[Point] = []
     models: dict[int, ReducedModel] = {}
