@@ -47,8 +47,7 @@ class Diagnosis:
     def require(self, but: Collection[str] = ()) -> None:
         """Go on only when solvable, whatever the errors of the topics ``but`` are.
 
-        Raises:
-            ControlError: with the first error's sentence.
+        Raises ControlError: with the first error's sentence.
         """
         for finding in self.findings:
             if finding.kind == "error" and finding.topic not in but:

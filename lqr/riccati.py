@@ -49,8 +49,7 @@ def choose(problem: RiccatiProblem, method: Method = "auto") -> SolverChoice:
     however many modes are kept short of all (residual 1e-4 after one Newton step with 10 to 120 of 286 modes): three
     steps, where RADI takes the solves of one. Nor is that start known to stabilise.
 
-    Raises:
-        SolverError: the name is unknown.
+    Raises SolverError: the name is unknown.
     """
     if method not in METHODS:
         raise SolverError(f"the Riccati method {method!r} is unknown; choose one of {', '.join(METHODS)}")

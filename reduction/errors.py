@@ -90,8 +90,7 @@ def row_weights(system: BlockSystem) -> tuple[Array, float]:
 def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: BlockSystem) -> Array:
     """V with V Y = what the model shows for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
 
-    Raises:
-        ModelError: the model holds no basis on the mesh.
+    Raises ModelError: the model holds no basis on the mesh.
     """
     N, n_s = model.N, small.n_s
     width = N + 2 * n_s
@@ -172,8 +171,7 @@ class Comparison:
     def span(self, view: View) -> Span:
         """Snapshots in what the largest model shows; factored at the first call. Collective.
 
-        Raises:
-            ModelError: the model holds no basis on the mesh.
+        Raises ModelError: the model holds no basis on the mesh.
         """
         if view not in self._spans:
             V = shown_rows(view, self.model, self.small, self.system)
@@ -183,8 +181,7 @@ class Comparison:
     def state_error(self, view: View, model: ReducedModel, small: SmallModel, run: ReducedTrajectory) -> float:
         """|X - X_r|_F / |X|_F of a run on the full model's time grid, of the largest model or a smaller. Collective.
 
-        Raises:
-            ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
+        Raises ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
         """
         steps = self.snapshots.steps
         if len(run.x) <= int(steps.max(initial=0)):
@@ -205,8 +202,7 @@ class Comparison:
 
         The hand of V y is that of the state, q_s = S_q y and v_s = S_v y.
 
-        Raises:
-            ModelError: the model shows more than the largest.
+        Raises ModelError: the model shows more than the largest.
         """
         span = self.span(view)
         R = span.inside(shown_rows(view, model, small, self.system))

@@ -67,8 +67,7 @@ def reading(
 
     The block must not communicate. The hash of the lift counts where a layout takes it.
 
-    Raises:
-        ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
+    Raises ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
     """
     comm = MPI.COMM_SELF if layout is None else layout.comm
     with agree(comm):

@@ -169,8 +169,7 @@ def check_axis(hamiltonian: Array, values: Complex, stable: int) -> None:
     A double eigenvalue on the axis splits by sqrt(eps), so a small real part alone says nothing: what counts is the
     distance min sigma(H - i omega I) to a matrix with an eigenvalue there.
 
-    Raises:
-        ControlError: the distance is of the order of rounding.
+    Raises ControlError: the distance is of the order of rounding.
     """
     n = len(hamiltonian) // 2
     size = float(np.linalg.norm(hamiltonian))

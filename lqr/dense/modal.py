@@ -27,12 +27,11 @@ NOISE = 100 * EPS  # of the largest row of Z: an entry of X beside it is roundin
 
 @dataclass(frozen=True)
 class TissueMatrices:
-    """Dense M_ee, K_ee, D_ee (n_e, n_e); T, G (n_e, n_s); C_z (n_e, p); B_z (n_e, m), in global numbering."""
+    """Dense M_ee, K_ee, D_ee (n_e, n_e); G (n_e, n_s); C_z (n_e, p); B_z (n_e, m), in global numbering."""
 
     M: Array
     K: Array
     D: Array
-    T: Array
     G: Array
     C_z: Array
     B_z: Array | None = None
@@ -76,12 +75,12 @@ def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
     matrix = system.damping.matrix
     extra = None if matrix is None else gather_matrix(layout, matrix)
-    T, G, C_z = (rows_on_root(layout.comm, a) for a in (system.T, system.G, problem.C_z))
+    G, C_z = (rows_on_root(layout.comm, a) for a in (system.G, problem.C_z))
     B_z = None if problem.B_z is None else rows_on_root(layout.comm, problem.B_z)
-    if M is None or K is None or T is None or G is None or C_z is None:
+    if M is None or K is None or G is None or C_z is None:
         return None
     D = system.damping.alpha * M + (system.damping.beta * K if extra is None else extra)
-    return TissueMatrices(M, K, D, T, G, C_z, B_z)
+    return TissueMatrices(M, K, D, G, C_z, B_z)
 
 
 def assemble_space(
@@ -146,8 +145,7 @@ def in_energy(space: StateSpace, omega: Array) -> StateSpace:
 def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
     """The plant in all its modes, K_ee phi = omega^2 M_ee phi.
 
-    Raises:
-        SolverError: the stiffness is not positive definite: the hand does not hold the body.
+    Raises SolverError: the stiffness is not positive definite: the hand does not hold the body.
     """
     squares, Phi = scipy.linalg.eigh(tissue.K, tissue.M)
     _check_held(float(squares[0]), float(squares[-1]))

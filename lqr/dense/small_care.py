@@ -40,10 +40,7 @@ def solve_reduced(matrices: ReducedMatrices) -> Array:
 
     The Hamiltonian matrix, scaled by one number so that its off-diagonal blocks have like size, is brought to ordered
     real Schur form. When the residual shows that this is not good enough, :func:`softgrasp.lqr.dense.care.care`
-    balances, polishes and explains.
-
-    Raises:
-        ControlError: there is no stabilising solution.
+    balances, polishes and explains. Raises ControlError: there is no stabilising solution.
     """
     P = fast_solution(matrices)
     if P is not None:
@@ -55,8 +52,7 @@ def solve_reduced(matrices: ReducedMatrices) -> Array:
 def fast_solution(m: ReducedMatrices) -> Array | None:
     """P_N without balancing, or None when it is not accurate or not stabilising.
 
-    Raises:
-        ControlError: see :func:`check_seen`.
+    Raises ControlError: see :func:`check_seen`.
     """
     n = m.N
     lu, pivots, info = scipy.linalg.lapack.dgetrf(m.E)
@@ -101,10 +97,7 @@ def check_seen(A: Array, G: Array, H: Array, omega: float) -> None:
     """The Hamiltonian matrix is farther from one with the eigenvalue i omega than a projection rounds.
 
     A rigid motion that inputs do not reach or outputs do not see makes a quadruple eigenvalue 0, which rounding moves
-    by eps^(1/4): a solution exists then, but another one on another number of ranks.
-
-    Raises:
-        ControlError: it is not.
+    by eps^(1/4): a solution exists then, but another one on another number of ranks. Raises ControlError: it is not.
     """
     hamiltonian, _, _ = balanced_hamiltonian(A, G, H)
     if smallest_singular_value(hamiltonian, 1j * omega) <= UNSEEN * float(np.linalg.norm(hamiltonian)):

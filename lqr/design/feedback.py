@@ -75,8 +75,7 @@ class Design:
 def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
     """The problem and what is known before the solve; whether only some modes are to be controlled. Collective.
 
-    Raises:
-        SoftgraspError: the scene has no solution, in one sentence.
+    Raises SoftgraspError: the scene has no solution, in one sentence.
     """
     scene_target(model)
     actuation(model)

@@ -51,8 +51,7 @@ class SmallPlant:
     def rest_at(self, q_bar: Array) -> tuple[Array, Array]:
         """x_bar (N,) and u_bar (n_s,) with 0 = A x + B u + f and S_q x = q_bar.
 
-        Raises:
-            ControlError: the plant has no such state, or more than one.
+        Raises ControlError: the plant has no such state, or more than one.
         """
         n_s = len(self.S_q)
         K = np.block([[self.A, self.B], [self.S_q, np.zeros((n_s, n_s))]])

@@ -169,8 +169,7 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: AdiSweep, queue: ShiftQ
 def sweep_norms(plant: Plant, sweep: AdiSweep) -> tuple[float, float]:
     """||W W'||_2 of the Lyapunov and ||W W' - dK' dK||_2 of the Riccati residual, dK = K_new - K. Collective.
 
-    Raises:
-        SolverError: the residual grows without bound: the closed loop of the gain is unstable.
+    Raises SolverError: the residual grows without bound: the closed loop of the gain is unstable.
     """
     begin = time.perf_counter()
     q, both = sweep.W.columns, sweep.state[plant.inputs :].block  # [W, dK']

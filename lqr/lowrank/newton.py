@@ -146,13 +146,8 @@ class NewtonADI:
     ) -> RiccatiSolution:
         """Compressed Z, its true residual and the bookkeeping."""
         state.seconds |= tissue.seconds
-        counts = {
-            "newton_steps": state.step,
-            "adi_steps": state.solves,
-            "solves": state.solves,
-            "factorisations": tissue.factors,
-            "columns": sweep.Z.appended,
-        }
+        counts = {"newton_steps": state.step, "adi_steps": state.solves, "solves": state.solves}
+        counts |= {"factorisations": tissue.factors, "columns": sweep.Z.appended}
         about = f"low rank, {state.step} Newton steps, {tissue.name} tissue solves"
         iterate = Iterate(
             sweep.Z.block, sweep.new.block, "newton_adi", about, self.tol, state.history, counts, dict(state.seconds)

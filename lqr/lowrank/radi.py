@@ -49,8 +49,7 @@ def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, A
 def radi_step(plant: Plant, tissue: ShiftedTissue, state: LowRankSweep, queue: ShiftQueue) -> complex:
     """One solve with p + m right-hand sides; W, K and Z are updated. Collective. Returns the shift.
 
-    Raises:
-        SolverError: Y is not positive definite: rounding has destroyed the step.
+    Raises SolverError: Y is not positive definite: rounding has destroyed the step.
     """
     q = state.W.columns
     s, V = state.solve(tissue, queue)
@@ -102,13 +101,8 @@ class RADI:
             queue = ShiftQueue.start(shift_range(plant, poles), poles)
             history = self._iterate(plant, tissue, state, queue)
             state.seconds |= tissue.seconds
-            counts = {
-                "newton_steps": 0,
-                "adi_steps": state.steps,
-                "solves": state.steps,
-                "factorisations": tissue.factors,
-                "columns": state.Z.appended,
-            }
+            counts = {"newton_steps": 0, "adi_steps": state.steps, "solves": state.steps}
+            counts |= {"factorisations": tissue.factors, "columns": state.Z.appended}
             about = f"low rank from X = 0, {tissue.name} tissue solves"
             columns = state.Z.block, state.gain.block
             iterate = Iterate(*columns, "radi", about, self.tol, history, counts, state.seconds)

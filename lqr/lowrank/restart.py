@@ -85,8 +85,7 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: AdiSweep) ->
 def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> AdiSweep | None:
     """Put ``state`` back and return the sweep in progress; None without restart files. Collective.
 
-    Raises:
-        CheckpointError: the files are damaged or belong to another problem, tolerance apart, or rank count.
+    Raises CheckpointError: the files are damaged or belong to another problem, tolerance apart, or rank count.
     """
     comm, manifest = plant.comm, _manifest(folder)
     if not comm.bcast(manifest.exists()):

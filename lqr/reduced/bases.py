@@ -118,10 +118,7 @@ def weighted_pod(problem: RiccatiProblem, Z: Block) -> BasisFamily:
     """V = W^{-1/2} POD_k(W^{1/2} P), W = (E + E')/2, so that V'WV = I. Collective.
 
     W^{1/2} P has the left singular vectors of W^{1/2} Y, Y = Z R_Z'; with Y = Q R, Q'W Q = LL', L'R = u s v' this gives
-    V = Q L^{-T} u: no root of W is needed.
-
-    Raises:
-        ControlError: W is not positive definite.
+    V = Q L^{-T} u: no root of W is needed. Raises ControlError: W is not positive definite.
     """
     check_weight(problem)
     comm = problem.layout.comm
@@ -267,8 +264,7 @@ def weight_times(problem: RiccatiProblem, X: Block) -> Block:
 def check_weight(problem: RiccatiProblem) -> None:
     """W is positive definite: M_ss - N' M_ee^{-1} N > 0 for its coupling block N. Collective.
 
-    Raises:
-        ControlError: it is not; the hand is too light.
+    Raises ControlError: it is not; the hand is too light.
     """
     system = problem.system
     M_ss, coupling = weight_blocks(problem)

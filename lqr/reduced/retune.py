@@ -75,8 +75,7 @@ class Retuner:
     def at(self, materials: Materials) -> ReducedMatrices:
         """The reduced equation for other Lame constants and viscosities.
 
-        Raises:
-            ControlError: the number of layers or a density differs from the reference.
+        Raises ControlError: the number of layers or a density differs from the reference.
         """
         if len(materials) != len(self.reference):
             raise ControlError(f"{len(materials)} materials are given; the body has {len(self.reference)} layers")

@@ -170,8 +170,7 @@ class GainJudge:
         :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa` and the cost from the lowest modes; where
         the certificate fails, all modes are taken up to :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
 
-        Raises:
-            SolverError: no eigenvalue converges, and there are too many modes to take all.
+        Raises SolverError: no eigenvalue converges, and there are too many modes to take all.
         """
         K = gain.block
         if self.loop.complete:

@@ -41,8 +41,7 @@ class PartsRequest:
 def cholesky_of(comm: MPI.Intracomm, G: Array) -> Array:
     """Lower factor of a small Gram matrix (real or complex), the same bits on every rank. Collective.
 
-    Raises:
-        BasisError: the inner product is not positive definite.
+    Raises BasisError: the inner product is not positive definite.
     """
     try:
         return on_root(comm, lambda: np.linalg.cholesky((G + G.T.conj()) / 2))

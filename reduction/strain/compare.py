@@ -52,8 +52,7 @@ class Reference:
     def missed(self, a: Array, v: Array) -> Array:
         """[missed, whole] squares of z, v and the energy norm for states (steps + 1, k), (3, 2).
 
-        Raises:
-            ModelError: the run is shorter than the snapshots.
+        Raises ModelError: the run is shorter than the snapshots.
         """
         steps = self.full.snapshots.steps
         if len(a) <= int(steps.max(initial=0)):

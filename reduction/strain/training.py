@@ -110,8 +110,7 @@ class Training:
     def galerkin(self, k: int) -> tuple[StrainRun, ...]:
         """All training runs of the model on all cells; made once for each k. Collective.
 
-        Raises:
-            SolverError: a run did not converge.
+        Raises SolverError: a run did not converge.
         """
         if k not in self._galerkin:
             with self._stage(k, "galerkin"):
@@ -199,8 +198,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
     Both weigh the same. The velocities of one run hold shapes that its displacements pass too fast; several runs
     have these shapes, and their velocities would only crowd out the soft ones.
 
-    Raises:
-        BasisError: the snapshots carry fewer columns, or are zero or not finite.
+    Raises BasisError: the snapshots carry fewer columns, or are zero or not finite.
     """
     layout, n = system.layout, system.layout.n_local
     parts = [thinned(run, -(-SNAPSHOTS // len(runs))).Z for run in runs]

@@ -61,8 +61,7 @@ def run_reduce(
 ) -> dict[str, Any]:
     """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
 
-    Raises:
-        SoftgraspError: with one sentence.
+    Raises SoftgraspError: with one sentence.
     """
     if tolerance is not None:
         overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
