@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.run.trajectory import Trajectory
@@ -21,6 +20,9 @@ from softgrasp.reduction.errors import Comparison, ModelErrors, full_energy, sho
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.propagator import Propagator, propagator
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
 
 REST = 1e-9  # of the largest displacement: a solve for an equilibrium leaves 1e-12, a motion of use far more
 

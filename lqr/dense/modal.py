@@ -139,7 +139,8 @@ def in_energy(space: StateSpace, omega: Array) -> StateSpace:
     """L E S, L A S, B, C S with S = blkdiag(I, 1/omega, I), L = blkdiag(I, omega, I), of [q_s, v_s, eta, eta']."""
     k = len(omega)
     L = np.concatenate([np.ones(len(space.E) - 2 * k), omega, np.ones(k)])
-    return StateSpace(L[:, None] * space.E / L, L[:, None] * space.A / L, space.B, space.C / L)
+    S = 1 / L
+    return StateSpace(L[:, None] * space.E * S, L[:, None] * space.A * S, space.B, space.C * S)
 
 
 def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
