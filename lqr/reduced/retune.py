@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,32 +109,26 @@ class RetunedGain(JudgedGain):
     seconds: float = NAN  # of the re-tuning
 
 
-def over_box(
+def retuned_gain(
     retuner: Retuner,
-    settings: Sequence[Materials],
+    materials: Materials,
     solve: Callable[[RiccatiProblem], RiccatiSolution],
     start: Block,
     modes: int | None = None,
     law: Sampling | None = None,
-) -> tuple[RetunedGain, ...]:
-    """Error of the re-tuned gain at every setting of a box. Collective.
+) -> RetunedGain:
+    """Error of the re-tuned gain at one setting of the box. Collective.
 
     Args:
-        settings: materials of all layers, one tuple per point.
         solve: full solver, the reference.
         start: start minus target of hand and tissue, one column.
         modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
         law: instants of the loop; None judges the continuous law alone.
     """
-    result = []
-    comm = retuner.problem.layout.comm
-    for materials in settings:
-        problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
-        try:
-            tuned = on_root(comm, lambda materials=materials: retuner.solve(materials))  # type: ignore[misc]
-        except ControlError as error:
-            result.append(RetunedGain(materials, reason=str(error)))
-            continue
-        judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
-        result.append(judge.judged(RetunedGain(materials, tuned.seconds), retuner.full_gain(tuned)))
-    return tuple(result)
+    try:
+        tuned = on_root(retuner.problem.layout.comm, lambda: retuner.solve(materials))
+    except ControlError as error:
+        return RetunedGain(materials, reason=str(error))
+    problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
+    judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
+    return judge.judged(RetunedGain(materials, tuned.seconds), retuner.full_gain(tuned))
