@@ -53,12 +53,9 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     if study.bases:
         parts += _reduced(study, pick("errors.png"))
     if study.margins is not None:
-        from softgrasp.study.control.bode import MARGIN_HEADER, margin_rows, margin_text  # brings Matplotlib
+        from softgrasp.study.control.bode import margin_table, margin_text  # brings Matplotlib
 
-        rows, text = margin_rows(study.margins), margin_text(study.margins)
-        parts.append(
-            Section("Margins of the small controller", text, header=MARGIN_HEADER, rows=rows, figures=pick("bode.png"))
-        )
+        parts.append(margin_table(study.margins).section(margin_text(study.margins), figures=pick("bode.png")))
     for i, r in enumerate(study.retuned):
         text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
         own = [] if i else pick("retune.png")

@@ -17,7 +17,7 @@ from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
-from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
+from softgrasp.lqr.plant.identities import rigid_gains, translation_defect, velocity_defect
 from softgrasp.lqr.plant.target import Target
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.reduced.retune import RetunedGain
@@ -144,6 +144,7 @@ def gain_result(
 ) -> dict[str, Any]:
     """The keys of ``result.json`` that need no closed loop. Collective."""
     problem, solution, quality, layout = d.problem, d.solution, d.quality, d.problem.layout
+    displaced, moving = rigid_gains(problem, solution)
     return {
         "command": "control",
         **origin(d.model.scene, layout.comm.size),
@@ -155,8 +156,8 @@ def gain_result(
         **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
         "residual": solution.residual,
         "optimal_cost": d.judge.optimal,
-        "gain_translation": gain_translation(problem, solution).tolist(),
-        "gain_rigid_velocity": gain_rigid_velocity(problem, solution).tolist(),
+        "gain_translation": displaced.tolist(),
+        "gain_rigid_velocity": moving.tolist(),
         "identity_translation": translation_defect(problem, solution),
         "identity_velocity": velocity_defect(problem, solution),
         "closed_loop_abscissa": quality.abscissa,

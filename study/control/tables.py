@@ -12,7 +12,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
-from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation
+from softgrasp.lqr.plant.identities import rigid_gains
 from softgrasp.lqr.reduced.riccati import JudgedGain
 from softgrasp.study.control.result import TITLES, ControlStudy, Retuned, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header
@@ -94,7 +94,7 @@ def _controller(controller: CertifiedController | None, tick: float) -> str:
 
 def gain_rows(design: Design) -> list[tuple[str, str]]:
     """The solution of the Riccati equation and its closed loop as label and text."""
-    solution = design.solution
+    solution, (displaced, moving) = design.solution, rigid_gains(design.problem, design.solution)
     counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
     return [
         ("method", solution.summary),
@@ -102,8 +102,8 @@ def gain_rows(design: Design) -> list[tuple[str, str]]:
         ("true relative residual", f"{solution.residual:.1e}"),
         ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
         *_spectrum(design),
-        ("gain, body displaced", _matrix(gain_translation(design.problem, solution))),
-        ("gain, body moving", _matrix(gain_rigid_velocity(design.problem, solution))),
+        ("gain, body displaced", _matrix(displaced)),
+        ("gain, body moving", _matrix(moving)),
     ]
 
 
