@@ -11,7 +11,7 @@ kappa a + c_0, into G (c_1 + C p). Inputs beyond their limits are fixed there, a
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -31,7 +31,7 @@ class FiniteDrive(LoopDrive):
         super().__init__(plant, steps)
         system, dt, n_s = plant.system, plant.dt, plant.system.layout.n_s
         self.gain, self.bound = gain, bound
-        self.midpoint: Any = plant.midpoint  # that of finite strain
+        self.midpoint = cast(Any, plant.midpoint)  # that of finite strain
         self.inertia = system.M_hand + (plant.kappa * system.M_rigid if system.two_way else 0.0)
         K_z = K_v = np.zeros_like(system.G)
         self.offset, self.F = np.zeros(n_s), np.zeros((n_s, n_s))
