@@ -37,12 +37,13 @@ COMPARED_3D = 3e-2
 MOST_COMPARED = {2: 60_000, 3: 60_000}  # unknowns of the mesh to compare with
 
 
-def estimate(model: Model, coarse: Small | None = None) -> MeshEstimate:
+def estimate(model: Model, coarse: Small | None = None, finer: Small | None = None) -> MeshEstimate:
     """Estimate the error that the mesh leaves in the outputs of the scene's run. Collective.
 
     Args:
         model: the model.
         coarse: its small model, if there is one.
+        finer: that of :func:`next_order`, likewise, for scenes with ``tissue.refine``.
 
     Raises:
         SolverError: a static solve fails.
@@ -50,26 +51,24 @@ def estimate(model: Model, coarse: Small | None = None) -> MeshEstimate:
     """
     begin = time.perf_counter()
     small = coarse or reduced(model)
-    run = run_small(small)
+    run = small.run
     if model.scene.tissue.refine is not None:
-        other = reduced(next_order(model))
+        other = finer or reduced(next_order(model))
         by, bound, offer = "order", BOUNDS[min(model.scene.tissue.order, 3)], None
-        finer = run_small(other)
-        relative, delta = difference(small, other, finer.deformation, run.deformation)
+        relative, delta = difference(small, other)
     else:
         by, bound = "graded", GRADED_BOUND
         for goal in COMPARED if small.model.system.layout.dimension == 2 else (COMPARED_3D,):
             other = reduced(build(comparison(model.scene, goal), comm=model.system.layout.comm))
-            finer = run_small(other)
-            relative, delta = difference(small, other, finer.deformation, run.deformation)
+            relative, delta = difference(small, other)
             offer = (goal, other.model.system.layout.n_e)
             if relative > goal / SHARE or relative == 0:
                 break
         bound = bound if relative > goal / SHARE else bound + goal / max(relative, 1e-300)
     steps = model.scene.time.steps
     halved = run_small(small, 2 * steps).deformation[::2]
-    late, _ = difference(small, small, halved, run.deformation)
-    delta = delta + finer.rigid - run.rigid
+    late, _ = difference(small, small, halved)
+    delta = delta + other.run.rigid - run.rigid
     omega = small.modes[0][:2] / other.modes[0][:2] - 1
     comm = model.system.layout.comm
     return MeshEstimate(
@@ -96,15 +95,20 @@ def reduced(model: Model) -> Small:
         free()
 
 
-def difference(small: Small, other: Small, finer: Array, coarse: Array) -> tuple[float, Array]:
+def difference(small: Small, other: Small, finer: Array | None = None) -> tuple[float, Array]:
     """Largest difference of two runs over the largest deformation [1], and the difference (steps + 1, p).
 
     Outputs that are the hand's count only where there are no others.
+
+    Args:
+        small, other: the two models.
+        finer: deformation (steps + 1, p) instead of that of the other's run.
     """
+    finer = other.run.deformation if finer is None else finer
     tissue = np.abs(small.C).max(axis=1) + np.abs(other.C).max(axis=1) > 0
     if not tissue.any():
         tissue[:] = True
-    delta = finer - coarse
+    delta = finer - small.run.deformation
     scale = np.linalg.norm(finer[:, tissue], axis=1).max()
     largest = np.linalg.norm(delta[:, tissue], axis=1).max()
     return float(largest / scale) if scale > 0 else 0.0, delta

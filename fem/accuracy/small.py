@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,7 +48,12 @@ class Small:
     X: Array
     model: Model  # whose it is
 
-    @property
+    @cached_property
+    def run(self) -> SmallRun:
+        """The run of the scene, see :func:`run_small`."""
+        return run_small(self)
+
+    @cached_property
     def modes(self) -> tuple[Array, Array]:
         """Ritz frequencies omega (N,), ascending [1/s], and modes (N, N) with Phi' M Phi = 1."""
         squares, Phi = scipy.linalg.eigh(np.eye(len(self.M)), self.M)
@@ -100,18 +106,22 @@ def small_model(model: Model, solve: Solve, blocks: int = BLOCKS) -> Small:
     outputs = make_outputs(model.scene, system)
     C = output_columns(outputs, system.layout.n_local)
     X = solve(np.hstack([system.G, C]))
-    V, last = np.zeros((len(X), 0)), X
+    V = K_V = np.zeros((len(X), 0))
+    last = X
     for k in range(blocks):
         if k:
             last = solve(times_columns(system.M_ee, last))
         for _ in range(2):  # once is not enough where blocks are nearly dependent
-            last = last - V @ total(comm, V.T @ times_columns(system.K_ee, last)) if V.shape[1] else last
-            gram = total(comm, last.T @ times_columns(system.K_ee, last))
+            K_last = times_columns(system.K_ee, last)
+            known = total(comm, V.T @ K_last)
+            last, K_last = last - V @ known, K_last - K_V @ known
+            gram = total(comm, last.T @ K_last)
             scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
             squares, Q = np.linalg.eigh((gram + gram.T) / 2 / np.outer(scale, scale))
             kept = squares > DROPPED
-            last = last @ comm.bcast((Q[:, kept] / np.sqrt(squares[kept])) / scale[:, None])
-        V = np.hstack([V, last])
+            Q = comm.bcast((Q[:, kept] / np.sqrt(squares[kept])) / scale[:, None])
+            last, K_last = last @ Q, K_last @ Q
+        V, K_V = np.hstack([V, last]), np.hstack([K_V, K_last])
     damping = system.damping
     M = total(comm, V.T @ times_columns(system.M_ee, V))
     D = damping.alpha * M + damping.beta * np.eye(len(M))
@@ -157,16 +167,15 @@ def run_small(small: Small, steps: int | None = None) -> SmallRun:
     loads = g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
     s = 2 / dt
     inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
-    A, B = inverse @ (s * small.M), -inverse
-    responses = loads @ (inverse @ small.G).T
-    v, Z, a = np.zeros_like(z), np.empty((n + 1, len(z))), np.empty((n, len(z)))
-    Z[0] = z
+    half = np.hstack([-inverse, s * s * inverse @ small.M])  # w = z_mid - z_n from z_n and u_n = v_n / s
+    T = np.vstack([2 * half, 2 * half]) + np.diag(np.repeat([1.0, -1.0], len(z)))  # u_{n+1} = 2 w - u_n
+    Y = np.empty((n + 1, 2 * len(z)))
+    Y[0, : len(z)], Y[0, len(z) :] = z, 0.0
+    Y[1:] = np.tile(2 * loads @ (inverse @ small.G).T, 2)
     for i in range(n):
-        w = A @ v + B @ Z[i] + responses[i]
-        a[i] = s * (s * w - v)
-        Z[i + 1] = Z[i] + 2 * w
-        v = 2 * s * w - v
-    return SmallRun(Z @ small.C.T, table.q @ small.C_s.T, loads, a)
+        Y[i + 1] += T @ Y[i]
+    u = Y[:, len(z) :]
+    return SmallRun(Y[:, : len(z)] @ small.C.T, table.q @ small.C_s.T, loads, s * s * np.diff(u, axis=0) / 2)
 
 
 def _table(small: Small, scene: Scene, dt: float) -> HandTable:
