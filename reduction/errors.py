@@ -1,4 +1,4 @@
-"""How far reduced models are from the full one: states, deformation, energy, and the floor that their basis sets.
+"""How far reduced models are from the full one: states, deformation, energy, and the projection error of their basis.
 
 Everything that a model shows is linear in Y = [x; q_s; v_s], its state and its hand. With one QR factorisation V = Q R
 of what the largest model of a family shows, and snapshots X = Q C + rest,
@@ -120,7 +120,7 @@ class Span:
         """|X - V Y|_F / |X|_F for R from :meth:`inside`."""
         return ratio(self.rest + squares(self.C - R @ Y), self.square)
 
-    def floor(self, R: Array) -> float:
+    def projection_error(self, R: Array) -> float:
         """min_Y |X - V Y|_F / |X|_F.
 
         Nearly dependent columns keep all their digits: no Gram matrix is formed.
@@ -197,8 +197,8 @@ class Comparison:
         peak = float(self.energy.max(initial=0.0))
         return ModelErrors(velocities, momenta, deformation, float(off) / (peak if peak > 0 else 1.0))
 
-    def floor(self, view: View, model: ReducedModel, small: SmallModel) -> float:
-        """min_Y |X - V Y|_F / |X|_F over all states V y that the model can show: the floor of its error. Collective.
+    def projection_error(self, view: View, model: ReducedModel, small: SmallModel) -> float:
+        """min_Y |X - V Y|_F / |X|_F over all states V y that the model can show. Collective.
 
         The hand of V y is that of the state, q_s = S_q y and v_s = S_v y.
 
@@ -206,7 +206,7 @@ class Comparison:
         """
         span = self.span(view)
         R = span.inside(shown_rows(view, model, small, self.system))
-        return span.floor(R @ with_hand(small))
+        return span.projection_error(R @ with_hand(small))
 
 
 def with_hand(small: SmallModel) -> Array:

@@ -13,17 +13,17 @@ from softgrasp.lqr.loop.responses import Notify
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.reduced.riccati import JudgedGain
+from softgrasp.lqr.reduced.riccati import GainQuality
 
 
-def with_bounds[Judged: JudgedGain](
+def with_bounds[Figures: GainQuality](
     problem: RiccatiProblem,
     solution: RiccatiSolution,
-    gains: Iterable[Judged],
+    gains: Iterable[Figures],
     start: Block,
     plan: LoopPlan,
     notify: Notify | None = None,
-) -> list[Judged]:
+) -> list[Figures]:
     """The same with bounds of the cost where the gain is stable, see :mod:`softgrasp.lqr.loop.gap`. Collective.
 
     ``cost_excess_proved`` holds for the run to the end of the plan and the optimal feedback after it. What the loop's

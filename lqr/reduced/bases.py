@@ -79,7 +79,7 @@ def left_singular(problem: RiccatiProblem, X: Block) -> tuple[Block, Array]:
     rows = np.vstack([X.hand, X.tall]) if comm.rank == 0 else X.tall
     f = factor(comm, rows)
     u, s, _ = small_svd(comm, f.R)
-    keep = s > f.floor * s[0]
+    keep = s > f.noise * s[0]
     U = f.Q @ u[:, keep]
     k = len(X.hand)
     hand = np.ascontiguousarray(comm.bcast(U[:k] if comm.rank == 0 else None))

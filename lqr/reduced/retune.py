@@ -17,7 +17,7 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.reduced.riccati import NAN, GainJudge, JudgedGain, project_plant
+from softgrasp.lqr.reduced.riccati import NAN, GainJudge, GainQuality, project_plant
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
 
@@ -102,7 +102,7 @@ class Retuner:
 
 
 @dataclass(frozen=True)
-class RetunedGain(JudgedGain):
+class RetunedGain(GainQuality):
     """The gain at one setting of the box, against the full Riccati solution there."""
 
     materials: Materials  # of all layers
@@ -131,4 +131,4 @@ def retuned_gain(
         return RetunedGain(materials, reason=str(error))
     problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
     judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
-    return judge.judged(RetunedGain(materials, tuned.seconds), retuner.full_gain(tuned))
+    return judge.with_quality(RetunedGain(materials, tuned.seconds), retuner.full_gain(tuned))

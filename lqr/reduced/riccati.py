@@ -35,7 +35,7 @@ class ReducedRiccati:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgedGain:
+class GainQuality:
     """A gain against the optimal one, on the full plant; nan where there is none."""
 
     error_K: float = NAN  # noqa: N815  ||K - K_hat||_F / ||K||_F in the paper's coordinates
@@ -66,7 +66,7 @@ class JudgedGain:
 
 
 @dataclass(frozen=True)
-class GainReport(JudgedGain):
+class GainReport(GainQuality):
     """The gain of one reduced equation."""
 
     method: str  # key of the basis
@@ -218,11 +218,11 @@ class GainJudge:
         off = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N)
         report = GainReport(basis.name, basis.N, off, matrices=reduced.matrices, gain=reduced.gain)
         try:
-            return self.judged(report, reduced.gain)
+            return self.with_quality(report, reduced.gain)
         except SolverError:
             return replace(report, error_K=gain_error(self.problem, self.gain, reduced.gain), certified=False)
 
-    def judged[Judged: JudgedGain](self, report: Judged, gain: Gain) -> Judged:
+    def with_quality[Figures: GainQuality](self, report: Figures, gain: Gain) -> Figures:
         """The same with the figures of a gain. Collective. Raises SolverError: see :meth:`quality`."""
         quality = self.quality(gain)
         return replace(

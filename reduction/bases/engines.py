@@ -44,7 +44,7 @@ class Factor:
     Q: Array  # local rows (n_local, r), orthonormal columns over all ranks
     R: Array  # (r, c), the same bits on every rank
     scale: float  # power of two that keeps squares of R from under- and overflow
-    floor: float  # singular values below ``floor * sigma_1`` are noise
+    noise: float  # singular values below ``noise * sigma_1`` are rounding
     partial: bool  # only the leading singular triplets were computed
     square: float  # sum of all sigma^2 of X / scale, also of those that are not in R
 
@@ -81,10 +81,10 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         raise BasisError("all snapshots are zero; there is nothing to build a basis from")
     rows = int(comm.allreduce(X.shape[0]))
     if engine == "gram":
-        Q, R, floor = *_gram(comm, X, k), GRAM_FLOOR
+        Q, R, noise = *_gram(comm, X, k), GRAM_FLOOR
     else:
         # LAPACK's own bound on an absolute error in sigma, with its usual factor sqrt of the size
-        floor = EPS * max(X.shape[1], 100) ** 0.5
+        noise = EPS * max(X.shape[1], 100) ** 0.5
         if comm.allreduce(X.shape[0], MPI.MIN) < X.shape[1]:
             # SLEPc loses columns of Q when a rank has fewer rows than columns and the snapshots are deficient
             Q, R = _flat(comm, X)
@@ -93,7 +93,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         else:
             Q, R = _svd(comm, X, rows, k)
     partial = engine != "tsqr" and k is not None and Q.shape[1] < min(rows, X.shape[1])
-    return Factor(Q, R, scale, floor, partial, square)
+    return Factor(Q, R, scale, noise, partial, square)
 
 
 def _dense(comm: MPI.Intracomm, X: Array, rows: int) -> PETSc.Mat:

@@ -104,7 +104,7 @@ def pod_part(
         return (place(rows.split(U)),)
 
     square = f.square if L is None else float(np.sum(s**2))
-    return Part(title, s, square, int(np.count_nonzero(s > f.floor * s[0])), columns, f.scale)
+    return Part(title, s, square, int(np.count_nonzero(s > f.noise * s[0])), columns, f.scale)
 
 
 def _whole(halves: Halves) -> Columns:

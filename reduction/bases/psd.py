@@ -166,5 +166,5 @@ def svd_like_parts(request: PartsRequest) -> tuple[Part, ...]:
 
 
 def _part(title: str, c: Canonical, s: Array, columns: Callable[[int], tuple[Columns, ...]]) -> Part:
-    rank = int(np.count_nonzero(s > c.factor.floor * s[0]))
+    rank = int(np.count_nonzero(s > c.factor.noise * s[0]))
     return Part(title, s, float(np.sum(s**2)), rank, columns, c.scale, c.rate)

@@ -71,7 +71,7 @@ class Reference:
         """Errors of one run."""
         return errors_of([self.missed(a, v)])
 
-    def floor(self, k: int) -> float:
+    def projection_error(self, k: int) -> float:
         """min_A |Z - Phi A|_F / |Z|_F over the first k columns."""
         cross = self.flat.cross[:k]
         best = np.linalg.solve(self.flat.gram[:k, :k], cross)

@@ -21,7 +21,7 @@ from softgrasp.lqr.plant.identities import rigid_gains, translation_defect, velo
 from softgrasp.lqr.plant.target import Target
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.reduced.retune import RetunedGain
-from softgrasp.lqr.reduced.riccati import GainReport, JudgedGain
+from softgrasp.lqr.reduced.riccati import GainQuality, GainReport
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
@@ -182,12 +182,12 @@ def report_dict(report: GainReport) -> dict[str, Any]:
     return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
 
 
-def bounds_dict(report: JudgedGain) -> dict[str, Any]:
+def bounds_dict(report: GainQuality) -> dict[str, Any]:
     """Bounds on the excess cost, and why there is none."""
     return {key: getattr(report, key) for key in ("cost_excess_proved", "cost_excess_at_most", "unbounded")}
 
 
-def radius_of(report: JudgedGain) -> float:
+def radius_of(report: GainQuality) -> float:
     """Spectral radius from tick to tick; nan where there is no gain."""
     return float("nan") if report.sampled is None else report.sampled.value
 

@@ -13,7 +13,7 @@ from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.plant.identities import rigid_gains
-from softgrasp.lqr.reduced.riccati import JudgedGain
+from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.control.result import TITLES, ControlStudy, Retuned, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.report.tables import Table
@@ -149,7 +149,7 @@ def _fast(r: Retuned) -> str:
     )
 
 
-def _mark(gain: JudgedGain) -> str:
+def _mark(gain: GainQuality) -> str:
     if gain.reason:
         return "none"
     if gain.stable or not gain.certified:
@@ -159,12 +159,12 @@ def _mark(gain: JudgedGain) -> str:
     return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
 
 
-def _cells(gain: JudgedGain, *values: float) -> list[float | None]:
+def _cells(gain: GainQuality, *values: float) -> list[float | None]:
     """Nothing where there is no gain, or no finite number."""
     return [None if gain.reason or not np.isfinite(x) else float(x) for x in values]
 
 
-def _excess(gain: JudgedGain) -> tuple[float, float, float]:
+def _excess(gain: GainQuality) -> tuple[float, float, float]:
     return gain.cost_excess, gain.cost_excess_proved, gain.cost_excess_at_most
 
 

@@ -180,7 +180,8 @@ def _measure(
     return StrainPoint(
         N=rom.N, k=rom.k, tau=rom.tau, residual=rom.residual, cells=rom.cells.count,
         error_own=own.z, error_own_velocity=own.v, error_own_energy_norm=own.energy_norm,
-        error_training=trained.z, error_galerkin=rom.error_galerkin, floor=training.references[0].floor(rom.k),
+        error_training=trained.z, error_galerkin=rom.error_galerkin,
+        floor=training.references[0].projection_error(rom.k),
         error_materials=worst["material"], error_motions=worst["motion"],
         drift=max(run.energy_drift for run in done), evaluations=done[0].evaluations, engine=done[0].engine,
         time_offline=sum(rom.seconds.values()), time_setup=setup, time_online=online,
