@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from rich.console import Console
@@ -22,7 +22,7 @@ from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.page import Section, captioned, equation_text
 from softgrasp.study.report.tables import pairs
-from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
+from softgrasp.study.shell.session import How, Page, Session, list_files, show_warnings
 
 CAPTIONS = {
     "move.png": "The body at some instants of the move.",
@@ -38,19 +38,17 @@ def run_simulate(
     overrides: list[str],
     console: Console,
     *,
-    quiet: bool = False,
     resume: bool = False,
     until: int | None = None,
-    pictures: bool = True,
     certify: bool = False,
-    empty: bool = False,
+    **how: Unpack[How],
 ) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective."""
-    if resume and empty:
+    if resume and how.get("empty"):
         raise SceneError("--empty removes what --resume goes on from; give one of them")
-    session = Session("simulate", path, overrides, out, console, quiet, pictures, empty)
+    session = Session("simulate", path, overrides, out, console, **how)
     model = session.model(session.scene())
-    scene, frames = model.scene, Frames(model, out, pictures)
+    scene, frames = model.scene, Frames(model, out, session.pictures)
 
     def join(run: Run) -> None:
         frames.begin(run)
@@ -80,7 +78,7 @@ def run_simulate(
 
     def page() -> Page:
         drawn = frames.draw(out, run)
-        if pictures and mesh_error is not None:
+        if session.pictures and mesh_error is not None:
             drawn += accuracy.draw(out / "mesh_error.png", run, mesh_error)
         sections = _sections(result, rows, drawn)
         told = [*result.summary(), *accuracy.summary(mesh_error)]

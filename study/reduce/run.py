@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
@@ -25,7 +25,7 @@ from softgrasp.study.reduce.times import measured_run, speed_notes, speed_of
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.session import Page, Session, list_files
+from softgrasp.study.shell.session import How, Page, Session, list_files
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
@@ -49,15 +49,7 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
 
 
 def run_reduce(
-    path: Path,
-    out: Path,
-    overrides: list[str],
-    console: Console,
-    *,
-    quiet: bool = False,
-    pictures: bool = True,
-    empty: bool = False,
-    tolerance: float | None = None,
+    path: Path, out: Path, overrides: list[str], console: Console, *, tolerance: float | None = None, **how: Unpack[How]
 ) -> dict[str, Any]:
     """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
 
@@ -65,7 +57,7 @@ def run_reduce(
     """
     if tolerance is not None:
         overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
-    session = Session("reduce", path, overrides, out, console, quiet, pictures, empty)
+    session = Session("reduce", path, overrides, out, console, **how)
     scene = session.scene()
     names = check_scene(scene)
     if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
@@ -83,14 +75,14 @@ def run_reduce(
     with watch.stage("models"):
         models = save_models(out, study.sweeps)
     views = None
-    if pictures:
+    if session.pictures:
         from softgrasp.study.reduce.pictures import draw, gather_views  # brings Matplotlib
 
         views = gather_views(model, study.full, study.sweeps)
     result = reduce_result(study, watch)
 
     def page() -> Page:
-        files = draw(out, study, views) if pictures else []
+        files = draw(out, study, views) if session.pictures else []
         parts = sections(study, files)
         points = {"points.csv": tables.point_table(study)}
         return Page(f"{scene.name}: reduced models", tables.summary(study), parts, points, [*files, *models])
