@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.estimate import estimate, next_order, reduced
+from softgrasp.fem.accuracy.estimate import estimate, next_order
 from softgrasp.fem.accuracy.marking import marked_cells
+from softgrasp.fem.accuracy.small import Small, reduced
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.bisect import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
@@ -20,7 +21,6 @@ from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
 
 if TYPE_CHECKING:
-    from softgrasp.fem.accuracy.small import Small
     from softgrasp.fem.scene.scene import Scene
     from softgrasp.fem.scene.tissue import Refine
 
@@ -71,7 +71,9 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
         if mesh is None:
             spent = comm.allreduce(time.perf_counter() - begin, MPI.MAX)
             model.watch.seconds["mesh"] = spent - model.watch.seconds["assembly"]  # with all passes and estimates
-            return replace(model, accuracy=_final(result, refine, passes, obstacle))
+            return replace(
+                model, accuracy=replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
+            )
         model, passes = build(scene, comm=comm, mesh=mesh), passes + 1
 
 
@@ -87,10 +89,6 @@ def _effectivity(old: Array, error: Array, new: Array) -> float:
     return float(np.clip(value, SEEN, MOST_ACCEPTED))
 
 
-def _final(result: MeshEstimate, refine: Refine, passes: int, obstacle: str) -> MeshEstimate:
-    return replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
-
-
 def judged(model: Model) -> MeshEstimate:
     """The estimate of a model that was built without one, against the tolerance of its scene if it has one. Collective.
 
@@ -101,7 +99,7 @@ def judged(model: Model) -> MeshEstimate:
     if refine is None or refine.tolerance is None:
         return result
     obstacle = "tissue.refine.passes = 0 allow none" if result.estimate > ACCEPTED * refine.tolerance else ""
-    return _final(result, refine, 0, obstacle)
+    return replace(result, tolerance=refine.tolerance, obstacle=obstacle)
 
 
 def _check_steps(scene: Scene, tolerance: float, error: float) -> None:

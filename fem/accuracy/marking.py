@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from softgrasp.fem.accuracy.small import Small, static_solves
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns
 
@@ -60,9 +60,8 @@ def indicators(small: Small, finer: Small) -> Array:
     m = min(MODES, len(omega))
     Phi = small.V @ Q[:, :m]
     coarse = prolong(model, finer.model, np.hstack([small.X, Phi]))
-    solve, free = static_solves(finer.model)
-    modal = solve(times_columns(finer.model.system.M_ee, coarse[:, n_s + p :]))
-    free()
+    with static_solves(finer.model) as solve:
+        modal = solve(times_columns(finer.model.system.M_ee, coarse[:, n_s + p :]))
     e = np.hstack([finer.X, modal]) - coarse / np.concatenate([np.ones(n_s + p), omega[:m] ** 2])
     at = np.unique(np.linspace(0, len(run.loads) - 1, INSTANTS).round().astype(int))
     accelerations = run.accelerations[at] @ (small.M @ Q[:, :m])  # xi'' = Phi' M z''
@@ -92,12 +91,9 @@ def prolong(model: Model, finer: Model, X: Array) -> Array:
 def cell_products(model: Model, X: Array) -> Array:
     """Elastic energy products k_T(x_i, x_j) of columns on the owned cells, (cells, k, k). Collective."""
     V, d, tissue = model.space.V, model.space.mesh.dimension, model.space.mesh
-    cells = tissue.mesh.topology.index_map(d).size_local
-    lam, mu = np.empty(cells), np.empty(cells)
-    whole = {model.system.layers[0].name: np.arange(cells)}
-    layers = cells_of_layers(tissue, model.scene) if model.scene.tissue.layers else whole
-    for blocks, m in zip(model.system.layers, model.system.materials, strict=True):
-        lam[layers[blocks.name]], mu[layers[blocks.name]] = m.lam, m.mu
+    _, layer = layer_numbers(tissue, model.scene)
+    lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[layer].T
+    cells = len(layer)
     element = V.element.basix_element
     shape = basix.CellType.triangle if d == 2 else basix.CellType.tetrahedron
     points, weights = basix.make_quadrature(shape, max(2 * (element.degree - 1), 1))

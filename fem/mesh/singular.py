@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -82,19 +82,15 @@ def exponent(angle: float, nu: float, held: int) -> float:
         return _mixed(angle, kappa, s)
     if angle <= np.pi:  # nothing is singular there
         return 1.0
-    factor = 1.0 if held == 0 else 1 / kappa
-    best = 1.0
-    for sign in (1.0, -1.0):
+    best, grid = 1.0, np.linspace(0.05, 1 - 1e-9, 400)
+    for factor in (s, -s) if held == 0 else (s / kappa, -s / kappa):
 
-        def gap(a: float, sign: float = sign) -> float:
-            return float(np.sin(a * angle) - sign * factor * a * s)
+        def gap(a: Any, factor: float = factor) -> Any:
+            return np.sin(a * angle) - factor * a
 
-        grid = np.linspace(0.05, 1 - 1e-9, 400)
-        values = [gap(a) for a in grid]
-        for i in range(len(grid) - 1):
-            if values[i] * values[i + 1] < 0:
-                best = min(best, float(brentq(gap, grid[i], grid[i + 1])))
-                break
+        changes = np.flatnonzero(np.diff(np.sign(gap(grid))))
+        if changes.size:
+            best = min(best, float(brentq(gap, *grid[changes[0] : changes[0] + 2])))
     return best
 
 
