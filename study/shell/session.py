@@ -47,7 +47,7 @@ class Page:
     options: str = ""
 
 
-class How(TypedDict, total=False):
+class Flags(TypedDict, total=False):
     """What every command may be told beside its own options, see :class:`Session`."""
 
     quiet: bool
