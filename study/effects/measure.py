@@ -244,7 +244,7 @@ def created(comm: MPI.Intracomm) -> Counter[str]:
 def read_table(text: str) -> dict[str, int]:
     """Class and number of creations from the text of PETSc's log."""
     counts: Counter[str] = Counter()
-    table = text.partition("\nObject Type")[2].partition("\n===")[0]
+    table = f"\n{text}".partition("\nObject Type")[2].partition("\n===")[0]
     for line in table.splitlines():
         parts = line.rsplit(None, 2)
         if len(parts) == 3 and parts[1].isdigit() and parts[2].isdigit() and parts[0].strip() != OWN:
