@@ -41,22 +41,26 @@ def write_model(
     """
     comm = MPI.COMM_SELF if lift is None else lift.layout.comm
     partial = path.with_name(path.name + ".part")
-    with agree(comm):
-        if comm.rank == 0:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with h5py.File(partial, "w") as file:
-                file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
-                small(file)
-    for rank in range(comm.size):
-        # one file, one writer at a time: the file library here is not a parallel one
+    try:
         with agree(comm):
-            if lift is not None and comm.rank == rank:
-                _write_rows(lift, partial)
-    with agree(comm):
+            if comm.rank == 0:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with h5py.File(partial, "w") as file:
+                    file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
+                    small(file)
+        for rank in range(comm.size):
+            # one file, one writer at a time: the file library here is not a parallel one
+            with agree(comm):
+                if lift is not None and comm.rank == rank:
+                    _write_rows(lift, partial)
+        with agree(comm):
+            if comm.rank == 0:
+                with h5py.File(partial, "r+") as file:
+                    seal(file)
+                partial.replace(path)
+    finally:  # of a file that was not written whole
         if comm.rank == 0:
-            with h5py.File(partial, "r+") as file:
-                seal(file)
-            partial.replace(path)
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager

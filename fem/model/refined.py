@@ -7,13 +7,12 @@ with r the distance from the nearest end of the contact zone, re-entrant corner 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 import dolfinx.mesh
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError, agree
@@ -22,6 +21,7 @@ from softgrasp.fem.mesh.check import longest_edges
 from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField
 from softgrasp.fem.mesh.lines import box_axes, box_of_lines, even_cells
 from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.seams import sort_facets
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.assembly import cells_of_layers
@@ -122,7 +122,10 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
         if aim is None:
             raise _too_large(refine, unknowns(whole, order))
         aim *= SHRINK
-    return whole if refine.contact == "inherit" else _forget(whole)
+    if refine.contact == "inherit":
+        return whole
+    kept, tags = ({k: v for k, v in marks.items() if k == "tags"} for marks in (whole.cells, whole.facets))
+    return replace(whole, cells=kept, facets=tags)  # zone and layers are selected again
 
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
@@ -162,18 +165,6 @@ def marked(tissue: TissueMesh, scene: Scene) -> Whole:
     return Whole(tissue.mesh, tissue.source, on_cells, on_facets, tissue.facet_sets, tissue.cell_sets)
 
 
-def _forget(whole: Whole) -> Whole:
-    """The mesh without the contact zone and layers it has inherited: they are selected again."""
-    return Whole(
-        whole.mesh,
-        whole.source,
-        {k: v for k, v in whole.cells.items() if k != "layers"},
-        {k: v for k, v in whole.facets.items() if k != "contact"},
-        whole.facet_sets,
-        whole.cell_sets,
-    )
-
-
 def ends_of(whole: Whole, scene: Scene) -> Ends:
     """Singular ends of a marked mesh."""
     layers = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
@@ -209,15 +200,8 @@ def unknowns(whole: Whole, order: int) -> int:
         pairs = np.concatenate([cells[:, list(pair)] for pair in combinations(range(d + 1), 2)])
         count += (order - 1) * len(np.unique(pairs[:, 0] * len(whole.points) + pairs[:, 1]))
     if order > 2:
-        faces = len(cells) if d == 2 else (4 * len(cells) + _outer(cells)) // 2
-        count += faces
+        count += len(cells) if d == 2 else (4 * len(cells) + int(sort_facets(cells).outer.sum())) // 2
     return d * count
-
-
-def _outer(cells: npt.NDArray[np.int64]) -> int:
-    facets = np.concatenate([np.delete(cells, i, axis=1) for i in range(4)])
-    _, count = np.unique(facets, axis=0, return_counts=True)
-    return int((count == 1).sum())
 
 
 def lattice(cells: list[int], order: int) -> int:

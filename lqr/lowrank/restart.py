@@ -16,7 +16,7 @@ from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 
-FORMAT = 3
+FORMAT = 4
 
 
 @dataclass

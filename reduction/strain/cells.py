@@ -14,11 +14,11 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.strain.compiled import LANES
 from softgrasp.fem.strain.laws import LAWS, LawName, Start
 from softgrasp.fem.system import LayerMaterial
 
 BLOCK = 1 << 20  # entries of H at a time
-LANES = 8  # points that `stepper.c` takes at a time
 
 
 @dataclass(frozen=True)

@@ -60,12 +60,12 @@ def parse_axis(text: str) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A scene file with ``--set``, and the keys of which all combinations of values are run."""
+    """What is asked for."""
 
-    path: Path
-    overrides: Sequence[str]
-    axes: tuple[Axis, ...]
-    N: int | None = None  # columns of the reduced model that runs instead of the full one
+    path: Path  # scene file
+    overrides: Sequence[str]  # arguments of ``--set``
+    axes: tuple[Axis, ...]  # keys with their values; all combinations are run
+    N: int | None = None  # columns of the reduced model that runs instead of the full one; None for the full model
 
     def points(self) -> list[dict[str, float]]:
         """The values of every point, the last key fastest."""
