@@ -36,17 +36,17 @@ def runs_below(folder: Path) -> Table:
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: there is no such folder; runs write into out/SCENE-COMMAND or where --out says")
-    found = []
+    runs = []
     for root, _, files in os.walk(folder):
         if "result.json" in files and (result := read_result(Path(root))):
-            found.append(((Path(root) / "result.json").stat().st_mtime, Path(root), result))
+            runs.append(((Path(root) / "result.json").stat().st_mtime, Path(root), result))
     header = ("folder", "command", "scene", "n_e", "total [s]", "warnings", "ended")
     rows = [
         (
             str(path), r["command"], r.get("scene", ""), r.get("n_e"), r.get("time", {}).get("total"),
             len(r.get("warnings", ())), time.strftime("%Y-%m-%d %H:%M", time.localtime(ended)),
         )
-        for ended, path, r in sorted(found, key=lambda entry: entry[0])
+        for ended, path, r in sorted(runs, key=lambda entry: entry[0])
     ]  # fmt: skip
     return Table(header, rows)
 

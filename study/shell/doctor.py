@@ -38,7 +38,7 @@ class Check:
 
     name: str  # what was looked at
     ok: bool  # whether it will work
-    value: str  # what was found
+    value: str  # version, path or number
     cure: str = ""  # one sentence on what to do; empty when ok
 
 
@@ -202,7 +202,7 @@ def checks() -> list[Check]:
 def show(console: Console) -> bool:
     """Write the diagnosis as a table; True when nothing needs a cure. Not collective: call on one rank."""
     table = Table(box=None, pad_edge=False)
-    for title in ("", "check", "found", "cure"):
+    for title in ("", "check", "value", "cure"):
         table.add_column(title, overflow="fold")
     results = checks()
     for check in results:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from mpi4py import MPI
 from rich.console import Console
@@ -45,6 +45,14 @@ class Page:
     tables: Mapping[str, Table] = field(default_factory=dict)
     files: Sequence[Path] = ()
     options: str = ""
+
+
+class How(TypedDict, total=False):
+    """What every command may be told beside its own options, see :class:`Session`."""
+
+    quiet: bool
+    pictures: bool
+    empty: bool
 
 
 @dataclass(frozen=True)
