@@ -26,7 +26,7 @@ from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_to_relative
+from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
@@ -105,7 +105,7 @@ def _answer(problem: RiccatiProblem, E: Any, B: Array, Z: Array, seconds: float)
     s = 2 * problem.layout.n_s
     gain = -np.linalg.solve(problem.R, (B.T @ Z) @ (E.T @ Z).T).T
     relative = costates_to_relative(problem.system, Block(Z[:s], Z[s:]))
-    return relative, Gain.of_block(gain_to_relative(problem.system, Block(gain[:s], gain[s:]))), seconds
+    return relative, Gain.of_block(gain_to_absolute(problem.system, Block(gain[:s], gain[s:]), -1)), seconds
 
 
 def scipy_answer(problem: RiccatiProblem) -> Answer:

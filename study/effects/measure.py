@@ -53,7 +53,7 @@ class Case:
 
 
 class Stepper:
-    """A run that can be taken back to its start, to time its steps as often as wanted. Collective."""
+    """A run that can be taken back to its start, to time its steps any number of times. Collective."""
 
     def __init__(self, model: Model) -> None:
         self.comm: MPI.Intracomm = model.system.layout.comm

@@ -72,7 +72,7 @@ def compose(study: EffectsStudy, scene: Scene, session: Session) -> Page:
         cost_table(study).section(),
         Section("", text, rows=objects),
         *([proofs.section()] if proofs.rows else []),
-        Section("How it is judged", rows=how),
+        Section("How an effect is tested", rows=how),
     ]
     return Page(f"{scene.name}: effects", summary(study), sections, {"effects.csv": csv_table(study)}, files)
 

@@ -39,7 +39,7 @@ class Check:
 
     name: str  # what was looked at
     ok: bool  # whether it will work
-    value: str  # what was found
+    value: str  # version, path or number
     cure: str = ""  # one sentence on what to do; empty when ok
 
 
@@ -192,7 +192,7 @@ def checks() -> list[Check]:
 
 def show(console: Console) -> bool:
     """Write the diagnosis as a table; True when nothing needs a cure. Not collective: call on one rank."""
-    table = Table("", "check", "found", "cure", box=None, pad_edge=False)
+    table = Table("", "check", "value", "cure", box=None, pad_edge=False)
     for column in table.columns:
         column.overflow = "fold"
     results = checks()

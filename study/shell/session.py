@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from mpi4py import MPI
 from rich.console import Console
@@ -36,6 +36,14 @@ class Page:
     tables: Mapping[str, Table] = field(default_factory=dict)  # by the name of its CSV file
     files: Sequence[Path] = ()  # written already: pictures and fields
     options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
+
+
+class How(TypedDict, total=False):
+    """What every command may be told beside its own options, see :class:`Session`."""
+
+    quiet: bool
+    pictures: bool
+    empty: bool
 
 
 @dataclass(frozen=True)
