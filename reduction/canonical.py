@@ -51,8 +51,7 @@ class CanonicalLift:
 def mass_solve(system: BlockSystem, *blocks: Array) -> list[Array]:
     """M_ee^-1 X for dense local blocks with one factorisation; columns of zeros cost nothing. Collective.
 
-    Raises:
-        SolverError: the factorisation fails or a residual is too large.
+    Raises SolverError: the factorisation fails or a residual is too large.
     """
     X, ends = np.hstack(blocks), np.cumsum([block.shape[1] for block in blocks])[:-1]
     return np.split(solve_columns(system.M_ee, system.layout, X, "the momentum of a basis vector", MASS_RTOL), ends, 1)
@@ -72,8 +71,7 @@ def _rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array, Array]:
 def check_fixed(basis: Basis) -> None:
     """Refuse hand columns that move the tissue: canonical models take the hand as their input. Collective.
 
-    Raises:
-        SoftgraspError: the first 2 n_s columns have rows in the tissue.
+    Raises SoftgraspError: the first 2 n_s columns have rows in the tissue.
     """
     k = 2 * basis.layout.n_s if basis.fixed_solid else 0
     local = float(np.abs(basis.V_q[:, :k]).sum() + np.abs(basis.V_p[:, :k]).sum())

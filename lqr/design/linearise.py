@@ -18,10 +18,7 @@ from softgrasp.lqr.plant.target import Target, hand_target
 def linearised(model: Model) -> Model:
     """The model with K(z*) for K_ee and without finite strain; z* is the rest state, or the equilibrium under gravity.
 
-    Deviations from z* obey it to first order. Collective.
-
-    Raises:
-        SolverError: there is no equilibrium.
+    Deviations from z* obey it to first order. Collective. Raises SolverError: there is no equilibrium.
     """
     system = model.system
     if system.points is None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.loop.responses import Notify as Notify
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import GainReport
@@ -18,8 +19,6 @@ MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by
 WHOLE_SPECTRUM = 500  # n_e from which the Schur form of all modes for every gain takes seconds, so few orders are tried
 FEW_ORDERS = 3
 ORDERS = (4, 6, 8, 10, 12, 16, 20, 30, 40)  # of a scene without a [control] table
-
-Notify = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

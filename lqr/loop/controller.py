@@ -143,11 +143,7 @@ class Controller:
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
-        """The same gain with another target of the hand.
-
-        Raises:
-            ControlError: the plant has no state of rest there.
-        """
+        """The same gain with another target of the hand. Raises ControlError: the plant has no state of rest there."""
         x_bar, u_bar = self.plant.rest_at(q_bar)
         return replace(self, x_bar=x_bar, u_bar=u_bar)
 

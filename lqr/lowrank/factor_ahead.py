@@ -15,7 +15,6 @@ class FactorsAhead:
 
     Args:
         make: factor of a shift; the second argument is the number of the thread, for what it may overwrite.
-        threads: how many.
     """
 
     def __init__(self, make: Callable[[complex, int], scipy.sparse.linalg.SuperLU], threads: int) -> None:

@@ -25,7 +25,6 @@ def residual(problem: RiccatiProblem, Z: Block) -> float:
     Collective. Inputs are not changed.
 
     Args:
-        problem: operators and weights.
         Z: factor, (2 n_s, rank) on every rank and local rows (2 n_local, rank).
 
     Returns:

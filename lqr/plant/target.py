@@ -23,17 +23,11 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 
 @dataclass(frozen=True)
 class Target:
-    """State, input and outputs at rest.
+    """State, input and outputs at rest."""
 
-    Attributes:
-        state: x_bar.
-        u: steady input u_bar [N, N m], (n_s,).
-        y: outputs there [m], (p,).
-    """
-
-    state: PlantState
-    u: Array
-    y: Array
+    state: PlantState  # x_bar
+    u: Array  # steady input u_bar [N, N m], (n_s,)
+    y: Array  # outputs there [m], (p,)
 
 
 def steady_input(system: BlockSystem) -> Array:

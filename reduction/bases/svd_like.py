@@ -165,8 +165,7 @@ class _Pool:
 def symplectic_repair(B: Array) -> Array:
     """C = (J^-1 B)^(-1/2) with C' B C = J for a skew B near J: S C is symplectic when S' J S = B.
 
-    Raises:
-        BasisError: B is singular, far from J.
+    Raises BasisError: B is singular, far from J.
     """
     try:
         return np.linalg.inv(np.real(scipy.linalg.sqrtm(-poisson(B))))

@@ -70,8 +70,6 @@ class Potential:
     """W_r and its derivatives at one set of materials.
 
     Args:
-        cells: where.
-        materials: one a layer.
         comm: ranks whose cells are summed up; None where every rank has all of them.
     """
 

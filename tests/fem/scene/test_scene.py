@@ -45,6 +45,7 @@ def write_tetrahedra(path: Path, top: float = 1.0, tag: int = 1, cells: int = 2)
 REFUSED: list[tuple[Path, list[str], str]] = [
     # unknown, missing, ill-typed
     (PAPER, ["tissue.cels=[1, 2]"], "tissue.cels is not a key; did you mean tissue.cells?"),
+    (PAPER, ["mu=1"], "mu is not a key; did you mean tissue.material.mu?"),
     (PAPER, ["tissu.order=1"], "tissu is not a key; did you mean tissue?"),
     (PAPER, ["time.zzz=1"], "time.zzz is not a key; keys of time are steps, end, start, solver, rtol"),
     (

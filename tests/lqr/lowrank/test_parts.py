@@ -163,10 +163,10 @@ def test_energy_products_are_those_of_the_dense_matrices(name: str) -> None:
 
 def test_clip_and_choice_of_shifts() -> None:
     limits = ShiftRange(0.01, 100.0, 50.0)
-    assert limits.clip(-5.6e-11 + 0j) == -0.01  # the spurious Ritz value of the hand's zero poles
-    assert abs(limits.clip(-1e4 + 1e4j)) == pytest.approx(100.0)
-    assert limits.clip(2.0 - 3.0j) == pytest.approx(-2.0 + 3.0j)
-    assert limits.clip(-0.0 + 5.0j).real < 0
+    assert limits.clip(np.array([-5.6e-11 + 0j]))[0] == -0.01  # the spurious Ritz value of the hand's zero poles
+    assert abs(limits.clip(np.array([-1e4 + 1e4j]))[0]) == pytest.approx(100.0)
+    assert limits.clip(np.array([2.0 - 3.0j]))[0] == pytest.approx(-2.0 + 3.0j)
+    assert limits.clip(np.array([-0.0 + 5.0j]))[0].real < 0
     candidates = np.array([-1.0 + 0j, -1.0 + 10j, -1.0 + 20j])
     chosen = choose_shifts(candidates, np.array([1.0, 5.0, 3.0]), 3)
     # what is planned already counts as chosen
