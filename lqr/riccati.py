@@ -101,6 +101,7 @@ def solve(
 ) -> RiccatiSolution:
     """Solve A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 and return X ~ Z Z' and the gain. Collective.
 
+    By Newton-ADI [K68, BHSW16], RADI [BBKS18], structured Galerkin, or dense in modal coordinates [L79].
     When Newton's start does not stabilise, the choice ``auto`` goes on with RADI. The problem is not changed.
 
     Args:

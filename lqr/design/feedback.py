@@ -77,7 +77,7 @@ def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
 def design(
     model: Model, watch: Stopwatch | None = None, progress: Progress | None = None, checkpoint: Path | None = None
 ) -> Design:
-    """Solve the Riccati equation of a scene and check the closed loop of the full plant. Collective.
+    """Optimal feedback u = u_bar + K (x - x_bar), K = -R^-1 B'XE, of a scene, checked on the full plant. Collective.
 
     Args:
         watch: takes the seconds of "diagnosis", "are" and "judge".

@@ -94,7 +94,7 @@ class LoopTrajectory:
 class ClosedLoop:
     """E x' = A x + B u + F g under u = u_bar + K (x - x_bar), in hand-relative coordinates.
 
-    The step matrix is factored once, here; gains, targets and actuation change from run to run.
+    The matrix of the midpoint step [HLW06] is factored once, here; gains, targets and actuation change with the run.
 
     Args:
         problem: plant, outputs and weights.

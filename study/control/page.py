@@ -66,7 +66,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
 def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:
     plan = study.loops.plan
     text = (
-        "Each equation is projected on N basis vectors and solved; its gain is judged on the full plant. The bases "
+        "Each equation is projected on N basis vectors and solved; its gain is tested on the full plant. The bases "
         "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
         "The excess cost is J/J* - 1 on the modes kept. The first bound beside it is proved for the whole plant, by "
         f"the duality gap, for the run to t = {plan.dt * plan.steps:.4g} s and the optimal feedback after it; the "

@@ -185,4 +185,4 @@ def show(console: Console, study: ControlStudy, seconds: dict[str, float]) -> No
         console.print(f"note: {sentence}", soft_wrap=True, markup=False)
     console.print(pairs(summary_rows(study, seconds)))
     if study.bases:
-        console.print(best_table(study.bases).terminal(wrap=[0]))
+        console.print(best_table(study.bases).terminal(wrap=[0], width=console.width))
