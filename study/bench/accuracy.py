@@ -43,7 +43,8 @@ HELP = f"""Error of the deformation against time on even and graded meshes of P1
 For every mesh: a full run of paper_forward with {STEPS} steps, a reduced one ({METHOD}, N = {N}) and the Riccati
 equation of paper_lqr by Newton-ADI, each with its time and its error: of the tip against the hand, and of the cost from
 the scene's start, both against graded P3 meshes; and what the tolerances of [tissue.refine] reach with P2. Seconds are
-of the processor, the median of {REPEATS} after a first one. Some minutes; keep the machine quiet."""
+of the processor, the median of {REPEATS} after a first one; those of Riccati equations are of the clock. Some minutes;
+keep the machine quiet."""
 
 
 @dataclass(frozen=True)
@@ -191,8 +192,8 @@ def goals(rows: list[Row], reached: list[Reached]) -> list[Goal]:
     for r in reached:
         name, (most, run, whole) = f"tolerance {r.tolerance:g}, P2:", ASKED[r.tolerance]
         result += [Goal(f"{name} error", r.error, r.tolerance), Goal(f"{name} n_e", r.n_e, most)]
-        seconds = ((r.time_run, run, ""), (r.time_all, whole, ", with estimate and passes"))
-        result += [Goal(f"{name} mesh, assembly, run{more} [s]", t, limit) for t, limit, more in seconds if limit]
+        seconds = ((r.time_run, run, "mesh, assembly, run"), (r.time_all, whole, "these, estimate, passes"))
+        result += [Goal(f"{name} seconds of {what}", t, limit) for t, limit, what in seconds if limit]
     return result
 
 

@@ -6,7 +6,7 @@ import itertools
 import operator
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -39,11 +39,11 @@ from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project as project_model
 from softgrasp.reduction.propagator import propagator
-from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, write_bench
+from softgrasp.study.bench import driver
+from softgrasp.study.bench.driver import Failure
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
 from softgrasp.study.bench.riccati_rows import problem_for
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.timing import interleave, medians, timed
 
 BATCH = 100  # models of a batch
@@ -74,22 +74,14 @@ Keep the machine quiet. A fast look: --switches batch,start --repeats 3."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """Two methods at one size.
-
-    Attributes:
-        switch: which one.
-        limit: the constant and its value.
-        setting: the size.
-        ranks: MPI ranks.
-        first, second: median seconds.
-    """
+class SwitchPoint:
+    """Two methods at one size."""
 
     switch: str
-    limit: str
-    setting: str
+    limit: str  # the constant and its value
+    setting: str  # the size
     ranks: int
-    first: float
+    first: float  # first, second: median seconds
     second: float
 
 
@@ -99,12 +91,12 @@ def compare(
     setting: str,
     calls: tuple[Callable[[], Any], Callable[[], Any]],
     n: int,
-) -> Row:
+) -> SwitchPoint:
     """Time two calls in turn, after one run of each. Collective."""
     for call in calls:
         call()
     seconds = medians(interleave({str(i): partial(timed, comm, call) for i, call in enumerate(calls)}, n))
-    return Row(*names, setting, comm.size, seconds["0"], seconds["1"])
+    return SwitchPoint(*names, setting, comm.size, seconds["0"], seconds["1"])
 
 
 def under(module: ModuleType, name: str, value: float, call: Callable[..., Any], *args: Any) -> Any:
@@ -117,7 +109,7 @@ def under(module: ModuleType, name: str, value: float, call: Callable[..., Any],
         setattr(module, name, before)
 
 
-def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """Reduced models of random materials, together and one by one. One rank."""
     changes = ["effects.damping={kind='kelvin-voigt', beta=0.002}", "motion={drive='force', profile='hold'}"]
     model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm=comm)
@@ -144,7 +136,7 @@ def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         )
 
 
-def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """The Riccati equation of the modal start. One rank."""
     few = softgrasp.lqr.lowrank.modal_start.FEW_MODES
     plant = Plant(problem_for(comm, 10, 0.002))
@@ -155,7 +147,7 @@ def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         yield compare(comm, ("start", f"FEW_MODES = {few}"), f"2D, {k} modes", calls, repeats)
 
 
-def dense(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def dense(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """All modes against low rank. One rank."""
     for nx in (2, 3, 4, 5, 8):
         problem = problem_for(comm, nx, 0.002)
@@ -164,7 +156,7 @@ def dense(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         yield compare(comm, ("dense", limit), f"2D, {problem.layout.states} states", calls, repeats)
 
 
-def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """Factor and solve at one shift a rank, with whole matrices and spread ones."""
     for d, size in ((2, 10_000), (2, 100_000), (3, 8_000), (3, 20_000), *(((3, 39_000),) if large else ())):
         model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
@@ -187,7 +179,7 @@ def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
             solver.destroy()
 
 
-def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """Set-up and step of the forward run with PETSc's Cholesky and with MUMPS."""
     for d, size in ((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000), (3, 20_000)):
         model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
@@ -195,7 +187,7 @@ def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[
         yield from _two(comm, model, ("cholesky", "auto"), ("mumps", "auto"), ("set-up", "step"), names, repeats)
 
 
-def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """Set-up and step with MUMPS, its factor whole on every rank or spread. Two ranks or more."""
     if comm.size == 1:
         return
@@ -206,7 +198,7 @@ def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         yield from _two(comm, model, ("mumps", True), ("mumps", False), heads, names, 1 if size > 60_000 else repeats)
 
 
-def product(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def product(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """K_ee times columns stored by rows and by columns. CPU seconds; a sample is a mean of calls in a row. One rank."""
     rng = np.random.default_rng(0)
     np.ones(FREED)  # given back at once: from now on the C library keeps arrays up to this size, as in any longer run
@@ -221,7 +213,7 @@ def product(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
             seconds = medians(interleave(dict(ways), 3 * repeats))
             for way in ("SciPy", "PETSc"):
                 setting = f"n_e = {n}, {k} columns by {storage}"
-                yield Row(f"product, {way}", limit, setting, comm.size, seconds["ours"], seconds[way])
+                yield SwitchPoint(f"product, {way}", limit, setting, comm.size, seconds["ours"], seconds[way])
 
 
 def by_petsc(A: PETSc.Mat, X: Array) -> Any:
@@ -238,7 +230,7 @@ def cpu_seconds(call: Callable[[], Any]) -> float:
     return (time.process_time() - begin) / CALLS
 
 
-def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """Whole runs with linear elasticity and with finite strain, CPU seconds. One rank."""
 
     def run_of(changes: list[str]) -> Callable[[], float]:
@@ -255,7 +247,9 @@ def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         cells = f"tissue.cells=[{nx}, {2 * nx}]"
         runs = {"off": run_of([cells]), "on": run_of([cells, "effects.finite_strain={}"])}
         seconds = medians(interleave(runs, repeats))
-        yield Row("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, seconds["off"], seconds["on"])
+        yield SwitchPoint(
+            "finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, seconds["off"], seconds["on"]
+        )
 
 
 def _two(
@@ -266,7 +260,7 @@ def _two(
     heads: tuple[str, str],
     limit: str,
     repeats: int,
-) -> Iterator[Row]:
+) -> Iterator[SwitchPoint]:
     """Set-up and step with two solvers."""
     system = model.system
     setting = f"{system.layout.dimension}D, n_e = {system.layout.n_e}"
@@ -276,7 +270,7 @@ def _two(
         begin = time.perf_counter()
         midpoints.append(TissueMidpoint(system, DT, name, reproducible=reproducible))
         seconds.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
-    yield Row(heads[0], limit, setting, comm.size, *seconds)
+    yield SwitchPoint(heads[0], limit, setting, comm.size, *seconds)
     c = np.ones(system.layout.n_s)
     states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in midpoints]
     for midpoint, state in zip(midpoints, states, strict=True):
@@ -291,7 +285,7 @@ def _two(
         midpoint.destroy()
 
 
-SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
+SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[SwitchPoint]]] = {
     "batch": batch,
     "start": start,
     "dense": dense,
@@ -304,50 +298,41 @@ SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
 SERIAL = ("batch", "start", "dense", "product", "finite")
 
 
-def measure(switch: str, repeats: int, large: bool) -> dict[str, Any]:
-    """The rows of one switch. Collective."""
-    return {"rows": [asdict(row) for row in SWITCHES[switch](MPI.COMM_WORLD, repeats, large)]}
-
-
 HEADER = ("switch", "constant", "size", "ranks", "first s", "second s", "second / first")
 
 
-def table_of(rows: list[Row]) -> Table:
+def measure(switch: str, repeats: int, large: bool) -> Iterator[SwitchPoint]:
+    """The points of one switch. Collective."""
+    return SWITCHES[switch](MPI.COMM_WORLD, repeats, large)
+
+
+def table_of(points: list[SwitchPoint]) -> Table:
     """The one table."""
-    cells = [
-        (r.switch, r.limit, r.setting, r.ranks, f"{r.first:.3g}", f"{r.second:.3g}", f"{r.second / r.first:.2f}")
-        for r in rows
-    ]
+    cells = [(*astuple(p)[:4], f"{p.first:.3g}", f"{p.second:.3g}", f"{p.second / p.first:.2f}") for p in points]
     return Table(HEADER, cells, "two methods around the sizes of a switch, median seconds")
 
 
 def main(
     switches: Annotated[str, typer.Option(help="which, with commas")] = ",".join(SWITCHES),
-    ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
-    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 5,
+    ranks: driver.Ranks = "1,2",
+    repeats: driver.Repeats = 5,
     large: Annotated[bool, typer.Option("--large", help="also sizes that take minutes")] = False,
     out: Annotated[Path, typer.Option(help="folder for bench_switches.json and bench_switches.csv")] = Path("out"),
 ) -> None:
     """See HELP."""
-    names, counts = [name.strip() for name in switches.split(",")], parse_ranks(ranks)
+    names, counts = [name.strip() for name in switches.split(",")], driver.parse_ranks(ranks)
     for name in names:
         if name not in SWITCHES:
             raise typer.BadParameter(f"'{name}' is no switch; choose from {', '.join(SWITCHES)}")
         if name == "whole" and max(counts) == 1 and len(names) == 1:
             raise typer.BadParameter("whole and spread factors are the same on one rank; add --ranks 2")
-    console = open_console(130)
-    rows: list[Row] = []
-    failed = False
+    console, rows = driver.open_console(130), list[SwitchPoint | Failure]()
     for name in names:
         for k in [k for k in counts if k == 1 or name not in SERIAL]:
-            with console.status(f"{name}, {k} rank(s)"):
-                spec = {"switch": name, "repeats": repeats, "large": large}
-                answer = launch_worker("switches", spec, k)
-            if "error" in answer:
-                failed = True
-                console.print(f"{name}, {k} rank(s): {answer['error']}", markup=False)
-            rows += [Row(**row) for row in answer.get("rows", [])]
-    console.print(table_of(rows).terminal())
-    content = {"command": "bench_switches", "rows": [asdict(row) for row in rows]}
-    table = Table(tuple(Row.__dataclass_fields__), [tuple(asdict(row).values()) for row in rows])
-    list_bench(console, write_bench(out, "bench_switches", content, table), failed)
+            spec = {"switch": name, "repeats": repeats, "large": large}
+            rows += driver.measure(console, SwitchPoint, "switches", spec, k, name)
+    points, failed = driver.of(SwitchPoint, rows), driver.failures(rows)
+    console.print(table_of(points).terminal())
+    content = {"command": "bench_switches", "rows": driver.as_rows(points), "failed": driver.as_rows(failed)}
+    table = Table(tuple(f.name for f in fields(SwitchPoint)), [astuple(point) for point in points])
+    driver.list_bench(console, driver.write_bench(out, "bench_switches", content, table), failed)
