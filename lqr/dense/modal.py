@@ -124,11 +124,7 @@ def relative_space(problem: RiccatiProblem) -> StateSpace | None:
 def modal_plant(
     problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, ...]
 ) -> ModalPlant:
-    """The plant restricted to modes.
-
-    Args:
-        parts: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi.
-    """
+    """The plant restricted to modes. ``parts``: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi."""
     D, g, c = parts
     G, B_z = (g, None) if problem.B_z is None else (g[:, :0], g)
     space = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)

@@ -22,10 +22,7 @@ ROWS = 4_000  # rows of U that are reduced at a time
 def residual(problem: RiccatiProblem, Z: Block) -> float:
     """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'.
 
-    Collective. Inputs are not changed.
-
-    Args:
-        Z: factor, (2 n_s, rank) on every rank and local rows (2 n_local, rank).
+    Collective. Inputs are not changed. ``Z``: factor, (2 n_s, rank) on every rank and local rows (2 n_local, rank).
 
     Returns:
         The relative residual; 2-norm in hand-relative coordinates.

@@ -91,8 +91,7 @@ def on_one_rank(comm: MPI.Intracomm, G: Array) -> tuple[Array, Array]:
 
     With more rows than columns, the triangle of G = Q R and Q'b instead: the same least squares problem.
 
-    Args:
-        G: all rows of this rank's columns, (m, n_local).
+    ``G``: all rows of this rank's columns, (m, n_local).
 
     Returns:
         G or R, and b or Q'b, on rank 0; empty elsewhere.
