@@ -146,8 +146,7 @@ def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
 def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
     """The k lowest modes: LAPACK on rank 0 up to :data:`DENSE_MODES` unknowns, else SLEPc. Collective.
 
-    Returns:
-        omega (k,), Phi and M_ee Phi, local rows (n_local, k).
+    Returns omega (k,), Phi and M_ee Phi, local rows (n_local, k).
     """
     system, layout = problem.system, problem.layout
     if layout.n_e > DENSE_MODES:

@@ -93,8 +93,7 @@ def on_one_rank(comm: MPI.Intracomm, G: Array) -> tuple[Array, Array]:
 
     ``G``: all rows of this rank's columns, (m, n_local).
 
-    Returns:
-        G or R, and b or Q'b, on rank 0; empty elsewhere.
+    Returns G or R, and b or Q'b, on rank 0; empty elsewhere.
     """
     columns = rows_on_root(comm, G.T)
     if columns is None:
