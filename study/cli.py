@@ -172,7 +172,7 @@ def simulate(
     empty: Empty = False,
     pdf: Pdf = False,
 ) -> None:
-    """Run a scene with the full-order model; also under `mpiexec -n N`."""
+    """Run a scene with the full model; also under `mpiexec -n N`."""
     from softgrasp.study.forward.run import run_simulate
 
     more = {"resume": resume, "until": until, "certify": certify}

@@ -140,7 +140,7 @@ def build(
     mesh: TissueMesh | None = None,
     run: bool = True,
 ) -> Model:
-    """M q'' + D q' + K q = f + B_u u, q = [q_s; q_e] [SBRH21]: mesh, assemble and couple. Collective.
+    """M q'' + D q' + K q = f + B_u u for q = [q_s; q_e], as in [SBRH21]: mesh, assemble, couple. Collective.
 
     Args:
         scene: a scene, the path of its file, or the name of one that ships.

@@ -62,27 +62,21 @@ def reduce_gains(
 
     Args:
         orders: of the reduced equations; those that a basis has not are left out.
-        notify: called with the number of equations done and in all.
+        notify: called with the number of equations done and at most.
         names: keys of :data:`softgrasp.lqr.reduced.bases.BASES`.
     """
-    families: dict[str, BasisFamily | str] = {}
-    for name in names:
+    bases = []
+    for i, name in enumerate(names):
         try:
-            families[name] = make_family(name, design.problem, design.solution.factor)
+            family = make_family(name, design.problem, design.solution.factor)
         except ControlError as error:
-            families[name] = str(error)
-    total = sum(len(f.orders(orders)) for f in families.values() if isinstance(f, BasisFamily))
-    bases, done = list[BasisGains](), 0
-    for name, family in families.items():
-        if isinstance(family, str):
-            bases.append(BasisGains(name, None, (), family))
+            bases.append(BasisGains(name, None, (), str(error)))
             continue
         reports = []
-        for N in family.orders(orders):
+        for j, N in enumerate(family.orders(orders), 1):
             reports.append(design.judge.report(family.at(N)))
-            done += 1
             if notify is not None:
-                notify(done, total)
+                notify(i * len(orders) + j, len(names) * len(orders))
         bases.append(BasisGains(name, family, tuple(reports)))
     return tuple(bases)
 

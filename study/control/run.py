@@ -28,14 +28,14 @@ from softgrasp.study.control.sweep import retune, sweep
 from softgrasp.study.control.tables import best_table, summary, summary_rows, tables
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.tables import pairs
-from softgrasp.study.shell.session import How, Page, Session, list_files
+from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 GOAL = 1e-10  # of the solver when the scene names none: the right end of its progress bar
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
 
 def run_control(
-    path: Path, out: Path, overrides: list[str], console: Console, *, gain_only: bool = False, **how: Unpack[How]
+    path: Path, out: Path, overrides: list[str], console: Console, *, gain_only: bool = False, **flags: Unpack[Flags]
 ) -> dict[str, Any]:
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
@@ -43,7 +43,7 @@ def run_control(
     the same scene, folder and rank count goes on from them; they are removed at the end. ``gain_only`` writes the
     controllers, without closed loop and pictures.
     """
-    session = Session("control", path, overrides, out, console, **how)
+    session = Session("control", path, overrides, out, console, **flags)
     model, sentence = with_control(session.model(session.scene(), steps=False))
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)

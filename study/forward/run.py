@@ -22,7 +22,7 @@ from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import equation
 from softgrasp.study.report.page import Section, captioned, equation_text
 from softgrasp.study.report.tables import pairs
-from softgrasp.study.shell.session import How, Page, Session, list_files, show_warnings
+from softgrasp.study.shell.session import Flags, Page, Session, list_files, show_warnings
 
 CAPTIONS = {
     "move.png": "The body at some instants of the move.",
@@ -41,12 +41,12 @@ def run_simulate(
     resume: bool = False,
     until: int | None = None,
     certify: bool = False,
-    **how: Unpack[How],
+    **flags: Unpack[Flags],
 ) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective."""
-    if resume and how.get("empty"):
+    if resume and flags.get("empty"):
         raise SceneError("--empty removes what --resume goes on from; give one of them")
-    session = Session("simulate", path, overrides, out, console, **how)
+    session = Session("simulate", path, overrides, out, console, **flags)
     model = session.model(session.scene())
     scene, frames = model.scene, Frames(model, out, session.pictures)
 

@@ -25,7 +25,7 @@ from softgrasp.study.reduce.times import measured_run, speed_notes, speed_of
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.session import How, Page, Session, list_files
+from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
@@ -49,7 +49,13 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
 
 
 def run_reduce(
-    path: Path, out: Path, overrides: list[str], console: Console, *, tolerance: float | None = None, **how: Unpack[How]
+    path: Path,
+    out: Path,
+    overrides: list[str],
+    console: Console,
+    *,
+    tolerance: float | None = None,
+    **flags: Unpack[Flags],
 ) -> dict[str, Any]:
     """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
 
@@ -57,7 +63,7 @@ def run_reduce(
     """
     if tolerance is not None:
         overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
-    session = Session("reduce", path, overrides, out, console, **how)
+    session = Session("reduce", path, overrides, out, console, **flags)
     scene = session.scene()
     names = check_scene(scene)
     if scene.reduction.certify != "off" or scene.reduction.train == "greedy":

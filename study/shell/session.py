@@ -38,7 +38,7 @@ class Page:
     options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
 
 
-class How(TypedDict, total=False):
+class Flags(TypedDict, total=False):
     """What every command may be told beside its own options, see :class:`Session`."""
 
     quiet: bool
