@@ -130,16 +130,11 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
     """The mesh to bisect with contact zone and layers marked."""
-    size = scene.tissue.size
-    if size is None:
-        tissue = make_mesh(MPI.COMM_SELF, scene)
-    else:
-        cells = list(scene.tissue.cells or [])
-        if aim is not None:
-            h = min(size) / aims(refine, scene.tissue.order, len(size), aim).across
-            cells = [even_cells(axis, h) for axis in box_axes(scene)]
-        tissue = box_of_lines(MPI.COMM_SELF, scene, cells, 1.0, min(size) / 2)
-    return marked(tissue, scene)
+    size, cells = scene.tissue.size, None
+    if size is not None and aim is not None:
+        h = min(size) / aims(refine, scene.tissue.order, len(size), aim).across
+        cells = [even_cells(axis, h) for axis in box_axes(scene)]
+    return marked(_even(scene, cells), scene)
 
 
 def marked(tissue: TissueMesh, scene: Scene) -> Whole:
@@ -235,8 +230,9 @@ def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     return result
 
 
-def _even(scene: Scene) -> TissueMesh:
+def _even(scene: Scene, cells: list[int] | None = None) -> TissueMesh:
     """The scene's mesh without grading, on one rank; a box meets the ends where the graded one does."""
-    if scene.tissue.refine is None or scene.tissue.size is None:
+    tissue = scene.tissue
+    if tissue.refine is None or tissue.size is None:
         return make_mesh(MPI.COMM_SELF, scene)
-    return box_of_lines(MPI.COMM_SELF, scene, scene.tissue.cells or [], 1.0, min(scene.tissue.size) / 2)
+    return box_of_lines(MPI.COMM_SELF, scene, cells or tissue.cells or [], 1.0, min(tissue.size) / 2)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import Feel, TissueState
+from softgrasp.fem.run.midpoint import Feedback, TissueState
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
 
@@ -73,10 +73,10 @@ class FiniteDrive:
             right += plant.s * total(plant.comm, system.G.T @ state.array[system.layout.n_local :])
             C[:, 2 * n_s :] = -plant.theta * np.eye(n_s)
         inverse = np.linalg.inv(self.inertia - free[:, None] * self.F)
-        feel = Feel(-plant.kappa * inverse @ C, self.N, self.speed)
-        plant.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feel)
+        feedback = Feedback(-plant.kappa * inverse @ C, self.N, self.speed)
+        plant.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feedback)
         a = -(plant.midpoint.c + c_0) / plant.kappa
-        return a, known + self.F @ a + plant.midpoint.felt[:n_s] + plant.midpoint.felt[n_s : 2 * n_s]
+        return a, known + self.F @ a + plant.midpoint.sensed[:n_s] + plant.midpoint.sensed[n_s : 2 * n_s]
 
     def move(self, n: int, u: Array, a: Array) -> None:
         """Midpoint rule of the hand."""
