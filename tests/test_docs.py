@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -141,6 +142,14 @@ def test_every_command_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         stopped = "--until" in words and isinstance(result.exception, Interrupted)
         blind = words[0] == "view" and "--save" not in words and "no display" in str(result.exception)
         assert stopped or blind or result.exit_code == 0, f"{line}: {result.output[-600:]} {result.exception}"
+    for page in Path("out").rglob("report.html"):
+        text, head = page.read_text(), page.read_text().split("<section")[0]
+        assert 1 <= head.partition('class="summary"')[2].count("<p>") <= 4, f"{page}: a summary of some lines"
+        assert re.search(r"<nav>\s*<a href", head), f"{page}: contents"
+        assert {"Files", "Reproduce"} <= set(re.findall("<h2>(.*?)</h2>", text)), page
+        assert all((page.parent / file).exists() for file in re.findall('<li><a href="(.*?)"', text)), page
+        warned = json.loads((page.parent / "result.json").read_text()).get("warnings")
+        assert not warned or ">Warnings</h2>" in text, page
     controller = sg.Controller.load("out/strip-control/controller.npz")
     assert controller.plant.lti().under(controller.K).to_control().poles().real.max() < 0
     assert (tmp_path / "out/answer/report.html").exists()

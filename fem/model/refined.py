@@ -7,7 +7,7 @@ with r the distance from the nearest end of the contact zone, re-entrant corner 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -42,21 +42,12 @@ DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a toleran
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """What an a-priori mesh aims at: cells across the shortest side, grading, and smallest cell over that side."""
-
-    across: float
-    mu: float
-    floor: float
-
-
-def aims(refine: Refine, order: int, d: int, tolerance: float) -> Sizes:
-    """A-priori sizes for a tolerance of the deformation."""
+def aims(refine: Refine, order: int, d: int, tolerance: float) -> tuple[float, float, float]:
+    """Cells across the shortest side, grading, and smallest cell over that side, for a tolerance of the deformation."""
     p = min(order, 3)
     mu = refine.grading if isinstance(refine.grading, float) else BISECTION[p]
     across = MORE[p] + ACROSS[d][p] * (1e-2 / tolerance) ** (1 / (2 * p))
-    return Sizes(across, mu, FLOOR[d][p] * tolerance)
+    return across, mu, FLOOR[d][p] * tolerance
 
 
 def by_lines(scene: Scene) -> bool:
@@ -130,10 +121,10 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
     """The mesh to bisect with contact zone and layers marked."""
-    size, cells = scene.tissue.size, None
+    size, cells = scene.tissue.size, scene.tissue.cells
     if size is not None and aim is not None:
-        h = min(size) / aims(refine, scene.tissue.order, len(size), aim).across
-        cells = [even_cells(axis, h) for axis in box_axes(scene)]
+        across, *_ = aims(refine, scene.tissue.order, len(size), aim)
+        cells = [even_cells(axis, min(size) / across) for axis in box_axes(scene)]
     return marked(_even(scene, cells), scene)
 
 
@@ -181,9 +172,8 @@ def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Who
         h0 = float(np.median(edges))
         sizes = SizeField(ends_of(whole, scene), h0, max(short / 2, h0), mu, DEEPEST[d] * h0)
     else:
-        plan = aims(refine, scene.tissue.order, d, aim)
-        h0 = np.sqrt(d) * short / plan.across
-        sizes = SizeField(ends_of(whole, scene), h0, short / 2, plan.mu, plan.floor * short)
+        across, mu, floor = aims(refine, scene.tissue.order, d, aim)
+        sizes = SizeField(ends_of(whole, scene), np.sqrt(d) * short / across, short / 2, mu, floor * short)
     return bisect_to(whole, sizes, SLACK, refine.most)
 
 
@@ -223,16 +213,16 @@ def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     ends: Ends | None = None
     with agree(comm):
         if comm.rank == 0:
-            known = tissue.whole is not None and "contact" in tissue.whole.facets
-            whole = tissue.whole if known else marked(_even(scene), scene)
-            ends = ends_of(whole, scene) if whole is not None else None
+            whole = tissue.whole
+            if whole is None or "contact" not in whole.facets:
+                whole = marked(_even(scene, scene.tissue.cells), scene)
+            ends = ends_of(whole, scene)
     result: Ends = comm.bcast(ends)
     return result
 
 
-def _even(scene: Scene, cells: list[int] | None = None) -> TissueMesh:
+def _even(scene: Scene, cells: list[int] | None) -> TissueMesh:
     """The scene's mesh without grading, on one rank; a box meets the ends where the graded one does."""
-    tissue = scene.tissue
-    if tissue.refine is None or tissue.size is None:
+    if scene.tissue.refine is None or scene.tissue.size is None:
         return make_mesh(MPI.COMM_SELF, scene)
-    return box_of_lines(MPI.COMM_SELF, scene, cells or tissue.cells or [], 1.0, min(tissue.size) / 2)
+    return box_of_lines(MPI.COMM_SELF, scene, cells or [], 1.0, min(scene.tissue.size) / 2)

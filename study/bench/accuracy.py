@@ -5,9 +5,9 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -25,9 +25,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.design.feedback import Design, design
 from softgrasp.reduction.reduce import reduce_linear
 from softgrasp.reduction.replay import full_run, replay_linear
-from softgrasp.study.bench.driver import Goal, goal_rows, open_console, show_goals, write_bench
+from softgrasp.study.bench.driver import Goal, goal_rows, open_console, show_goals, table_of, write_bench
 from softgrasp.study.report.origin import machine
-from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import list_files
 
 STEPS, N, METHOD, REPEATS = 600, 20, "craig_bampton", 3
@@ -43,7 +42,8 @@ HELP = f"""Error of the deformation against time on even and graded meshes of P1
 For every mesh: a full run of paper_forward with {STEPS} steps, a reduced one ({METHOD}, N = {N}) and the Riccati
 equation of paper_lqr by Newton-ADI, each with its time and its error: of the tip against the hand, and of the cost from
 the scene's start, both against graded P3 meshes; and what the tolerances of [tissue.refine] reach with P2. Seconds are
-of the processor, the median of {REPEATS} after a first one. Some minutes; keep the machine quiet."""
+of the processor, the median of {REPEATS} after a first one; those of Riccati equations are of the clock. Some minutes;
+keep the machine quiet."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,16 @@ class Reached:
     time_all: float  # with the estimate, and the passes it asks for
 
 
-HEADER = (
-    "mesh", "n_e", "build [s]", "run [s]", "error", "reduced run [s]", "its error", "Riccati [s]", "error of the cost",
-    "solves", "residual",
-)  # fmt: skip
-HEADER_REACHED = (
-    "tolerance, P2", "n_e", "passes", "error", "estimate / error", "bound / error", "corrected / error",
-    "mesh, assembly, run [s]", "with estimate and passes [s]",
-)  # fmt: skip
+COLUMNS = {
+    "mesh": "mesh", "n_e": "n_e", "build [s]": "time_build .2g", "run [s]": "time_run .2g", "error": "error .1e",
+    "reduced run [s]": "time_reduced .1g", "its error": "error_reduced .1e", "Riccati [s]": "time_riccati .2g",
+    "error of the cost": "error_cost .1e", "solves": "solves", "residual": "residual .0e",
+}  # fmt: skip
+COLUMNS_REACHED = {
+    "tolerance, P2": "tolerance .0e", "n_e": "n_e", "passes": "passes", "error": "error .1e",
+    "estimate / error": "estimate .2f", "bound / error": "bound .2f", "corrected / error": "corrected .2f",
+    "mesh, assembly, run [s]": "time_run .2g", "with estimate and passes [s]": "time_all .2g",
+}  # fmt: skip
 
 
 def meshes() -> dict[str, list[str]]:
@@ -191,8 +193,8 @@ def goals(rows: list[Row], reached: list[Reached]) -> list[Goal]:
     for r in reached:
         name, (most, run, whole) = f"tolerance {r.tolerance:g}, P2:", ASKED[r.tolerance]
         result += [Goal(f"{name} error", r.error, r.tolerance), Goal(f"{name} n_e", r.n_e, most)]
-        seconds = ((r.time_run, run, ""), (r.time_all, whole, ", with estimate and passes"))
-        result += [Goal(f"{name} mesh, assembly, run{more} [s]", t, limit) for t, limit, more in seconds if limit]
+        seconds = ((r.time_run, run, "mesh, assembly, run"), (r.time_all, whole, "these, estimate, passes"))
+        result += [Goal(f"{name} seconds of {what}", t, limit) for t, limit, what in seconds if limit]
     return result
 
 
@@ -207,15 +209,13 @@ def main(
     for name, sets in meshes().items():
         rows.append(measure(name, sets, exact, cost))
         console.print(f"{name}: n_e = {rows[-1].n_e}, error {rows[-1].error:.2e}", style="dim")
-    table = Table(HEADER, [astuple(row) for row in rows], "error of the deformation against time")
-    tolerances = Table(HEADER_REACHED, [astuple(r) for r in reached], "what tissue.refine.tolerance reaches")
+    content: dict[str, Any] = {"rows": [asdict(row) for row in rows], "reached": [asdict(r) for r in reached]}
+    table = table_of(content["rows"], COLUMNS, "error of the deformation against time")
+    tolerances = table_of(content["reached"], COLUMNS_REACHED, "what tissue.refine.tolerance reaches")
     for part in (table, tolerances):
         console.print(part.terminal())
     aims = goals(rows, reached)
     show_goals(console, aims)
-    content = {
-        "rows": [asdict(row) for row in rows], "reached": [asdict(r) for r in reached], "goals": goal_rows(aims),
-        "version": package_version(), "machine": machine(),
-    }  # fmt: skip
+    content |= {"goals": goal_rows(aims), "version": package_version(), "machine": machine()}
     markdown = f"{table.markdown()}\n{tolerances.markdown()}"
     list_files(console, write_bench(out, "accuracy", content, table, markdown))

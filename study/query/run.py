@@ -81,7 +81,7 @@ def run_query(
     own = parse_settings(settings)
     asked = [own] if batch is None else [{**own, **row} for row in read_batch(batch)]
     if not h5py.is_hdf5(path):
-        what = "is no HDF5 file" if path.is_file() else "is not there"
+        what = "is no HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "is not there"
         raise SceneError(f"{path} {what}; name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
     many = [materials_of(model, setting) for setting in asked]

@@ -132,7 +132,7 @@ def test_a_run_that_starts_at_its_target_costs_nothing_and_bounds_nothing() -> N
     """0 / 0 of the relative excess: the bound says infinite, and nothing is divided by zero."""
     case = setup("one_way")
     start, plan = hand_start(case.problem, [0.0, 0.0]), LoopPlan(DT, STEPS, settle=1.0)
-    report = GainReport("structured", 4, 0.0, 0.0, 0.0, -1.0, gain=case.gain)
+    report = GainReport("structured", 4, 0.0, error_K=0.0, cost_excess=0.0, abscissa_full=-1.0, gain=case.gain)
     (judged,) = with_bounds(case.problem, case.solution, [report], start, plan)
     assert judged.cost_excess_at_most == np.inf
 
