@@ -127,10 +127,10 @@ def compare(
 @app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
-    from softgrasp.study.shell.schema import full_schema
+    from softgrasp.fem.scene.scene import scene_schema
 
     if rank() == 0:
-        typer.echo(json.dumps(full_schema(), indent=2))
+        typer.echo(json.dumps(scene_schema(), indent=2))
 
 
 @app.command()
