@@ -21,15 +21,8 @@ from softgrasp.study.pictures.animation import Film, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow, speed_up
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save, segments
-from softgrasp.study.reduce.plots import (
-    figure_errors,
-    figure_further_errors,
-    figure_sigma,
-    figure_times,
-    further_methods,
-    of_paper,
-)
-from softgrasp.study.reduce.result import ReductionStudy, Sweep, nearest
+from softgrasp.study.reduce import plots
+from softgrasp.study.reduce.result import MethodSweep, ReductionStudy, nearest
 
 MODES = 4  # a method
 FRAMES = 30
@@ -68,14 +61,14 @@ def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
     """All figures. Rank 0 only."""
     files: list[Path] = []
     shown = [s for s in study.sweeps if s.points]
-    if of_paper(shown):
-        files += figure_errors(of_paper(shown), out / "errors.png")
-        files += figure_further_errors(of_paper(shown), out / "errors_state.png")
-    if any(s not in of_paper(shown) for s in shown):
-        files += figure_errors(further_methods(shown), out / "errors_beyond.png")
+    if plots.of_paper(shown):
+        files += plots.figure_errors(plots.of_paper(shown), out / "errors.png")
+        files += plots.figure_further_errors(plots.of_paper(shown), out / "errors_state.png")
+    if any(s not in plots.of_paper(shown) for s in shown):
+        files += plots.figure_errors(plots.further_methods(shown), out / "errors_beyond.png")
     if shown:
-        files += figure_times(shown, study.times.steps, out / "times.png")
-        files += figure_sigma(shown, out / "sigma.png") or ()
+        files += plots.figure_times(shown, study.times.steps, out / "times.png")
+        files += plots.figure_sigma(shown, out / "sigma.png") or ()
     if views is not None and views.modes:
         files += figure_modes(views, out / "modes.png")
     if views is not None and views.reduced:
@@ -84,7 +77,7 @@ def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
     return files
 
 
-def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
+def compared(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
     """First of the paper's methods and best of all at the N compared."""
     first = [s for s in sweeps if s.method.key in PAPER_METHODS and s.points][:1]
     chosen = [(s, i) for s in first if (i := nearest(s.points, stable=False)) is not None]
@@ -93,11 +86,11 @@ def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     return chosen + [f for f in stable[:1] if f[0] not in first]
 
 
-def _error(chosen: tuple[Sweep, int]) -> float:
+def _error(chosen: tuple[MethodSweep, int]) -> float:
     return chosen[0].points[chosen[1]].error_deformation
 
 
-def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views | None:
+def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> Views | None:
     """Bring to rank 0 what the pictures need; None on other ranks and for very large bodies. Collective."""
     if model.space.mesh.mesh.geometry.index_map().size_global > MANY_VERTICES:
         return None
@@ -123,7 +116,7 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views |
     return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
 
 
-def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
+def modes_of(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
     """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
     fixed = sorted(((s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None), key=_error)
     old = [f for f in fixed if f[0].method.key in PAPER_METHODS][:1]
@@ -132,7 +125,7 @@ def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     return old + new
 
 
-def _modes(model: Model, s: Sweep, i: int) -> Array | None:
+def _modes(model: Model, s: MethodSweep, i: int) -> Array | None:
     """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
     layout = model.system.layout
     lift = s.models[i].lift

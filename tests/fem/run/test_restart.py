@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +17,7 @@ from mpi4py import MPI
 from softgrasp.fem.disk import MARGIN, check_room
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError
 from softgrasp.fem.model.build import build
+from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.sealed import read_manifest, write_arrays, write_manifest
@@ -74,7 +74,7 @@ def test_a_checkpoint_removes_what_older_ones_left(comm: MPI.Intracomm, mpi_tmp_
     stopped(mpi_tmp_path, 6)
     stopped(mpi_tmp_path, 8, resume=True)
     files = {path.name for path in (mpi_tmp_path / "checkpoint").iterdir()}
-    name = read_manifest(mpi_tmp_path / "checkpoint" / "checkpoint.json", 4)["run"]
+    name = read_manifest(mpi_tmp_path / "checkpoint" / "checkpoint.json", FORMAT)["run"]
     assert files == {"checkpoint.json", *(f"{name}-step8-rank{rank}.npz" for rank in range(comm.size))}
 
 
@@ -155,14 +155,6 @@ def test_snapshots_stream_through_the_smallest_buffer(
         assert np.array_equal(file["z"][:, start : start + n], memory.Z[:n].T)
         assert np.array_equal(file["v"][:, start : start + n], memory.Z[n:].T)
         assert np.array_equal(file["steps"], memory.steps)
-
-
-@pytest.fixture
-def small_files() -> Iterator[Callable[[int], None]]:
-    """Limit the size of the files of this process."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_room_counts_all_ranks_and_the_size_so_far(
