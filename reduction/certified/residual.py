@@ -61,10 +61,8 @@ class ResidualNorms:
     @cached_property
     def galerkin(self) -> ResidualNorms:
         """The same for residuals with Phi' r = 0: these have no part in the rows of K_r Phi, nor of M_r Phi."""
-        static, mass = (
-            _beyond(T, self.columns(which, self.reference)[i])
-            for T, which, i in ((self.static, "static", 2), (self.mass, "mass", 1))
-        )
+        static = _beyond(self.static, self.columns("static", self.reference)[2])
+        mass = _beyond(self.mass, self.columns("mass", self.reference)[1])
         return replace(self, static=static, mass=mass)
 
     @cached_property
