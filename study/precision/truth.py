@@ -58,7 +58,7 @@ def make_truth(scene: Scene, runs: FullRuns, tolerance: float | None = None) -> 
         run = runs.run(setting, 1)
         if not sizes or run.n_e > LEAST * sizes[-1]:
             meshes[setting] = run
-        if goal <= aim:
+        if goal <= aim and setting in meshes:
             break
     fit = [s for s, r in meshes.items() if r.n_e * 4 * base <= TIME_WORK[d]]
     middle = (fit or list(meshes))[-1 if fit else 0]
