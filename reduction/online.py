@@ -67,7 +67,9 @@ def run(
     step = prepared(model, dt, hand is not None)
     _check_stable(step, allow_unstable)
     model = step.model
-    inputs = force_inputs(model, force) if hand is None else hand_inputs(model, hand, step.dt)
+    inputs = np.asarray(force, dtype=float) if hand is None else hand_inputs(model, hand, step.dt)
+    if hand is None and (inputs.ndim != 2 or inputs.shape[1] != model.n_s or len(inputs) < 1):
+        raise ModelError(f"the force has the shape {inputs.shape}; it must be (steps, {model.n_s})")
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
     w = march(step, inputs, step.X_inverse @ start[model.N - step.size :])
     return trajectory(step, w, hand)
@@ -82,14 +84,6 @@ def prepared(model: SmallModel | Propagator, dt: float | None, driven: bool) -> 
     if model.driven != driven or (dt is not None and dt != model.dt):
         raise ModelError("the propagator was made for another time step or another kind of input")
     return model
-
-
-def force_inputs(model: SmallModel, force: Array | None) -> Array:
-    """Check the forces (steps, n_s)."""
-    u = np.asarray(force, dtype=float)
-    if u.ndim != 2 or u.shape[1] != model.n_s or len(u) < 1:
-        raise ModelError(f"the force has the shape {u.shape}; it must be (steps, {model.n_s})")
-    return u
 
 
 def consistent(q: Array, v: Array, dt: float) -> Array:

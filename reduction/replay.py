@@ -139,11 +139,9 @@ def comparison_of(rom: ReducedModel, full: FullRun) -> Comparison:
 def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[Propagator, dict[str, Any]]:
     """Propagator, and keywords of :func:`softgrasp.reduction.online.run`, that repeat a full run. Collective.
 
-    Args:
-        small: the same at the materials of the run that is to be made.
+    ``small``: the same at the materials of the run that is to be made.
 
-    Raises:
-        ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.
+    Raises ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.
     """
     drive: dict[str, Any] = {"hand": full.hand} if small.fixed_solid else {"force": full.force}
     step = propagator(small, full.dt, driven=small.fixed_solid)

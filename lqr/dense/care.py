@@ -38,12 +38,9 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
     work is 25 (2n)^3 operations; memory some 20 n^2. Inputs are not changed.
 
     Args:
-        A: (n, n).
-        B: (n, m).
-        C: (p, n).
-        Q: (p, p), symmetric positive semidefinite.
-        R: (m, m), symmetric positive definite.
-        E: (n, n), regular; None stands for I.
+        A, E: (n, n), E regular; None stands for I.
+        B, C: (n, m) and (p, n).
+        Q, R: (p, p), symmetric positive semidefinite, and (m, m), symmetric positive definite.
 
     Raises:
         ControlError: data that are no numbers, an indefinite weight, (E, A, B) not stabilisable, (E, A, C) not

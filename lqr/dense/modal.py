@@ -113,22 +113,10 @@ def assemble_space(
     return StateSpace(E, A, B, C)
 
 
-def relative_space(problem: RiccatiProblem) -> StateSpace | None:
-    """E, A, B, C in hand-relative coordinates, dense on rank 0, None elsewhere. Collective."""
-    tissue = gather_tissue(problem)
-    if tissue is None:
-        return None
-    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
-
-
 def modal_plant(
     problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, ...]
 ) -> ModalPlant:
-    """The plant restricted to modes.
-
-    Args:
-        parts: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi.
-    """
+    """The plant restricted to modes. ``parts``: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi."""
     D, g, c = parts
     G, B_z = (g, None) if problem.B_z is None else (g[:, :0], g)
     space = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
@@ -158,8 +146,7 @@ def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
 def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
     """The k lowest modes: LAPACK on rank 0 up to :data:`DENSE_MODES` unknowns, else SLEPc. Collective.
 
-    Returns:
-        omega (k,), Phi and M_ee Phi, local rows (n_local, k).
+    Returns omega (k,), Phi and M_ee Phi, local rows (n_local, k).
     """
     system, layout = problem.system, problem.layout
     if layout.n_e > DENSE_MODES:

@@ -111,8 +111,7 @@ def sampling(model: Model) -> Sampling:
 def with_control(model: Model) -> tuple[Model, str]:
     """A scene without a [control] table gets tip output and Q = R = 1, and a turning hand is seen too. Collective.
 
-    Returns:
-        The model, and the sentence that says so; empty when the scene has its own table.
+    Returns the model, and the sentence that says so; empty when the scene has its own table.
     """
     if model.scene.control is not None:
         return model, ""

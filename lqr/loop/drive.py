@@ -28,8 +28,7 @@ class PlantStep:
 
     ([...] two-way only). No matrix of the closed loop is ever factored.
 
-    Args:
-        midpoint: factored step, before its start: its vectors are used as scratch.
+    ``midpoint``: factored step, before its start: its vectors are used as scratch.
     """
 
     def __init__(self, system: BlockSystem, midpoint: TissueMidpoint) -> None:
@@ -145,8 +144,7 @@ class ImplicitDrive(LoopDrive):
 class HeldDrive(LoopDrive):
     """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, if asked for one tick later.
 
-    Args:
-        target: x_bar and u_bar; u_bar acts until the first command arrives.
+    ``target``: x_bar and u_bar; u_bar acts until the first command arrives.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
@@ -176,11 +174,7 @@ class HeldDrive(LoopDrive):
 
 
 class OpenDrive(LoopDrive):
-    """Input that is given for every step.
-
-    Args:
-        inputs: u of each step [N, N m], (steps, n_s).
-    """
+    """Input that is given for every step. ``inputs``: u of each step [N, N m], (steps, n_s)."""
 
     def __init__(self, plant: PlantStep, inputs: Array) -> None:
         super().__init__(plant, len(inputs))

@@ -96,13 +96,9 @@ def galerkin(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
     """Galerkin on x = [q_s, v_s, V eta, V eta']: the hand stays whole, the tissue stays of second order.
 
     V'M V, V'D V and V'K V keep their definiteness, so the reduced plant is as stable as the full one, for every V.
-    Collective.
+    Collective. ``V``: shapes of z, local rows (n_local, k), linearly independent; k = 0 leaves the hand alone.
 
-    Args:
-        V: shapes of z, local rows (n_local, k), linearly independent; k = 0 leaves the hand alone.
-
-    Raises:
-        ControlError: the columns of V are linearly dependent.
+    Raises ControlError: the columns of V are linearly dependent.
     """
     system, comm = problem.system, problem.layout.comm
     M_V, K_V = times_columns(system.M_ee, V), times_columns(system.K_ee, V)

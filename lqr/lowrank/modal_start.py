@@ -107,11 +107,7 @@ def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> ModalSubspace:
 def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) -> SmallSolution:
     """Riccati equation of the small plant on rank 0, the result on all. Collective.
 
-    Args:
-        guess: an X near the solution, (N, N).
-
-    Raises:
-        ControlError: not stabilisable or not detectable.
+    ``guess``: an X near the solution, (N, N). Raises ControlError: not stabilisable or not detectable.
     """
 
     def solve() -> SmallSolution:
@@ -211,11 +207,9 @@ def check_damped(plant: Plant) -> None:
 def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     """Riccati equation of the hand and the lowest ``modes`` modes. Collective.
 
-    Args:
-        modes: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
+    ``modes``: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
 
-    Raises:
-        ControlError: there is no damping at all, or the small problem has no stabilising solution.
+    Raises ControlError: there is no damping at all, or the small problem has no stabilising solution.
     """
     check_damped(plant)
     count = MODES if modes is None else modes

@@ -76,8 +76,7 @@ class Plant:
     def mass_adjoint(self, V: Block, out: Array | None = None) -> Block:
         """E'V of a costate block; the z-row of the result is unscaled. Collective.
 
-        Args:
-            out: room for the tissue rows of the result.
+        ``out``: room for the tissue rows of the result.
         """
         n, s = self.n_local, self.n_s
         a, b, b_s = V.tall[:n], V.tall[n:], V.hand[s:]

@@ -72,8 +72,7 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
         W: residual factor.
         gain: K', None for K = 0.
 
-    Returns:
-        The values, and the norm of the component of W along each Ritz vector.
+    Returns the values, and the norm of the component of W along each Ritz vector.
     """
     empty = Block(np.zeros((2 * plant.n_s, 0)), np.zeros((2 * plant.n_local, 0)))
     F, G, seen, X_part = energy_products(plant, V, W, empty if gain is None else gain.block)

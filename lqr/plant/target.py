@@ -51,8 +51,7 @@ def rest(system: BlockSystem, *, deformed: bool = True) -> PlantState:
 def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
     """Rest with the hand at q_bar. Collective.
 
-    Args:
-        q_bar: displacement of the hand [m], (d,), which moves it without turning, or with angles [rad], (n_s,).
+    ``q_bar``: displacement of the hand [m], (d,), which moves it without turning, or with angles [rad], (n_s,).
 
     Raises:
         ControlError: q_bar has another number of entries, or one that is not finite.

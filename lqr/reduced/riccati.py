@@ -100,11 +100,9 @@ def reduce_riccati(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedRicca
 
     The basis is scaled to energy first, and the equation is solved on rank 0.
 
-    Args:
-        basis: costates W and states U of N columns.
+    ``basis``: costates W and states U of N columns.
 
-    Raises:
-        ControlError: the reduced equation has no stabilising solution.
+    Raises ControlError: the reduced equation has no stabilising solution.
     """
     basis = energy_scaled(problem, basis)
     matrices = project_plant(problem, basis)

@@ -69,8 +69,7 @@ class Packed:
 class Potential:
     """W_r and its derivatives at one set of materials.
 
-    Args:
-        comm: ranks whose cells are summed up; None where every rank has all of them.
+    ``comm``: ranks whose cells are summed up; None where every rank has all of them.
     """
 
     def __init__(self, cells: Cells, materials: tuple[LayerMaterial, ...], comm: MPI.Intracomm | None = None) -> None:

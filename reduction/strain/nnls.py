@@ -91,11 +91,9 @@ def on_one_rank(comm: MPI.Intracomm, G: Array) -> tuple[Array, Array]:
 
     With more rows than columns, the triangle of G = Q R and Q'b instead: the same least squares problem.
 
-    Args:
-        G: all rows of this rank's columns, (m, n_local).
+    ``G``: all rows of this rank's columns, (m, n_local).
 
-    Returns:
-        G or R, and b or Q'b, on rank 0; empty elsewhere.
+    Returns G or R, and b or Q'b, on rank 0; empty elsewhere.
     """
     columns = rows_on_root(comm, G.T)
     if columns is None:

@@ -35,11 +35,9 @@ TIMER = 0.03  # relative difference of two equal runs that cache and page placem
 def study_effects(
     scene: Scene, comm: MPI.Intracomm, progress: Callable[[int, int], None] | None = None
 ) -> EffectsStudy:
-    """Measure every effect of a scene on and off. Collective.
+    """Measure every effect of a scene on and off, as its section study asks. Collective.
 
-    Args:
-        scene: the scene; tolerance and repeats are those of its section study.
-        progress: called with steps of work done and in all.
+    ``progress`` is called with steps of work done and in all.
 
     Raises:
         SceneError, MeshError: the scene cannot be built.

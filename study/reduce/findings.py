@@ -57,15 +57,12 @@ def _best(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
             yield f"In {name} the same methods lead as in {seen[order]}."
             continue
         seen[order] = name
+        spans = [" to ".join(str(N) for N in sorted({points[0].N, points[-1].N})) for _, points in rows]
         texts = [
-            f"{s.method.short_title} at N = {_span([p.N for p in points])} ({_value(points, key)})"
-            for s, points in rows
+            f"{s.method.short_title} at N = {span} ({_value(points, key)})"
+            for (s, points), span in zip(rows, spans, strict=True)
         ]
         yield f"Least error of {name} among stable models: {'; '.join(texts)}."
-
-
-def _span(sizes: list[int]) -> str:
-    return str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
 
 
 def _value(points: Sequence[Point], key: str) -> str:

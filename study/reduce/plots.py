@@ -63,13 +63,11 @@ def further_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
 
 def figure_errors(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...]:
     """Error of the deformation against N; a curve is dotted where its model is unstable."""
-    look = looks(sweeps)
     with style.paper_style():
         figure, ax = plt.subplots(figsize=(style.COLUMN + 1.6, 3.4))
         figure.subplots_adjust(left=0.13, right=0.66, bottom=0.13, top=0.9)
-        ends = _errors_axis(ax, sweeps, look, *QUANTITIES[0])
+        _errors_axis(ax, sweeps, *QUANTITIES[0])
         ax.set_xlabel("$N$, columns of the basis")
-        style.direct_labels(ax, ends)
         if handles := _remarks(sweeps):
             ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.1, 1.0), borderaxespad=0.2, ncols=2)
         return style.save(figure, out_png)
@@ -77,34 +75,31 @@ def figure_errors(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, .
 
 def figure_further_errors(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...]:
     """State, canonical state and energy, one below the other, as the deformation in :func:`figure_errors`."""
-    look = looks(sweeps)
     with style.paper_style():
         figure, axes = plt.subplots(3, 1, figsize=(style.COLUMN + 1.6, 6.4), sharex=True)
         figure.subplots_adjust(left=0.13, right=0.66, bottom=0.07, top=0.97, hspace=0.1)
         for ax, quantity in zip(axes, QUANTITIES[1:], strict=True):
-            ends = _errors_axis(ax, sweeps, look, *quantity)
-            style.direct_labels(ax, ends)
+            _errors_axis(ax, sweeps, *quantity)
         axes[-1].set_xlabel("$N$, columns of the basis")
         return style.save(figure, out_png)
 
 
-def _errors_axis(
-    ax: Any, sweeps: Sequence[MethodSweep], look: dict[str, tuple[str, str, str]], key: str, label: str
-) -> list[tuple[float, float, str, str]]:
-    """Curves of one error; the end of each with its name and colour."""
-    ends = []
+def _errors_axis(ax: Any, sweeps: Sequence[MethodSweep], key: str, label: str) -> None:
+    """Curves of one error, each with its name at its end."""
+    look, ends = looks(sweeps), []
     for s in sweeps:
         colour, dashes, marker = look[s.method.key]
         N, values = [p.N for p in s.points], _values(s.points, key)
         held = np.where([p.stable for p in s.points], values, np.nan)
         ax.plot(N, held, color=colour, ls=dashes, marker=marker, ms=3.0, lw=1.1, zorder=2)
         ax.plot(N, values, color=colour, ls=(0, (1, 2.5)), lw=0.6, zorder=1)
-        _crosses(ax, s, N, key, colour)
+        bad = [i for i, p in enumerate(s.points) if not p.stable]  # marked, where the curve is dotted
+        ax.plot([N[i] for i in bad], values[bad], **CROSS, color=colour, zorder=1)
         ends.append((float(N[-1]), float(values[-1]), s.method.short_title, colour))
     ax.set_ylabel(label)
     style.log_axis(ax, 1.6 * TOP)
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=style.STEPS))
-    return ends
+    style.direct_labels(ax, ends)
 
 
 def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> tuple[Path, ...]:
@@ -185,12 +180,6 @@ def _values(points: Sequence[Point], key: str) -> np.ndarray:
     """Values of points, those that overflowed or exceed the frame at its edge."""
     values = np.array([getattr(p, key) for p in points], dtype=float)
     return np.where(np.isfinite(values), np.minimum(values, TOP), TOP)
-
-
-def _crosses(ax: Any, s: MethodSweep, at: Sequence[float], key: str, colour: str) -> None:
-    """Faint marks of the unstable models, where the curve is dotted."""
-    bad = [i for i, p in enumerate(s.points) if not p.stable]
-    ax.plot([at[i] for i in bad], _values(s.points, key)[bad], **CROSS, color=colour, zorder=1)
 
 
 def _remarks(sweeps: Sequence[MethodSweep]) -> list[Line2D]:

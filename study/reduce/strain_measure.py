@@ -171,7 +171,9 @@ def _measure(
     done = [replay_strain(rom, run, outside=True) for _, run in pairs]
     trained = errors_of([r.missed(x.a, x.v) for (r, _), x in zip(pairs, done, strict=True)])
     own = training.references[0].errors(done[0].a, done[0].v)
-    worst = {kind: _worst(rom, kind, held, references) for kind in ("material", "motion")}
+    errors = [(h.kind, _error(rom, h, r)) for h, r in zip(held, references, strict=True)]
+    worst = {key: max((e for kind, e in errors if kind == key and e is not None), default=None)
+             for key in ("material", "motion")}  # fmt: skip
     full, comm = training.runs[0], training.model.system.layout.comm
     small = rom.at(full.dt, outside=True)  # few cells may overshoot
     start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
@@ -186,11 +188,6 @@ def _measure(
         drift=max(run.energy_drift for run in done), evaluations=done[0].evaluations, engine=done[0].engine,
         time_offline=sum(rom.seconds.values()), time_setup=setup, time_online=online,
     )  # fmt: skip
-
-
-def _worst(rom: StrainModel, kind: str, held: Sequence[HeldOutRun], references: Sequence[Reference]) -> float | None:
-    errors = [_error(rom, h, r) for h, r in zip(held, references, strict=True) if h.kind == kind]
-    return max((e for e in errors if e is not None), default=None)
 
 
 def _error(rom: StrainModel, held: HeldOutRun, reference: Reference) -> float | None:

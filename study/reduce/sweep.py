@@ -70,11 +70,9 @@ def bases_of(
 def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = None) -> Point:
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
-    Args:
-        comparison: of the largest model of the family; None prepares one for this model alone.
+    ``comparison``: of the largest model of the family; None prepares one for this model alone.
 
-    Raises:
-        ModelError: E or A is singular, so that the model has no run or no equilibrium to start in.
+    Raises ModelError: E or A is singular, so that the model has no run or no equilibrium to start in.
     """
     layout = full.model.system.layout
     comparison = comparison or comparison_of(model, full)

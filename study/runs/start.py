@@ -10,8 +10,8 @@ import numpy as np
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.materials import LIBRARY
+from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.schema import full_schema
 
 SCHEMA = "scene.schema.json"
 SCENE = """\
@@ -90,7 +90,7 @@ def new_scene(file: Path, *, solid: bool = False, mesh: Path | None = None) -> l
     except SceneError:
         file.unlink()
         raise
-    schema.write_text(json.dumps(full_schema(), indent=1) + "\n")
+    schema.write_text(json.dumps(scene_schema(), indent=1) + "\n")
     return [file, schema]
 
 

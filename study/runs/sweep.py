@@ -100,7 +100,7 @@ class Runner:
         m = scene.tissue.material
         return self.model.with_materials(m.lam, m.mu, m.rho) if only_material(self.model.scene, scene) else self.model
 
-    def row(self, values: dict[str, float], scene: Scene, judged: bool) -> Row:
+    def row(self, values: dict[str, float], scene: Scene, with_error: bool) -> Row:
         """Largest distance of each output from the rigid motion, final outputs, energy drift, seconds. Collective."""
         N = self.sweep.N
         if N is None:
@@ -118,7 +118,7 @@ class Runner:
         begin = MPI.Wtime()
         small = replay_linear(self.rom, model, self.base)
         seconds, off = MPI.Wtime() - begin, None
-        if judged:
+        if with_error:
             off = float(errors_linear(self.rom, small, full_run(model, simulate(model))).error_deformation)
         return {**values, **_outputs(self.base, small.outputs), "seconds": seconds, "error_deformation": off}
 
@@ -157,7 +157,7 @@ def run_sweep_points(
     own: dict[str, Row] = {}
     for count, i in enumerate(missing[number::groups], start=1):
         try:
-            row = runner.row(points[i], scenes[i], judged=i in (0, len(points) - 1))
+            row = runner.row(points[i], scenes[i], with_error=i in (0, len(points) - 1))
         except Interrupted:
             raise
         except SoftgraspError as error:

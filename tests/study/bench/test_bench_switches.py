@@ -14,14 +14,14 @@ import softgrasp.reduction.online
 from softgrasp.study.bench import driver
 from softgrasp.study.bench import switches as bench_switches
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.switches import SwitchPoint, product, start, table_of
+from softgrasp.study.bench.switches import Setup, SwitchPoint, product, start, table_of
 from softgrasp.study.shell.processes import IN_MPI_JOB
 
 
 @pytest.mark.serial
 def test_rows_compare_two_methods_and_leave_the_constants_alone(comm: MPI.Intracomm) -> None:
     before = softgrasp.lqr.lowrank.modal_start.FEW_MODES, softgrasp.reduction.online.TOGETHER
-    rows = list(start(comm, 1, False))
+    rows = list(start(Setup(comm, 1, False)))
     assert [row.setting for row in rows] == [f"2D, {k} modes" for k in (15, 16, 30, 60)]
     assert all(row.first > 0 and row.second > 0 and row.ranks == 1 for row in rows)
     assert rows[0].limit == f"FEW_MODES = {before[0]}"
@@ -35,7 +35,7 @@ def test_products_are_measured_beside_scipy_and_petsc_by_rows_and_by_columns(
 ) -> None:
     sizes = iter(([2, 4], [3, 6]))
     monkeypatch.setattr(bench_switches, "cells_for", lambda d, size: next(sizes))
-    rows = list(product(comm, 1, False))
+    rows = list(product(Setup(comm, 1, False)))
     assert len(rows) == 2 * 3 * 2 * 2
     assert {row.switch for row in rows} == {"product, SciPy", "product, PETSc"}
     assert all(row.first > 0 and row.second > 0 for row in rows)
