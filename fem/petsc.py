@@ -20,6 +20,7 @@ Complex = NDArray[np.complex128]
 SAME = PETSc.Mat.Structure.SAME_NONZERO_PATTERN
 FEW_COLUMNS = 2  # up to which setting up a product of matrices costs more than it saves
 BLOCK_COLUMNS = 8  # at least so many of a block
+FEW_ENTRIES = 524_288  # of eight columns and more, up to which SciPy's product is the faster one
 BLOCK_ENTRIES = 131_072  # about so many of a block of columns: room that the C library need not ask the system for
 
 
@@ -97,13 +98,14 @@ def combine(terms: list[tuple[float, PETSc.Mat]]) -> PETSc.Mat:
 def times_columns(A: PETSc.Mat, X: Array) -> Array:
     """A X for local rows of dense columns, (n_local, k), in the storage of the faster way. Collective.
 
-    On one rank X stored by rows, or of few entries, goes by SciPy's product, for which the matrix keeps a copy, and
-    other X by PETSc's in blocks; on more ranks all columns go at once, since every block costs messages. One or two
-    columns, and a rank without rows, on which PETSc's product crashes, go by the product with vectors.
+    On one rank X stored by rows, or of eight columns and more with few entries, goes by SciPy's product, for which the
+    matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block costs
+    messages. One or two columns, and a rank without rows, on which PETSc's product crashes, go by the product with
+    vectors.
     ``python -m softgrasp.study.bench switches --switches product`` measures the ways.
     """
     k, serial, entries = X.shape[1], A.comm.size == 1, A.getType() != PETSc.Mat.Type.PYTHON
-    few = k >= BLOCK_COLUMNS and X.size <= BLOCK_ENTRIES
+    few = k >= BLOCK_COLUMNS and X.size <= FEW_ENTRIES
     if serial and entries and k > 1 and (few or not X.flags.f_contiguous):
         return np.asarray(_kept_rows(A) @ X)
     result = np.empty((A.getLocalSize()[0], k), order="F")
@@ -144,6 +146,31 @@ def _by_blocks(A: PETSc.Mat, X: Array, result: Array, blocks: int) -> None:
         result[:, first : first + width] = product.getDenseArray(readonly=True)
         product.destroy()
         dense.destroy()
+
+
+def led(
+    comm: MPI.Intracomm, call: Callable[[Array], Array], method: Callable[[Callable[[Array], Array]], Array]
+) -> Array:
+    """What ``method(call)`` returns: it decides on rank 0 alone, and every rank takes part in its calls. Collective.
+
+    Raises:
+        ArithmeticError: ``call`` raised it, as it must on all ranks alike.
+    """
+    if comm.rank == 0:
+        try:
+            answer = method(lambda x: call(np.array(comm.bcast(x))))  # a copy: the method may write into its own later
+        finally:
+            comm.bcast(None)
+        return np.asarray(comm.bcast(answer))
+    failed = False
+    while (x := comm.bcast(None)) is not None:
+        try:
+            call(x)
+        except ArithmeticError:
+            failed = True
+    if failed:
+        raise ArithmeticError
+    return np.asarray(comm.bcast(None))
 
 
 def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:

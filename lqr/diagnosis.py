@@ -8,19 +8,15 @@ from typing import Literal
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.dense.care import care
+from softgrasp.fem.petsc import Array, total
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
 from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.reduced.bases import modal_basis
-from softgrasp.lqr.reduced.riccati import project_plant
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
 
 MODES = 60
-RANK_LEVEL = 1e-10  # singular values of X are counted down to this share of the largest
 WEAK = ENOUGH / 4  # damping ratio of the first mode where the low-rank solvers begin to need many hundred solves
 
 Kind = Literal["error", "warning"]
@@ -41,9 +37,6 @@ class Diagnosis:
 
     findings: tuple[Finding, ...]  # problems, worst first
     rates: ModeRates | None  # estimated closed-loop poles of the lowest modes; None when the data are unusable
-    # singular values of X above RANK_LEVEL of the largest on hand and these modes; a lower bound of the rank when it is
-    # close to 2 (n_s + modes). 0 when there is no solution.
-    rank_estimate: int
     damping_enough: float  # Kelvin-Voigt time beta [s] from which the low-rank solvers converge quickly; nan if unknown
 
     @property
@@ -52,13 +45,9 @@ class Diagnosis:
         return all(f.kind != "error" for f in self.findings)
 
     def require(self, but: Collection[str] = ()) -> None:
-        """Go on only when solvable.
+        """Go on only when solvable, whatever the errors of the topics ``but`` are.
 
-        Args:
-            but: topics whose errors do not matter.
-
-        Raises:
-            ControlError: with the first error's sentence.
+        Raises ControlError: with the first error's sentence.
         """
         for finding in self.findings:
             if finding.kind == "error" and finding.topic not in but:
@@ -66,25 +55,20 @@ class Diagnosis:
 
 
 def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
-    """Check weights and data, outputs and inputs, and the damping of the closed loop. Collective.
-
-    Args:
-        modes: lowest modes to look at.
-    """
+    """Check weights and data, outputs and inputs, and the damping of the closed loop. Collective."""
     unusable = _data(problem)
     if unusable:
-        return Diagnosis(tuple(unusable), None, 0, float("nan"))
+        return Diagnosis(tuple(unusable), None, float("nan"))
     system, comm = problem.system, problem.layout.comm
     findings = _outputs(problem)
     k = min(modes, system.layout.n_e)
-    omega, Phi, massed = modes_of_plant(problem, k)
+    omega, Phi, _ = modes_of_plant(problem, k)
     damping = np.diag(modal_damping(problem, Phi))
     g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
     rates = closed_loop_rates(problem, omega, damping, g, c, largest=_largest_frequency(problem))
     findings += _damping(problem, rates)
     findings.sort(key=lambda f: f.kind != "error")
-    rank = 0 if any(f.kind == "error" for f in findings) else _small_rank(problem, omega, Phi, massed)
-    return Diagnosis(tuple(findings), rates, rank, enough_damping(rates))
+    return Diagnosis(tuple(findings), rates, enough_damping(rates))
 
 
 def _data(problem: RiccatiProblem) -> list[Finding]:
@@ -171,18 +155,3 @@ def _largest_frequency(problem: RiccatiProblem) -> float:
     ratio = float((rows / mass.array_r).max(initial=0.0))
     mass.destroy()
     return float(np.sqrt(max(comm.allgather(ratio))))
-
-
-def _small_rank(problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array) -> int:
-    """Rank of X on hand and modes in energy coordinates, by a dense solve of that order. Collective."""
-    basis = modal_basis(problem, "diagnose", omega, Phi, massed)
-    m = project_plant(problem, basis)
-
-    def count() -> int:
-        try:
-            values = np.linalg.eigvalsh(care(m.A, m.B, m.C, m.Q, m.R, m.E).X)
-        except ControlError:
-            return 0
-        return int(np.sum(values > RANK_LEVEL * values[-1]))
-
-    return on_root(problem.layout.comm, count)

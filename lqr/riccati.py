@@ -34,14 +34,14 @@ class Solver(Protocol):
 
 
 @dataclass(frozen=True)
-class Choice:
+class SolverChoice:
     """A method and the reason in words."""
 
     method: Method
     reason: str
 
 
-def choose(problem: RiccatiProblem, method: Method = "auto") -> Choice:
+def choose(problem: RiccatiProblem, method: Method = "auto") -> SolverChoice:
     """The method for a problem.
 
     Newton-ADI by default; RADI where damping couples the modes; Galerkin where complex factorisations no longer fit.
@@ -49,24 +49,27 @@ def choose(problem: RiccatiProblem, method: Method = "auto") -> Choice:
     however many modes are kept short of all (residual 1e-4 after one Newton step with 10 to 120 of 286 modes): three
     steps, where RADI takes the solves of one. Nor is that start known to stabilise.
 
-    Raises:
-        SolverError: the name is unknown.
+    Raises SolverError: the name is unknown.
     """
     if method not in METHODS:
         raise SolverError(f"the Riccati method {method!r} is unknown; choose one of {', '.join(METHODS)}")
     if method != "auto":
-        return Choice(method, "asked for")
+        return SolverChoice(method, "asked for")
     layout, damping = problem.layout, problem.system.damping
     if layout.states <= DENSE_STATES:
-        return Choice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes, exact to rounding")
+        return SolverChoice("dense", f"{layout.states} states <= {DENSE_STATES}: all modes, exact to rounding")
     if not damping.active:
-        return Choice("dense", "without damping X has no low rank: only the dense method can tell what is lost")
+        return SolverChoice("dense", "without damping X has no low rank: only the dense method can tell what is lost")
     limit = LOW_RANK_LIMIT[layout.dimension]
     if layout.n_e > limit:
-        return Choice("galerkin", f"n_e = {layout.n_e} > {limit} in {layout.dimension}D: few factorisations fit")
+        return SolverChoice("galerkin", f"n_e = {layout.n_e} > {limit} in {layout.dimension}D: few factorisations fit")
     if modes_couple(problem.system):
-        return Choice("radi", "damping couples the modes: the modal start of Newton's method is not known to stabilise")
-    return Choice("newton_adi", f"{layout.states} states, modes decoupled: modal start and usually one Newton step")
+        return SolverChoice(
+            "radi", "damping couples the modes: the modal start of Newton's method is not known to stabilise"
+        )
+    return SolverChoice(
+        "newton_adi", f"{layout.states} states, modes decoupled: modal start and usually one Newton step"
+    )
 
 
 def make_solver(
@@ -98,6 +101,7 @@ def solve(
 ) -> RiccatiSolution:
     """Solve A'XE + E'XA - E'XB R^{-1} B'XE + C'QC = 0 and return X ~ Z Z' and the gain. Collective.
 
+    By Newton-ADI [K68, BHSW16], RADI [BBKS18], structured Galerkin, or dense in modal coordinates [L79].
     When Newton's start does not stabilise, the choice ``auto`` goes on with RADI. The problem is not changed.
 
     Args:
@@ -129,6 +133,6 @@ def solve(
     except SolverError as error:
         if method != "auto" or choice.method != "newton_adi":
             raise
-        choice = Choice("radi", f"newton_adi failed ({error})")
+        choice = SolverChoice("radi", f"newton_adi failed ({error})")
         solution = make_solver("radi", tol, progress).solve(problem)
     return replace(solution, reason=choice.reason)

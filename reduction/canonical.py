@@ -48,16 +48,6 @@ class CanonicalLift:
     W_G: Array | None  # M_ee^-1 G, (n_local, n_s), or None in the relative frame
 
 
-def mass_solve(system: BlockSystem, *blocks: Array) -> list[Array]:
-    """M_ee^-1 X for dense local blocks with one factorisation; columns of zeros cost nothing. Collective.
-
-    Raises:
-        SolverError: the factorisation fails or a residual is too large.
-    """
-    X, ends = np.hstack(blocks), np.cumsum([block.shape[1] for block in blocks])[:-1]
-    return np.split(solve_columns(system.M_ee, system.layout, X, "the momentum of a basis vector", MASS_RTOL), ends, 1)
-
-
 def _rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array, Array]:
     """S_q, rows of the hand's velocity or momentum, and L_q."""
     S_q, S_p = basis.V_sq, basis.V_sv
@@ -69,18 +59,6 @@ def _rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array, Array]:
     return S_q, S_p, L_q
 
 
-def check_fixed(basis: Basis) -> None:
-    """Refuse hand columns that move the tissue: canonical models take the hand as their input. Collective.
-
-    Raises:
-        SoftgraspError: the first 2 n_s columns have rows in the tissue.
-    """
-    k = 2 * basis.layout.n_s if basis.fixed_solid else 0
-    local = float(np.abs(basis.V_q[:, :k]).sum() + np.abs(basis.V_p[:, :k]).sum())
-    if total(basis.layout.comm, np.array([local]))[0] > 0:
-        raise SoftgraspError(f"{basis.name}: the hand's own columns of a canonical basis must be zero in the tissue")
-
-
 def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, CanonicalLift]:
     """Small matrices at the densities of ``system``, and what lifts velocities. Collective.
 
@@ -88,11 +66,15 @@ def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Canonical
         SoftgraspError: the hand's own columns reach into the tissue.
         SolverError: the mass matrix cannot be factored.
     """
-    check_fixed(basis)
     comm, absolute = system.layout.comm, basis.frame == "absolute"
+    k = 2 * system.layout.n_s if basis.fixed_solid else 0
+    # canonical models take the hand as their input
+    if comm.allreduce(float(np.abs(basis.V_q[:, :k]).sum() + np.abs(basis.V_p[:, :k]).sum())) > 0:
+        raise SoftgraspError(f"{basis.name}: the hand's own columns of a canonical basis must be zero in the tissue")
     S_q, S_p, L_q = _rows(basis, system)
     V_p, G, T = basis.V_p, system.G, system.T
-    Y, W_G = mass_solve(system, V_p, G)
+    both = solve_columns(system.M_ee, system.layout, np.hstack([V_p, G]), "the momentum of a basis vector", MASS_RTOL)
+    Y, W_G = np.split(both, [basis.N], axis=1)
     W = basis.V_q if basis.fixed_solid and not system.two_way else L_q
     G_WG = total(comm, G.T @ W_G)
     parts: Parts = {

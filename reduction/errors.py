@@ -1,4 +1,4 @@
-"""How far reduced models are from the full one: states, deformation, energy, and the floor that their basis sets.
+"""How far reduced models are from the full one: states, deformation, energy, and the projection error of their basis.
 
 Everything that a model shows is linear in Y = [x; q_s; v_s], its state and its hand. With one QR factorisation V = Q R
 of what the largest model of a family shows, and snapshots X = Q C + rest,
@@ -37,19 +37,12 @@ VIEWS: tuple[View, ...] = get_args(View)
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """Relative errors of a reduced run against snapshots of the full one, dimensionless.
+    """Relative errors of a reduced run against snapshots of the full one, dimensionless."""
 
-    Attributes:
-        error: |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21].
-        error_canonical: the same of X = [q_s, p_s, q_e, p_e], which canonical bases are built from.
-        error_deformation: the same of [z, v_z], after removing the rigid motion of the hand.
-        error_energy: max_t |H_r - H| / max_t H of the tissue's energy relative to the hand.
-    """
-
-    error: float
-    error_canonical: float
-    error_deformation: float
-    error_energy: float
+    error: float  # |X - X_r|_F / |X|_F of X = [q_s, v_s, q_e, v_e] in absolute coordinates: the paper's error [SBRH21]
+    error_canonical: float  # the same of X = [q_s, p_s, q_e, p_e], which canonical bases are built from
+    error_deformation: float  # the same of [z, v_z], after removing the rigid motion of the hand
+    error_energy: float  # max_t |H_r - H| / max_t H of the tissue's energy relative to the hand
 
 
 def full_energy(system: BlockSystem, Z: Array) -> Array:
@@ -97,8 +90,7 @@ def row_weights(system: BlockSystem) -> tuple[Array, float]:
 def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: BlockSystem) -> Array:
     """V with V Y = what the model shows for Y = [x; q_s; v_s], local rows, (..., N + 2 n_s). Collective.
 
-    Raises:
-        ModelError: the model holds no basis on the mesh.
+    Raises ModelError: the model holds no basis on the mesh.
     """
     N, n_s = model.N, small.n_s
     width = N + 2 * n_s
@@ -117,11 +109,7 @@ class Span:
     square: float  # |X|_F^2
 
     def inside(self, V: Array) -> Array:
-        """R = Q'V for columns V, local rows, that lie in the span. Collective.
-
-        Raises:
-            ModelError: they do not.
-        """
+        """R = Q'V for columns V, local rows, that lie in the span. Collective. Raises ModelError: they do not."""
         R = total(self.comm, self.Q.T @ V)
         lost = total(self.comm, np.array([((V - self.Q @ R) ** 2).sum(axis=0), (V**2).sum(axis=0)]))
         if (lost[0] > INSIDE**2 * lost[1]).any():
@@ -132,7 +120,7 @@ class Span:
         """|X - V Y|_F / |X|_F for R from :meth:`inside`."""
         return ratio(self.rest + squares(self.C - R @ Y), self.square)
 
-    def floor(self, R: Array) -> float:
+    def projection_error(self, R: Array) -> float:
         """min_Y |X - V Y|_F / |X|_F.
 
         Nearly dependent columns keep all their digits: no Gram matrix is formed.
@@ -183,8 +171,7 @@ class Comparison:
     def span(self, view: View) -> Span:
         """Snapshots in what the largest model shows; factored at the first call. Collective.
 
-        Raises:
-            ModelError: the model holds no basis on the mesh.
+        Raises ModelError: the model holds no basis on the mesh.
         """
         if view not in self._spans:
             V = shown_rows(view, self.model, self.small, self.system)
@@ -194,8 +181,7 @@ class Comparison:
     def state_error(self, view: View, model: ReducedModel, small: SmallModel, run: ReducedTrajectory) -> float:
         """|X - X_r|_F / |X|_F of a run on the full model's time grid, of the largest model or a smaller. Collective.
 
-        Raises:
-            ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
+        Raises ModelError: the run is shorter than the snapshots, or the model shows more than the largest.
         """
         steps = self.snapshots.steps
         if len(run.x) <= int(steps.max(initial=0)):
@@ -211,17 +197,16 @@ class Comparison:
         peak = float(self.energy.max(initial=0.0))
         return ModelErrors(velocities, momenta, deformation, float(off) / (peak if peak > 0 else 1.0))
 
-    def floor(self, view: View, model: ReducedModel, small: SmallModel) -> float:
-        """min_Y |X - V Y|_F / |X|_F over all states V y that the model can show: the floor of its error. Collective.
+    def projection_error(self, view: View, model: ReducedModel, small: SmallModel) -> float:
+        """min_Y |X - V Y|_F / |X|_F over all states V y that the model can show. Collective.
 
         The hand of V y is that of the state, q_s = S_q y and v_s = S_v y.
 
-        Raises:
-            ModelError: the model shows more than the largest.
+        Raises ModelError: the model shows more than the largest.
         """
         span = self.span(view)
         R = span.inside(shown_rows(view, model, small, self.system))
-        return span.floor(R @ with_hand(small))
+        return span.projection_error(R @ with_hand(small))
 
 
 def with_hand(small: SmallModel) -> Array:

@@ -41,22 +41,26 @@ def write_model(
     """
     comm = MPI.COMM_SELF if lift is None else lift.layout.comm
     partial = path.with_name(path.name + ".part")
-    with agree(comm):
-        if comm.rank == 0:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with h5py.File(partial, "w") as file:
-                file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
-                small(file)
-    for rank in range(comm.size):
-        # one file, one writer at a time: the file library here is not a parallel one
+    try:
         with agree(comm):
-            if lift is not None and comm.rank == rank:
-                _write_rows(lift, partial)
-    with agree(comm):
+            if comm.rank == 0:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with h5py.File(partial, "w") as file:
+                    file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
+                    small(file)
+        for rank in range(comm.size):
+            # one file, one writer at a time: the file library here is not a parallel one
+            with agree(comm):
+                if lift is not None and comm.rank == rank:
+                    _write_rows(lift, partial)
+        with agree(comm):
+            if comm.rank == 0:
+                with h5py.File(partial, "r+") as file:
+                    seal(file)
+                partial.replace(path)
+    finally:  # of a file that was not written whole
         if comm.rank == 0:
-            with h5py.File(partial, "r+") as file:
-                seal(file)
-            partial.replace(path)
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -67,8 +71,7 @@ def reading(
 
     The block must not communicate. The hash of the lift counts where a layout takes it.
 
-    Raises:
-        ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
+    Raises ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
     """
     comm = MPI.COMM_SELF if layout is None else layout.comm
     with agree(comm):
@@ -113,16 +116,13 @@ def _digest(file: h5py.File, lift: bool) -> str:
     return digest.hexdigest()
 
 
-def _lift_arrays(lift: Lift) -> dict[str, Array]:
-    arrays = {"L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
-    return {key: array for key, array in arrays.items() if array is not None}
-
-
 def _write_rows(lift: Lift, path: Path) -> None:
     layout, d = lift.layout, lift.layout.dimension
-    parts = {"nodes": layout.nodes, **_lift_arrays(lift)}
+    parts = {"nodes": layout.nodes, "L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
     with h5py.File(path, "r+") as file:
         for key, part in parts.items():
+            if part is None:
+                continue
             n, start = (layout.n_e // d, layout.start // d) if key == "nodes" else (layout.n_e, layout.start)
             rows = file.require_dataset(f"lift/{key}", (n, part.shape[1]), "f8")
             for at in range(0, len(part), ROWS):

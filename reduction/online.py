@@ -18,22 +18,15 @@ TOGETHER = 5_000_000
 
 @dataclass(frozen=True)
 class ReducedTrajectory:
-    """What a reduced run returns.
+    """What a reduced run returns."""
 
-    Attributes:
-        times: (steps + 1,) [s].
-        x: reduced states, (steps + 1, N).
-        q_s, v_s: hand, (steps + 1, n_s).
-        outputs: y, (steps + 1, p) [m].
-        output_names: one per component.
-    """
-
-    times: Array
-    x: Array
+    times: Array  # (steps + 1,) [s]
+    x: Array  # reduced states, (steps + 1, N)
+    # q_s, v_s: hand, (steps + 1, n_s)
     q_s: Array
     v_s: Array
-    outputs: Array
-    output_names: tuple[str, ...]
+    outputs: Array  # y, (steps + 1, p) [m]
+    output_names: tuple[str, ...]  # one per component
 
 
 def _check_stable(step: Propagator, allow_unstable: bool) -> None:
@@ -74,7 +67,9 @@ def run(
     step = prepared(model, dt, hand is not None)
     _check_stable(step, allow_unstable)
     model = step.model
-    inputs = force_inputs(model, force) if hand is None else hand_inputs(model, hand, step.dt)
+    inputs = np.asarray(force, dtype=float) if hand is None else hand_inputs(model, hand, step.dt)
+    if hand is None and (inputs.ndim != 2 or inputs.shape[1] != model.n_s or len(inputs) < 1):
+        raise ModelError(f"the force has the shape {inputs.shape}; it must be (steps, {model.n_s})")
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
     w = march(step, inputs, step.X_inverse @ start[model.N - step.size :])
     return trajectory(step, w, hand)
@@ -91,14 +86,6 @@ def prepared(model: SmallModel | Propagator, dt: float | None, driven: bool) -> 
     return model
 
 
-def force_inputs(model: SmallModel, force: Array | None) -> Array:
-    """Check the forces (steps, n_s)."""
-    u = np.asarray(force, dtype=float)
-    if u.ndim != 2 or u.shape[1] != model.n_s or len(u) < 1:
-        raise ModelError(f"the force has the shape {u.shape}; it must be (steps, {model.n_s})")
-    return u
-
-
 def consistent(q: Array, v: Array, dt: float) -> Array:
     """Positions that the midpoint rule reaches with the velocities v: q_0 + dt sum (v_n + v_{n+1}) / 2.
 
@@ -107,13 +94,17 @@ def consistent(q: Array, v: Array, dt: float) -> Array:
     return np.vstack([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
 
 
+def checked_hand(hand: tuple[Array, Array], n_s: int) -> tuple[Array, Array]:
+    """Tables q_s and v_s of a prescribed hand. Raises ModelError: their shapes are not (steps + 1, n_s)."""
+    q, v = (np.asarray(table, dtype=float) for table in hand)
+    if q.shape != v.shape or q.ndim != 2 or q.shape[1] != n_s or len(q) < 2:
+        raise ModelError(f"the hand's tables have the shapes {q.shape} and {v.shape}; both must be (steps + 1, {n_s})")
+    return q, v
+
+
 def hand_inputs(model: SmallModel, hand: tuple[Array, Array], dt: float) -> Array:
     """Mean position, velocity and acceleration of each step from tables (steps + 1, n_s); (steps, 3 n_s)."""
-    q, v = hand
-    if q.shape != v.shape or q.ndim != 2 or q.shape[1] != model.n_s or len(q) < 2:
-        raise ModelError(
-            f"the hand's tables have the shapes {q.shape} and {v.shape}; both must be (steps + 1, {model.n_s})"
-        )
+    q, v = checked_hand(hand, model.n_s)
     q = consistent(q, v, dt)
     return np.hstack([(q[1:] + q[:-1]) / 2, (v[1:] + v[:-1]) / 2, np.diff(v, axis=0) / dt])
 
@@ -135,14 +126,7 @@ class Stepper:
 
     One product with a prefactored matrix of (N + p) x (N + n_s + 1) a step; nothing is allocated.
 
-    Args:
-        model: small model, or a propagator made beforehand.
-        dt: step [s]; needed with a small model.
-        x0: initial state (N,); None is zero.
-        allow_unstable: step a model with growing modes all the same.
-
-    Raises:
-        UnstableModelError: the model is unstable and ``allow_unstable`` is not set.
+    Arguments as for :func:`run`. Raises UnstableModelError: the model is unstable and ``allow_unstable`` is not set.
     """
 
     def __init__(

@@ -82,11 +82,6 @@ def materials_at(model: Model, lam: float, mu: float) -> tuple[LayerMaterial, ..
     return tuple(replace(m, lam=m.lam * lam / first.lam, mu=m.mu * mu / first.mu) for m in model.system.materials)
 
 
-def box_materials(model: Model) -> list[tuple[LayerMaterial, ...]]:
-    """Materials at every parameter of the grid."""
-    return [materials_at(model, lam, mu) for lam, mu in grid_of(model)]
-
-
 def run_at(model: Model, lam: float, mu: float) -> FullRun:
     """The full run at other constants. Collective."""
     return run_with(model, materials_at(model, lam, mu))

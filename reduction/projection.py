@@ -37,8 +37,6 @@ def project(
     Args:
         basis: V in the blocks of hand and tissue.
         system: operators; a canonical model is affine around their densities.
-        outputs: outputs of the scene.
-        scene_hash: kept for the archive.
 
     Raises:
         SolverError: the mass matrix cannot be factored.

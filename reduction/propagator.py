@@ -67,11 +67,7 @@ class Propagator:
 
     @cached_property
     def matrix(self) -> Array:
-        """One step, (k, k + m + 1) for m inputs, C order.
-
-        Raises:
-            ModelError: E - dt/2 A is singular.
-        """
+        """One step, (k, k + m + 1) for m inputs, C order. Raises ModelError: E - dt/2 A is singular."""
         dt, X = self.dt, self.X
         try:
             implicit = (self.E - dt / 2 * self.A) @ X

@@ -95,7 +95,7 @@ def replay(rom: StrainModel, model: Model, run: Trajectory | FullRun, *, allow: 
 def replay(
     rom: ReducedModel | StrainModel, model: Model, run: Trajectory | FullRun, *, allow: bool = False
 ) -> ReducedTrajectory | StrainRun:
-    """Run a reduced model under the hand of a full run, from its start. Collective.
+    """E x' = A x + B u + F g by the midpoint rule [HLW06], under the hand of a full run. Collective.
 
     The hand moves as it did where the basis keeps it apart (fixed solid modes), else it feels the force that gave its
     motion. The materials are those of ``model``: a model with others replays a new parameter, and nothing of full order
@@ -138,7 +138,7 @@ def errors(rom: StrainModel, reduced_run: StrainRun, model: Model, run: Trajecto
 def errors(
     rom: ReducedModel | StrainModel, reduced_run: ReducedTrajectory, model: Model, run: Trajectory | FullRun
 ) -> ModelErrors | StrainErrors:
-    """|X - X_r| / |X| over the snapshots X of a full run: states, deformation, energy. Collective.
+    """|X - X_r| / |X| over the snapshots X of a full run [SBRH21]: states, deformation, energy. Collective.
 
     >>> import softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])

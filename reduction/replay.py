@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.run.trajectory import Trajectory
@@ -22,22 +21,19 @@ from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.propagator import Propagator, propagator
 
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+
 REST = 1e-9  # of the largest displacement: a solve for an equilibrium leaves 1e-12, a motion of use far more
 
 
 @dataclass(frozen=True)
 class FullRun:
-    """A full run with its states in memory; made by :func:`full_run`.
+    """A full run with its states in memory; made by :func:`full_run`."""
 
-    Attributes:
-        model: the scene, at the materials of the run.
-        trajectory: hand and outputs.
-        snapshots: states.
-    """
-
-    model: Model
-    trajectory: Trajectory
-    snapshots: Snapshots
+    model: Model  # the scene, at the materials of the run
+    trajectory: Trajectory  # hand and outputs
+    snapshots: Snapshots  # states
 
     @property
     def dt(self) -> float:
@@ -143,11 +139,9 @@ def comparison_of(rom: ReducedModel, full: FullRun) -> Comparison:
 def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[Propagator, dict[str, Any]]:
     """Propagator, and keywords of :func:`softgrasp.reduction.online.run`, that repeat a full run. Collective.
 
-    Args:
-        small: the same at the materials of the run that is to be made.
+    ``small``: the same at the materials of the run that is to be made.
 
-    Raises:
-        ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.
+    Raises ModelError: E or the midpoint matrix is singular, or there is no single equilibrium to start in.
     """
     drive: dict[str, Any] = {"hand": full.hand} if small.fixed_solid else {"force": full.force}
     step = propagator(small, full.dt, driven=small.fixed_solid)

@@ -62,8 +62,7 @@ def balanced(E: Array, A: Array, L: Array | None) -> Array:
 def skew_modes(S: Array) -> tuple[Array, Array]:
     """Orthonormal U and omega >= 0 with U' S U = blocks [0, -omega; omega, 0], then zeros, for a skew S.
 
-    Returns:
-        U, (n, n); omega, (m,) with 2 m <= n, descending.
+    Returns U, (n, n); omega, (m,) with 2 m <= n, descending.
     """
     n = len(S)
     omega, vectors = np.linalg.eigh(1j * S)

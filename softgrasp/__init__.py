@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before numpy: ranks share the cores
     os.environ.setdefault(_variable, "1")
+# Before PETSc, whose own handler aborts the program when the reader of its output has gone (`| head`).
+if "-no_signal_handler" not in (_given := os.environ.get("PETSC_OPTIONS", "")).split():
+    os.environ["PETSC_OPTIONS"] = f"{_given} -no_signal_handler".strip()
 
 PACKAGE = Path(__file__).parent
 """Folder of the package; in a checkout its subpackages are links to the folders beside it."""

@@ -127,10 +127,10 @@ def compare(
 @app.command()
 def schema() -> None:
     """Print the JSON schema of a scene: every key with its unit and meaning."""
-    from softgrasp.study.shell.schema import full_schema
+    from softgrasp.fem.scene.scene import scene_schema
 
     if rank() == 0:
-        typer.echo(json.dumps(full_schema(), indent=2))
+        typer.echo(json.dumps(scene_schema(), indent=2))
 
 
 @app.command()
@@ -172,7 +172,7 @@ def simulate(
     empty: Empty = False,
     pdf: Pdf = False,
 ) -> None:
-    """Run a scene with the full-order model; also under `mpiexec -n N`."""
+    """Run a scene with the full model; also under `mpiexec -n N`."""
     from softgrasp.study.forward.run import run_simulate
 
     more = {"resume": resume, "until": until, "certify": certify}

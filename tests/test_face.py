@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -34,3 +35,19 @@ def test_every_name_has_an_example_that_runs(name: str, tmp_path: Path, monkeypa
     result = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example)
     assert result.attempted > 1
     assert result.failed == 0
+
+
+@pytest.mark.parametrize("name", sg.__all__)
+def test_every_docstring_says_what_a_user_needs(name: str) -> None:
+    """The equation first, units or shapes, errors, and a source that REFERENCES.md has."""
+    value = getattr(sg, name)
+    text = value.__doc__
+    assert ("Raises:" in text) == (name not in ("Model", "Scene"))  # data that others make
+    if isinstance(value, type) and name != "Scene":  # its keys say their units in the schema
+        assert re.search(r"^    (Attributes|Args):$", text, re.MULTILINE)
+    known = set(re.findall(r"\*\*\[(\w+)\]", (ROOT / "REFERENCES.md").read_text()))
+    cited = {key for keys in re.findall(r"\[([A-Z][\w, ]*\d\d\w?)\]", text) for key in keys.split(", ")}
+    assert cited <= known
+    if name not in ("Scene", "Model", "load", "load_scene", "save"):  # what computes
+        assert re.search(r" = |/ \|X\|", text.split(">>>")[0])
+        assert cited or name in ("abscissa", "problem", "Controller", "design", "make_controller")  # definitions

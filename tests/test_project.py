@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -19,19 +20,57 @@ PACKAGES = ("fem", "reduction", "lqr", "study")
 SCENES = ROOT / "demos" / "scenes"
 INSIDE = ROOT / "softgrasp"  # links in a checkout, folders in an unpacked sdist
 SOURCES = sorted(path for package in PACKAGES for path in (INSIDE / package).rglob("*.py"))
+DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef
 MODULE_LINES, FUNCTION_LINES = 400, 60  # what a reader holds in mind
+
+
+@cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    """All nodes of a source file."""
+    return list(ast.walk(ast.parse(path.read_text())))
 
 
 @pytest.mark.serial
 def test_modules_and_functions_are_small() -> None:
     long = [str(p.relative_to(ROOT)) for p in SOURCES if len(p.read_text().splitlines()) > MODULE_LINES]
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 body = node.body[1:] if ast.get_docstring(node) else node.body
                 if body and (body[-1].end_lineno or 0) - body[0].lineno + 1 > FUNCTION_LINES:
                     long.append(f"{path.relative_to(ROOT)}: {node.name}")
     assert long == []
+
+
+PRIVATE = re.compile(  # words of docs/style.md that a sentence of a command, a page or the pages avoids
+    r"\b(gripper|surrogate|FOM|high fidelity|dear(er|est)|rightly off|for good|mine|wanted|judged|worth|guaranteed"
+    r"|regulator|observable)\b",
+    re.IGNORECASE,
+)
+
+
+@pytest.mark.serial
+def test_sentences_have_no_private_words() -> None:
+    """Texts of two words and more in the source, docstrings apart, and the pages but the one that lists the words."""
+    texts: list[tuple[Path, str]] = [
+        (page, page.read_text()) for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    ]
+    for path in SOURCES:
+        nodes = nodes_of(path)
+        docs = {
+            id(n.body[0].value)
+            for n in nodes
+            if getattr(n, "body", 0) and isinstance(n, DOCUMENTED) and isinstance(n.body[0], ast.Expr)
+        }
+        texts += [
+            (path, n.value)
+            for n in nodes
+            if isinstance(n, ast.Constant) and isinstance(n.value, str) and id(n) not in docs
+        ]
+    found = [
+        (p.name, m[0]) for p, text in texts if " " in text and p.name != "style.md" for m in PRIVATE.finditer(text)
+    ]
+    assert found == []
 
 
 @pytest.mark.serial

@@ -15,7 +15,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 import softgrasp
-from softgrasp.study.shell.schema import full_schema
+from softgrasp.fem.scene.scene import scene_schema
 
 ROOT = Path(__file__).parents[1]
 ROOMS = {"fem": "Scene, model, run", "reduction": "Reduced models", "lqr": "Control"}
@@ -28,7 +28,7 @@ MORE = {
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made."""
-    pages = {"scene.md": scene_keys(full_schema()), "references.md": (ROOT / "REFERENCES.md").read_text()}
+    pages = {"scene.md": scene_keys(scene_schema()), "references.md": (ROOT / "REFERENCES.md").read_text()}
     pages["api.md"] = python_names()
     pages["changes.md"] = (ROOT / "CHANGELOG.md").read_text()
     for path in sorted((ROOT / "demos").glob("demo_*.py")):

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.estimate import estimate, next_order, reduced
+from softgrasp.fem.accuracy.estimate import estimate, next_order
 from softgrasp.fem.accuracy.marking import marked_cells
-from softgrasp.fem.accuracy.small import run_small
+from softgrasp.fem.accuracy.small import Small, reduced
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.bisect import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
@@ -21,7 +21,6 @@ from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
 
 if TYPE_CHECKING:
-    from softgrasp.fem.accuracy.small import Small
     from softgrasp.fem.scene.scene import Scene
     from softgrasp.fem.scene.tissue import Refine
 
@@ -53,9 +52,8 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
     passes, aim, accepted = 0, refine.tolerance, ACCEPTED
     last: tuple[Array, Array] | None = None
     while True:
-        small = reduced(model)
-        result = estimate(model, small)
-        outputs = run_small(small).deformation
+        small, finer = reduced(model), reduced(next_order(model))
+        result, outputs = estimate(model, small, finer), small.run.deformation
         if last is not None:
             accepted = _effectivity(last[1], outputs + result.delta - last[0], result.delta)
         last = outputs, result.delta
@@ -67,13 +65,15 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
         if not reached and passes < refine.passes:
             factor = 0.9 * max(accepted, GUESSED) * refine.tolerance / result.estimate
             aim *= factor
-            mesh = _finer(model, small, refine, aim, factor)
+            mesh = _finer(small, finer, refine, aim, factor)
             if mesh is None:
                 obstacle = f"tissue.refine.most = {refine.most} unknowns allow no finer mesh"
         if mesh is None:
             spent = comm.allreduce(time.perf_counter() - begin, MPI.MAX)
             model.watch.seconds["mesh"] = spent - model.watch.seconds["assembly"]  # with all passes and estimates
-            return replace(model, accuracy=_final(result, refine, passes, obstacle))
+            return replace(
+                model, accuracy=replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
+            )
         model, passes = build(scene, comm=comm, mesh=mesh), passes + 1
 
 
@@ -89,10 +89,6 @@ def _effectivity(old: Array, error: Array, new: Array) -> float:
     return float(np.clip(value, SEEN, MOST_ACCEPTED))
 
 
-def _final(result: MeshEstimate, refine: Refine, passes: int, obstacle: str) -> MeshEstimate:
-    return replace(result, tolerance=refine.tolerance, passes=passes, obstacle=obstacle)
-
-
 def judged(model: Model) -> MeshEstimate:
     """The estimate of a model that was built without one, against the tolerance of its scene if it has one. Collective.
 
@@ -103,7 +99,7 @@ def judged(model: Model) -> MeshEstimate:
     if refine is None or refine.tolerance is None:
         return result
     obstacle = "tissue.refine.passes = 0 allow none" if result.estimate > ACCEPTED * refine.tolerance else ""
-    return _final(result, refine, 0, obstacle)
+    return replace(result, tolerance=refine.tolerance, obstacle=obstacle)
 
 
 def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
@@ -115,12 +111,13 @@ def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
         )
 
 
-def _finer(model: Model, small: Small, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
+def _finer(small: Small, finer: Small, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
     """The next mesh, or None if it has too many unknowns. Collective."""
+    model = small.model
     comm, scene = model.system.layout.comm, model.scene
     if by_lines(scene):
         return _more_lines(model, aim)
-    marked = marked_cells(small, next_order(model), factor)
+    marked = marked_cells(small, finer, factor)
     whole: Whole | None = None
     with agree(comm):
         if model.space.mesh.whole is not None and marked is not None:

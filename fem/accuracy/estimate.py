@@ -16,7 +16,7 @@ import dolfinx.mesh
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.small import Small, run_small, small_model, static_solves
+from softgrasp.fem.accuracy.small import Small, reduced, run_small
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.contact import contact_facets
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
 BOUNDS = {1: 1.5, 2: 2.2, 3: 3.0}
 GRADED_BOUND = 1.5
 SHARE = 0.2  # of the estimate that a graded mesh may leave by its own tolerance
-COMPARED = (1e-2, 1e-3)  # tolerances of graded meshes to compare with
-COMPARED_3D = 3e-2
-MOST_COMPARED = {2: 60_000, 3: 60_000}  # unknowns of the mesh to compare with
+COMPARED = {2: (1e-2, 1e-3), 3: (3e-2,)}  # tolerances of graded meshes to compare with, by dimension
+MOST_COMPARED = 60_000  # unknowns of such a mesh
 
 
-def estimate(model: Model, coarse: Small | None = None) -> MeshEstimate:
+def estimate(model: Model, coarse: Small | None = None, finer: Small | None = None) -> MeshEstimate:
     """Estimate the error that the mesh leaves in the outputs of the scene's run. Collective.
 
     Args:
         model: the model.
         coarse: its small model, if there is one.
+        finer: that of :func:`next_order`, likewise, for scenes with ``tissue.refine``.
 
     Raises:
         SolverError: a static solve fails.
@@ -50,28 +50,24 @@ def estimate(model: Model, coarse: Small | None = None) -> MeshEstimate:
     """
     begin = time.perf_counter()
     small = coarse or reduced(model)
-    run = run_small(small)
+    run = small.run
     if model.scene.tissue.refine is not None:
-        other = reduced(next_order(model))
+        other = finer or reduced(next_order(model))
         by, bound, offer = "order", BOUNDS[min(model.scene.tissue.order, 3)], None
-        finer = run_small(other)
-        relative, delta = difference(small, other, finer.deformation, run.deformation)
+        relative, delta = difference(small, other)
     else:
         by, bound = "graded", GRADED_BOUND
-        for goal in COMPARED if small.model.system.layout.dimension == 2 else (COMPARED_3D,):
+        for goal in COMPARED[model.system.layout.dimension]:
             other = reduced(build(comparison(model.scene, goal), comm=model.system.layout.comm))
-            finer = run_small(other)
-            relative, delta = difference(small, other, finer.deformation, run.deformation)
+            relative, delta = difference(small, other)
             offer = (goal, other.model.system.layout.n_e)
             if relative > goal / SHARE or relative == 0:
                 break
         bound = bound if relative > goal / SHARE else bound + goal / max(relative, 1e-300)
-    steps = model.scene.time.steps
-    halved = run_small(small, 2 * steps).deformation[::2]
-    late, _ = difference(small, small, halved, run.deformation)
-    delta = delta + finer.rigid - run.rigid
+    halved = run_small(small, 2 * model.scene.time.steps).deformation[::2]
+    late, _ = difference(small, small, halved)
+    delta = delta + other.run.rigid - run.rigid
     omega = small.modes[0][:2] / other.modes[0][:2] - 1
-    comm = model.system.layout.comm
     return MeshEstimate(
         estimate=relative,
         bound=bound * relative,
@@ -83,28 +79,24 @@ def estimate(model: Model, coarse: Small | None = None) -> MeshEstimate:
         finer=other.model.system.layout.n_e,
         by=by,
         offer=offer,
-        seconds=comm.allreduce(time.perf_counter() - begin, MPI.MAX),
+        seconds=model.system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX),
     )
 
 
-def reduced(model: Model) -> Small:
-    """The small model of a model. Collective."""
-    solve, free = static_solves(model)
-    try:
-        return small_model(model, solve)
-    finally:
-        free()
-
-
-def difference(small: Small, other: Small, finer: Array, coarse: Array) -> tuple[float, Array]:
+def difference(small: Small, other: Small, finer: Array | None = None) -> tuple[float, Array]:
     """Largest difference of two runs over the largest deformation [1], and the difference (steps + 1, p).
 
     Outputs that are the hand's count only where there are no others.
+
+    Args:
+        small, other: the two models.
+        finer: deformation (steps + 1, p) instead of that of the other's run.
     """
+    finer = other.run.deformation if finer is None else finer
     tissue = np.abs(small.C).max(axis=1) + np.abs(other.C).max(axis=1) > 0
     if not tissue.any():
         tissue[:] = True
-    delta = finer - coarse
+    delta = finer - small.run.deformation
     scale = np.linalg.norm(finer[:, tissue], axis=1).max()
     largest = np.linalg.norm(delta[:, tissue], axis=1).max()
     return float(largest / scale) if scale > 0 else 0.0, delta
@@ -113,20 +105,17 @@ def difference(small: Small, other: Small, finer: Array, coarse: Array) -> tuple
 def next_order(model: Model) -> Model:
     """The same cells with elements of the next order. Collective."""
     tissue = model.scene.tissue.model_copy(update={"order": model.scene.tissue.order + 1})
-    return build(_with(model.scene, tissue), comm=model.system.layout.comm, mesh=model.space.mesh)
+    return build(
+        model.scene.model_copy(update={"tissue": tissue}), comm=model.system.layout.comm, mesh=model.space.mesh
+    )
 
 
 def comparison(scene: Scene, tolerance: float) -> Scene:
     """The scene on a graded mesh of quadratic elements or better."""
     tissue = scene.tissue
-    refine = Refine(tolerance=tolerance, most=MOST_COMPARED[scene.dimension or 3])
-    return _with(scene, tissue.model_copy(update={"order": max(2, tissue.order), "refine": refine}))
-
-
-def _with(scene: Scene, tissue: object) -> Scene:
-    result = scene.model_copy(update={"tissue": tissue})
-    result._directory = scene._directory
-    return result
+    refine = Refine(tolerance=tolerance, most=MOST_COMPARED)
+    tissue = tissue.model_copy(update={"order": max(2, tissue.order), "refine": refine})
+    return scene.model_copy(update={"tissue": tissue})
 
 
 def zone_shift(model: Model) -> float:

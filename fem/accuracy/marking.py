@@ -16,11 +16,10 @@ import dolfinx.fem
 import numpy as np
 import numpy.typing as npt
 
-from softgrasp.fem.accuracy.small import Small, output_columns, run_small, static_solves
+from softgrasp.fem.accuracy.small import Small, static_solves
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, times_columns
 
 MODES = 4  # 4 and 10 modes gave the same estimate to one percent on the paper's scene
@@ -30,12 +29,12 @@ GAIN = 1.2  # eta_T of the marked cells over what bisection takes away: it split
 LEAST, LARGEST = 0.15, 0.8  # share of the sum of eta_T that the marked cells hold [D96]
 
 
-def marked_cells(small: Small, finer: Model, factor: float) -> npt.NDArray[np.int32] | None:
+def marked_cells(small: Small, finer: Small, factor: float) -> npt.NDArray[np.int32] | None:
     """Cells to split, in the order of the mesh on rank 0; None on other ranks. Collective.
 
     Args:
         small: small model of the mesh.
-        finer: elements of the next order on the same cells.
+        finer: that of elements of the next order on the same cells.
         factor: by which the error should fall, below 1.
     """
     share = float(np.clip((1 - factor) / GAIN, LEAST, LARGEST))
@@ -54,29 +53,25 @@ def marked_cells(small: Small, finer: Model, factor: float) -> npt.NDArray[np.in
     return np.asarray(np.sort(cells[values >= least]), dtype=np.int32)
 
 
-def indicators(small: Small, finer: Model) -> Array:
+def indicators(small: Small, finer: Small) -> Array:
     """eta_T of the owned cells. Collective."""
-    model, system = small.model, small.model.system
-    n_s, p = system.layout.n_s, len(small.C)
-    run = run_small(small)
+    model, n_s, p, run = small.model, small.model.system.layout.n_s, len(small.C), small.run
     omega, Q = small.modes
     m = min(MODES, len(omega))
     Phi = small.V @ Q[:, :m]
-    C = output_columns(make_outputs(model.scene, finer.system), finer.system.layout.n_local)
-    coarse = prolong(model, finer, np.hstack([small.X, Phi]))
-    solve, free = static_solves(finer)
-    e = solve(np.hstack([finer.system.G, C, times_columns(finer.system.M_ee, coarse[:, n_s + p :])]))
-    free()
-    e -= coarse / np.concatenate([np.ones(n_s + p), omega[:m] ** 2])
+    coarse = prolong(model, finer.model, np.hstack([small.X, Phi]))
+    with static_solves(finer.model) as solve:
+        modal = solve(times_columns(finer.model.system.M_ee, coarse[:, n_s + p :]))
+    e = np.hstack([finer.X, modal]) - coarse / np.concatenate([np.ones(n_s + p), omega[:m] ** 2])
     at = np.unique(np.linspace(0, len(run.loads) - 1, INSTANTS).round().astype(int))
     accelerations = run.accelerations[at] @ (small.M @ Q[:, :m])  # xi'' = Phi' M z''
     s = np.hstack([run.loads[at], np.zeros((len(at), p)), -accelerations])
-    E = cell_products(finer, e)
+    E = cell_products(finer.model, e)
     statics = np.linalg.norm(np.einsum("ckj,tj->ckt", E[:, n_s : n_s + p], s, optimize=True), axis=1).max(axis=1)
     amplitude = np.abs(accelerations).max(axis=0) / omega[:m] ** 2
     reach = np.linalg.norm(small.C @ Q[:, :m], axis=0) * amplitude * omega[:m] ** 3 * model.scene.time_end / 2
-    modal = np.einsum("ckk->ck", E[:, n_s + p :, n_s + p :]) @ np.minimum(reach, np.sqrt(reach.max() * reach))
-    return np.asarray(statics + modal)
+    phases = np.einsum("ckk->ck", E[:, n_s + p :, n_s + p :]) @ np.minimum(reach, np.sqrt(reach.max() * reach))
+    return np.asarray(statics + phases)
 
 
 def prolong(model: Model, finer: Model, X: Array) -> Array:
@@ -96,12 +91,9 @@ def prolong(model: Model, finer: Model, X: Array) -> Array:
 def cell_products(model: Model, X: Array) -> Array:
     """Elastic energy products k_T(x_i, x_j) of columns on the owned cells, (cells, k, k). Collective."""
     V, d, tissue = model.space.V, model.space.mesh.dimension, model.space.mesh
-    cells = tissue.mesh.topology.index_map(d).size_local
-    lam, mu = np.empty(cells), np.empty(cells)
-    whole = {model.system.layers[0].name: np.arange(cells)}
-    layers = cells_of_layers(tissue, model.scene) if model.scene.tissue.layers else whole
-    for blocks, m in zip(model.system.layers, model.system.materials, strict=True):
-        lam[layers[blocks.name]], mu[layers[blocks.name]] = m.lam, m.mu
+    _, layer = layer_numbers(tissue, model.scene)
+    lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[layer].T
+    cells = len(layer)
     element = V.element.basix_element
     shape = basix.CellType.triangle if d == 2 else basix.CellType.tetrahedron
     points, weights = basix.make_quadrature(shape, max(2 * (element.degree - 1), 1))

@@ -9,8 +9,10 @@ the difference between two meshes needs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,7 +49,12 @@ class Small:
     X: Array
     model: Model  # whose it is
 
-    @property
+    @cached_property
+    def run(self) -> SmallRun:
+        """The run of the scene, see :func:`run_small`."""
+        return run_small(self)
+
+    @cached_property
     def modes(self) -> tuple[Array, Array]:
         """Ritz frequencies omega (N,), ascending [1/s], and modes (N, N) with Phi' M Phi = 1."""
         squares, Phi = scipy.linalg.eigh(np.eye(len(self.M)), self.M)
@@ -66,8 +73,9 @@ def output_columns(outputs: tuple[Output, ...], n_local: int) -> Array:
     return np.asfortranarray(np.array(columns).reshape(len(columns), n_local).T)
 
 
-def static_solves(model: Model) -> tuple[Solve, Callable[[], None]]:
-    """What applies K_ee^-1 to columns, factored once, and what frees it. Collective."""
+@contextmanager
+def static_solves(model: Model) -> Iterator[Solve]:
+    """What applies K_ee^-1 to columns, factored once. Collective."""
     system, time = model.system, model.scene.time
     name, _ = choose_solver(system.layout, "auto", few=True)
     solver = make_solver(system.K_ee.copy(), name, system.layout, PREFIX, min(time.rtol, 1e-10), reproducible=False)
@@ -81,37 +89,35 @@ def static_solves(model: Model) -> tuple[Solve, Callable[[], None]]:
             X[:, j] = w.array_r
         return X
 
-    def free() -> None:
+    try:
+        yield solve
+    finally:
         for used in (solver, r, w):
             used.destroy()
 
-    return solve, free
 
-
-def small_model(model: Model, solve: Solve, blocks: int = BLOCKS) -> Small:
-    """Project a model. Collective.
-
-    Args:
-        model: the model.
-        solve: applies K_ee^-1, from :func:`static_solves`.
-        blocks: static solves of each column.
-    """
+def reduced(model: Model) -> Small:
+    """The small model of a model, with `BLOCKS` static solves of each column. Collective."""
     system, comm = model.system, model.system.layout.comm
     outputs = make_outputs(model.scene, system)
     C = output_columns(outputs, system.layout.n_local)
-    X = solve(np.hstack([system.G, C]))
-    V, last = np.zeros((len(X), 0)), X
-    for k in range(blocks):
-        if k:
-            last = solve(times_columns(system.M_ee, last))
-        for _ in range(2):  # once is not enough where blocks are nearly dependent
-            last = last - V @ total(comm, V.T @ times_columns(system.K_ee, last)) if V.shape[1] else last
-            gram = total(comm, last.T @ times_columns(system.K_ee, last))
-            scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-            squares, Q = np.linalg.eigh((gram + gram.T) / 2 / np.outer(scale, scale))
-            kept = squares > DROPPED
-            last = last @ comm.bcast((Q[:, kept] / np.sqrt(squares[kept])) / scale[:, None])
-        V = np.hstack([V, last])
+    V = K_V = np.zeros((len(C), 0))
+    with static_solves(model) as solve:
+        last = X = solve(np.hstack([system.G, C]))
+        for k in range(BLOCKS):
+            if k:
+                last = solve(times_columns(system.M_ee, last))
+            for _ in range(2):  # once is not enough where blocks are nearly dependent
+                K_last = times_columns(system.K_ee, last)
+                known = total(comm, V.T @ K_last)
+                last, K_last = last - V @ known, K_last - K_V @ known
+                gram = total(comm, last.T @ K_last)
+                scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+                squares, Q = np.linalg.eigh((gram + gram.T) / 2 / np.outer(scale, scale))
+                kept = squares > DROPPED
+                Q = comm.bcast((Q[:, kept] / np.sqrt(squares[kept])) / scale[:, None])
+                last, K_last = last @ Q, K_last @ Q
+            V, K_V = np.hstack([V, last]), np.hstack([K_V, K_last])
     damping = system.damping
     M = total(comm, V.T @ times_columns(system.M_ee, V))
     D = damping.alpha * M + damping.beta * np.eye(len(M))
@@ -146,7 +152,6 @@ def run_small(small: Small, steps: int | None = None) -> SmallRun:
     system, scene = small.model.system, small.model.scene
     n = steps or scene.time.steps
     scene = scene.model_copy(update={"time": scene.time.model_copy(update={"steps": n})})
-    scene._directory = small.model.scene._directory
     dt, n_s = scene.time_end / n, system.layout.n_s
     g = np.zeros(n_s) if system.gravity is None else system.gravity
     z = small.G @ g if scene.time.start == "equilibrium" else np.zeros(len(small.M))  # V' K V = 1
@@ -157,16 +162,15 @@ def run_small(small: Small, steps: int | None = None) -> SmallRun:
     loads = g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
     s = 2 / dt
     inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
-    A, B = inverse @ (s * small.M), -inverse
-    responses = loads @ (inverse @ small.G).T
-    v, Z, a = np.zeros_like(z), np.empty((n + 1, len(z))), np.empty((n, len(z)))
-    Z[0] = z
+    half = np.hstack([-inverse, s * s * inverse @ small.M])  # w = z_mid - z_n from z_n and u_n = v_n / s
+    T = np.vstack([2 * half, 2 * half]) + np.diag(np.repeat([1.0, -1.0], len(z)))  # u_{n+1} = 2 w - u_n
+    Y = np.empty((n + 1, 2 * len(z)))
+    Y[0, : len(z)], Y[0, len(z) :] = z, 0.0
+    Y[1:] = np.tile(2 * loads @ (inverse @ small.G).T, 2)
     for i in range(n):
-        w = A @ v + B @ Z[i] + responses[i]
-        a[i] = s * (s * w - v)
-        Z[i + 1] = Z[i] + 2 * w
-        v = 2 * s * w - v
-    return SmallRun(Z @ small.C.T, table.q @ small.C_s.T, loads, a)
+        Y[i + 1] += T @ Y[i]
+    u = Y[:, len(z) :]
+    return SmallRun(Y[:, : len(z)] @ small.C.T, table.q @ small.C_s.T, loads, s * s * np.diff(u, axis=0) / 2)
 
 
 def _table(small: Small, scene: Scene, dt: float) -> HandTable:

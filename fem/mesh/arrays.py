@@ -8,14 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from softgrasp.fem.mesh.parts import Parts
+from softgrasp.fem.sealed import digest
 
 Floats = npt.NDArray[np.float64]
-
-
 Integers = npt.NDArray[np.int64]
 Tags = npt.NDArray[np.int32]
-
-
 Sets = dict[int | str, tuple[int, ...]]
 
 
@@ -33,3 +30,13 @@ class MeshArrays:
     facet_sets: Sets  # marks in ``facet_tags`` of each tag number and named set
     cell_sets: Sets  # marks in ``cell_tags`` of each tag number and named set
     notes: tuple[str, ...] = ()  # warnings, one sentence each
+
+    def digest(self) -> str:
+        """SHA-256 of coordinates, cells, tags and sets, which some formats spread over several files; 64 hex digits."""
+        sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (self.cell_sets, self.facet_sets)]
+        return digest(self.points, self.cells, self.cell_tags, self.facets, self.facet_tags, *sets)
+
+
+def _text(sets: Sets) -> str:
+    """The same for equal sets, in whatever order they were read."""
+    return repr(sorted((repr(name), tuple(int(mark) for mark in marks)) for name, marks in sets.items()))

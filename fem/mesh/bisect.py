@@ -9,23 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import basix.ufl
-import dolfinx.io
 import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
-import ufl
-from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh.check import FLAT, counted, longest_edges, place_text, signed_volumes
-from softgrasp.fem.mesh.parts import Parts, find_parts
+from softgrasp.fem.mesh.parts import find_parts
 from softgrasp.fem.mesh.seams import sort_facets
+from softgrasp.fem.mesh.spread import Marks, spread
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 
 Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 Ints = npt.NDArray[np.int32]
 
 MOST_LEVELS = 60  # each halves the longest edge at most; 2^-30 of a body is below any useful cell
@@ -96,52 +92,30 @@ def distribute(comm: MPI.Intracomm, whole: Whole | None, dimension: int) -> Tiss
         whole: on rank 0, None elsewhere.
         dimension: 2 or 3, on all ranks.
     """
-    d = dimension
-    points, cells = np.zeros((0, d)), np.zeros((0, d + 1), dtype=np.int64)
-    facts: tuple[str, list[str], list[str], dict[int | str, tuple[int, ...]], dict[int | str, tuple[int, ...]]] | None
-    facts, parts = None, None
+    facts, body = None, None
+    marks: Marks = {}
     if whole is not None:
-        points, cells = whole.points.copy(), whole.simplices
-        facts = whole.source, sorted(whole.cells), sorted(whole.facets), whole.facet_sets, whole.cell_sets
+        body = points, cells = whole.points, whole.simplices
         parts = find_parts(points, cells, sort_facets(cells), whole.source)
-    source, cell_names, facet_names, facet_sets, cell_sets = comm.bcast(facts)
-    known: Parts | None = comm.bcast(None if parts is None else parts[1])
-    shape = {2: "triangle", 3: "tetrahedron"}[d]
-    mesh = dolfinx.mesh.create_mesh(comm, cells, ufl.Mesh(basix.ufl.element("Lagrange", shape, 1, shape=(d,))), points)
-    nothing = np.zeros(0, dtype=np.int32)
-    on_cells = {name: _spread(mesh, d, cells, whole.cells[name] if whole else nothing) for name in cell_names}
-    on_facets = {
-        name: _spread(
-            mesh,
-            d - 1,
-            whole.facet_nodes(name) if whole else np.zeros((0, d), dtype=np.int64),
-            whole.facets[name].values if whole else nothing,
-        )
-        for name in facet_names
-    }
+        marks = {f"{name} of cells": (dimension, cells, values) for name, values in whole.cells.items()}
+        for name, tags in whole.facets.items():
+            marks[f"{name} of facets"] = dimension - 1, whole.facet_nodes(name), tags.values
+        if parts is not None:
+            marks["parts"] = dimension, cells, parts[0]
+        facts = whole.source, None if parts is None else parts[1], whole.facet_sets, whole.cell_sets
+    source, known, facet_sets, cell_sets = comm.bcast(facts)
+    mesh, found = spread(comm, dimension, body, marks)
     return TissueMesh(
         mesh=mesh,
-        dimension=d,
-        facet_tags=on_facets.get("tags"),
-        cell_tags=on_cells.get("tags"),
+        dimension=dimension,
+        facet_tags=found.get("tags of facets"),
+        cell_tags=found.get("tags of cells"),
         source=source,
-        part_tags=None if known is None else _spread(mesh, d, cells, nothing if parts is None else parts[0]),
+        part_tags=found.get("parts"),
         parts=known,
         facet_sets=facet_sets,
         cell_sets=cell_sets,
-        contact=on_facets.get("contact"),
-        layers=on_cells.get("layers"),
+        contact=found.get("contact of facets"),
+        layers=found.get("layers of cells"),
         whole=whole,
     )
-
-
-def _spread(mesh: dolfinx.mesh.Mesh, dimension: int, entities: Integers, values: Ints) -> dolfinx.mesh.MeshTags:
-    """Mesh tags from entities by their nodes, given on rank 0. Collective."""
-    mesh.topology.create_entities(dimension)
-    mesh.topology.create_connectivity(dimension, 0)
-    mesh.topology.create_connectivity(dimension, mesh.topology.dim)
-    local, here = dolfinx.io.distribute_entity_data(
-        mesh, dimension, np.ascontiguousarray(entities), np.ascontiguousarray(values, dtype=np.int32)
-    )
-    nodes = adjacencylist(np.ascontiguousarray(local, dtype=np.int32))
-    return dolfinx.mesh.meshtags_from_entities(mesh, dimension, nodes, here.astype(np.int32))

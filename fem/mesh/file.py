@@ -4,14 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import basix.ufl
-import dolfinx.io
-import dolfinx.mesh
 import meshio
 import numpy as np
 import numpy.typing as npt
-import ufl
-from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, agree
@@ -26,16 +21,15 @@ from softgrasp.fem.mesh.cells import (
     simplices,
 )
 from softgrasp.fem.mesh.check import check_cells
-from softgrasp.fem.mesh.digest import mesh_digest
 from softgrasp.fem.mesh.foreign import read_foreign
 from softgrasp.fem.mesh.parts import find_parts
 from softgrasp.fem.mesh.seams import SEAM, doubled_nodes, doubled_text, hanging_nodes, hanging_text, sort_facets
+from softgrasp.fem.mesh.spread import Marks, spread
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 
-_SHAPES = {2: "triangle", 3: "tetrahedron"}
+_MARKS = ("facets", "cells", "parts")
 _TAG_NAMES = ("gmsh:physical", "medit:ref", "CellEntityIds")  # preferred names of integer cell data
 _NOT_TAGS = ("gmsh:geometrical",)  # numbers of CAD entities, not marks of the user
-_NO_TAGS: Tags = np.zeros(0, dtype=np.int32)
 
 
 def read_mesh(
@@ -70,29 +64,23 @@ def read_mesh(
     with agree(comm):
         if comm.rank == 0:
             arrays = load_arrays(path, scale, repair, seam, limit)
-    facts = (arrays.points.shape[1], arrays.cell_tags is not None, arrays.facet_tags is not None,
-             arrays.parts, arrays.facet_sets, arrays.cell_sets, arrays.notes) if arrays else None  # fmt: skip
-    dimension, has_cell_tags, has_facet_tags, parts, facet_sets, cell_sets, notes = comm.bcast(facts)
-    digest = comm.bcast(mesh_digest(arrays) if arrays else "")
-    if arrays is None:
-        none = np.zeros((0, dimension))
-        empty = np.zeros((0, dimension + 1), dtype=np.int64)
-        arrays = MeshArrays(none, empty, _NO_TAGS, empty[:, 1:], _NO_TAGS, _NO_TAGS, parts, facet_sets, cell_sets)
-    domain = ufl.Mesh(basix.ufl.element("Lagrange", _SHAPES[dimension], 1, shape=(dimension,)))
-    mesh = dolfinx.mesh.create_mesh(comm, arrays.cells, domain, arrays.points)
-    return TissueMesh(
-        mesh,
-        dimension,
-        _distribute(mesh, dimension - 1, arrays.facets, arrays.facet_tags) if has_facet_tags else None,
-        _distribute(mesh, dimension, arrays.cells, arrays.cell_tags) if has_cell_tags else None,
-        path.name,
-        _distribute(mesh, dimension, arrays.cells, arrays.part_tags) if parts is not None else None,
-        parts,
-        facet_sets,
-        cell_sets,
-        notes,
-        digest,
-    )
+    facts, body = None, None
+    marks: Marks = {}
+    if arrays is not None:
+        d, body = arrays.points.shape[1], (arrays.points, arrays.cells)
+        tagged = (
+            (d - 1, arrays.facets, arrays.facet_tags),
+            (d, arrays.cells, arrays.cell_tags),
+            (d, arrays.cells, arrays.part_tags),
+        )
+        marks = {
+            name: (k, nodes, tags) for name, (k, nodes, tags) in zip(_MARKS, tagged, strict=True) if tags is not None
+        }
+        facts = (d, arrays.parts, arrays.facet_sets, arrays.cell_sets, arrays.notes, arrays.digest())
+    dimension, *known = comm.bcast(facts)
+    mesh, found = spread(comm, dimension, body, marks)
+    facet_tags, cell_tags, part_tags = (found.get(name) for name in _MARKS)
+    return TissueMesh(mesh, dimension, facet_tags, cell_tags, path.name, part_tags, *known)
 
 
 def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
@@ -284,18 +272,3 @@ def _in_plane(points: Floats, used: Integers, path: Path) -> Floats:
                 "give a flat mesh in x and y, or one of solid cells."
             )
     return np.ascontiguousarray(points[:, :2])
-
-
-def _distribute(
-    mesh: dolfinx.mesh.Mesh, dimension: int, entities: Integers, values: Tags | None
-) -> dolfinx.mesh.MeshTags:
-    """Mesh tags from entities in file numbering, given on rank 0. Collective."""
-    mesh.topology.create_entities(dimension)
-    mesh.topology.create_connectivity(dimension, 0)
-    mesh.topology.create_connectivity(dimension, mesh.topology.dim)
-    given = values if values is not None else _NO_TAGS
-    local, local_values = dolfinx.io.distribute_entity_data(
-        mesh, dimension, np.ascontiguousarray(entities), np.ascontiguousarray(given, dtype=np.int32)
-    )
-    vertices = adjacencylist(np.ascontiguousarray(local, dtype=np.int32))
-    return dolfinx.mesh.meshtags_from_entities(mesh, dimension, vertices, local_values.astype(np.int32))

@@ -29,12 +29,11 @@ def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -
 
 
 def _mesh_digest(scene: Scene) -> str:
-    from softgrasp.fem.mesh.digest import mesh_digest
     from softgrasp.fem.mesh.file import load_arrays  # meshio is needed for mesh files only
 
     tissue = scene.tissue
     path = scene.path(str(tissue.mesh))
-    return mesh_digest(load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit))
+    return load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit).digest()
 
 
 def _bytes(scene: Scene, name: str, key: str) -> bytes:

@@ -136,19 +136,19 @@ def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple
     layers = cells_of_layers(space.mesh, scene) if scene.tissue.layers else {"tissue": None}
     forms = _bilinear(space.V)
     inventory.forms += list(forms)
-    pattern = None
+    csr = None  # one pattern for all
     if len(layers) > 1:
         # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
         owned = np.arange(domain.topology.index_map(space.mesh.dimension).size_local, dtype=np.int32)
         whole = ufl.Measure("dx", domain=domain, subdomain_data=[(1, owned)])(1)
-        pattern = dolfinx.fem.create_matrix(dolfinx.fem.form(forms["M_1"](whole)))
+        csr = dolfinx.fem.create_matrix(dolfinx.fem.form(forms["M_1"](whole)))
     result = []
     for name, cells in layers.items():
         dx = ufl.dx(domain) if cells is None else ufl.Measure("dx", domain=domain, subdomain_data=[(1, cells)])(1)
         parts = {}
         for key, form in forms.items():
             compiled = dolfinx.fem.form(form(dx))
-            csr = dolfinx.fem.create_matrix(compiled) if pattern is None else pattern
+            csr = csr or dolfinx.fem.create_matrix(compiled)
             parts[key] = _component(space, _assembled(domain.comm, csr, compiled), scene.tissue.thickness)
             inventory.operators.append(f"{key}[{name}]")
         result.append(LayerBlocks(name, **parts))

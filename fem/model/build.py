@@ -140,7 +140,7 @@ def build(
     mesh: TissueMesh | None = None,
     run: bool = True,
 ) -> Model:
-    """Mesh, assemble and couple: M q'' + D q' + K q = f + B_u u with q = [q_s; q_e]. Collective.
+    """M q'' + D q' + K q = f + B_u u for q = [q_s; q_e], as in [SBRH21]: mesh, assemble, couple. Collective.
 
     Args:
         scene: a scene, the path of its file, or the name of one that ships.

@@ -138,8 +138,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
         fits = f"time.steps = {_digits(scene.time.steps * max(free - tissue, 0.0) / (ranks * estimate.tables))}"
         parts = "tables of hand, loads and outputs"
     else:
-        key = "tissue.cells" if scene.tissue.cells else "tissue.mesh"
-        given = f"{scene.tissue.cells}" if scene.tissue.cells else f"'{scene.tissue.mesh}'"
+        given, key = _size_key(scene)
         fits = _fitting(scene, comm, run, dimension, cells, share, ranks, free)
         parts = f"mesh and matrices {size_text(share * estimate.mesh)}"
         if estimate.factor:  # conjugate gradients have none
@@ -156,7 +155,7 @@ def _fitting(
     scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int, share: float, ranks: int, free: float
 ) -> str:
     """What fits, as text: cells along the edges of a box, or of a mesh file in all."""
-    box = scene.tissue.cells
+    box = scene.tissue.cells if _size_key(scene)[1] == "tissue.cells" else None
 
     def smaller(factor: float) -> list[int]:
         return [max(_digits(factor * n), 1) for n in box or [cells]]
@@ -168,6 +167,14 @@ def _fitting(
         fits = need(scene, dimension, count, comm, run).of(share, ranks) <= free
         low, high = (middle, high) if fits else (low, middle)
     return f"tissue.cells = {smaller(low)}" if box else f"{smaller(low)[0]} of its {cells} cells"
+
+
+def _size_key(scene: Scene) -> tuple[str, str]:
+    """The value and the key that decide how many cells there are."""
+    tissue, refine = scene.tissue, scene.tissue.refine
+    if refine is not None and refine.tolerance is not None:
+        return f"{refine.tolerance:g}", "tissue.refine.tolerance"
+    return (f"{tissue.cells}", "tissue.cells") if tissue.cells else (f"'{tissue.mesh}'", "tissue.mesh")
 
 
 def _digits(value: float) -> int:

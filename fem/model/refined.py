@@ -7,13 +7,12 @@ with r the distance from the nearest end of the contact zone, re-entrant corner 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 import dolfinx.mesh
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError, agree
@@ -22,6 +21,7 @@ from softgrasp.fem.mesh.check import longest_edges
 from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField
 from softgrasp.fem.mesh.lines import box_axes, box_of_lines, even_cells
 from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.seams import sort_facets
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.assembly import cells_of_layers
@@ -42,21 +42,12 @@ DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a toleran
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """What an a-priori mesh aims at: cells across the shortest side, grading, and smallest cell over that side."""
-
-    across: float
-    mu: float
-    floor: float
-
-
-def aims(refine: Refine, order: int, d: int, tolerance: float) -> Sizes:
-    """A-priori sizes for a tolerance of the deformation."""
+def aims(refine: Refine, order: int, d: int, tolerance: float) -> tuple[float, float, float]:
+    """Cells across the shortest side, grading, and smallest cell over that side, for a tolerance of the deformation."""
     p = min(order, 3)
     mu = refine.grading if isinstance(refine.grading, float) else BISECTION[p]
     across = MORE[p] + ACROSS[d][p] * (1e-2 / tolerance) ** (1 / (2 * p))
-    return Sizes(across, mu, FLOOR[d][p] * tolerance)
+    return across, mu, FLOOR[d][p] * tolerance
 
 
 def by_lines(scene: Scene) -> bool:
@@ -122,21 +113,19 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
         if aim is None:
             raise _too_large(refine, unknowns(whole, order))
         aim *= SHRINK
-    return whole if refine.contact == "inherit" else _forget(whole)
+    if refine.contact == "inherit":
+        return whole
+    kept, tags = ({k: v for k, v in marks.items() if k == "tags"} for marks in (whole.cells, whole.facets))
+    return replace(whole, cells=kept, facets=tags)  # zone and layers are selected again
 
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
     """The mesh to bisect with contact zone and layers marked."""
-    size = scene.tissue.size
-    if size is None:
-        tissue = make_mesh(MPI.COMM_SELF, scene)
-    else:
-        cells = list(scene.tissue.cells or [])
-        if aim is not None:
-            h = min(size) / aims(refine, scene.tissue.order, len(size), aim).across
-            cells = [even_cells(axis, h) for axis in box_axes(scene)]
-        tissue = box_of_lines(MPI.COMM_SELF, scene, cells, 1.0, min(size) / 2)
-    return marked(tissue, scene)
+    size, cells = scene.tissue.size, scene.tissue.cells
+    if size is not None and aim is not None:
+        across, *_ = aims(refine, scene.tissue.order, len(size), aim)
+        cells = [even_cells(axis, min(size) / across) for axis in box_axes(scene)]
+    return marked(_even(scene, cells), scene)
 
 
 def marked(tissue: TissueMesh, scene: Scene) -> Whole:
@@ -162,18 +151,6 @@ def marked(tissue: TissueMesh, scene: Scene) -> Whole:
     return Whole(tissue.mesh, tissue.source, on_cells, on_facets, tissue.facet_sets, tissue.cell_sets)
 
 
-def _forget(whole: Whole) -> Whole:
-    """The mesh without the contact zone and layers it has inherited: they are selected again."""
-    return Whole(
-        whole.mesh,
-        whole.source,
-        {k: v for k, v in whole.cells.items() if k != "layers"},
-        {k: v for k, v in whole.facets.items() if k != "contact"},
-        whole.facet_sets,
-        whole.cell_sets,
-    )
-
-
 def ends_of(whole: Whole, scene: Scene) -> Ends:
     """Singular ends of a marked mesh."""
     layers = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
@@ -195,9 +172,8 @@ def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Who
         h0 = float(np.median(edges))
         sizes = SizeField(ends_of(whole, scene), h0, max(short / 2, h0), mu, DEEPEST[d] * h0)
     else:
-        plan = aims(refine, scene.tissue.order, d, aim)
-        h0 = np.sqrt(d) * short / plan.across
-        sizes = SizeField(ends_of(whole, scene), h0, short / 2, plan.mu, plan.floor * short)
+        across, mu, floor = aims(refine, scene.tissue.order, d, aim)
+        sizes = SizeField(ends_of(whole, scene), np.sqrt(d) * short / across, short / 2, mu, floor * short)
     return bisect_to(whole, sizes, SLACK, refine.most)
 
 
@@ -209,15 +185,8 @@ def unknowns(whole: Whole, order: int) -> int:
         pairs = np.concatenate([cells[:, list(pair)] for pair in combinations(range(d + 1), 2)])
         count += (order - 1) * len(np.unique(pairs[:, 0] * len(whole.points) + pairs[:, 1]))
     if order > 2:
-        faces = len(cells) if d == 2 else (4 * len(cells) + _outer(cells)) // 2
-        count += faces
+        count += len(cells) if d == 2 else (4 * len(cells) + int(sort_facets(cells).outer.sum())) // 2
     return d * count
-
-
-def _outer(cells: npt.NDArray[np.int64]) -> int:
-    facets = np.concatenate([np.delete(cells, i, axis=1) for i in range(4)])
-    _, count = np.unique(facets, axis=0, return_counts=True)
-    return int((count == 1).sum())
 
 
 def lattice(cells: list[int], order: int) -> int:
@@ -244,15 +213,16 @@ def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     ends: Ends | None = None
     with agree(comm):
         if comm.rank == 0:
-            known = tissue.whole is not None and "contact" in tissue.whole.facets
-            whole = tissue.whole if known else marked(_even(scene), scene)
-            ends = ends_of(whole, scene) if whole is not None else None
+            whole = tissue.whole
+            if whole is None or "contact" not in whole.facets:
+                whole = marked(_even(scene, scene.tissue.cells), scene)
+            ends = ends_of(whole, scene)
     result: Ends = comm.bcast(ends)
     return result
 
 
-def _even(scene: Scene) -> TissueMesh:
+def _even(scene: Scene, cells: list[int] | None) -> TissueMesh:
     """The scene's mesh without grading, on one rank; a box meets the ends where the graded one does."""
     if scene.tissue.refine is None or scene.tissue.size is None:
         return make_mesh(MPI.COMM_SELF, scene)
-    return box_of_lines(MPI.COMM_SELF, scene, scene.tissue.cells or [], 1.0, min(scene.tissue.size) / 2)
+    return box_of_lines(MPI.COMM_SELF, scene, cells or [], 1.0, min(scene.tissue.size) / 2)

@@ -16,7 +16,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import AGAIN, digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 
-FORMAT = 4
+FORMAT = 5
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes
 FREE = ("name", "description", "reduction", "study")
 OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manifest makes useless

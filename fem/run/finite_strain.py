@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import SAME, Array, PETSc, total
+from softgrasp.fem.petsc import SAME, Array, PETSc, led, total
 from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState, viscosity
 from softgrasp.fem.strain.body import Body
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
@@ -313,7 +313,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
         def miss(load: Array) -> Array:
             nonlocal root
-            root = self._taken(np.array(load), begin)  # MINPACK hands over its own memory
+            root = self._taken(load, begin)
             if root is None:
                 raise ArithmeticError
             w = self._dots(feel.N.T, root.x)
@@ -323,11 +323,11 @@ class FiniteStrainMidpoint(TissueMidpoint):
         from scipy.optimize import root as solve  # few runs need it
 
         try:
-            load = solve(miss, c, options={"xtol": 1e-13, "eps": 1e-6}).x
-            fine = np.abs(miss(load)).max() <= 10 * self.tol * max(np.abs(load).max(), np.abs(c).max())
+            load = led(self.comm, miss, lambda ask: np.array(solve(ask, c, options={"xtol": 1e-13, "eps": 1e-6}).x))
+            largest = np.abs(miss(load)).max() / max(np.abs(load).max(), np.abs(c).max())
         except ArithmeticError:
             return None
-        return root if fine else None
+        return root if self.comm.bcast(bool(largest <= 10 * self.tol)) else None
 
     def _taken(self, load: Array, begin: Begin) -> Root | None:
         """All parts of a step, each with a tangent of its own; None where one of them fails. Collective."""

@@ -6,7 +6,7 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
@@ -254,10 +254,20 @@ def _keys(model: type[BaseModel]) -> dict[str, tuple[Any, str]]:
     return {f.alias or name: (f.annotation, f.description or "") for name, f in model.model_fields.items()}
 
 
+def _below(path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Keys below a table, those of layers left out."""
+    for name in _fields(path):
+        yield (*path, name)
+        if name != "layers":
+            yield from _below((*path, name))
+
+
 def _suggest(path: Sequence[str]) -> str:
     known = _fields(path[:-1])
     if path[-2:-1] == ["material"]:
         known = known | {"young": (float, ""), "poisson": (float, "")}
+    if len(path) == 1 and (below := next((p for p in _below() if p[-1] == path[0]), None)):
+        return f"did you mean {'.'.join(below)}?"
     near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
     if near:
         return f"did you mean {'.'.join([*path[:-1], near[0]])}?"

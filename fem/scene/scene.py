@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from softgrasp.fem.scene.control import Control, ControlOutput, Loop, Reduction, Study
+from softgrasp.fem.scene.control import BASES, Control, ControlOutput, Loop, Reduction, Study
 from softgrasp.fem.scene.tissue import Contact, Dropped, Label, Layer, Material, NonNegative, Positive, Section, Tissue
 
 __all__ = [
@@ -251,5 +251,7 @@ def check_dimension(scene: Scene, d: int) -> None:
 
 
 def scene_schema() -> dict[str, Any]:
-    """JSON schema of a scene file; `study.shell.schema` adds what only the packages above know."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)
+    """JSON schema of a scene file, draft 2020-12."""
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema(by_alias=True)
+    schema["$defs"]["Reduction"]["properties"]["methods"]["items"]["enum"] = list(BASES)
+    return schema

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import hashlib
 import os
@@ -16,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 LAWS = Path(__file__).parent  # of law.h, which every source includes
-FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+LANES = 8  # points that the C code takes at a time
+FLAGS = (f"-DLANES={LANES}", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
 
 @functools.cache
@@ -52,6 +54,7 @@ def _shared(source: Path) -> Path:
         root.mkdir(parents=True, exist_ok=True)
     if not os.access(root, os.W_OK):
         root = Path(tempfile.mkdtemp(prefix="softgrasp-"))  # of this process alone
+        atexit.register(shutil.rmtree, root, ignore_errors=True)
     path = root / f"{source.stem}-{key}.so"
     if not path.exists():
         # several ranks may compile at once: each its own file, and the last one stays

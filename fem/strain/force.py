@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.petsc import Array, to_scipy
-from softgrasp.fem.strain.compiled import library
+from softgrasp.fem.strain.compiled import LANES, library
 from softgrasp.fem.strain.laws import LAWS, Start
 from softgrasp.fem.strain.points import Points
 
-LANES = 8  # points that `law.h` takes at a time
 DECLARATION = """
 void softgrasp_start(int d, int k, int p, const int *node, const double *G, const double *z, double *H0, double *j0,
                      double *l0);

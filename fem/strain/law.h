@@ -4,7 +4,6 @@
 #include <stddef.h>
 
 enum { NEO_HOOKE, NEO_HOOKE_QUADRATIC, STVK };
-enum { LANES = 8 };
 #define EACH for (int l = 0; l < LANES; l++)
 #define INLINE static inline __attribute__((always_inline)) /* so that d is a constant in all loops */
 

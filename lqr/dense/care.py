@@ -38,12 +38,9 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
     work is 25 (2n)^3 operations; memory some 20 n^2. Inputs are not changed.
 
     Args:
-        A: (n, n).
-        B: (n, m).
-        C: (p, n).
-        Q: (p, p), symmetric positive semidefinite.
-        R: (m, m), symmetric positive definite.
-        E: (n, n), regular; None stands for I.
+        A, E: (n, n), E regular; None stands for I.
+        B, C: (n, m) and (p, n).
+        Q, R: (p, p), symmetric positive semidefinite, and (m, m), symmetric positive definite.
 
     Raises:
         ControlError: data that are no numbers, an indefinite weight, (E, A, B) not stabilisable, (E, A, C) not
@@ -66,7 +63,8 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
         Y, poles, steps = riccati_schur(A, G, H)
     except ControlError as error:
         raise ControlError(_explain(A, B_1, root) or str(error)) from error
-    _check_detectable(A, root)
+    if hidden := unreached(A.T, root.T):
+        raise ControlError(_unseen(hidden))
     K = -scipy.linalg.cho_solve((lower, True), B.T @ Y)
     residual = riccati_residual(A, G, H, Y)
     size = float(np.linalg.norm(residual))
@@ -102,12 +100,8 @@ def riccati_schur(A: Array, G: Array, H: Array) -> tuple[Array, Complex, int]:
         ControlError: an eigenvalue of the Hamiltonian matrix lies on the imaginary axis, or the stable invariant
             subspace gives no X.
     """
-    scale, weight = balance(A, G, H)
-    a = A / scale[:, None] * scale
-    g = G / scale[:, None] / scale * weight
-    h = H * scale[:, None] * scale / weight
+    hamiltonian, scale, weight = balanced_hamiltonian(A, G, H)
     n = len(A)
-    hamiltonian = np.block([[a, -g], [-h, -a.T]])
     try:
         T, U, stable = scipy.linalg.schur(hamiltonian, output="real", sort="lhp")
     except np.linalg.LinAlgError as error:  # eigenvalues that rounding moves over the axis while they are sorted
@@ -136,11 +130,10 @@ def riccati_schur(A: Array, G: Array, H: Array) -> tuple[Array, Complex, int]:
     return X, poles, steps
 
 
-def balance(A: Array, G: Array, H: Array) -> tuple[Array, float]:
-    """Scales d (powers of 2) and c so that D^{-1}AD, c D^{-1}GD^{-1} and DHD/c have rows of like size.
+def balanced_hamiltonian(A: Array, G: Array, H: Array) -> tuple[Array, Array, float]:
+    """[a, -g; -h, -a'], a = D^{-1}AD, g = c D^{-1}GD^{-1}, h = DHD/c with rows of like size, d (powers of 2) and c.
 
     The Hamiltonian matrix keeps its structure because x is scaled by D and the costate by D^{-1}/c [B01].
-
     """
     n = len(A)
     size = np.block([[np.abs(A), np.abs(G)], [np.abs(H), np.abs(A.T)]])
@@ -150,8 +143,9 @@ def balance(A: Array, G: Array, H: Array) -> tuple[Array, float]:
     scale = np.exp2(np.round((exponent[:n] - exponent[n:]) / 2))
     g = float(np.linalg.norm(G / scale[:, None] / scale))
     h = float(np.linalg.norm(H * scale[:, None] * scale))
-    weight = np.exp2(np.round(np.log2(h / g) / 2)) if g > 0 and h > 0 else 1.0
-    return scale, float(weight)
+    weight = float(np.exp2(np.round(np.log2(h / g) / 2))) if g > 0 and h > 0 else 1.0
+    a, G, H = A / scale[:, None] * scale, G / scale[:, None] / scale * weight, H * scale[:, None] * scale / weight
+    return np.block([[a, -G], [-H, -a.T]]), scale, weight
 
 
 def block_eigenvalues(T: Array) -> Complex:
@@ -172,8 +166,7 @@ def check_axis(hamiltonian: Array, values: Complex, stable: int) -> None:
     A double eigenvalue on the axis splits by sqrt(eps), so a small real part alone says nothing: what counts is the
     distance min sigma(H - i omega I) to a matrix with an eigenvalue there.
 
-    Raises:
-        ControlError: the distance is of the order of rounding.
+    Raises ControlError: the distance is of the order of rounding.
     """
     n = len(hamiltonian) // 2
     size = float(np.linalg.norm(hamiltonian))
@@ -261,12 +254,6 @@ def unreached(A: Array, B: Array) -> list[complex]:
         if scipy.linalg.svdvals(pencil)[-1] <= 10 * n * EPS * size:
             poles.append(complex(s))
     return poles
-
-
-def _check_detectable(A: Array, C: Array) -> None:
-    hidden = unreached(A.T, C.T)
-    if hidden:
-        raise ControlError(_unseen(hidden))
 
 
 def _explain(A: Array, B: Array, C: Array) -> str | None:

@@ -14,9 +14,9 @@ from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_sc
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
 from softgrasp.lqr.dense.care import care as care
-from softgrasp.lqr.dense.poles import check_poles, closed_loop_rates
+from softgrasp.lqr.dense.poles import closed_loop_rates, lost_sentence
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.checks import EPS, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
@@ -27,12 +27,11 @@ NOISE = 100 * EPS  # of the largest row of Z: an entry of X beside it is roundin
 
 @dataclass(frozen=True)
 class TissueMatrices:
-    """Dense M_ee, K_ee, D_ee (n_e, n_e); T, G (n_e, n_s); C_z (n_e, p); B_z (n_e, m), in global numbering."""
+    """Dense M_ee, K_ee, D_ee (n_e, n_e); G (n_e, n_s); C_z (n_e, p); B_z (n_e, m), in global numbering."""
 
     M: Array
     K: Array
     D: Array
-    T: Array
     G: Array
     C_z: Array
     B_z: Array | None = None
@@ -76,12 +75,12 @@ def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
     M, K = gather_matrix(layout, system.M_ee), gather_matrix(layout, system.K_ee)
     matrix = system.damping.matrix
     extra = None if matrix is None else gather_matrix(layout, matrix)
-    T, G, C_z = (rows_on_root(layout.comm, a) for a in (system.T, system.G, problem.C_z))
+    G, C_z = (rows_on_root(layout.comm, a) for a in (system.G, problem.C_z))
     B_z = None if problem.B_z is None else rows_on_root(layout.comm, problem.B_z)
-    if M is None or K is None or T is None or G is None or C_z is None:
+    if M is None or K is None or G is None or C_z is None:
         return None
     D = system.damping.alpha * M + (system.damping.beta * K if extra is None else extra)
-    return TissueMatrices(M, K, D, T, G, C_z, B_z)
+    return TissueMatrices(M, K, D, G, C_z, B_z)
 
 
 def assemble_space(
@@ -114,40 +113,28 @@ def assemble_space(
     return StateSpace(E, A, B, C)
 
 
-def relative_space(problem: RiccatiProblem) -> StateSpace | None:
-    """E, A, B, C in hand-relative coordinates, dense on rank 0, None elsewhere. Collective."""
-    tissue = gather_tissue(problem)
-    if tissue is None:
-        return None
-    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
-
-
 def modal_plant(
     problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, ...]
 ) -> ModalPlant:
-    """The plant restricted to modes.
-
-    Args:
-        problem: weights, hand and flags.
-        omega, Phi, massed: the modes.
-        parts: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi.
-    """
+    """The plant restricted to modes. ``parts``: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi."""
     D, g, c = parts
     G, B_z = (g, None) if problem.B_z is None else (g[:, :0], g)
-    plain = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
-    n_s = problem.layout.n_s
-    one = np.ones(2 * n_s)
-    S = np.concatenate([one, 1 / omega, np.ones_like(omega)])
-    L = np.concatenate([one, omega, np.ones_like(omega)])
-    space = StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, plain.B, plain.C * S)
-    return ModalPlant(omega, Phi, massed, D, g, c, space)
+    space = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
+    return ModalPlant(omega, Phi, massed, D, g, c, in_energy(space, omega))
+
+
+def in_energy(space: StateSpace, omega: Array) -> StateSpace:
+    """L E S, L A S, B, C S with S = blkdiag(I, 1/omega, I), L = blkdiag(I, omega, I), of [q_s, v_s, eta, eta']."""
+    k = len(omega)
+    L = np.concatenate([np.ones(len(space.E) - 2 * k), omega, np.ones(k)])
+    S = 1 / L
+    return StateSpace(L[:, None] * space.E * S, L[:, None] * space.A * S, space.B, space.C * S)
 
 
 def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
     """The plant in all its modes, K_ee phi = omega^2 M_ee phi.
 
-    Raises:
-        SolverError: the stiffness is not positive definite: the hand does not hold the body.
+    Raises SolverError: the stiffness is not positive definite: the hand does not hold the body.
     """
     squares, Phi = scipy.linalg.eigh(tissue.K, tissue.M)
     _check_held(float(squares[0]), float(squares[-1]))
@@ -159,8 +146,7 @@ def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
 def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array]:
     """The k lowest modes: LAPACK on rank 0 up to :data:`DENSE_MODES` unknowns, else SLEPc. Collective.
 
-    Returns:
-        omega (k,), Phi and M_ee Phi, local rows (n_local, k).
+    Returns omega (k,), Phi and M_ee Phi, local rows (n_local, k).
     """
     system, layout = problem.system, problem.layout
     if layout.n_e > DENSE_MODES:
@@ -213,14 +199,10 @@ def dense_residual(problem: RiccatiProblem, space: StateSpace, Z: Array) -> floa
 
 @dataclass(frozen=True)
 class DenseRiccati:
-    """Solve the Riccati equation of a small scene in energy-scaled modal coordinates, on rank 0.
+    """Solve the Riccati equation of a small scene in energy-scaled modal coordinates, on rank 0."""
 
-    Attributes:
-        tolerance: bound on the true relative residual in hand-relative coordinates.
-        limit: largest number of states; the work grows with its cube, memory is about 400 byte times its square.
-    """
-
-    tolerance: float = 1e-8
+    tolerance: float = 1e-8  # bound on the true relative residual in hand-relative coordinates
+    # largest number of states; the work grows with its cube, memory is about 400 byte times its square
     limit: int = 2500
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
@@ -248,7 +230,9 @@ class DenseRiccati:
         begin = time.perf_counter()
         check_finite(M=tissue.M, K=tissue.K, D=tissue.D, G=tissue.G, C=tissue.C_z)
         plant = dense_modes(problem, tissue)
-        check_poles(closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c))
+        rates = closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c)
+        if rates.lost.any():
+            raise ControlError(lost_sentence(rates))
         middle = time.perf_counter()
         space = plant.space
         solution = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)

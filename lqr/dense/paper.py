@@ -15,10 +15,7 @@ def paper_form(problem: RiccatiProblem) -> tuple[Any, Any, Array, Array]:
     """Sparse E, A, shape (2n, 2n), and dense B, (2n, n_s), C, (outputs, 2n), of x = [q_s, v_s, q_e, v_e]. One rank.
 
     M_s v_s' = u, M_es v_s' + M_ee v_e' = -K_es q_s - D_es v_s - K_ee q_e - D_ee v_e: the hand moves the tissue and
-    does not feel it.
-
-    Raises:
-        ValueError: more than one rank, or two-way coupling.
+    does not feel it. Raises ValueError: more than one rank, or two-way coupling.
     """
     system, n_s = problem.system, problem.layout.n_s
     if system.two_way or system.layout.comm.size > 1:

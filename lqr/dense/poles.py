@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, square_root
+from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, square_root
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 # A rate below this share of the largest frequency is rounding: an error eps |H| of the Hamiltonian matrix moves a pole
@@ -56,7 +56,6 @@ def closed_loop_rates(
     """Estimate the closed-loop pole of every mode; good to 3 or 4 digits when modes do not overlap.
 
     Args:
-        problem: weights and hand.
         omega: natural frequencies [1/s], (k,).
         damping: phi_k' D_ee phi_k [1/s], (k,).
         g: Phi' G, (k, n_s); without a hand Phi' B_z, (k, m).
@@ -77,19 +76,8 @@ def closed_loop_rates(
     return ModeRates(omega, damping / 2, product / (2 * omega), size)
 
 
-def check_poles(rates: ModeRates) -> None:
-    """Every mode decays measurably in the closed loop.
-
-    Raises:
-        ControlError: names the modes that do not, the damping that would be enough, and the way out.
-    """
-    lost = np.flatnonzero(rates.lost)
-    if len(lost):
-        raise ControlError(lost_sentence(rates))
-
-
 def lost_sentence(rates: ModeRates) -> str:
-    """The sentence about the modes that feedback cannot stabilise."""
+    """The modes that feedback cannot stabilise, the damping that would be enough, and the way out."""
     lost = np.flatnonzero(rates.lost)
     shown = ", ".join(f"{i + 1} (omega = {rates.omega[i]:.4g}/s)" for i in lost[:3])
     more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""

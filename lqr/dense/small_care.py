@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.care import balance, care, lyapunov, smallest_singular_value
+from softgrasp.lqr.dense.care import balanced_hamiltonian, care, lyapunov, smallest_singular_value
 from softgrasp.lqr.plant.checks import EPS, ControlError
 
 FAST_RESIDUAL = 1e-9  # relative to C'QC; the structured plant in energy scaling reaches 1e-13
@@ -40,10 +40,7 @@ def solve_reduced(matrices: ReducedMatrices) -> Array:
 
     The Hamiltonian matrix, scaled by one number so that its off-diagonal blocks have like size, is brought to ordered
     real Schur form. When the residual shows that this is not good enough, :func:`softgrasp.lqr.dense.care.care`
-    balances, polishes and explains.
-
-    Raises:
-        ControlError: there is no stabilising solution.
+    balances, polishes and explains. Raises ControlError: there is no stabilising solution.
     """
     P = fast_solution(matrices)
     if P is not None:
@@ -55,8 +52,7 @@ def solve_reduced(matrices: ReducedMatrices) -> Array:
 def fast_solution(m: ReducedMatrices) -> Array | None:
     """P_N without balancing, or None when it is not accurate or not stabilising.
 
-    Raises:
-        ControlError: see :func:`check_seen`.
+    Raises ControlError: see :func:`check_seen`.
     """
     n = m.N
     lu, pivots, info = scipy.linalg.lapack.dgetrf(m.E)
@@ -73,7 +69,9 @@ def fast_solution(m: ReducedMatrices) -> Array | None:
     hamiltonian = np.empty((2 * n, 2 * n), order="F")
     hamiltonian[:n, :n], hamiltonian[:n, n:] = A, -c * G
     hamiltonian[n:, :n], hamiltonian[n:, n:] = H / -c, -A.T
-    _, stable, real, imag, U, _, info = scipy.linalg.lapack.dgees(_left, hamiltonian, sort_t=1, overwrite_a=1)
+    _, stable, real, imag, U, _, info = scipy.linalg.lapack.dgees(
+        lambda x, _: x < 0, hamiltonian, sort_t=1, overwrite_a=1
+    )
     if info or stable != n or not real[:n].max() < -1e-10 * np.abs(real).max():
         return None
     if real[:n].max() > -(EPS**0.25) * np.hypot(real, imag).max():
@@ -99,14 +97,9 @@ def check_seen(A: Array, G: Array, H: Array, omega: float) -> None:
     """The Hamiltonian matrix is farther from one with the eigenvalue i omega than a projection rounds.
 
     A rigid motion that inputs do not reach or outputs do not see makes a quadruple eigenvalue 0, which rounding moves
-    by eps^(1/4): a solution exists then, but another one on another number of ranks.
-
-    Raises:
-        ControlError: it is not.
+    by eps^(1/4): a solution exists then, but another one on another number of ranks. Raises ControlError: it is not.
     """
-    scale, weight = balance(A, G, H)
-    a, g, h = A / scale[:, None] * scale, G / scale[:, None] / scale * weight, H * scale[:, None] * scale / weight
-    hamiltonian = np.block([[a, -g], [-h, -a.T]])
+    hamiltonian, _, _ = balanced_hamiltonian(A, G, H)
     if smallest_singular_value(hamiltonian, 1j * omega) <= UNSEEN * float(np.linalg.norm(hamiltonian)):
         raise ControlError(
             f"the reduced equation of order {len(A)} has a solution by rounding alone: a mode that does not decay by "
@@ -119,7 +112,3 @@ def _residual(A: Array, G: Array, H: Array, Y: Array) -> tuple[Array, float]:
     product, square = A.T @ Y, Y @ G @ Y
     size = 2 * np.linalg.norm(product) + np.linalg.norm(square) + np.linalg.norm(H)
     return product + product.T - square + H, float(size)
-
-
-def _left(real: float, imag: float) -> bool:
-    return real < 0

@@ -13,30 +13,25 @@ from softgrasp.lqr.loop.responses import Notify
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.reduced.retune import BoxPoint
-from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.lqr.reduced.riccati import GainQuality
 
 
-def with_bounds[Judged: (GainReport, BoxPoint)](
+def with_bounds[Figures: GainQuality](
     problem: RiccatiProblem,
     solution: RiccatiSolution,
-    gains: Iterable[Judged],
+    gains: Iterable[Figures],
     start: Block,
     plan: LoopPlan,
     notify: Notify | None = None,
-) -> list[Judged]:
+) -> list[Figures]:
     """The same with bounds of the cost where the gain is stable, see :mod:`softgrasp.lqr.loop.gap`. Collective.
 
     ``cost_excess_proved`` holds for the run to the end of the plan and the optimal feedback after it. What the loop's
     own way costs after that is an allowance in ``cost_excess_at_most``, at least what the modes kept say of it.
 
     Args:
-        problem: the plant.
         solution: says what is to come after the end of the plan; its error does not matter to the bound.
-        gains: judged before.
         start: start minus target, one column.
-        plan: step and number of steps.
-        notify: called with the number of steps done and in all.
     """
     gains = list(gains)
     laws: dict[int, Gain] = {i: g.gain for i, g in enumerate(gains) if g.stable and g.gain is not None}

@@ -37,7 +37,7 @@ class CertifiedController:
 
 
 def make_controller(design: Design, order: int | None = None) -> Controller:
-    """The best certified a-priori gain of a small order as a controller. Collective.
+    """Controller u = u_bar + K (x - x_bar), K (n_s, N), the best certified a-priori one of a small order. Collective.
 
     Args:
         design: the optimal feedback of a scene.

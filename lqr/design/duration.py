@@ -26,8 +26,7 @@ class LoopPlan:
 def plan(design: Design, own_end: bool) -> LoopPlan:
     """Steps of the closed loop, from the poles of the hand alone: M_s q'' = K_s [q; q'].
 
-    Args:
-        own_end: keep the end of the scene; else take as many steps as the move needs.
+    ``own_end``: keep the end of the scene; else take as many steps as the move needs.
     """
     scene, n_s = design.model.scene, design.problem.layout.n_s
     dt, steps = scene.time_end / scene.time.steps, scene.time.steps

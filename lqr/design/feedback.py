@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
@@ -31,30 +30,19 @@ ROUNDING = 1e-8  # of an eigenvalue on the unit circle
 
 @dataclass(frozen=True)
 class Design:
-    """The optimal feedback of a scene.
+    """The optimal feedback of a scene."""
 
-    Attributes:
-        model: the built scene.
-        problem: plant, outputs and weights.
-        solution: Riccati solution and gain.
-        target, start: where the loop goes and where it begins.
-        error: start minus target, one column.
-        diagnosis: what was known before the solve.
-        judge: compares gains with the optimal one.
-        quality: closed loop of the full plant under the optimal gain.
-        modal: the gain controls some modes only.
-    """
-
-    model: Model
-    problem: RiccatiProblem
-    solution: RiccatiSolution
+    model: Model  # the built scene
+    problem: RiccatiProblem  # plant, outputs and weights
+    solution: RiccatiSolution  # Riccati solution and gain
+    # target, start: where the loop goes and where it begins
     target: Target
     start: PlantState
-    error: Block
-    diagnosis: Diagnosis
-    judge: GainJudge
-    quality: LoopQuality
-    modal: bool
+    error: Block  # start minus target, one column
+    diagnosis: Diagnosis  # what was known before the solve
+    judge: GainJudge  # compares gains with the optimal one
+    quality: LoopQuality  # closed loop of the full plant under the optimal gain
+    modal: bool  # the gain controls some modes only
 
     @property
     def gain(self) -> Gain:
@@ -75,8 +63,7 @@ class Design:
 def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
     """The problem and what is known before the solve; whether only some modes are to be controlled. Collective.
 
-    Raises:
-        SoftgraspError: the scene has no solution, in one sentence.
+    Raises SoftgraspError: the scene has no solution, in one sentence.
     """
     scene_target(model)
     actuation(model)
@@ -90,7 +77,7 @@ def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
 def design(
     model: Model, watch: Stopwatch | None = None, progress: Progress | None = None, checkpoint: Path | None = None
 ) -> Design:
-    """Solve the Riccati equation of a scene and check the closed loop of the full plant. Collective.
+    """Optimal feedback u = u_bar + K (x - x_bar), K = -R^-1 B'XE, of a scene, checked on the full plant. Collective.
 
     Args:
         watch: takes the seconds of "diagnosis", "are" and "judge".
@@ -107,17 +94,14 @@ def design(
     >>> sg.design(sg.build("paper_lqr", ["tissue.cells=[2, 4]"])).quality.stable
     True
     """
-
-    def stage(name: str) -> Any:
-        return nullcontext() if watch is None else watch.stage(name)
-
-    with stage("diagnosis"):
+    watch = watch or Stopwatch(model.system.layout.comm)
+    with watch.stage("diagnosis"):
         plant, diagnosis, modal = check(model)
         target = hand_target(plant, scene_target(model))
         start = rest(plant.system, deformed=model.scene.time.start == "equilibrium")
-    with stage("are"):
+    with watch.stage("are"):
         solution = _modal(plant, diagnosis) if modal else _solve(model, plant, progress, checkpoint)
-    with stage("judge"):
+    with watch.stage("judge"):
         error = (start - target.state).block
         loop = ModalLoop(plant, min(SOME_MODES, plant.layout.n_e))
         judge = GainJudge(plant, solution, error, loop, sampling(model))
@@ -128,7 +112,7 @@ def design(
             "negative; add damping, or try another control.method"
         )
     result = Design(model, plant, solution, target, start, error, diagnosis, judge, quality, modal)
-    with stage("judge"):
+    with watch.stage("judge"):
         _require_sampled(result)
     return result
 

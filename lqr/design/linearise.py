@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import SAME, PETSc
+from softgrasp.fem.petsc import PETSc, combine
 from softgrasp.fem.solve.statics import equilibrium
 from softgrasp.fem.strain.body import Body
 from softgrasp.fem.system import BlockSystem, Damping
@@ -18,10 +18,7 @@ from softgrasp.lqr.plant.target import Target, hand_target
 def linearised(model: Model) -> Model:
     """The model with K(z*) for K_ee and without finite strain; z* is the rest state, or the equilibrium under gravity.
 
-    Deviations from z* obey it to first order. Collective.
-
-    Raises:
-        SolverError: there is no equilibrium.
+    Deviations from z* obey it to first order. Collective. Raises SolverError: there is no equilibrium.
     """
     system = model.system
     if system.points is None:
@@ -42,11 +39,8 @@ def _kept(system: BlockSystem) -> Damping:
     damping = system.damping
     if not damping.beta:
         return damping
-    D = system.K_ee.copy()
-    D.scale(damping.beta)
-    if damping.matrix is not None:
-        D.axpy(1.0, damping.matrix, SAME)
-    return replace(damping, beta=0.0, matrix=D)
+    terms = [(damping.beta, system.K_ee)] + ([] if damping.matrix is None else [(1.0, damping.matrix)])
+    return replace(damping, beta=0.0, matrix=combine(terms))
 
 
 def finite_problem(problem: RiccatiProblem, system: BlockSystem, target: Target) -> tuple[RiccatiProblem, Target]:

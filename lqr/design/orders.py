@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.loop.responses import Notify as Notify
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import GainReport
@@ -18,8 +19,6 @@ MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by
 WHOLE_SPECTRUM = 500  # n_e from which the Schur form of all modes for every gain takes seconds, so few orders are tried
 FEW_ORDERS = 3
 ORDERS = (4, 6, 8, 10, 12, 16, 20, 30, 40)  # of a scene without a [control] table
-
-Notify = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -63,27 +62,21 @@ def reduce_gains(
 
     Args:
         orders: of the reduced equations; those that a basis has not are left out.
-        notify: called with the number of equations done and in all.
+        notify: called with the number of equations done and at most.
         names: keys of :data:`softgrasp.lqr.reduced.bases.BASES`.
     """
-    families: dict[str, BasisFamily | str] = {}
-    for name in names:
+    bases = []
+    for i, name in enumerate(names):
         try:
-            families[name] = make_family(name, design.problem, design.solution.factor)
+            family = make_family(name, design.problem, design.solution.factor)
         except ControlError as error:
-            families[name] = str(error)
-    total = sum(len(f.orders(orders)) for f in families.values() if isinstance(f, BasisFamily))
-    bases, done = list[BasisGains](), 0
-    for name, family in families.items():
-        if isinstance(family, str):
-            bases.append(BasisGains(name, None, (), family))
+            bases.append(BasisGains(name, None, (), str(error)))
             continue
         reports = []
-        for N in family.orders(orders):
+        for j, N in enumerate(family.orders(orders), 1):
             reports.append(design.judge.report(family.at(N)))
-            done += 1
             if notify is not None:
-                notify(done, total)
+                notify(i * len(orders) + j, len(names) * len(orders))
         bases.append(BasisGains(name, family, tuple(reports)))
     return tuple(bases)
 

@@ -62,8 +62,7 @@ def problem(model: Model) -> RiccatiProblem:
 def scene_target(model: Model) -> Array:
     """Where the closed loop takes the hand: motion.target, or the end of the table.
 
-    Raises:
-        SceneError: the scene names no target, or it is the start.
+    Raises SceneError: the scene names no target, or it is the start.
     """
     scene, n_s = model.scene, model.system.layout.n_s
     target = scene.motion.target
@@ -79,8 +78,7 @@ def scene_target(model: Model) -> Array:
 def actuation(model: Model) -> Actuation:
     """How the feedback of the scene reaches the hand; checked against the time step.
 
-    Raises:
-        ControlError: rate, delay or limit do not fit.
+    Raises ControlError: rate, delay or limit do not fit.
     """
     scene = model.scene
     if scene.control is None:
@@ -113,8 +111,7 @@ def sampling(model: Model) -> Sampling:
 def with_control(model: Model) -> tuple[Model, str]:
     """A scene without a [control] table gets tip output and Q = R = 1, and a turning hand is seen too. Collective.
 
-    Returns:
-        The model, and the sentence that says so; empty when the scene has its own table.
+    Returns the model, and the sentence that says so; empty when the scene has its own table.
     """
     if model.scene.control is not None:
         return model, ""

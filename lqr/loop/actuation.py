@@ -26,8 +26,7 @@ class Actuation:
     def bound(self, inputs: int) -> Array | None:
         """Limits as an array (inputs,), or None.
 
-        Raises:
-            ControlError: a limit is not positive, or their number does not fit.
+        Raises ControlError: a limit is not positive, or their number does not fit.
         """
         if self.limits is None:
             return None
@@ -39,8 +38,7 @@ class Actuation:
     def ticks(self, dt: float) -> int:
         """Steps of length dt in one tick; 0 for continuous feedback.
 
-        Raises:
-            ControlError: the tick is no multiple of dt, the rate is not positive, or a delay has no rate.
+        Raises ControlError: the tick is no multiple of dt, the rate is not positive, or a delay has no rate.
         """
         if self.rate is None:
             if self.delay:
@@ -66,10 +64,6 @@ class ImplicitInput:
     feedback). An input at its limit is fixed there, the others stay implicit: a linear complementarity problem between
     bounds for a few unknowns, whose solution is unique where I - H is a P-matrix (feedback that takes energy out).
     Block pivoting [JP94]: all wrong inputs change sides together, after a few rounds only the last one, which ends.
-
-    Args:
-        H: (inputs, inputs).
-        bound: limits, or None.
     """
 
     max_iterations = 1000

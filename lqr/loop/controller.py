@@ -13,6 +13,7 @@ import numpy as np
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.sealed import write_arrays
 from softgrasp.lqr.loop.small_plant import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
@@ -143,11 +144,7 @@ class Controller:
         return self._x[2 * self.n_s :].copy()
 
     def towards(self, q_bar: Array) -> Controller:
-        """The same gain with another target of the hand.
-
-        Raises:
-            ControlError: the plant has no state of rest there.
-        """
+        """The same gain with another target of the hand. Raises ControlError: the plant has no state of rest there."""
         x_bar, u_bar = self.plant.rest_at(q_bar)
         return replace(self, x_bar=x_bar, u_bar=u_bar)
 
@@ -275,9 +272,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
     path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
     fresh = path.with_name("new-" + path.name)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with fresh.open("wb") as file:
-            np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+        write_arrays(fresh, {"meta": np.array(json.dumps(meta)), **arrays})
         fresh.replace(path)
     except OSError as error:
         raise ControlError(f"{path} cannot be written ({error}); free the disk or choose another folder") from error

@@ -28,8 +28,7 @@ def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: floa
         R: (n_s, n_s).
         dt: step [s].
 
-    Returns:
-        J at the grid points, (steps + 1,), J[0] = 0.
+    Returns J at the grid points, (steps + 1,), J[0] = 0.
     """
     y = (outputs[1:] + outputs[:-1]) / 2
     rate = np.einsum("ki,ij,kj->k", y, Q, y, optimize=True) + np.einsum("ki,ij,kj->k", inputs, R, inputs, optimize=True)

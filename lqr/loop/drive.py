@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,9 +10,11 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
-from softgrasp.lqr.loop.finite import FiniteDrive
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
+
+if TYPE_CHECKING:
+    from softgrasp.lqr.loop.finite import FiniteDrive
 
 
 class PlantStep:
@@ -26,8 +28,7 @@ class PlantStep:
 
     ([...] two-way only). No matrix of the closed loop is ever factored.
 
-    Args:
-        midpoint: factored step, before its start: its vectors are used as scratch.
+    ``midpoint``: factored step, before its start: its vectors are used as scratch.
     """
 
     def __init__(self, system: BlockSystem, midpoint: TissueMidpoint) -> None:
@@ -50,18 +51,52 @@ class PlantStep:
         self.finite: FiniteDrive | None = None  # of a pushed hand that feels a tissue of finite strain
 
 
-class Drive(Protocol):
+class LoopDrive:
     """Solves one step for hand and tissue; ``q``, ``v`` and ``u`` are the histories."""
 
-    q: Array
-    v: Array
-    u: Array
+    def __init__(self, plant: PlantStep, steps: int) -> None:
+        self.plant, n_s = plant, plant.system.layout.n_s
+        self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
 
     def solve(self, n: int, state: TissueState) -> None:
         """Leave w and load of step n in the midpoint; fill row n of u, row n + 1 of q and v. Collective."""
+        raise NotImplementedError
+
+    def move(self, n: int, u: Array, a: Array) -> None:
+        """Midpoint rule of the hand."""
+        dt = self.plant.dt
+        self.u[n], self.v[n + 1] = u, self.v[n] + dt * a
+        self.q[n + 1] = self.q[n] + dt * (self.v[n] + self.v[n + 1]) / 2
+
+    def finish(self, n: int, u: Array, a: Array) -> None:
+        """Turn S^{-1} h into w for the acceleration a, set load and right-hand side, move the hand."""
+        self.plant.midpoint.accelerate(self.plant.kappa * a + self.plant.alpha * self.v[n] - self.plant.g)
+        self.move(n, u, a)
+
+    def push(self, n: int, u: Array, state: TissueState) -> None:
+        """One step of hand and tissue under an input that is known before it. Collective."""
+        plant, midpoint, system = self.plant, self.plant.midpoint, self.plant.system
+        c_0 = plant.alpha * self.v[n] - plant.g
+        if system.two_way and system.points is not None:
+            if plant.finite is None:
+                from softgrasp.lqr.loop.finite import FiniteDrive  # only plants of finite strain pay for it
+
+                plant.finite = FiniteDrive(plant, None, None, None, 0)
+            plant.finite.v = self.v
+            self.move(n, u, plant.finite.respond(n, u, np.zeros(len(u), dtype=bool), state)[0])
+            return
+        if not system.two_way:
+            a = plant.inverse @ (u + plant.weight)
+            midpoint.solve_midpoint(-(plant.kappa * a + c_0))
+            self.move(n, u, a)
+            return
+        x = midpoint.respond()
+        relative = plant.theta * x - plant.s * state.array[system.layout.n_local :]
+        pull = total(plant.comm, system.G.T @ relative) - plant.theta * (plant.GY @ c_0)
+        self.finish(n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
 
 
-class ImplicitDrive:
+class ImplicitDrive(LoopDrive):
     """u = clip(u_bar + K (x_mid - x_bar)), the law at the midpoint of every step.
 
     x_mid is [q + dt/2 v + dt^2/4 a, v + dt/2 a, z + w, s w], so with N = K_z + s K_v
@@ -71,17 +106,11 @@ class ImplicitDrive:
 
     and a = L^{-1} (u + f) leaves an equation of n_s unknowns: Sherman-Morrison-Woodbury with columns made once, one
     tissue solve and one small reduction a step.
-
-    Args:
-        plant: from :class:`PlantStep`.
-        target: x_bar and u_bar.
-        bound: limits of the input, or None.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
-        self.plant, self.gain, self.target = plant, gain, target
-        n_s, dt = plant.system.layout.n_s, plant.dt
-        self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
+        super().__init__(plant, steps)
+        self.gain, n_s, dt = gain, plant.system.layout.n_s, plant.dt
         self.K_q, self.K_v = gain.K_s[:, :n_s], gain.K_s[:, n_s:]
         self.N = gain.K_z + plant.s * gain.K_v
         self.NY = total(plant.comm, self.N.T @ plant.Y)
@@ -109,22 +138,18 @@ class ImplicitDrive:
         u_0 = self.offset + self.K_q @ (q + plant.dt / 2 * v) + self.K_v @ v
         u_0 += sums[:n_s] + sums[n_s : 2 * n_s] - self.NY @ c_0 + self.FL @ f
         u = self.input.solve(u_0)
-        finish(plant, self, n, u, plant.inverse @ (u + f))
+        self.finish(n, u, plant.inverse @ (u + f))
 
 
-class HeldDrive:
+class HeldDrive(LoopDrive):
     """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, if asked for one tick later.
 
-    Args:
-        plant: from :class:`PlantStep`.
-        target: x_bar and u_bar; u_bar acts until the first command arrives.
-        actuation: rate, delay, limits.
+    ``target``: x_bar and u_bar; u_bar acts until the first command arrives.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
-        self.plant, self.gain, self.target = plant, gain, target
-        n_s = plant.system.layout.n_s
-        self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
+        super().__init__(plant, steps)
+        self.gain, n_s = gain, plant.system.layout.n_s
         self.bound, self.every, self.delay = actuation.bound(n_s), actuation.ticks(plant.dt), actuation.delay
         self.K = np.vstack([gain.K_z, gain.K_v])
         state = target.state
@@ -142,58 +167,19 @@ class HeldDrive:
 
     def solve(self, n: int, state: TissueState) -> None:
         """One step. Collective."""
-        plant = self.plant
         if n % self.every == 0:
             new = self.command(n, state)
             self.held, self.waiting = (self.waiting, new) if self.delay else (new, new)
-        push(plant, self, n, self.held, state)
+        self.push(n, self.held, state)
 
 
-class OpenDrive:
-    """Input that is given for every step.
-
-    Args:
-        plant: from :class:`PlantStep`.
-        inputs: u of each step [N, N m], (steps, n_s).
-    """
+class OpenDrive(LoopDrive):
+    """Input that is given for every step. ``inputs``: u of each step [N, N m], (steps, n_s)."""
 
     def __init__(self, plant: PlantStep, inputs: Array) -> None:
-        steps, n_s = inputs.shape
-        self.plant, self.u = plant, inputs
-        self.q, self.v = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s))
+        super().__init__(plant, len(inputs))
+        self.u = inputs
 
     def solve(self, n: int, state: TissueState) -> None:
         """One step. Collective."""
-        push(self.plant, self, n, self.u[n], state)
-
-
-def push(plant: PlantStep, drive: Drive, n: int, u: Array, state: TissueState) -> None:
-    """One step of hand and tissue under an input that is known before it. Collective."""
-    midpoint, system, c_0 = plant.midpoint, plant.system, plant.alpha * drive.v[n] - plant.g
-    if system.two_way and system.points is not None:
-        plant.finite = plant.finite or FiniteDrive(plant, None, None, None, 0)
-        plant.finite.v = drive.v
-        move(drive, n, u, plant.finite.push(n, u, np.zeros(len(u), dtype=bool), state)[0], plant.dt)
-        return
-    if not system.two_way:
-        a = plant.inverse @ (u + plant.weight)
-        midpoint.solve_midpoint(-(plant.kappa * a + c_0))
-        move(drive, n, u, a, plant.dt)
-        return
-    x = midpoint.respond()
-    relative = plant.theta * x - plant.s * state.array[system.layout.n_local :]
-    pull = total(plant.comm, system.G.T @ relative) - plant.theta * (plant.GY @ c_0)
-    finish(plant, drive, n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
-
-
-def finish(plant: PlantStep, drive: Drive, n: int, u: Array, a: Array) -> None:
-    """Turn S^{-1} h into w for the acceleration a, set load and right-hand side, move the hand."""
-    plant.midpoint.accelerate(plant.kappa * a + plant.alpha * drive.v[n] - plant.g)
-    move(drive, n, u, a, plant.dt)
-
-
-def move(drive: Drive, n: int, u: Array, a: Array, dt: float) -> None:
-    """Midpoint rule of the hand."""
-    drive.u[n] = u
-    drive.v[n + 1] = drive.v[n] + dt * a
-    drive.q[n + 1] = drive.q[n] + dt * (drive.v[n] + drive.v[n + 1]) / 2
+        self.push(n, self.u[n], state)

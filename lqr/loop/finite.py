@@ -11,30 +11,27 @@ kappa a + c_0, into G (c_1 + C p). Inputs beyond their limits are fixed there, a
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.midpoint import Feel, TissueState
+from softgrasp.lqr.loop.drive import LoopDrive, PlantStep
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
 
 
-class FiniteDrive:
-    """u = clip(u_bar + K (x_mid - x_bar)) on a plant of finite strain.
+class FiniteDrive(LoopDrive):
+    """u = clip(u_bar + K (x_mid - x_bar)) on a plant of finite strain."""
 
-    Args:
-        plant: :class:`softgrasp.lqr.loop.drive.PlantStep`.
-        target: x_bar and u_bar.
-        bound: limits of the input, or None.
-    """
-
-    def __init__(self, plant: Any, gain: Gain | None, target: Target | None, bound: Array | None, steps: int) -> None:
-        system, dt = plant.system, plant.dt
-        n_s = system.layout.n_s
-        self.plant, self.gain, self.bound = plant, gain, bound
-        self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
+    def __init__(
+        self, plant: PlantStep, gain: Gain | None, target: Target | None, bound: Array | None, steps: int
+    ) -> None:
+        super().__init__(plant, steps)
+        system, dt, n_s = plant.system, plant.dt, plant.system.layout.n_s
+        self.gain, self.bound = gain, bound
+        self.midpoint = cast(Any, plant.midpoint)  # that of finite strain
         self.inertia = system.M_hand + (plant.kappa * system.M_rigid if system.two_way else 0.0)
         K_z = K_v = np.zeros_like(system.G)
         self.offset, self.F = np.zeros(n_s), np.zeros((n_s, n_s))
@@ -42,7 +39,7 @@ class FiniteDrive:
             self.K_q, self.K_v, K_z, K_v = gain.K_s[:, :n_s], gain.K_s[:, n_s:], gain.K_z, plant.s * gain.K_v
             self.F = dt**2 / 4 * self.K_q + dt / 2 * self.K_v
             self.offset = target.u - self.K_q @ target.state.q_s - total(plant.comm, gain.K_z.T @ target.state.z)
-        self.N = plant.midpoint.hold(np.hstack([K_z, K_v, system.G]))
+        self.N = self.midpoint.hold(np.hstack([K_z, K_v, system.G]))
         self.speed = np.repeat([0.0, 1.0, plant.s**2 / plant.theta], n_s)
 
     def solve(self, n: int, state: TissueState) -> None:
@@ -53,7 +50,7 @@ class FiniteDrive:
         known = self.offset + self.K_q @ (self.q[n] + self.plant.dt / 2 * self.v[n]) + self.K_v @ self.v[n] + tissue
         free = np.ones(layout.n_s, dtype=bool)
         while True:
-            a, law = self.push(n, known, free, state)
+            a, law = self.respond(n, known, free, state)
             over_limit = free & (np.abs(law) > (np.inf if self.bound is None else self.bound))
             if not over_limit.any():
                 break
@@ -62,7 +59,7 @@ class FiniteDrive:
             known[over_limit] = (np.sign(law) * self.bound)[over_limit]
         self.move(n, np.where(free, law, known), a)
 
-    def push(self, n: int, known: Array, free: Array, state: TissueState) -> tuple[Array, Array]:
+    def respond(self, n: int, known: Array, free: Array, state: TissueState) -> tuple[Array, Array]:
         """The step with u = known, where ``free`` with the part F a + N'w of the law; a and the law. Collective."""
         plant, system, n_s = self.plant, self.plant.system, len(known)
         c_0 = plant.alpha * self.v[n] - plant.g
@@ -74,12 +71,6 @@ class FiniteDrive:
             C[:, 2 * n_s :] = -plant.theta * np.eye(n_s)
         inverse = np.linalg.inv(self.inertia - free[:, None] * self.F)
         feel = Feel(-plant.kappa * inverse @ C, self.N, self.speed)
-        plant.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feel)
-        a = -(plant.midpoint.c + c_0) / plant.kappa
-        return a, known + self.F @ a + plant.midpoint.felt[:n_s] + plant.midpoint.felt[n_s : 2 * n_s]
-
-    def move(self, n: int, u: Array, a: Array) -> None:
-        """Midpoint rule of the hand."""
-        dt = self.plant.dt
-        self.u[n], self.v[n + 1] = u, self.v[n] + dt * a
-        self.q[n + 1] = self.q[n] + dt * (self.v[n] + self.v[n + 1]) / 2
+        self.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feel)
+        a = -(self.midpoint.c + c_0) / plant.kappa
+        return a, known + self.F @ a + self.midpoint.felt[:n_s] + self.midpoint.felt[n_s : 2 * n_s]

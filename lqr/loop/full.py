@@ -20,7 +20,7 @@ from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.solve.solvers import Reproducible, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
-from softgrasp.lqr.loop.drive import Drive, HeldDrive, ImplicitDrive, PlantStep
+from softgrasp.lqr.loop.drive import HeldDrive, ImplicitDrive, LoopDrive, PlantStep
 from softgrasp.lqr.loop.finite import FiniteDrive
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
@@ -35,26 +35,17 @@ CHUNKS = 50  # segments of a run without frames: progress, and the check that th
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """What to keep of a run and whom to tell.
+    """What to keep of a run and whom to tell."""
 
-    Attributes:
-        snapshots: where states go.
-        every: a snapshot every so many steps.
-        directory: where streamed snapshots go.
-        frames: steps at which ``frame`` is called.
-        frame: observer with ``run.state``, ``run.drive.q``, ``run.drive.v``, ``run.reached`` and ``run.dt``, the same
-            as in a forward run.
-        progress: called between segments, with ``run.reached`` and ``run.steps``.
-        most: cost beyond which the run stops: no loop that works pays it.
-    """
-
-    snapshots: Literal["none", "memory", "hdf5"] = "none"
-    every: int = 1
-    directory: Path = Path("out")
-    frames: Sequence[int] = ()
+    snapshots: Literal["none", "memory", "hdf5"] = "none"  # where states go
+    every: int = 1  # a snapshot every so many steps
+    directory: Path = Path("out")  # where streamed snapshots go
+    frames: Sequence[int] = ()  # steps at which ``frame`` is called
+    # observer with ``run.state``, ``run.drive.q``, ``run.drive.v``, ``run.reached`` and ``run.dt``, the same as in a
+    # forward run
     frame: Callable[[Any], None] | None = None
-    progress: Callable[[Any], None] | None = None
-    most: float = np.inf
+    progress: Callable[[Any], None] | None = None  # called between segments, with ``run.reached`` and ``run.steps``
+    most: float = np.inf  # cost beyond which the run stops: no loop that works pays it
 
 
 @dataclass(frozen=True)
@@ -103,7 +94,7 @@ class LoopTrajectory:
 class ClosedLoop:
     """E x' = A x + B u + F g under u = u_bar + K (x - x_bar), in hand-relative coordinates.
 
-    The step matrix is factored once, here; gains, targets and actuation change from run to run.
+    The matrix of the midpoint step [HLW06] is factored once, here; gains, targets and actuation change with the run.
 
     Args:
         problem: plant, outputs and weights.
@@ -174,7 +165,7 @@ class ClosedLoop:
         bound = actuation.bound(self.problem.layout.n_s)
         held = actuation.ticks(self.dt) > 0
         start = start or rest(self.problem.system)
-        drive: Drive = (
+        drive: LoopDrive = (
             HeldDrive(self.plant, gain, target, actuation, steps)
             if held
             else FiniteDrive(self.plant, gain, target, bound, steps)
@@ -191,18 +182,10 @@ class ClosedLoop:
 
 
 class LoopRun(Stepped):
-    """One closed-loop run in progress: the TS context, with the fields that observers of a forward run read.
-
-    Args:
-        loop: factor and plant.
-        drive: feedback law.
-        start: state at t = 0.
-        options: what to keep.
-        target: where the cost is zero.
-    """
+    """One closed-loop run in progress: the TS context, with the fields that observers of a forward run read."""
 
     def __init__(
-        self, loop: ClosedLoop, drive: Drive, start: PlantState, steps: int, options: LoopOptions, target: Target
+        self, loop: ClosedLoop, drive: LoopDrive, start: PlantState, steps: int, options: LoopOptions, target: Target
     ) -> None:
         if steps < 1:
             raise ControlError(f"steps = {steps} must be at least 1")

@@ -41,21 +41,13 @@ ROUNDING = 1e-12  # of a cost: sums over the steps with the growing responses of
 
 @dataclass(frozen=True)
 class DualityGap:
-    """Proved bound on the excess cost of one run.
+    """Proved bound on the excess cost of one run."""
 
-    Attributes:
-        gap: J(u) - min J is at most this; infinite when the run diverges.
-        cost: J(u) with what is to come.
-        least: proved lower bound of min J, J - gap of this run or of a better one from the same start.
-        to_come: |Z'E x_N|^2, what is to come after the end.
-        end: N dt [s].
-    """
-
-    gap: float
-    cost: float
-    least: float
-    to_come: float
-    end: float
+    gap: float  # J(u) - min J is at most this; infinite when the run diverges
+    cost: float  # J(u) with what is to come
+    least: float  # proved lower bound of min J, J - gap of this run or of a better one from the same start
+    to_come: float  # |Z'E x_N|^2, what is to come after the end
+    end: float  # N dt [s]
 
     @property
     def cost_excess_proved(self) -> float:
@@ -91,8 +83,6 @@ def duality_gaps(
         problem: plant, outputs and weights; it has a hand.
         gains: u = K_hat x at the midpoint of every step.
         start: x(0) minus target, one column.
-        dt: step [s].
-        steps: N.
         factor: Z; None takes the cost up to the end alone.
         notify: called with the number of steps done and in all.
 
@@ -121,7 +111,6 @@ def run_gap(outputs: Responses, end: Responses, u: Array, Q: Array, R: Array) ->
         outputs: responses of y at the midpoints.
         end: responses of Z'E x at the grid points; without columns there is nothing to come.
         u: inputs, (steps, n_s).
-        Q, R: weights.
     """
     dt, steps = outputs.dt, len(u)
     if not np.isfinite(u).all():

@@ -26,23 +26,14 @@ NEAR = 60  # more around each resonance, where the phase turns at once
 
 @dataclass(frozen=True)
 class AxisMargins:
-    """Margins of the loop seen at one input; nan where it has no such crossing.
+    """Margins of the loop seen at one input; nan where it has no such crossing."""
 
-    Attributes:
-        name: of the input, with unit.
-        gain_up: factor > 1 by which its gain may grow; inf if by any.
-        gain_down: factor < 1 by which it may shrink; 0 if by any.
-        phase: lag that it bears [deg].
-        crossover: frequency of that phase margin [rad/s].
-        delay: dead time that it bears [s].
-    """
-
-    name: str
-    gain_up: float
-    gain_down: float
-    phase: float
-    crossover: float
-    delay: float
+    name: str  # of the input, with unit
+    gain_up: float  # factor > 1 by which its gain may grow; inf if by any
+    gain_down: float  # factor < 1 by which it may shrink; 0 if by any
+    phase: float  # lag that it bears [deg]
+    crossover: float  # frequency of that phase margin [rad/s]
+    delay: float  # dead time that it bears [s]
 
 
 @dataclass(frozen=True)

@@ -78,11 +78,8 @@ def responses(
     """One factor and n_s runs of the full plant, one more where the start moves by itself. Collective.
 
     Args:
-        problem: a plant with a hand.
         W: functionals as columns of the size of the state.
         start: x(0) as a difference to a state of rest, one column.
-        dt: step [s].
-        steps: number of steps.
         notify: called with the number of steps done and in all.
 
     Raises:

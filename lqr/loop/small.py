@@ -34,14 +34,7 @@ class ReducedLoop:
 
     x_mid = P x_n + Y u + b with P = S^{-1} E, Y = dt/2 S^{-1} B, b = dt/2 S^{-1} f, S = E - dt/2 A, and
     x_{n+1} = 2 x_mid - x_n; at the midpoint u = u_0 + K Y u is solved for the few inputs. Not collective: every rank
-    may run its own.
-
-    Args:
-        plant: the matrices.
-        dt: time step [s].
-
-    Raises:
-        ControlError: dt is not positive, or E - dt/2 A is singular.
+    may run its own. Raises ControlError: dt is not positive, or E - dt/2 A is singular.
     """
 
     def __init__(self, plant: SmallPlant, dt: float) -> None:
@@ -74,7 +67,6 @@ class ReducedLoop:
             K: gain, (n_s, N).
             rest: x_bar and u_bar, see :meth:`SmallPlant.rest_at`.
             weights: Q and R of the cost.
-            actuation: sampling, delay, limits.
             start: x(0), default the state of rest with the hand at 0.
 
         Raises:

@@ -12,7 +12,7 @@ from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
 from softgrasp.lqr.dense.modal import assemble_space
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
-from softgrasp.lqr.plant.operators import damp
+from softgrasp.lqr.plant.operators import damp, normalising
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import steady_input
 from softgrasp.reduction.lti import LTI, make_lti
@@ -51,8 +51,7 @@ class SmallPlant:
     def rest_at(self, q_bar: Array) -> tuple[Array, Array]:
         """x_bar (N,) and u_bar (n_s,) with 0 = A x + B u + f and S_q x = q_bar.
 
-        Raises:
-            ControlError: the plant has no such state, or more than one.
+        Raises ControlError: the plant has no such state, or more than one.
         """
         n_s = len(self.S_q)
         K = np.block([[self.A, self.B], [self.S_q, np.zeros((n_s, n_s))]])
@@ -97,13 +96,9 @@ def galerkin(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
     """Galerkin on x = [q_s, v_s, V eta, V eta']: the hand stays whole, the tissue stays of second order.
 
     V'M V, V'D V and V'K V keep their definiteness, so the reduced plant is as stable as the full one, for every V.
-    Collective.
+    Collective. ``V``: shapes of z, local rows (n_local, k), linearly independent; k = 0 leaves the hand alone.
 
-    Args:
-        V: shapes of z, local rows (n_local, k), linearly independent; k = 0 leaves the hand alone.
-
-    Raises:
-        ControlError: the columns of V are linearly dependent.
+    Raises ControlError: the columns of V are linearly dependent.
     """
     system, comm = problem.system, problem.layout.comm
     M_V, K_V = times_columns(system.M_ee, V), times_columns(system.K_ee, V)
@@ -129,12 +124,6 @@ def galerkin(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
 def m_orthonormal(M: PETSc.Mat, V: Array, tolerance: float = 1e-10) -> Array:
     """Columns that span V with V' M V = I; directions below ``tolerance`` of the largest are dropped. Collective."""
     comm = M.comm.tompi4py()
-
-    def normalising(gram: Array) -> Array:
-        values, vectors = np.linalg.eigh((gram + gram.T) / 2)
-        keep = values > tolerance**2 * values.max(initial=0.0)
-        return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
-
     for _ in range(2):  # the second pass repairs what rounding left after the first
-        V = V @ on_root(comm, partial(normalising, total(comm, V.T @ times_columns(M, V))))
+        V = V @ on_root(comm, partial(normalising, total(comm, V.T @ times_columns(M, V)), tolerance**2))
     return np.asfortranarray(V)

@@ -11,7 +11,7 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex, on_root
-from softgrasp.lqr.lowrank.adjoint import Right, closed_adjoint, mass_right
+from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, mass_right
 from softgrasp.lqr.lowrank.compress import compress, gram
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
@@ -24,7 +24,7 @@ SHARE = 0.02  # of the tolerance that one compression on the way may use up
 GROWTH = 1e6  # of the residual against its start: the closed loop of the given gain is unstable
 
 
-class Columns:
+class FactorColumns:
     """Z as it grows, in costate form; compressed when it gets wide.
 
     Args:
@@ -85,31 +85,45 @@ class Columns:
 
 
 @dataclass
-class Sweep:
-    """State of one ADI sweep for A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K."""
+class LowRankSweep:
+    """State of a sweep of solves, of ADI or RADI."""
 
-    # [K', W, dK'] with K' of the sweep, the residual factor W, W W' the Lyapunov residual, and dK = B'XE - K of the X
-    # found so far
-    state: Right
-    Z: Columns  # factor of X
+    state: Right  # [K', W, ...] with the gain K' and the residual factor W
+    Z: FactorColumns  # factor of X
     steps: int = 0  # solves so far
-    first: float = 0.0  # ||W_0 W_0'||
     seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
-
-    @property
-    def q(self) -> int:
-        """Columns of W."""
-        return self.state.columns - 2 * self.Z.plant.inputs
 
     @property
     def W(self) -> Right:
         """Residual factor (views)."""
-        return self.state[self.Z.plant.inputs : -self.Z.plant.inputs]
+        return self.state[self.Z.plant.inputs :]
 
     @property
     def gain(self) -> Right:
         """K' (views)."""
         return self.state[: self.Z.plant.inputs]
+
+    def solve(self, tissue: ShiftedTissue, queue: ShiftQueue) -> tuple[complex, Solution]:
+        """The next shift p and V of (A - B K + p E)'V = W. Collective."""
+        begin, plant, m = time.perf_counter(), self.Z.plant, self.Z.plant.inputs
+        if queue.short(self.steps):
+            queue.refill(plant, self.Z.recent(), self.W.block, self.gain)
+        p, ahead = queue.next()
+        self.seconds["shifts"] += time.perf_counter() - begin
+        self.steps += 1
+        return p, closed_adjoint(plant, tissue, p, self.state[: m + self.W.columns], ahead)
+
+
+@dataclass
+class AdiSweep(LowRankSweep):
+    """[K', W, dK'] of A_c'XE + E'XA_c = -W_0 W_0', A_c = A - B K, with dK = B'XE - K of the X so far."""
+
+    first: float = 0.0  # ||W_0 W_0'||
+
+    @property
+    def W(self) -> Right:
+        """Residual factor, W W' the Lyapunov residual (views)."""
+        return self.state[self.Z.plant.inputs : -self.Z.plant.inputs]
 
     @property
     def change(self) -> Right:
@@ -118,14 +132,8 @@ class Sweep:
 
     @property
     def new(self) -> Right:
-        """(B'XE)' of the X found so far."""
+        """(B'XE)' of the X so far."""
         return self.gain.plus(self.change, np.eye(self.Z.plant.inputs))
-
-
-def start_sweep(plant: Plant, outputs: Right, gain: Right, tol: float) -> Sweep:
-    """W_0 = [C', K']."""
-    state = Right.join([gain, outputs, gain, Right(-gain.hand, -gain.rows)])
-    return Sweep(state, Columns(plant, SHARE * tol * plant.scale))
 
 
 def real_columns(p: complex, q: int) -> tuple[Complex, float]:
@@ -142,16 +150,11 @@ def real_columns(p: complex, q: int) -> tuple[Complex, float]:
     return np.hstack([g * (1 - 1j * d) * one, -1j * g * np.sqrt(d * d + 1) * one]), g
 
 
-def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueue) -> complex:
+def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: AdiSweep, queue: ShiftQueue) -> complex:
     """One solve, two real blocks of columns for a pair. Collective. Returns the shift."""
+    q, m = sweep.W.columns, plant.inputs
+    p, V = sweep.solve(tissue, queue)
     begin = time.perf_counter()
-    q, m = sweep.q, plant.inputs
-    if queue.short(sweep.steps):
-        queue.refill(plant, sweep.Z.recent(), sweep.W.block, sweep.gain)
-    p, ahead = queue.next()
-    middle = time.perf_counter()
-    V = closed_adjoint(plant, tissue, p, sweep.state[: m + q], ahead)
-    last = time.perf_counter()
     coefficients, g = real_columns(p, q)
     Z = V.real(coefficients)
     small = np.zeros((Z.columns, q + 2 * m))
@@ -159,20 +162,17 @@ def adi_step(plant: Plant, tissue: ShiftedTissue, sweep: Sweep, queue: ShiftQueu
     small[:, m + q :] = plant.inputs_of(Z)
     sweep.state = sweep.state.plus(mass_right(plant, Z), small)
     sweep.Z.append(Z)
-    sweep.steps += 1
-    sweep.seconds["shifts"] += middle - begin
-    sweep.seconds["products"] += time.perf_counter() - last
+    sweep.seconds["products"] += time.perf_counter() - begin
     return p
 
 
-def sweep_norms(plant: Plant, sweep: Sweep) -> tuple[float, float]:
+def sweep_norms(plant: Plant, sweep: AdiSweep) -> tuple[float, float]:
     """||W W'||_2 of the Lyapunov and ||W W' - dK' dK||_2 of the Riccati residual, dK = K_new - K. Collective.
 
-    Raises:
-        SolverError: the residual grows without bound: the closed loop of the gain is unstable.
+    Raises SolverError: the residual grows without bound: the closed loop of the gain is unstable.
     """
     begin = time.perf_counter()
-    q, both = sweep.q, sweep.state[plant.inputs :].block  # [W, dK']
+    q, both = sweep.W.columns, sweep.state[plant.inputs :].block  # [W, dK']
     products = gram(plant.comm, both, both)
     # the eigenvalues of U S U' that are not zero are those of S U'U
     signed = products.copy()

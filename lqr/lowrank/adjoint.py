@@ -155,8 +155,6 @@ def closed_adjoint(
     [N, L] = (A + pE)^{-T} [K', W],  V = L + N (I - B'N)^{-1} B'L. Collective.
 
     Args:
-        tissue: solver with S(p).
-        p: shift.
         right: [K', W].
         ahead: shifts that will probably come next.
     """

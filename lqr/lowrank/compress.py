@@ -10,24 +10,16 @@ from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
+from softgrasp.lqr.plant.operators import damp
+from softgrasp.reduction.bases.engines import triangle
 
 COLUMNS = 64  # columns whose products are held at a time
 PROBES = 8  # sums of columns whose products estimate a norm
-CHUNK = 20_000  # rows a QR takes at once; LAPACK copies its argument
 
 
 def triangular(comm: MPI.Intracomm, X: Block) -> Array:
     """R of the thin QR factorisation X = Q R, the same on every rank, without Q. Collective."""
-    k = X.columns
-    rows = max(CHUNK, 4 * k)
-    R = X.hand if comm.rank == 0 else np.empty((0, k))
-    for first in range(0, len(X.tall), rows):
-        R = np.linalg.qr(np.vstack([R, X.tall[first : first + rows]]), mode="r")
-    if comm.size == 1:
-        return R
-    parts = comm.gather(R)
-    stacked = None if parts is None else np.linalg.qr(np.vstack(parts), mode="r")
-    return np.asarray(comm.bcast(stacked))
+    return triangle(comm, X.tall, X.hand)
 
 
 def gram(comm: MPI.Intracomm, X: Block, Y: Block) -> Array:
@@ -75,7 +67,7 @@ def _tissue_products(plant: Plant, Z: Block) -> tuple[Array, Array, Array, Array
     both[:, :c], both[:, c:] = Z.tall[:n], Z.tall[n:]
     b, K_both = both[:, c:], plant.stiff(both)
     M_b = plant.mass(b)
-    return both, K_both, M_b, K_both[:, :c] - plant.damp(b, M_b=M_b, K_b=K_both[:, c:])
+    return both, K_both, M_b, K_both[:, :c] - damp(plant.system, b, M_b, K_both[:, c:])
 
 
 def _ratio(plant: Plant, Z: Block) -> float:

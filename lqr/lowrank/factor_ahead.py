@@ -13,9 +13,7 @@ class FactorsAhead:
 
     SciPy frees the memory of a factor in the thread that made it and in no other, so each factor goes back there.
 
-    Args:
-        make: factor of a shift; the second argument is the number of the thread, for what it may overwrite.
-        threads: how many.
+    ``make``: factor of a shift; the second argument is the number of the thread, for what it may overwrite.
     """
 
     def __init__(self, make: Callable[[complex, int], scipy.sparse.linalg.SuperLU], threads: int) -> None:

@@ -11,21 +11,14 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
+from softgrasp.lqr.lowrank import modal_start
 from softgrasp.lqr.lowrank.adi import Progress
-from softgrasp.lqr.lowrank.modal_start import (
-    MODES,
-    ModalSubspace,
-    SmallSolution,
-    check_damped,
-    plant_modes,
-    restrict,
-    solve_small,
-)
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import shift_range
 from softgrasp.lqr.lowrank.solution import Iterate, make_solution
 from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.operators import normalising
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
@@ -53,7 +46,7 @@ class Space:
                 columns = columns - self.V @ total(comm, self.M_V.T @ columns)
             M_columns = plant.mass(columns)
             gram = total(comm, columns.T @ M_columns)
-            S: Array = on_root(comm, partial(_normalising, gram))
+            S: Array = on_root(comm, partial(normalising, gram, ROUNDING, NEW**2))
             columns, M_columns = columns @ S, M_columns @ S
         more = (columns, M_columns, plant.stiff(columns))
         return Space(*(np.hstack([a, b]) for a, b in zip((self.V, self.M_V, self.K_V), more, strict=True)))
@@ -76,20 +69,13 @@ class Space:
 class Level:
     """One Galerkin space with its solution."""
 
-    small: ModalSubspace  # the projected plant
-    solution: SmallSolution  # its Riccati equation
+    small: modal_start.ModalSubspace  # the projected plant
+    solution: modal_start.SmallSolution  # its Riccati equation
     Z: Block  # X ~ Z Z', costate form
     # a, b: tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m)
     a: Array
     b: Array
     gain: Block  # K', z-row as it stands
-
-
-def _normalising(gram: Array) -> Array:
-    """S with S'gram S = I on the part of gram that is not rounding."""
-    sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
-    keep = sizes > max(NEW**2, ROUNDING * float(sizes.max(initial=0.0)))
-    return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
 
 
 def _root(X: Array) -> Array:
@@ -118,8 +104,8 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
         old: the level before, near the solution.
     """
     ritz, omega, S = space.ritz(plant)
-    small = restrict(plant, ritz.V, omega, ritz.M_V)
-    solution = solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
+    small = modal_start.restrict(plant, ritz.V, omega, ritz.M_V)
+    solution = modal_start.solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
     root = on_root(plant.comm, partial(_root, solution.X))
     s, r = 2 * plant.n_s, len(omega)
     q, v = root[s : s + r] / omega[:, None], root[s + r :]
@@ -151,13 +137,9 @@ def gain_change(plant: Plant, new: Level, old: Level) -> float:
 
 def frequencies(low: float, high: float, count: int) -> Array:
     """Points that fill [low, high] on a log scale evenly at every stage (van der Corput)."""
-    position = []
-    for i in range(count):
-        x, share, k = 0.0, 0.5, i + 1
-        while k:
-            x, share, k = x + share * (k & 1), share / 2, k >> 1
-        position.append(x)
-    return np.asarray(low * (high / low) ** np.array(position))
+    from scipy.stats import qmc  # half a second, for large plants only
+
+    return np.asarray(low * (high / low) ** qmc.Halton(1, scramble=False).random(count + 1)[1:, 0])
 
 
 @dataclass(frozen=True)
@@ -169,22 +151,14 @@ class StructuredGalerkin:
     two spaces, or the space holds all of the tissue. The small problem keeps the second-order form and the energy, so
     it is stable whenever the tissue is damped. The residual of such a solution is large although the gain is right; it
     is reported, not judged.
-
-    Attributes:
-        tol: bound on the relative change of the gain between the last two spaces, see :func:`gain_change`.
-        max_iterations: bound on the number of spaces.
-        modes: number of modes.
-        per_step: responses added at a time.
-        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
-        progress: called on every rank after each space with the history entry.
     """
 
-    tol: float = 1e-6
-    max_iterations: int = 24
-    modes: int = MODES
-    per_step: int = 2
-    tissue: str = "auto"
-    progress: Progress | None = None
+    tol: float = 1e-6  # bound on the relative change of the gain between the last two spaces, see gain_change
+    max_iterations: int = 24  # bound on the number of spaces
+    modes: int = modal_start.MODES  # number of modes
+    per_step: int = 2  # responses added at a time
+    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
+    progress: Progress | None = None  # called on every rank after each space with the history entry
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
         """Grow the space until the gain settles. Collective. The problem is not changed.
@@ -195,8 +169,8 @@ class StructuredGalerkin:
         """
         begin = time.perf_counter()
         plant = Plant(problem)
-        check_damped(plant)
-        omega, Phi = plant_modes(plant, min(self.modes, plant.layout.n_e))
+        modal_start.check_damped(plant)
+        omega, Phi = modal_start.plant_modes(plant, min(self.modes, plant.layout.n_e))
         space = Space(Phi, plant.mass(Phi), plant.stiff(Phi))
         seconds = {"start": time.perf_counter() - begin}
         history: list[dict[str, float]] = []

@@ -22,8 +22,7 @@ def best_step(comm: MPI.Intracomm, old: tuple[Block, Array], W: Block, change: B
         W: residual factor of the Lyapunov equation.
         change: dK' = K_new' - K_j'.
 
-    Returns:
-        t, ||R_j||_F and the norm at t = 1.
+    Returns t, ||R_j||_F and the norm at t = 1.
     """
     U, signs = old
     r = triangular(comm, Block.join([U, W, change]))

@@ -12,11 +12,12 @@ from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.care import care, lyapunov, riccati_residual
-from softgrasp.lqr.dense.modal import StateSpace, assemble_space
+from softgrasp.lqr.dense.modal import StateSpace, assemble_space, in_energy
 from softgrasp.lqr.dense.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY, ControlError
+from softgrasp.lqr.plant.operators import damp
 
 MODES = 30
 MORE_MODES = 60  # when the last of MODES is still lightly damped
@@ -90,32 +91,23 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
 def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> ModalSubspace:
     """Galerkin projection on V with V' K_ee V = diag(omega^2). Collective."""
     r = len(omega)
-    columns = [M_V, plant.damp(V, M_b=M_V), plant.G, plant.C_z]
+    columns = [M_V, damp(plant.system, V, M_V), plant.G, plant.C_z]
     products = total(plant.comm, V.T @ np.hstack(columns))
     M, D, G, C_z = np.split(products, [r, 2 * r, 2 * r + plant.n_s], axis=1)
     folded = replace(plant.problem, C_s=plant.C_s)  # weights are in the outputs already
-    plain = assemble_space(folded, (M + M.T) / 2, np.diag(omega**2), (D + D.T) / 2, G, C_z)
-    one = np.ones(2 * plant.n_s)
-    S = np.concatenate([one, 1 / omega, np.ones(r)])
-    L = np.concatenate([one, omega, np.ones(r)])
-    C = plain.C * S
-    B = np.zeros((len(S), plant.inputs))
+    space = in_energy(assemble_space(folded, (M + M.T) / 2, np.diag(omega**2), (D + D.T) / 2, G, C_z), omega)
+    B = np.zeros((len(space.E), plant.inputs))
     if plant.B_z is None:
         B[plant.n_s : 2 * plant.n_s] = plant.B
     else:
         B[2 * plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
-    return ModalSubspace(V, omega, StateSpace(L[:, None] * plain.E * S, L[:, None] * plain.A * S, B, C))
+    return ModalSubspace(V, omega, replace(space, B=B))
 
 
 def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) -> SmallSolution:
     """Riccati equation of the small plant on rank 0, the result on all. Collective.
 
-    Args:
-        small: its projection.
-        guess: an X near the solution, (N, N).
-
-    Raises:
-        ControlError: not stabilisable or not detectable.
+    ``guess``: an X near the solution, (N, N). Raises ControlError: not stabilisable or not detectable.
     """
 
     def solve() -> SmallSolution:
@@ -215,11 +207,9 @@ def check_damped(plant: Plant) -> None:
 def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     """Riccati equation of the hand and the lowest ``modes`` modes. Collective.
 
-    Args:
-        modes: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
+    ``modes``: number of modes, 0 for the hand alone; None takes :data:`MODES`, or more when damping is light.
 
-    Raises:
-        ControlError: there is no damping at all, or the small problem has no stabilising solution.
+    Raises ControlError: there is no damping at all, or the small problem has no stabilising solution.
     """
     check_damped(plant)
     count = MODES if modes is None else modes

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.lqr.lowrank.adi import Progress, Sweep, adi_step, start_sweep, sweep_norms
+from softgrasp.lqr.lowrank.adi import SHARE, AdiSweep, FactorColumns, Progress, adi_step, sweep_norms
 from softgrasp.lqr.lowrank.adjoint import Right, make_right
 from softgrasp.lqr.lowrank.line_search import best_step, mixed_residual
 from softgrasp.lqr.lowrank.modal_start import modal_start
@@ -35,26 +35,16 @@ class NewtonADI:
     stabilises one-way plants with proportional damping for every damping > 0 and usually leaves one Newton step.
 
     Assumptions: tissue damping > 0; (E, A, B) stabilisable, (E, A, C) detectable.
-
-    Attributes:
-        tol: bound on the true relative residual, 2-norm, hand-relative coordinates.
-        max_iterations: bound on the Newton steps.
-        max_solves: bound on the solves of one sweep.
-        modes: modes of the start; 0 starts from the hand alone, None chooses.
-        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
-        progress: called on every rank after each solve with the history entry.
-        checkpoint: folder for restart files, one a rank; an existing one is resumed.
-        checkpoint_every: solves between two restart files.
     """
 
-    tol: float = 1e-10
-    max_iterations: int = 15
-    max_solves: int = 1000
-    modes: int | None = None
-    tissue: str = "auto"
-    progress: Progress | None = None
-    checkpoint: Path | None = None
-    checkpoint_every: int = 25
+    tol: float = 1e-10  # bound on the true relative residual, 2-norm, hand-relative coordinates
+    max_iterations: int = 15  # bound on the Newton steps
+    max_solves: int = 1000  # bound on the solves of one sweep
+    modes: int | None = None  # modes of the start; 0 starts from the hand alone, None chooses
+    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
+    progress: Progress | None = None  # called on every rank after each solve with the history entry
+    checkpoint: Path | None = None  # folder for restart files, one a rank; an existing one is resumed
+    checkpoint_every: int = 25  # solves between two restart files
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
         """Run to the tolerance. Collective. The problem is not changed.
@@ -82,13 +72,15 @@ class NewtonADI:
 
     def _iterate(
         self, plant: Plant, tissue: ShiftedTissue, outputs: Right, state: Iteration, first: ShiftQueue
-    ) -> Sweep:
+    ) -> AdiSweep:
         """Newton steps until the Riccati residual is small."""
         shifts = list(first.pending)
-        sweep: Sweep | None = load_state(self.checkpoint, plant, state, self.tol) if self.checkpoint else None
+        sweep: AdiSweep | None = load_state(self.checkpoint, plant, state, self.tol) if self.checkpoint else None
         while True:
             if sweep is None:
-                sweep = start_sweep(plant, outputs, state.gain, self.tol)
+                K = state.gain
+                W = Right.join([K, outputs, K, Right(-K.hand, -K.rows)])  # [K', W_0, dK'], W_0 = [C', K']
+                sweep = AdiSweep(W, FactorColumns(plant, SHARE * self.tol * plant.scale))
             queue = replace(first, pending=shifts[sweep.steps :])  # a resumed sweep has used some
             quadratic = min(0.1 * state.achieved, 0.9 * state.achieved**2) if np.isfinite(state.achieved) else 0.0
             state.achieved = self._sweep(plant, tissue, sweep, state, queue, max(0.1 * self.tol, quadratic))
@@ -107,7 +99,7 @@ class NewtonADI:
             self._advance(plant, sweep, state)
             sweep = None
 
-    def _advance(self, plant: Plant, sweep: Sweep, state: Iteration) -> None:
+    def _advance(self, plant: Plant, sweep: AdiSweep, state: Iteration) -> None:
         """K_{j+1} = K_j + t (K_new - K_j): the full step unless the residual hardly falls."""
         change, t = sweep.change.block, 1.0
         if state.factor is not None:
@@ -120,7 +112,7 @@ class NewtonADI:
         state.gain = sweep.gain.plus(sweep.change, t * np.eye(plant.inputs))
 
     def _sweep(
-        self, plant: Plant, tissue: ShiftedTissue, sweep: Sweep, state: Iteration, queue: ShiftQueue, forcing: float
+        self, plant: Plant, tissue: ShiftedTissue, sweep: AdiSweep, state: Iteration, queue: ShiftQueue, forcing: float
     ) -> float:
         """One Lyapunov equation. Returns the relative Riccati residual."""
         relative = np.inf
@@ -150,17 +142,12 @@ class NewtonADI:
         )
 
     def _finish(
-        self, plant: Plant, tissue: ShiftedTissue, sweep: Sweep, state: Iteration, begin: float
+        self, plant: Plant, tissue: ShiftedTissue, sweep: AdiSweep, state: Iteration, begin: float
     ) -> RiccatiSolution:
         """Compressed Z, its true residual and the bookkeeping."""
         state.seconds |= tissue.seconds
-        counts = {
-            "newton_steps": state.step,
-            "adi_steps": state.solves,
-            "solves": state.solves,
-            "factorisations": tissue.factors,
-            "columns": sweep.Z.appended,
-        }
+        counts = {"newton_steps": state.step, "adi_steps": state.solves, "solves": state.solves}
+        counts |= {"factorisations": tissue.factors, "columns": sweep.Z.appended}
         about = f"low rank, {state.step} Newton steps, {tissue.name} tissue solves"
         iterate = Iterate(
             sweep.Z.block, sweep.new.block, "newton_adi", about, self.tol, state.history, counts, dict(state.seconds)

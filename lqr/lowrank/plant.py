@@ -25,9 +25,6 @@ class Plant:
     with H = G, D_ss = alpha M_rigid, D_se = alpha G' for two-way coupling (alpha only when damping acts in space).
     Without a hand its rows are empty and the inputs act on the tissue, B = [0; B_z].
 
-    Args:
-        problem: the operators and weights.
-
     Raises:
         ControlError: R is not positive definite, Q has a negative eigenvalue or sees nothing, or a number is not
             finite.
@@ -65,16 +62,6 @@ class Plant:
         """Number of inputs."""
         return int(self.B.shape[1])
 
-    def damp(self, b: Array, M_b: Array | None = None, K_b: Array | None = None) -> Array:
-        """D_ee b for local rows. Collective."""
-        damping = self.system.damping
-        result = damping.alpha * (self.mass(b) if M_b is None else M_b) if damping.alpha else np.zeros_like(b)
-        if damping.beta:
-            result = result + damping.beta * (self.stiff(b) if K_b is None else K_b)
-        if self.viscous is not None:
-            result = result + self.viscous(b)
-        return result
-
     def inputs_of(self, V: Block) -> Array:
         """V'B, (k, m), on every rank. Collective without a hand."""
         if self.B_z is None:
@@ -89,9 +76,7 @@ class Plant:
     def mass_adjoint(self, V: Block, out: Array | None = None) -> Block:
         """E'V of a costate block; the z-row of the result is unscaled. Collective.
 
-        Args:
-            V: the block.
-            out: room for the tissue rows of the result.
+        ``out``: room for the tissue rows of the result.
         """
         n, s = self.n_local, self.n_s
         a, b, b_s = V.tall[:n], V.tall[n:], V.hand[s:]

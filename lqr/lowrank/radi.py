@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root
-from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, Columns, Progress
-from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, make_right, mass_right
+from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, FactorColumns, LowRankSweep, Progress
+from softgrasp.lqr.lowrank.adjoint import Right, Solution, make_right, mass_right
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
@@ -21,27 +21,6 @@ from softgrasp.lqr.lowrank.solution import STOP, Iterate, make_solution
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-
-
-@dataclass
-class RadiState:
-    """W with Res(X_k) = W W', K_k' and Z."""
-
-    both: Right  # [K', W], (B'X_k E)' and the residual factor with p columns
-    Z: Columns  # X_k = Z Z'
-    solves: int = 0  # tissue solves done
-    history: list[dict[str, float]] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=lambda: {"shifts": 0.0, "small": 0.0, "products": 0.0})
-
-    @property
-    def W(self) -> Right:
-        """Residual factor (views)."""
-        return self.both[self.Z.plant.inputs :]
-
-    @property
-    def gain(self) -> Right:
-        """K' (views)."""
-        return self.both[: self.Z.plant.inputs]
 
 
 def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, Array, float]:
@@ -67,31 +46,23 @@ def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, A
     return columns, Y, V_B, c
 
 
-def radi_step(plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: ShiftQueue) -> complex:
+def radi_step(plant: Plant, tissue: ShiftedTissue, state: LowRankSweep, queue: ShiftQueue) -> complex:
     """One solve with p + m right-hand sides; W, K and Z are updated. Collective. Returns the shift.
 
-    Raises:
-        SolverError: Y is not positive definite: rounding has destroyed the step.
+    Raises SolverError: Y is not positive definite: rounding has destroyed the step.
     """
-    begin = time.perf_counter()
-    if queue.short(state.solves):
-        queue.refill(plant, state.Z.recent(), state.W.block, state.gain)
-    s, ahead = queue.next()
-    middle = time.perf_counter()
     q = state.W.columns
-    V = closed_adjoint(plant, tissue, s, state.both, ahead)
-    last = time.perf_counter()
+    s, V = state.solve(tissue, queue)
+    begin = time.perf_counter()
     columns, Y, V_B, c = radi_columns(plant, s, V)
     try:
         inverse = on_root(plant.comm, lambda: np.linalg.inv(np.linalg.cholesky((Y + Y.T) / 2)))
     except np.linalg.LinAlgError as error:
         raise SolverError(f"radi: the step at the shift {s:.4g} is not definite; use newton_adi") from error
     weight = inverse.T @ inverse
-    state.both = state.both.plus(mass_right(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
+    state.state = state.state.plus(mass_right(plant, columns), np.hstack([weight @ V_B, c * weight[:, :q]]))
     state.Z.append(columns.times(inverse.T))
-    state.solves += 1
-    state.seconds["shifts"] += middle - begin
-    state.seconds["products"] += time.perf_counter() - last
+    state.seconds["products"] += time.perf_counter() - begin
     return s
 
 
@@ -102,18 +73,12 @@ class RADI:
     Each step is one solve (A - B K + s E)'V = W with the p columns of the residual factor, Res(X_k) = W W'. No
     stabilising start is needed; the modal problem gives shifts only. X_k grows monotonically to the stabilising
     solution when the plant is stabilisable and detectable.
-
-    Attributes:
-        tol: bound on the true relative residual, 2-norm, hand-relative coordinates.
-        max_iterations: bound on the solves.
-        tissue: gathered, distributed or auto, see :mod:`softgrasp.lqr.lowrank.shifted`.
-        progress: called on every rank after each solve with the history entry.
     """
 
-    tol: float = 1e-10
-    max_iterations: int = 1500
-    tissue: str = "auto"
-    progress: Progress | None = None
+    tol: float = 1e-10  # bound on the true relative residual, 2-norm, hand-relative coordinates
+    max_iterations: int = 1500  # bound on the solves
+    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
+    progress: Progress | None = None  # called on every rank after each solve with the history entry
 
     def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
         """Run to the tolerance. Collective. The problem is not changed.
@@ -131,43 +96,40 @@ class RADI:
         try:
             W = make_right(plant, tissue, plant.outputs())
             gain = Right(np.zeros((len(W.hand), plant.inputs)), np.zeros((len(W.rows), plant.inputs)))
-            state = RadiState(Right.join([gain, W]), Columns(plant, SHARE * self.tol * plant.scale))
+            state = LowRankSweep(Right.join([gain, W]), FactorColumns(plant, SHARE * self.tol * plant.scale))
             state.seconds["start"] = after_start - begin
             queue = ShiftQueue.start(shift_range(plant, poles), poles)
-            self._iterate(plant, tissue, state, queue)
+            history = self._iterate(plant, tissue, state, queue)
             state.seconds |= tissue.seconds
-            counts = {
-                "newton_steps": 0,
-                "adi_steps": state.solves,
-                "solves": state.solves,
-                "factorisations": tissue.factors,
-                "columns": state.Z.appended,
-            }
+            counts = {"newton_steps": 0, "adi_steps": state.steps, "solves": state.steps}
+            counts |= {"factorisations": tissue.factors, "columns": state.Z.appended}
             about = f"low rank from X = 0, {tissue.name} tissue solves"
             columns = state.Z.block, state.gain.block
-            iterate = Iterate(*columns, "radi", about, self.tol, state.history, counts, state.seconds)
+            iterate = Iterate(*columns, "radi", about, self.tol, history, counts, state.seconds)
             return make_solution(plant, iterate, begin)
         finally:
             tissue.destroy()
 
-    def _iterate(self, plant: Plant, tissue: ShiftedTissue, state: RadiState, queue: ShiftQueue) -> None:
-        relative = 1.0
-        while state.solves < self.max_iterations:
+    def _iterate(
+        self, plant: Plant, tissue: ShiftedTissue, state: LowRankSweep, queue: ShiftQueue
+    ) -> list[dict[str, float]]:
+        relative, history = 1.0, list[dict[str, float]]()
+        while state.steps < self.max_iterations:
             s = radi_step(plant, tissue, state, queue)
             begin = time.perf_counter()
             products = gram(plant.comm, state.W.block, state.W.block)
             # the same bits on every rank: they decide when all stop
             relative = on_root(plant.comm, partial(np.linalg.norm, products, 2)) / plant.scale
             state.seconds["small"] += time.perf_counter() - begin
-            entry = {"solve": float(state.solves), "shift_re": s.real, "shift_im": s.imag, "residual": relative}
-            state.history.append(entry)
+            entry = {"solve": float(state.steps), "shift_re": s.real, "shift_im": s.imag, "residual": relative}
+            history.append(entry)
             if self.progress is not None:
                 self.progress(entry)
             if relative <= STOP * self.tol:
-                return
+                return history
             if not relative <= GROWTH:
                 break
         raise SolverError(
-            f"radi: relative residual {relative:.1e} after {state.solves} solves, tolerance {self.tol:.0e}; add "
+            f"radi: relative residual {relative:.1e} after {state.steps} solves, tolerance {self.tol:.0e}; add "
             f"damping, or use {MODAL_KEY}, which leaves the high modes alone"
         )

@@ -22,14 +22,9 @@ ROWS = 4_000  # rows of U that are reduced at a time
 def residual(problem: RiccatiProblem, Z: Block) -> float:
     """||A'XE + E'XA - E'XB R^{-1} B'XE + C'QC||_2 / ||C'QC||_2 for X = Z Z'.
 
-    Collective. Inputs are not changed.
+    Collective. Inputs are not changed. ``Z``: factor, (2 n_s, rank) on every rank and local rows (2 n_local, rank).
 
-    Args:
-        problem: operators and weights.
-        Z: factor, (2 n_s, rank) on every rank and local rows (2 n_local, rank).
-
-    Returns:
-        The relative residual; 2-norm in hand-relative coordinates.
+    Returns the relative residual; 2-norm in hand-relative coordinates.
     """
     system, comm = problem.system, problem.layout.comm
     n_s, n, rank, p = problem.layout.n_s, len(Z.tall) // 2, Z.columns, problem.C_s.shape[0]

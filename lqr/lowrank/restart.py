@@ -11,12 +11,12 @@ import numpy as np
 from softgrasp.fem.errors import CheckpointError, agree
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.sealed import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
-from softgrasp.lqr.lowrank.adi import SHARE, Columns, Sweep
+from softgrasp.lqr.lowrank.adi import SHARE, AdiSweep, FactorColumns
 from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
 
-FORMAT = 3
+FORMAT = 4
 
 
 @dataclass
@@ -45,7 +45,7 @@ def _manifest(folder: Path) -> Path:
     return folder / "newton.json"
 
 
-def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> None:
+def save_state(folder: Path, plant: Plant, state: Iteration, sweep: AdiSweep) -> None:
     """Write everything a resumed run needs. Collective. Raises CheckpointError: the folder cannot be written."""
     keys = sorted(set.intersection(*map(set, state.history))) if state.history else []  # the last of a sweep has more
     entries: dict[str, Any] = {
@@ -82,16 +82,15 @@ def save_state(folder: Path, plant: Plant, state: Iteration, sweep: Sweep) -> No
             remove_others(folder, ["newton-*"], dict(files))
 
 
-def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> Sweep | None:
+def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> AdiSweep | None:
     """Put ``state`` back and return the sweep in progress; None without restart files. Collective.
 
-    Raises:
-        CheckpointError: the files are damaged or belong to another problem, tolerance apart, or rank count.
+    Raises CheckpointError: the files are damaged or belong to another problem, tolerance apart, or rank count.
     """
     comm, manifest = plant.comm, _manifest(folder)
     if not comm.bcast(manifest.exists()):
         return None
-    sweep: Sweep | None = None
+    sweep: AdiSweep | None = None
     advice = f"remove the folder {folder}"
     with agree(comm):
         entry = read_manifest(manifest, FORMAT, advice)
@@ -106,18 +105,18 @@ def load_state(folder: Path, plant: Plant, state: Iteration, tol: float) -> Swee
     return sweep
 
 
-def _restore(plant: Plant, state: Iteration, data: dict[str, Array], tol: float) -> Sweep:
+def _restore(plant: Plant, state: Iteration, data: dict[str, Array], tol: float) -> AdiSweep:
     state.step, state.solves, steps = (int(value) for value in data["numbers"])
     state.achieved, first = (float(value) for value in data["norms"])
     keys = [str(key) for key in data["history_keys"]]
     state.history = [dict(zip(keys, map(float, row), strict=True)) for row in data["history"]]
     if "factor_signs" in data:
         state.factor = (Block(data["factor_hand"], data["factor_tall"]), data["factor_signs"])
-    Z = Columns(plant, SHARE * tol * plant.scale)
+    Z = FactorColumns(plant, SHARE * tol * plant.scale)
     Z.hand, Z.tall = np.ascontiguousarray(data["Z_hand"]), np.ascontiguousarray(data["Z_tall"])
     Z.count, Z.compressed_to = Z.hand.shape[1], int(data["compressed_to"])
     Z.appended = int(data["appended"])
     Z.widths = [int(width) for width in data["widths"]]
-    sweep = Sweep(Right(data["sweep_hand"], data["sweep_rows"]), Z, steps, first)
+    sweep = AdiSweep(Right(data["sweep_hand"], data["sweep_rows"]), Z, steps, first=first)
     state.gain = sweep.gain
     return sweep

@@ -23,24 +23,17 @@ GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
 
 
 class ShiftedTissue(Protocol):
-    """Solves S(p) B = F for distributed F.
+    """Solves S(p) B = F for distributed F."""
 
-    Attributes:
-        name: gathered or distributed.
-        seconds: time by stage, factor and solve [s].
-        factors: factorisations made by this rank's communicator.
-    """
-
-    name: str
-    seconds: dict[str, float]
-    factors: int
+    name: str  # gathered or distributed
+    seconds: dict[str, float]  # time by stage, factor and solve [s]
+    factors: int  # factorisations made by this rank's communicator
 
     def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
         """Local rows of S(p)^{-1} F, (n_local, k). Collective.
 
         Args:
             p: shift; 0 gives K_ee^{-1}.
-            F: local rows.
             ahead: shifts that will probably come next.
         """
 

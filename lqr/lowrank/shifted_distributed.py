@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.sparse
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError, agree
@@ -44,21 +45,9 @@ class DistributedTissue:
         return np.asarray(values)
 
     def _set_up(self, comm: MPI.Intracomm) -> None:
-        n = self.n_local
-        lengths = np.repeat(2 * np.diff(self.indptr), 2)
-        self.real_indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
-        # rows 2i and 2i + 1 have the same columns: 2j and 2j + 1 for every j of row i
-        pair = (2 * np.repeat(self.columns, 2).reshape(-1, 2) + [0, 1]).astype(np.int32)
-        entry = np.repeat(np.arange(n), np.diff(self.indptr))
-        first = self.real_indptr[2 * entry] + 2 * (np.arange(len(entry)) - self.indptr[entry])
-        second = self.real_indptr[2 * entry + 1] + 2 * (np.arange(len(entry)) - self.indptr[entry])
-        self.at = (first, first + 1, second, second + 1)
-        self.real_columns = np.empty(int(self.real_indptr[-1]), dtype=np.int32)
-        for position, column in zip(self.at, (pair[:, 0], pair[:, 1]) * 2, strict=True):
-            self.real_columns[position] = column
+        S, n = self._real_form(0.0), self.n_local
         sizes = ((2 * n, 2 * self.n_e), (2 * n, 2 * self.n_e))
-        data = self._data(0.0)
-        self.S = PETSc.Mat().createAIJ(sizes, csr=(self.real_indptr, self.real_columns, data), comm=comm)
+        self.S = PETSc.Mat().createAIJ(sizes, csr=(S.indptr, S.indices, S.data), comm=comm)
         self.S.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.ksp = PETSc.KSP().create(comm)
         self.ksp.setOptionsPrefix(PREFIX)
@@ -71,18 +60,19 @@ class DistributedTissue:
         with petsc_options(PREFIX, {"mat_mumps_icntl_12": 1, "mat_mumps_icntl_14": 40}):
             self.ksp.setFromOptions()
 
-    def _data(self, p: complex) -> Array:
+    def _real_form(self, p: complex) -> scipy.sparse.csr_matrix:
+        """Local rows of the real form of S(p), a block of 2 x 2 an entry."""
         m, k = p * p - p * self.alpha, 1.0 - p * self.beta
         S = np.asarray(k * self.K + m * self.M, dtype=complex)
         if self.D is not None:
             S -= p * self.D
-        data = np.empty(int(self.real_indptr[-1]))
-        for position, value in zip(self.at, (S.real, -S.imag, -S.imag, -S.real), strict=True):
-            data[position] = value
-        return data
+        blocks = np.stack([S.real, -S.imag, -S.imag, -S.real], axis=-1).reshape(-1, 2, 2)
+        shape = (2 * self.n_local, 2 * self.n_e)
+        return scipy.sparse.bsr_matrix((blocks, self.columns, self.indptr), shape=shape).tocsr()
 
     def _factor(self, p: complex) -> None:
-        self.S.setValuesCSR(self.real_indptr, self.real_columns, self._data(p))
+        S = self._real_form(p)
+        self.S.setValuesCSR(S.indptr, S.indices, S.data)
         self.S.assemble()
         self.ksp.setOperators(self.S)  # without it setUp takes the old factor for good
         try:

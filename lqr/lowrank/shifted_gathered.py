@@ -13,7 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.errors import SolverError, agree
-from softgrasp.fem.petsc import Array, Complex, PETSc
+from softgrasp.fem.petsc import Array, Complex, PETSc, whole_copy
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.factor_ahead import FactorsAhead
 
@@ -61,7 +61,7 @@ class GatheredTissue:
 
     def _permuted(self, matrices: Sequence[PETSc.Mat]) -> tuple[list[scipy.sparse.csc_matrix], NDArray[np.int64]]:
         """All rows on every rank in the nested dissection order of the first, and that order. Collective."""
-        copies = [self._gather(A) for A in matrices] if self.comm.size > 1 else []
+        copies = [whole_copy(A) for A in matrices] if self.comm.size > 1 else []
         whole = copies or matrices
         rows, columns = whole[0].getOrdering("nd")
         parts = []
@@ -75,13 +75,6 @@ class GatheredTissue:
         for item in (rows, columns, *copies):
             item.destroy()
         return parts, order
-
-    def _gather(self, A: PETSc.Mat) -> PETSc.Mat:
-        indptr, columns, values = A.getValuesCSR()
-        parts = self.comm.allgather((np.diff(indptr), columns, values))
-        lengths, columns, values = (np.concatenate([part[i] for part in parts]) for i in range(3))
-        indptr = np.concatenate([[0], np.cumsum(lengths)]).astype(columns.dtype)
-        return PETSc.Mat().createAIJ(A.getSize(), csr=(indptr, columns, values), comm=PETSc.COMM_SELF)
 
     def _matrix(self, p: complex, shell: int) -> scipy.sparse.csc_matrix:
         p = p if p.imag else p.real

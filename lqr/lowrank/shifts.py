@@ -32,11 +32,7 @@ class ShiftRange:
     high: float
     fastest: float
 
-    def clip(self, p: complex) -> complex:
-        """Nearest admissible shift in the left half plane, Im >= 0."""
-        return complex(self.clip_all(np.array([p], dtype=complex))[0])
-
-    def clip_all(self, values: np.ndarray) -> np.ndarray:
+    def clip(self, values: np.ndarray) -> np.ndarray:
         """Nearest admissible shifts in the left half plane, Im >= 0, (k,)."""
         size = np.abs(values)
         usable = np.isfinite(size) & (size > 0)
@@ -76,8 +72,7 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
         W: residual factor.
         gain: K', None for K = 0.
 
-    Returns:
-        The values, and the norm of the component of W along each Ritz vector.
+    Returns the values, and the norm of the component of W along each Ritz vector.
     """
     empty = Block(np.zeros((2 * plant.n_s, 0)), np.zeros((2 * plant.n_local, 0)))
     F, G, seen, X_part = energy_products(plant, V, W, empty if gain is None else gain.block)
@@ -174,7 +169,7 @@ class ShiftQueue:
     def start(cls, limits: ShiftRange, poles: Sequence[complex] | np.ndarray) -> ShiftQueue:
         """The hand's and the lightly damped poles in their order, clipped, doubles removed."""
         pending: list[complex] = []
-        for i, p in enumerate(limits.clip_all(np.asarray(poles, dtype=complex)).tolist()):
+        for i, p in enumerate(limits.clip(np.asarray(poles, dtype=complex)).tolist()):
             important = i < 4 or -p.real < SHARP * abs(p)
             if important and all(abs(p - q) > 1e-3 * abs(p.real) for q in pending):
                 pending.append(p)
@@ -188,7 +183,7 @@ class ShiftQueue:
         """Ritz values of the recent blocks, clipped and chosen. Collective."""
         values, sizes = ritz_pairs(plant, recent, W, gain)
         upper = values.imag >= 0
-        clipped = self.limits.clip_all(values[upper])
+        clipped = self.limits.clip(values[upper])
         weights = sizes[upper] * np.abs(clipped)  # from the energy norm to the 2-norm of the residual
         self.pending += on_root(plant.comm, partial(choose_shifts, clipped, weights, BATCH, self.pending))
         self.projections += 1

@@ -40,7 +40,6 @@ def make_solution(plant: Plant, iterate: Iterate, start: float, check: bool = Tr
     """Compress, leave the costate scaling and recompute the residual from Z. Collective.
 
     Args:
-        iterate: columns and gain.
         start: clock when the solver began [s].
         check: raise when the true residual misses the tolerance.
 

@@ -49,13 +49,9 @@ def check_weights(Q: Array, R: Array, outputs: int, inputs: int) -> None:
 
 
 def check_finite(**arrays: Array | None) -> None:
-    """Every array holds finite numbers only.
+    """Every array holds finite numbers only. ``arrays``: by the name that a message should use; None is skipped.
 
-    Args:
-        arrays: by the name that a message should use; None is skipped.
-
-    Raises:
-        ControlError: an entry is infinite or no number.
+    Raises ControlError: an entry is infinite or no number.
     """
     for name, array in arrays.items():
         if array is not None and not np.isfinite(array).all():

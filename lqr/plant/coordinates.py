@@ -29,41 +29,26 @@ def _under(system: BlockSystem, local: Array) -> Array:
     return total(system.layout.comm, system.T.T @ local)
 
 
-def states_to_relative(system: BlockSystem, X: Block) -> Block:
-    """S X."""
+def states_to_relative(system: BlockSystem, X: Block, sign: int = 1) -> Block:
+    """S X; S^{-1} X for the other sign."""
     q_s, v_s, q, v = _split(system, X)
-    return Block(X.hand, np.concatenate([q - system.T @ q_s, v - system.T @ v_s]))
+    return Block(X.hand, np.concatenate([q - sign * (system.T @ q_s), v - sign * (system.T @ v_s)]))
 
 
-def states_to_absolute(system: BlockSystem, X: Block) -> Block:
-    """S^{-1} X."""
-    q_s, v_s, z, v = _split(system, X)
-    return Block(X.hand, np.concatenate([z + system.T @ q_s, v + system.T @ v_s]))
-
-
-def costates_to_absolute(system: BlockSystem, Z: Block) -> Block:
-    """L' Z: a factor of P from a factor of X. Collective."""
+def costates_to_absolute(system: BlockSystem, Z: Block, sign: int = 1) -> Block:
+    """L' Z, a factor of P from a factor of X; L'^{-1} Z for the other sign. Collective."""
     q_s, v_s, z, v = _split(system, Z)
     if system.two_way:
-        v = v + system.T @ v_s
-    return Block(np.concatenate([q_s - _under(system, z), v_s]), np.concatenate([z, v]))
+        v = v + sign * (system.T @ v_s)
+    return Block(np.concatenate([q_s - sign * _under(system, z), v_s]), np.concatenate([z, v]))
 
 
 def costates_to_relative(system: BlockSystem, Z: Block) -> Block:
     """L'^{-1} Z: a factor of X from a factor of P. Collective."""
-    q_s, v_s, z, v = _split(system, Z)
-    if system.two_way:
-        v = v - system.T @ v_s
-    return Block(np.concatenate([q_s + _under(system, z), v_s]), np.concatenate([z, v]))
+    return costates_to_absolute(system, Z, -1)
 
 
-def gain_to_absolute(system: BlockSystem, K: Block) -> Block:
-    """S' K' for a transposed gain: K = K_rel S. Collective."""
+def gain_to_absolute(system: BlockSystem, K: Block, sign: int = 1) -> Block:
+    """S' K' for a transposed gain, K = K_rel S; S'^{-1} K' for the other sign. Collective."""
     q_s, v_s, z, v = _split(system, K)
-    return Block(np.concatenate([q_s - _under(system, z), v_s - _under(system, v)]), K.tall)
-
-
-def gain_to_relative(system: BlockSystem, K: Block) -> Block:
-    """S'^{-1} K' for a transposed gain. Collective."""
-    q_s, v_s, z, v = _split(system, K)
-    return Block(np.concatenate([q_s + _under(system, z), v_s + _under(system, v)]), K.tall)
+    return Block(np.concatenate([q_s - sign * _under(system, z), v_s - sign * _under(system, v)]), K.tall)

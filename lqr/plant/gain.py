@@ -13,15 +13,12 @@ from softgrasp.lqr.plant.block import Block
 
 @dataclass(frozen=True)
 class PlantState:
-    """x = [q_s, v_s, z, v_z] with z = q_e - T q_s.
+    """x = [q_s, v_s, z, v_z] with z = q_e - T q_s."""
 
-    Attributes:
-        q_s, v_s: hand [m, rad] and [m/s, rad/s], (n_s,), on every rank.
-        z, v_z: relative displacement [m] and velocity [m/s] of the tissue, local rows (n_local,).
-    """
-
+    # q_s, v_s: hand [m, rad] and [m/s, rad/s], (n_s,), on every rank
     q_s: Array
     v_s: Array
+    # z, v_z: relative displacement [m] and velocity [m/s] of the tissue, local rows (n_local,)
     z: Array
     v_z: Array
 
@@ -36,14 +33,10 @@ class PlantState:
 
 @dataclass(frozen=True)
 class Gain:
-    """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z.
+    """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z."""
 
-    Attributes:
-        K_s: gain on the hand [N/m, N s/m; N m for torques], (n_s, 2 n_s), on every rank.
-        K_z, K_v: gain on z and v_z, transposed, local rows (n_local, n_s).
-    """
-
-    K_s: Array
+    K_s: Array  # gain on the hand [N/m, N s/m; N m for torques], (n_s, 2 n_s), on every rank
+    # K_z, K_v: gain on z and v_z, transposed, local rows (n_local, n_s)
     K_z: Array
     K_v: Array
 

@@ -15,15 +15,10 @@ from softgrasp.fem.petsc import Array
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 
-def gain_translation(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
-    """Gain u for the whole body displaced by unit translations, (n_s, d) [N/m]."""
-    return np.asarray(solution.gain.K_s[:, : problem.layout.dimension])
-
-
-def gain_rigid_velocity(problem: RiccatiProblem, solution: RiccatiSolution) -> Array:
-    """Gain u for the whole body moving with unit velocities, (n_s, d) [N s/m]."""
-    n_s = problem.layout.n_s
-    return np.asarray(solution.gain.K_s[:, n_s : n_s + problem.layout.dimension])
+def rigid_gains(problem: RiccatiProblem, solution: RiccatiSolution) -> tuple[Array, Array]:
+    """Gain u for the whole body displaced by unit translations [N/m], and moving so [N s/m], (n_s, d) each."""
+    n_s, d, K = problem.layout.n_s, problem.layout.dimension, solution.gain.K_s
+    return K[:, :d], K[:, n_s : n_s + d]
 
 
 def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float:

@@ -15,39 +15,33 @@ def modes_couple(system: BlockSystem) -> bool:
     return system.damping.matrix is not None or (system.two_way and system.damping.alpha > 0)
 
 
-def damp(system: BlockSystem, X: Array) -> Array:
-    """D_ee X for local rows. Collective."""
-    damping = system.damping
-    result = np.zeros_like(X)
+def damp(system: BlockSystem, X: Array, M_X: Array | None = None, K_X: Array | None = None) -> Array:
+    """D_ee X for local rows, with M_ee X and K_ee X where they are there already. Collective."""
+    damping, result = system.damping, np.zeros_like(X)
     if damping.alpha:
-        result += damping.alpha * times_columns(system.M_ee, X)
+        result += damping.alpha * (times_columns(system.M_ee, X) if M_X is None else M_X)
+    if damping.beta:
+        result += damping.beta * (times_columns(system.K_ee, X) if K_X is None else K_X)
     if damping.matrix is not None:
         result += times_columns(damping.matrix, X)
-    elif damping.beta:
-        result += damping.beta * times_columns(system.K_ee, X)
     return result
 
 
-def descriptor(problem: RiccatiProblem, X: Block) -> Block:
-    """E X. Collective."""
+def descriptor(problem: RiccatiProblem, X: Block, *, adjoint: bool = False) -> Block:
+    """E X, or E' X. Collective."""
     system, n_s, n = problem.system, problem.layout.n_s, problem.layout.n_local
     v_s, v = X.hand[n_s:], X.tall[n:]
-    hand = problem.M_s @ v_s
-    if system.two_way:
+    hand, momentum = problem.M_s @ v_s, times_columns(system.M_ee, v)
+    if system.two_way or adjoint:
         hand = hand + total(system.layout.comm, system.G.T @ v)
-    momentum = times_columns(system.M_ee, v) + system.G @ v_s
+    if system.two_way or not adjoint:
+        momentum = momentum + system.G @ v_s
     return Block(np.concatenate([X.hand[:n_s], hand]), np.concatenate([X.tall[:n], momentum]))
 
 
 def descriptor_adjoint(problem: RiccatiProblem, Z: Block) -> Block:
     """E' Z. Collective."""
-    system, n_s, n = problem.system, problem.layout.n_s, problem.layout.n_local
-    v_s, v = Z.hand[n_s:], Z.tall[n:]
-    hand = problem.M_s @ v_s + total(system.layout.comm, system.G.T @ v)
-    momentum = times_columns(system.M_ee, v)
-    if system.two_way:
-        momentum = momentum + system.G @ v_s
-    return Block(np.concatenate([Z.hand[:n_s], hand]), np.concatenate([Z.tall[:n], momentum]))
+    return descriptor(problem, Z, adjoint=True)
 
 
 def dynamics(problem: RiccatiProblem, X: Block) -> Block:
@@ -69,6 +63,13 @@ def inputs_adjoint(problem: RiccatiProblem, Z: Block) -> Array:
     if problem.B_z is None:
         return Z.hand[problem.layout.n_s :]
     return total(problem.layout.comm, problem.B_z.T @ Z.tall[problem.layout.n_local :])
+
+
+def normalising(gram: Array, share: float, least: float = 0.0) -> Array:
+    """S with S'gram S = I on the eigenvectors of gram above ``least`` and a share of the largest eigenvalue."""
+    sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
+    keep = sizes > max(least, share * float(sizes.max(initial=0.0)))
+    return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
 
 
 def modal_inputs(problem: RiccatiProblem, Phi: Array) -> Array:

@@ -32,8 +32,7 @@ def second_order(
         matrices: M, D, K, AIJ.
         B: forces of the inputs, local rows (n_local, m).
         C: outputs of the displacement, transposed, local rows (n_local, p).
-        Q: (p, p), symmetric positive semidefinite; None stands for I.
-        R: (m, m), symmetric positive definite; None stands for I.
+        Q, R: (p, p), symmetric positive semidefinite, and (m, m), symmetric positive definite; None stands for I.
         damping: what D is when it is known to be alpha M + beta K, which modes do not couple by; D is ignored then.
 
     Raises:

@@ -23,17 +23,11 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 
 @dataclass(frozen=True)
 class Target:
-    """State, input and outputs at rest.
+    """State, input and outputs at rest."""
 
-    Attributes:
-        state: x_bar.
-        u: steady input u_bar [N, N m], (n_s,).
-        y: outputs there [m], (p,).
-    """
-
-    state: PlantState
-    u: Array
-    y: Array
+    state: PlantState  # x_bar
+    u: Array  # steady input u_bar [N, N m], (n_s,)
+    y: Array  # outputs there [m], (p,)
 
 
 def steady_input(system: BlockSystem) -> Array:
@@ -57,8 +51,7 @@ def rest(system: BlockSystem, *, deformed: bool = True) -> PlantState:
 def hand_target(problem: RiccatiProblem, q_bar: Array) -> Target:
     """Rest with the hand at q_bar. Collective.
 
-    Args:
-        q_bar: displacement of the hand [m], (d,), which moves it without turning, or with angles [rad], (n_s,).
+    ``q_bar``: displacement of the hand [m], (d,), which moves it without turning, or with angles [rad], (n_s,).
 
     Raises:
         ControlError: q_bar has another number of entries, or one that is not finite.

@@ -73,33 +73,13 @@ class BasisFamily:
         return self.make(N)
 
 
-@dataclass(frozen=True)
-class _Factor:
-    """Z in the paper's coordinates with its parts by rows."""
-
-    problem: RiccatiProblem
-    Z: Block
-
-    @property
-    def q(self) -> Array:
-        return self.Z.tall[: self.problem.layout.n_local]
-
-    @property
-    def v(self) -> Array:
-        return self.Z.tall[self.problem.layout.n_local :]
-
-    def triangle(self, hand: Array, tall: Array) -> Array:
-        """R of the QR factorisation of some rows. Collective."""
-        return triangular(self.problem.layout.comm, Block(hand, np.ascontiguousarray(tall)))
-
-
 def left_singular(problem: RiccatiProblem, X: Block) -> tuple[Block, Array]:
     """Left singular vectors and values of a tall block, without those that are rounding. Collective."""
     comm = problem.layout.comm
     rows = np.vstack([X.hand, X.tall]) if comm.rank == 0 else X.tall
     f = factor(comm, rows)
     u, s, _ = small_svd(comm, f.R)
-    keep = s > f.floor * s[0]
+    keep = s > f.noise * s[0]
     U = f.Q @ u[:, keep]
     k = len(X.hand)
     hand = np.ascontiguousarray(comm.bcast(U[:k] if comm.rank == 0 else None))
@@ -107,25 +87,23 @@ def left_singular(problem: RiccatiProblem, X: Block) -> tuple[Block, Array]:
 
 
 def _whole(problem: RiccatiProblem, name: str, V: Block, sigma: Array) -> BasisFamily:
-    def make(N: int) -> RiccatiBasis:
-        part = V[:N]
-        system = problem.system
-        return RiccatiBasis(name, costates_to_relative(system, part), states_to_relative(system, part))
+    return BasisFamily(name, 1, V.columns, 1, (sigma,), lambda N: _basis(problem, name, V[:N]))
 
-    return BasisFamily(name, 1, V.columns, 1, (sigma,), make)
+
+def _basis(problem: RiccatiProblem, name: str, V: Block) -> RiccatiBasis:
+    return RiccatiBasis(name, costates_to_relative(problem.system, V), states_to_relative(problem.system, V))
 
 
 def _tissue(
     problem: RiccatiProblem, name: str, columns: Callable[[int], Array], count: int, step: int, sigma: tuple[Array, ...]
 ) -> BasisFamily:
     """V = blkdiag(I_{2 n_s}, V_e) with V_e = columns(k), local rows (2 n_local, k)."""
-    n_s, system = problem.layout.n_s, problem.system
+    n_s = problem.layout.n_s
 
     def make(N: int) -> RiccatiBasis:
         V_e = columns(N - 2 * n_s)
         hand = np.hstack([np.eye(2 * n_s), np.zeros((2 * n_s, V_e.shape[1]))])
-        V = Block(hand, np.hstack([np.zeros((len(V_e), 2 * n_s)), V_e]))
-        return RiccatiBasis(name, costates_to_relative(system, V), states_to_relative(system, V))
+        return _basis(problem, name, Block(hand, np.hstack([np.zeros((len(V_e), 2 * n_s)), V_e])))
 
     return BasisFamily(name, 2 * n_s, 2 * n_s + count, step, sigma, make)
 
@@ -140,10 +118,7 @@ def weighted_pod(problem: RiccatiProblem, Z: Block) -> BasisFamily:
     """V = W^{-1/2} POD_k(W^{1/2} P), W = (E + E')/2, so that V'WV = I. Collective.
 
     W^{1/2} P has the left singular vectors of W^{1/2} Y, Y = Z R_Z'; with Y = Q R, Q'W Q = LL', L'R = u s v' this gives
-    V = Q L^{-T} u: no root of W is needed.
-
-    Raises:
-        ControlError: W is not positive definite.
+    V = Q L^{-T} u: no root of W is needed. Raises ControlError: W is not positive definite.
     """
     check_weight(problem)
     comm = problem.layout.comm
@@ -171,11 +146,11 @@ def componentwise_pod(problem: RiccatiProblem, Z: Block) -> BasisFamily:
 
     k1 = k2, or k1 = k2 + 1 when N is odd.
     """
-    parts, n_s, n = _Factor(problem, Z), problem.layout.n_s, problem.layout.n_local
-    R_c = parts.triangle(Z.hand[:n_s], Z.tall)
+    n_s, n = problem.layout.n_s, problem.layout.n_local
+    R_c = triangular(problem.layout.comm, Block(Z.hand[:n_s], Z.tall))
     none = np.zeros((0, len(R_c)))
-    V_q, s_q = left_singular(problem, Block(none, parts.q @ R_c.T))
-    V_v, s_v = left_singular(problem, Block(none, parts.v @ R_c.T))
+    V_q, s_q = left_singular(problem, Block(none, Z.tall[:n] @ R_c.T))
+    V_v, s_v = left_singular(problem, Block(none, Z.tall[n:] @ R_c.T))
 
     def columns(k: int) -> Array:
         k_1, k_2 = (k + 1) // 2, k // 2
@@ -187,19 +162,17 @@ def componentwise_pod(problem: RiccatiProblem, Z: Block) -> BasisFamily:
     return _tissue(problem, "componentwise_pod", columns, count, 1, (s_q, s_v))
 
 
-def _doubled(V_1: Array) -> Array:
-    """blkdiag(V_1, V_1)."""
-    zero = np.zeros_like(V_1)
-    return np.vstack([np.hstack([V_1, zero]), np.hstack([zero, V_1])])
-
-
 def pod_decomposed(problem: RiccatiProblem, Z: Block) -> BasisFamily:
     """V = blkdiag(I, V_1, V_1), V_1 = POD_k([P_ee11, P_ee12, P_ee21, P_ee22]). Collective."""
-    parts = _Factor(problem, Z)
-    R_e = parts.triangle(np.zeros((0, Z.columns)), Z.tall)
-    both = np.hstack([parts.q @ R_e.T, parts.v @ R_e.T])
+    R_e = triangular(problem.layout.comm, Block(Z.hand[:0], Z.tall))
+    both = np.hstack([part @ R_e.T for part in np.vsplit(Z.tall, 2)])
     V, s = left_singular(problem, Block(np.zeros((0, both.shape[1])), both))
-    return _tissue(problem, "pod_decomposed", lambda k: _doubled(V.tall[:, : k // 2]), 2 * V.columns, 2, (s,))
+
+    def columns(k: int) -> Array:
+        V_1 = V.tall[:, : k // 2]
+        return np.asarray(scipy.linalg.block_diag(V_1, V_1))
+
+    return _tissue(problem, "pod_decomposed", columns, 2 * V.columns, 2, (s,))
 
 
 STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
@@ -291,8 +264,7 @@ def weight_times(problem: RiccatiProblem, X: Block) -> Block:
 def check_weight(problem: RiccatiProblem) -> None:
     """W is positive definite: M_ss - N' M_ee^{-1} N > 0 for its coupling block N. Collective.
 
-    Raises:
-        ControlError: it is not; the hand is too light.
+    Raises ControlError: it is not; the hand is too light.
     """
     system = problem.system
     M_ss, coupling = weight_blocks(problem)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +17,8 @@ from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.reduced.riccati import GainJudge, Verdict, gain_error, project_plant
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop, SampledRadius
+from softgrasp.lqr.reduced.riccati import NAN, GainJudge, GainQuality, project_plant
+from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
 
 Materials = tuple[LayerMaterial, ...]
@@ -75,8 +75,7 @@ class Retuner:
     def at(self, materials: Materials) -> ReducedMatrices:
         """The reduced equation for other Lame constants and viscosities.
 
-        Raises:
-            ControlError: the number of layers or a density differs from the reference.
+        Raises ControlError: the number of layers or a density differs from the reference.
         """
         if len(materials) != len(self.reference):
             raise ControlError(f"{len(materials)} materials are given; the body has {len(self.reference)} layers")
@@ -103,67 +102,33 @@ class Retuner:
 
 
 @dataclass(frozen=True)
-class BoxPoint(Verdict):
-    """One setting of the box: errors against the full Riccati solution there.
+class RetunedGain(GainQuality):
+    """The gain at one setting of the box, against the full Riccati solution there."""
 
-    ``reason`` says why there is no gain; ``stable`` comes from the spectrum of the full closed loop, and from tick to
-    tick where its instants are known; bounds of the cost are those of :func:`softgrasp.lqr.design.bounds.with_bounds`.
-    """
-
-    materials: Materials
-    error_K: float  # noqa: N815
-    cost_excess: float
-    abscissa_full: float
-    seconds: float
-    reason: str = ""
-    certified: bool = True
-    sampled: SampledRadius | None = None
-    gain: Gain | None = None
-    cost_excess_at_most: float = float("nan")
-    cost_excess_proved: float = float("nan")
+    materials: Materials  # of all layers
+    seconds: float = NAN  # of the re-tuning
 
 
-def over_box(
+def retuned_gain(
     retuner: Retuner,
-    settings: Sequence[Materials],
+    materials: Materials,
     solve: Callable[[RiccatiProblem], RiccatiSolution],
     start: Block,
     modes: int | None = None,
     law: Sampling | None = None,
-) -> tuple[BoxPoint, ...]:
-    """Error of the re-tuned gain at every setting of a box. Collective.
+) -> RetunedGain:
+    """Error of the re-tuned gain at one setting of the box. Collective.
 
     Args:
-        retuner: the reduced components.
-        settings: materials of all layers, one tuple per point.
         solve: full solver, the reference.
         start: start minus target of hand and tissue, one column.
         modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
         law: instants of the loop; None judges the continuous law alone.
     """
-    result = []
-    comm = retuner.problem.layout.comm
-    for materials in settings:
-        problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
-        try:
-            tuned = on_root(comm, lambda materials=materials: retuner.solve(materials))  # type: ignore[misc]
-        except ControlError as error:
-            nan = float("nan")
-            result.append(BoxPoint(materials, nan, nan, nan, nan, str(error)))
-            continue
-        gain = retuner.full_gain(tuned)
-        best = solve(problem)
-        quality = GainJudge(problem, best, start, ModalLoop(problem, modes), law).quality(gain)
-        result.append(
-            BoxPoint(
-                materials,
-                gain_error(problem, best.gain, gain),
-                quality.cost_excess,
-                quality.abscissa,
-                tuned.seconds,
-                certified=quality.certified,
-                sampled=quality.sampled,
-                gain=gain,
-            )
-        )
-    return tuple(result)
+    try:
+        tuned = on_root(retuner.problem.layout.comm, lambda: retuner.solve(materials))
+    except ControlError as error:
+        return RetunedGain(materials, reason=str(error))
+    problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
+    judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
+    return judge.with_quality(RetunedGain(materials, tuned.seconds), retuner.full_gain(tuned))

@@ -21,6 +21,8 @@ from softgrasp.lqr.spectrum.certificate import certified_abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radius
 
+NAN = float("nan")
+
 
 @dataclass(frozen=True)
 class ReducedRiccati:
@@ -32,14 +34,19 @@ class ReducedRiccati:
     gain: Gain  # K_hat on the full plant
 
 
-class Verdict:
-    """What follows from a judged gain's numbers."""
+@dataclass(frozen=True, kw_only=True)
+class GainQuality:
+    """A gain against the optimal one, on the full plant; nan where there is none."""
 
-    reason: str
-    certified: bool
-    abscissa_full: float
-    sampled: SampledRadius | None
-    cost_excess_at_most: float
+    error_K: float = NAN  # noqa: N815  ||K - K_hat||_F / ||K||_F in the paper's coordinates
+    cost_excess: float = NAN  # J(K_hat) / J(K) - 1 from the scene's start on the full plant
+    abscissa_full: float = NAN  # largest real part of the full closed loop [1/s]
+    reason: str = ""  # why there is no gain; empty when there is one
+    certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
+    sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
+    gain: Gain | None = None  # K_hat; None where there is none
+    cost_excess_at_most: float = NAN  # bound on the excess; nan where not asked for
+    cost_excess_proved: float = NAN  # the part that is proved, see softgrasp.lqr.design.bounds.with_bounds
 
     @property
     def stable(self) -> bool:
@@ -59,23 +66,13 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class GainReport(Verdict):
-    """A reduced gain against the optimal one, on the full plant."""
+class GainReport(GainQuality):
+    """The gain of one reduced equation."""
 
     method: str  # key of the basis
     N: int  # order of the reduced equation
-    # ||P - P_hat||_F / ||P||_F and ||K - K_hat||_F / ||K||_F in the paper's coordinates
-    error_P: float  # noqa: N815
-    error_K: float  # noqa: N815
-    cost_excess: float  # J(K_hat) / J(K) - 1 from the scene's start on the full plant
-    abscissa_full: float  # largest real part of the full closed loop [1/s]
-    time_are: float = float("nan")  # seconds of one solution of the reduced equation, for who measures it
-    reason: str = ""  # why there is no gain; empty when there is one
-    certified: bool = True  # the sign of the abscissa is certain, see LoopQuality
-    sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
-    gain: Gain | None = None  # K_hat; None where there is none
-    cost_excess_at_most: float = float("nan")  # bound on the excess; nan where not asked for
-    cost_excess_proved: float = float("nan")  # the part that is proved, see softgrasp.lqr.design.bounds.with_bounds
+    error_P: float = NAN  # noqa: N815  ||P - P_hat||_F / ||P||_F in the paper's coordinates
+    time_are: float = NAN  # seconds of one solution of the reduced equation, for who measures it
     matrices: ReducedMatrices | None = None  # of the reduced equation; None where they are not kept
 
 
@@ -103,12 +100,9 @@ def reduce_riccati(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedRicca
 
     The basis is scaled to energy first, and the equation is solved on rank 0.
 
-    Args:
-        problem: the plant of full order.
-        basis: costates W and states U of N columns.
+    ``basis``: costates W and states U of N columns.
 
-    Raises:
-        ControlError: the reduced equation has no stabilising solution.
+    Raises ControlError: the reduced equation has no stabilising solution.
     """
     basis = energy_scaled(problem, basis)
     matrices = project_plant(problem, basis)
@@ -174,8 +168,7 @@ class GainJudge:
         :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa` and the cost from the lowest modes; where
         the certificate fails, all modes are taken up to :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
 
-        Raises:
-            SolverError: no eigenvalue converges, and there are too many modes to take all.
+        Raises SolverError: no eigenvalue converges, and there are too many modes to take all.
         """
         K = gain.block
         if self.loop.complete:
@@ -216,24 +209,21 @@ class GainJudge:
         A reduced equation without solution is reported, not raised; a gain whose spectrum does not converge is not
         certified.
         """
-        nan = float("nan")
         try:
             reduced = reduce_riccati(self.problem, basis)
         except ControlError as error:
-            return GainReport(basis.name, basis.N, nan, nan, nan, nan, reason=str(error))
+            return GainReport(basis.name, basis.N, reason=str(error))
+        off = factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N)
+        report = GainReport(basis.name, basis.N, off, matrices=reduced.matrices, gain=reduced.gain)
         try:
-            quality = self.quality(reduced.gain)
+            return self.with_quality(report, reduced.gain)
         except SolverError:
-            quality = LoopQuality(nan, nan, False)
-        return GainReport(
-            method=basis.name,
-            N=basis.N,
-            error_P=factor_error(self.problem, self.Z_absolute, reduced.basis, reduced.P_N),
-            error_K=gain_error(self.problem, self.gain, reduced.gain),
-            cost_excess=quality.cost_excess,
-            abscissa_full=quality.abscissa,
-            certified=quality.certified,
-            sampled=quality.sampled,
-            gain=reduced.gain,
-            matrices=reduced.matrices,
-        )
+            return replace(report, error_K=gain_error(self.problem, self.gain, reduced.gain), certified=False)
+
+    def with_quality[Figures: GainQuality](self, report: Figures, gain: Gain) -> Figures:
+        """The same with the figures of a gain. Collective. Raises SolverError: see :meth:`quality`."""
+        quality = self.quality(gain)
+        return replace(
+            report, gain=gain, error_K=gain_error(self.problem, self.gain, gain), cost_excess=quality.cost_excess,
+            abscissa_full=quality.abscissa, certified=quality.certified, sampled=quality.sampled,
+        )  # fmt: skip

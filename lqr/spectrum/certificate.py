@@ -32,29 +32,19 @@ NEARLY = 1e-3  # share of the abscissa by which an eigenvalue outside may exceed
 
 @dataclass(frozen=True)
 class Abscissa:
-    """Largest real part of the closed-loop spectrum.
+    """Largest real part of the closed-loop spectrum."""
 
-    Attributes:
-        value: over the eigenvalues found [1/s]: a lower bound of the abscissa, which exceeds it by at most a thousandth
-            where ``exact``.
-        certified: the sign of ``value`` is that of the abscissa: it is >= 0, or no eigenvalue with Re s >= 0 lies
-            outside the radius.
-        radius: all eigenvalues with Re s >= 0 and |s| <= radius are among those found [1/s].
-        bound: of |K (sE - A)^{-1} B| over Re s >= 0, |s| >= radius; below 1 it excludes eigenvalues there.
-        eigenvalues: those found, nearest to ``shift`` first, (k,).
-        reason: why it is not certified; empty when it is.
-        exact: no eigenvalue outside lies right of ``value`` by more than a thousandth of it.
-        shift: real point whose neighbours were searched [1/s].
-    """
-
+    # over the eigenvalues found [1/s]: a lower bound of the abscissa, which exceeds it by at most a thousandth where
+    # ``exact``
     value: float
+    # the sign of ``value`` is that of the abscissa: it is >= 0, or no eigenvalue with Re s >= 0 lies outside the radius
     certified: bool
-    radius: float
-    bound: float
-    eigenvalues: np.ndarray
-    reason: str = ""
-    exact: bool = False
-    shift: float = 0.0
+    radius: float  # all eigenvalues with Re s >= 0 and |s| <= radius are among those found [1/s]
+    bound: float  # of |K (sE - A)^{-1} B| over Re s >= 0, |s| >= radius; below 1 it excludes eigenvalues there
+    eigenvalues: np.ndarray  # those found, nearest to ``shift`` first, (k,)
+    reason: str = ""  # why it is not certified; empty when it is
+    exact: bool = False  # no eigenvalue outside lies right of ``value`` by more than a thousandth of it
+    shift: float = 0.0  # real point whose neighbours were searched [1/s]
 
     @property
     def stable(self) -> bool:

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
-from softgrasp.lqr.dense.modal import ModalPlant, dense_modes, gather_tissue, modal_plant, modes_of_plant
+from softgrasp.lqr.dense.modal import (
+    ModalPlant,
+    TissueMatrices,
+    dense_modes,
+    gather_tissue,
+    modal_plant,
+    modes_of_plant,
+)
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import damp, modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -120,15 +128,8 @@ class ModalLoop:
 
 
 def _all(problem: RiccatiProblem) -> tuple[Array, Array, ModalPlant]:
-    layout = problem.layout
-    tissue = gather_tissue(problem)
-
-    def modes() -> ModalPlant:
-        if tissue is None:
-            raise RuntimeError("only rank 0 has the matrices")
-        return dense_modes(problem, tissue)
-
-    plant = on_root(layout.comm, modes)
+    layout, tissue = problem.layout, gather_tissue(problem)
+    plant: ModalPlant = on_root(layout.comm, lambda: dense_modes(problem, cast(TissueMatrices, tissue)))
     rows = slice(layout.start, layout.start + layout.n_local)
     return plant.Phi[rows], plant.massed[rows], plant
 

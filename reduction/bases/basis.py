@@ -35,38 +35,31 @@ class Basis:
     p_s = M_hand v_s of the hand when its rows take part. ``frame`` says whether the tissue rows are absolute or
     relative to the rigid motion of the hand, q_e = z + T q_s. With ``structure = "symplectic"`` the whole V is
     symplectic, V' J V = J; with ``fixed_solid`` its tissue columns are, by themselves.
-
-    Attributes:
-        name: key in the registry.
-        layout: sizes and ownership.
-        V_sq, V_sv: rows of the hand, (n_s, N), the same on every rank.
-        V_q, V_p: local rows of the tissue, (n_local, N): displacement, and velocity or momentum.
-        coordinates, frame, structure: see above.
-        fixed_solid: the first 2 n_s columns are the hand's own unit vectors.
-        inner: inner product it was built in, see `reduction/bases/inner.py`.
-        rate: weight c between displacement and momentum there; 1 unless the coordinates are canonical and weighted.
-        pairs: columns come as (first half; second half) with one complex structure on (q, p) or (q, v).
-        sigma: singular values the truncation was chosen from, descending (empty when no snapshots were used).
-        split: columns of every part of the decomposition; two for componentwise POD, displacement and velocity.
-        seconds: time to build it, by stage.
     """
 
-    name: str
-    layout: BlockLayout
+    name: str  # key in the registry
+    layout: BlockLayout  # sizes and ownership
+    # V_sq, V_sv: rows of the hand, (n_s, N), the same on every rank
     V_sq: Array
     V_sv: Array
+    # V_q, V_p: local rows of the tissue, (n_local, N): displacement, and velocity or momentum
     V_q: Array
     V_p: Array
+    # coordinates, frame, structure: see above
     coordinates: Coordinates = "qv"
     frame: Frame = "absolute"
     structure: Structure = "none"
-    fixed_solid: bool = False
+    fixed_solid: bool = False  # the first 2 n_s columns are the hand's own unit vectors
+    # inner product it was built in, see `reduction/bases/inner.py`
     inner: Literal["euclidean", "mass", "energy"] = "euclidean"
+    # weight c between displacement and momentum there; 1 unless the coordinates are canonical and weighted
     rate: float = 1.0
-    pairs: bool = False
+    pairs: bool = False  # columns come as (first half; second half) with one complex structure on (q, p) or (q, v)
+    # singular values the truncation was chosen from, descending (empty when no snapshots were used)
     sigma: tuple[Array, ...] = ()
+    # columns of every part of the decomposition; two for componentwise POD, displacement and velocity
     split: tuple[int, ...] = ()
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)  # time to build it, by stage
 
     @property
     def N(self) -> int:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.reduction.bases.pod import Request
+from softgrasp.reduction.bases.pod import PartsRequest
 from softgrasp.reduction.bases.truncation import Columns, Part
 
 
-def craig_bampton_parts(request: Request) -> tuple[Part, ...]:
+def craig_bampton_parts(request: PartsRequest) -> tuple[Part, ...]:
     """Clamped modes K_ee phi = omega^2 M_ee phi by SLEPc, used for z and for v_z: V_e = blkdiag(Phi, Phi) [CB68].
 
     The static modes -K_ee^-1 K_es are T, the rigid motion of the hand, because K_ee T + K_es = 0. In the

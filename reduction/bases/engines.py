@@ -44,7 +44,7 @@ class Factor:
     Q: Array  # local rows (n_local, r), orthonormal columns over all ranks
     R: Array  # (r, c), the same bits on every rank
     scale: float  # power of two that keeps squares of R from under- and overflow
-    floor: float  # singular values below ``floor * sigma_1`` are noise
+    noise: float  # singular values below ``noise * sigma_1`` are rounding
     partial: bool  # only the leading singular triplets were computed
     square: float  # sum of all sigma^2 of X / scale, also of those that are not in R
 
@@ -63,9 +63,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
     """Factor a row-distributed matrix. Collective.
 
     Args:
-        comm: ranks that share the rows.
         X: local rows (n_local, c); read only.
-        engine: see the module.
         k: number of leading triplets that are enough; ``tsqr`` makes all the same.
 
     Raises:
@@ -83,10 +81,10 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         raise BasisError("all snapshots are zero; there is nothing to build a basis from")
     rows = int(comm.allreduce(X.shape[0]))
     if engine == "gram":
-        Q, R, floor = *_gram(comm, X, k), GRAM_FLOOR
+        Q, R, noise = *_gram(comm, X, k), GRAM_FLOOR
     else:
         # LAPACK's own bound on an absolute error in sigma, with its usual factor sqrt of the size
-        floor = EPS * max(X.shape[1], 100) ** 0.5
+        noise = EPS * max(X.shape[1], 100) ** 0.5
         if comm.allreduce(X.shape[0], MPI.MIN) < X.shape[1]:
             # SLEPc loses columns of Q when a rank has fewer rows than columns and the snapshots are deficient
             Q, R = _flat(comm, X)
@@ -95,7 +93,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         else:
             Q, R = _svd(comm, X, rows, k)
     partial = engine != "tsqr" and k is not None and Q.shape[1] < min(rows, X.shape[1])
-    return Factor(Q, R, scale, floor, partial, square)
+    return Factor(Q, R, scale, noise, partial, square)
 
 
 def _dense(comm: MPI.Intracomm, X: Array, rows: int) -> PETSc.Mat:
@@ -178,11 +176,18 @@ def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
     return np.asfortranarray(Q_local @ comm.scatter(blocks)), np.asarray(comm.bcast(R))
 
 
-def _triangle(comm: MPI.Intracomm, X: Array) -> Array:
-    """R of X = Q R by QR of row blocks, then of the stacked triangles on rank 0."""
-    R = np.zeros((0, X.shape[1]))
+def triangle(comm: MPI.Intracomm, X: Array, top: Array | None = None) -> Array:
+    """R of X = Q R, without Q, by QR of row blocks, then of the stacked triangles on rank 0. Collective.
+
+    Args:
+        X: local rows (n_local, k).
+        top: rows above those of rank 0, known to every rank.
+    """
+    R = np.zeros((0, X.shape[1])) if top is None or comm.rank else top
     for i in range(0, len(X), BLOCK_ROWS):
         R = np.linalg.qr(np.vstack([R, X[i : i + BLOCK_ROWS]]), mode="r")
+    if comm.size == 1:
+        return R
     parts = comm.gather(R)
     return on_root(comm, lambda: np.linalg.qr(np.vstack(parts or []), mode="r"))
 
@@ -197,7 +202,7 @@ def _gram(comm: MPI.Intracomm, X: Array, k: int | None) -> tuple[Array, Array]:
         keep[k + k // 2 + 10 :] = False  # the last of those kept are not converged by the Rayleigh-Ritz step
     U = X @ (V[:, keep] / s[keep])
     # U is orthonormal to eps (sigma_1 / sigma_r)^2 only; dividing by its triangle keeps the nested spans
-    Q = np.asfortranarray(scipy.linalg.solve_triangular(_triangle(comm, U), U.T, trans="T", check_finite=False).T)
+    Q = np.asfortranarray(scipy.linalg.solve_triangular(triangle(comm, U), U.T, trans="T", check_finite=False).T)
     return Q, total(comm, Q.T @ X)
 
 

@@ -52,8 +52,7 @@ class Weight:
 def weights(system: BlockSystem, inner: InnerName) -> tuple[Weight, Weight] | None:
     """Weights of displacement and velocity in (q, v); None for the Euclidean product. Collective.
 
-    Raises:
-        BasisError: the name is unknown.
+    Raises BasisError: the name is unknown.
     """
     if inner == "euclidean":
         return None

@@ -20,7 +20,7 @@ Halves = list[tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
-class Request:
+class PartsRequest:
     """What a builder of parts gets."""
 
     states: States  # system and snapshots
@@ -41,8 +41,7 @@ class Request:
 def cholesky_of(comm: MPI.Intracomm, G: Array) -> Array:
     """Lower factor of a small Gram matrix (real or complex), the same bits on every rank. Collective.
 
-    Raises:
-        BasisError: the inner product is not positive definite.
+    Raises BasisError: the inner product is not positive definite.
     """
     try:
         return on_root(comm, lambda: np.linalg.cholesky((G + G.T.conj()) / 2))
@@ -80,11 +79,8 @@ def pod_part(
     They minimise sum_j |x_j - U U' W x_j|_W^2.
 
     Args:
-        title: what X holds, for messages.
-        rows: how X is stacked.
         X: snapshots, local rows (rows.local, m).
         by: weight of every half; None is Euclidean.
-        engine: engine of the tall factorisation.
         place: puts the rows of U into the rows of a basis.
         k: leading triplets that are enough, None for all.
     """
@@ -108,7 +104,7 @@ def pod_part(
         return (place(rows.split(U)),)
 
     square = f.square if L is None else float(np.sum(s**2))
-    return Part(title, s, square, int(np.count_nonzero(s > f.floor * s[0])), columns, f.scale)
+    return Part(title, s, square, int(np.count_nonzero(s > f.noise * s[0])), columns, f.scale)
 
 
 def _whole(halves: Halves) -> Columns:
@@ -126,7 +122,7 @@ def _velocity(halves: Halves) -> Columns:
     return Columns(np.zeros_like(s), s, np.zeros_like(e), e)
 
 
-def joint_parts(request: Request) -> tuple[Part, ...]:
+def joint_parts(request: PartsRequest) -> tuple[Part, ...]:
     """Global POD: V = POD_k(X), X = [q_s; v_s; q_e; v_e].
 
     With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e = POD_k(X_e), X_e = [q_e; v_e].
@@ -139,7 +135,7 @@ def joint_parts(request: Request) -> tuple[Part, ...]:
     return (pod_part("states", rows, X, by, request.engine, _whole, request.k),)
 
 
-def componentwise_parts(request: Request) -> tuple[Part, ...]:
+def componentwise_parts(request: PartsRequest) -> tuple[Part, ...]:
     """Componentwise POD: V = blkdiag(POD_k1(X_q), POD_k2(X_v)), displacement and velocity by themselves.
 
     With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e the same of the tissue's rows.

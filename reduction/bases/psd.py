@@ -21,7 +21,7 @@ from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.reduction.bases.engines import Factor, magnitude, small_svd
 from softgrasp.reduction.bases.inner import Rows, Weight, weights
-from softgrasp.reduction.bases.pod import Request, cholesky_of, weighted_factor
+from softgrasp.reduction.bases.pod import PartsRequest, cholesky_of, weighted_factor
 from softgrasp.reduction.bases.svd_like import svd_like_pairs, symplectic_repair
 from softgrasp.reduction.bases.truncation import Columns, Part
 
@@ -57,7 +57,7 @@ class Canonical:
         return Columns(s_q, s_p, e_q, e_p)
 
 
-def canonical(request: Request) -> Canonical:
+def canonical(request: PartsRequest) -> Canonical:
     """Factor [q~, y~] once, as real columns side by side: no Gram matrix, no complex arithmetic. Collective."""
     b, system = request.blocks, request.states.system
     rows, m = Rows(system.layout, 1, request.hand), b.e_q.shape[1]
@@ -94,7 +94,7 @@ def _rate(rows: Rows, Z: Array, by: Weight, m: int) -> float:
     return float(y / q) if q > 0 and y > 0 else 1.0
 
 
-def complex_svd_parts(request: Request) -> tuple[Part, ...]:
+def complex_svd_parts(request: PartsRequest) -> tuple[Part, ...]:
     """PSD complex SVD [PM16, Algorithm 2]: q + i p = E S C^H, V = [Re E, -Im E; Im E, Re E].
 
     V' V = I and V' J V = J at once (orthosymplectic); span of V is that of the leading left singular vectors of
@@ -117,7 +117,7 @@ def complex_svd_parts(request: Request) -> tuple[Part, ...]:
     return (_part("phase space", c, s, columns),)
 
 
-def cotangent_lift_parts(request: Request) -> tuple[Part, ...]:
+def cotangent_lift_parts(request: PartsRequest) -> tuple[Part, ...]:
     """PSD cotangent lift [PM16, Algorithm 1]: Phi = POD_k([q, p]), V = blkdiag(Phi, Phi).
 
     Phi' Phi = I, so that V' V = I and V' J V = J; weighted, V = blkdiag(Phi / sqrt(c), sqrt(c) A Phi) with
@@ -137,7 +137,7 @@ def cotangent_lift_parts(request: Request) -> tuple[Part, ...]:
     return (_part("phase space", c, s, columns),)
 
 
-def svd_like_parts(request: Request) -> tuple[Part, ...]:
+def svd_like_parts(request: PartsRequest) -> tuple[Part, ...]:
     """PSD SVD-like decomposition [BBH19, Algorithm 1]: X = S D Q with S symplectic, the pairs of largest weight.
 
     V' J V = J; V is not orthonormal. Directions without a well-conditioned partner in the snapshots get one from
@@ -166,5 +166,5 @@ def svd_like_parts(request: Request) -> tuple[Part, ...]:
 
 
 def _part(title: str, c: Canonical, s: Array, columns: Callable[[int], tuple[Columns, ...]]) -> Part:
-    rank = int(np.count_nonzero(s > c.factor.floor * s[0]))
+    rank = int(np.count_nonzero(s > c.factor.noise * s[0]))
     return Part(title, s, float(np.sum(s**2)), rank, columns, c.scale, c.rate)

@@ -13,7 +13,7 @@ from softgrasp.reduction.bases.basis import Basis, Coordinates, Frame, Structure
 from softgrasp.reduction.bases.craig_bampton import craig_bampton_parts
 from softgrasp.reduction.bases.engines import EngineName
 from softgrasp.reduction.bases.inner import INNERS, InnerName
-from softgrasp.reduction.bases.pod import Request, componentwise_parts, joint_parts
+from softgrasp.reduction.bases.pod import PartsRequest, componentwise_parts, joint_parts
 from softgrasp.reduction.bases.psd import complex_svd_parts, cotangent_lift_parts, svd_like_parts
 from softgrasp.reduction.bases.states import BasisError, Blocks, States
 from softgrasp.reduction.bases.truncation import PAPER_ENERGY, Columns, Part, Truncation, counts_of
@@ -27,7 +27,7 @@ class Method:
     title: str  # one line for tables and figures
     paper: str | None  # what the paper calls it, None for those beyond it
     preserving: bool  # the reduced model keeps the Hamiltonian or the second-order structure
-    build: Callable[[Request], tuple[Part, ...]]  # makes the parts from the snapshots
+    build: Callable[[PartsRequest], tuple[Part, ...]]  # makes the parts from the snapshots
     # coordinates, frame, structure: of the basis, see :class:`softgrasp.reduction.bases.basis.Basis`
     coordinates: Coordinates
     frame: Frame
@@ -44,46 +44,34 @@ class Method:
 
 
 def _methods() -> dict[str, Method]:
-    table: list[tuple[str, str, dict[str, str], Callable[[Request], tuple[Part, ...]], bool]] = [
-        ("global_pod", "global POD", {"": "Global POD", "_fixed": "POD with fixed solid modes"}, joint_parts, False),
-        (
-            "componentwise_pod",
-            "componentwise POD",
-            {"": "Componentwise POD", "_fixed": "Componentwise POD with fixed solid modes"},
-            componentwise_parts,
-            False,
-        ),
-        (
-            "psd",
-            "PSD complex SVD",
-            {"": "Global Proper Symplectic Decomposition (GPSD)", "_fixed": "PSD with fixed solid modes"},
-            complex_svd_parts,
-            True,
-        ),
-        ("psd_cotangent_lift", "PSD cotangent lift", {}, cotangent_lift_parts, True),
-        ("psd_svd_like", "PSD SVD-like", {}, svd_like_parts, True),
-    ]
+    solid, gpsd = "with fixed solid modes", "Global Proper Symplectic Decomposition (GPSD)"
+    table: list[tuple[str, str, str | None, str | None, Callable[[PartsRequest], tuple[Part, ...]], bool]] = [
+        ("global_pod", "global POD", "Global POD", f"POD {solid}", joint_parts, False),
+        ("componentwise_pod", "componentwise POD", "Componentwise POD", f"Componentwise POD {solid}",
+         componentwise_parts, False),
+        ("psd", "PSD complex SVD", gpsd, f"PSD {solid}", complex_svd_parts, True),
+        ("psd_cotangent_lift", "PSD cotangent lift", None, None, cotangent_lift_parts, True),
+        ("psd_svd_like", "PSD SVD-like", None, None, svd_like_parts, True),
+    ]  # fmt: skip
     result: dict[str, Method] = {}
-    for stem, title, papers, build, pairs in table:
-        for suffix, fixed in (("", False), ("_fixed", True)):
+    for stem, title, whole, apart, build, pairs in table:
+        for suffix, fixed, paper in (("", False, whole), ("_fixed", True, apart)):
             key = "pod_fixed" if stem + suffix == "global_pod_fixed" else stem + suffix
             words = ("POD" if key == "pod_fixed" else title) + (", fixed solid modes" if fixed else "")
-            paper = papers.get(suffix)
-            for form in ("qp", "qv") if pairs else ("qv",):
-                canonical = form == "qp"
+            for canonical in (True, False) if pairs else (False,):
                 tail = "_qv" if pairs and not canonical else ""
-                structure: Structure = "symplectic" if canonical else "none"
+                # SVD-like pairs hardly depend on the product; the paper's are Euclidean
+                inner: InnerName = "energy" if canonical and stem != "psd_svd_like" else "euclidean"
                 method = Method(
                     key + tail, words + (" in (q, v)" if tail else ""), paper, canonical, build,
-                    "qp" if canonical else "qv", "absolute", structure, fixed, pairs,
+                    "qp" if canonical else "qv", "absolute", "symplectic" if canonical else "none", fixed, pairs,
+                    inner="euclidean" if paper else inner,
                 )  # fmt: skip
-                if canonical and paper is None and stem != "psd_svd_like":
-                    method = replace(method, inner="energy")
                 result[method.key] = method
                 relative = f"{method.key}_relative"
                 result[relative] = replace(
                     method, key=relative, title=f"{method.title}, hand-relative", paper=None, frame="relative",
-                    inner="energy" if canonical and stem != "psd_svd_like" else "euclidean",
+                    inner=inner,
                 )  # fmt: skip
     result["craig_bampton"] = Method(
         "craig_bampton", "Craig-Bampton", None, True, craig_bampton_parts,
@@ -103,11 +91,7 @@ PAPER_PLAIN = ("global_pod", "componentwise_pod")
 
 
 def find_method(name: str) -> Method:
-    """Look a basis up.
-
-    Raises:
-        BasisError: there is none of this name.
-    """
+    """Look a basis up. Raises BasisError: there is none of this name."""
     if name not in METHODS:
         raise BasisError(f"basis '{name}' is unknown; choose one of {', '.join(METHODS)}")
     return METHODS[name]
@@ -164,16 +148,19 @@ def make_bases(
             f"use {name.replace('_relative', '')} or a basis with fixed solid modes",
             name,
         )
-    blocks = states.blocks(method.coordinates, method.frame) if method.snapshots else _no_blocks(states)
+    hand, tissue = np.zeros((n_s, 0)), np.zeros((states.layout.n_local, 0))
+    blocks = Blocks(hand, hand, tissue, tissue)
+    if method.snapshots:
+        blocks = states.blocks(method.coordinates, method.frame)
     clock.append(time.perf_counter())
     count = max((rule.N for rule in rules if rule.N is not None), default=None)
     share = min((rule.share for rule in rules if rule.N is None), default=None)
-    request = Request(states, blocks, not method.fixed, method.coordinates, metric, engine, count, share)
+    request = PartsRequest(states, blocks, not method.fixed, method.coordinates, metric, engine, count, share)
     parts = method.build(request)
-    hand = 2 * n_s if method.fixed else 0
     if not method.snapshots and share is not None:
         raise BasisError(f"{name} uses no snapshots, so it has no energy to keep; give N")
-    counts = [counts_of(parts, 2 if method.pairs else 1, hand, rule, name) for rule in rules]
+    fixed = 2 * n_s if method.fixed else 0
+    counts = [counts_of(parts, 2 if method.pairs else 1, fixed, rule, name) for rule in rules]
     clock.append(time.perf_counter())
     columns = [part.columns(max(c[i] for c in counts)) for i, part in enumerate(parts)]
     clock.append(time.perf_counter())
@@ -192,11 +179,6 @@ def _inner_of(method: Method, inner: InnerName | None, graded: bool) -> InnerNam
     if not method.snapshots and inner not in (None, method.inner):
         raise BasisError(f"{method.key} is orthonormal in the mass product by definition; leave inner out")
     return inner or ("energy" if graded and method.snapshots else method.inner)
-
-
-def _no_blocks(states: States) -> Blocks:
-    n_s, n = states.layout.n_s, states.layout.n_local
-    return Blocks(np.zeros((n_s, 0)), np.zeros((n_s, 0)), np.zeros((n, 0)), np.zeros((n, 0)))
 
 
 def _cut(whole: Basis, columns: Sequence[tuple[Columns, ...]], counts: tuple[int, ...]) -> Basis:

@@ -48,8 +48,7 @@ def svd_like_pairs(
         limit: number of pairs that are enough; None for all.
         share: part of |X|_F^2 that may be left out beyond the ``limit``; None sets no goal.
 
-    Returns:
-        S (2 r, 2 k), S' J S = J, and w (k,) descending; sum w^2 = |X|_F^2 when all are taken and have partners.
+    Returns S (2 r, 2 k), S' J S = J, and w (k,) descending; sum w^2 = |X|_F^2 when all are taken and have partners.
     """
     return on_root(comm, lambda: _pairs(X, limit, share))
 
@@ -165,8 +164,7 @@ class _Pool:
 def symplectic_repair(B: Array) -> Array:
     """C = (J^-1 B)^(-1/2) with C' B C = J for a skew B near J: S C is symplectic when S' J S = B.
 
-    Raises:
-        BasisError: B is singular, far from J.
+    Raises BasisError: B is singular, far from J.
     """
     try:
         return np.linalg.inv(np.real(scipy.linalg.sqrtm(-poisson(B))))

@@ -88,9 +88,7 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
 
     Args:
         width: columns of one unit.
-        N: dimension of the whole basis.
         hand: columns that the hand takes.
-        name: of the basis, for messages.
 
     Returns:
         Units of every part.
@@ -121,8 +119,7 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
 def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, name: str) -> tuple[int, ...]:
     """Units of every part by the rule; parts are equal, so that each keeps at least its share.
 
-    Raises:
-        BasisError: N does not fit, or the rule asks for more than the rank.
+    Raises BasisError: N does not fit, or the rule asks for more than the rank.
     """
     if rule.N is not None:
         return allocate(parts, width, rule.N, hand, name)

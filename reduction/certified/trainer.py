@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from softgrasp.fem.accuracy import estimate as accuracy
-from softgrasp.fem.accuracy.small import run_small
+from softgrasp.fem.accuracy.small import reduced
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, build
@@ -339,13 +339,12 @@ def mesh_number(model: Model, places: Sequence[Materials]) -> MeshNumber:
     if scene.tissue.refine is not None:
         other = accuracy.next_order(model)
     else:
-        other = build(accuracy.comparison(scene, accuracy.COMPARED[0]), comm=model.system.layout.comm)
+        other = build(accuracy.comparison(scene, accuracy.COMPARED[2][0]), comm=model.system.layout.comm)
     estimates = []
     for place in places:
         systems = ((m, m.system.with_materials(place)) for m in (model, other))
-        pair = [accuracy.reduced(replace(m, system=system)) for m, system in systems]
-        runs = [run_small(small).deformation for small in pair]
-        estimates.append(accuracy.difference(pair[0], pair[1], runs[1], runs[0])[0])
+        pair = [reduced(replace(m, system=system)) for m, system in systems]
+        estimates.append(accuracy.difference(pair[0], pair[1])[0])
     return MeshNumber(tuple((place[0].lam, place[0].mu) for place in places), tuple(estimates))
 
 

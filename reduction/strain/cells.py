@@ -14,11 +14,11 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.strain.compiled import LANES
 from softgrasp.fem.strain.laws import LAWS, LawName, Start
 from softgrasp.fem.system import LayerMaterial
 
 BLOCK = 1 << 20  # entries of H at a time
-LANES = 8  # points that `stepper.c` takes at a time
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,7 @@ class Packed:
 class Potential:
     """W_r and its derivatives at one set of materials.
 
-    Args:
-        cells: where.
-        materials: one a layer.
-        comm: ranks whose cells are summed up; None where every rank has all of them.
+    ``comm``: ranks whose cells are summed up; None where every rank has all of them.
     """
 
     def __init__(self, cells: Cells, materials: tuple[LayerMaterial, ...], comm: MPI.Intracomm | None = None) -> None:

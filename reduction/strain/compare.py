@@ -18,17 +18,11 @@ from softgrasp.reduction.replay import FullRun
 
 @dataclass(frozen=True)
 class StrainErrors:
-    """Relative errors over the snapshots of one full run, or of several, dimensionless.
+    """Relative errors over the snapshots of one full run, or of several, dimensionless."""
 
-    Attributes:
-        z: |Z - Phi A|_F / |Z|_F of the deformation.
-        v: |V - Phi A'|_M / |V|_M of its velocity.
-        energy_norm: of (z, v) in (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest.
-    """
-
-    z: float
-    v: float
-    energy_norm: float
+    z: float  # |Z - Phi A|_F / |Z|_F of the deformation
+    v: float  # |V - Phi A'|_M / |V|_M of its velocity
+    energy_norm: float  # of (z, v) in (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest
 
 
 @dataclass(frozen=True)
@@ -58,8 +52,7 @@ class Reference:
     def missed(self, a: Array, v: Array) -> Array:
         """[missed, whole] squares of z, v and the energy norm for states (steps + 1, k), (3, 2).
 
-        Raises:
-            ModelError: the run is shorter than the snapshots.
+        Raises ModelError: the run is shorter than the snapshots.
         """
         steps = self.full.snapshots.steps
         if len(a) <= int(steps.max(initial=0)):
@@ -78,7 +71,7 @@ class Reference:
         """Errors of one run."""
         return errors_of([self.missed(a, v)])
 
-    def floor(self, k: int) -> float:
+    def projection_error(self, k: int) -> float:
         """min_A |Z - Phi A|_F / |Z|_F over the first k columns."""
         cross = self.flat.cross[:k]
         best = np.linalg.solve(self.flat.gram[:k, :k], cross)

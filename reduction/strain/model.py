@@ -18,7 +18,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs
-from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.stepper import StrainProblem, march
 
@@ -30,18 +30,13 @@ LOAD_STEPS, NEWTON_STEPS = 10, 30  # on the way to an equilibrium
 
 @dataclass(frozen=True)
 class TrainedBox:
-    """What a model was trained on.
+    """What a model was trained on."""
 
-    Attributes:
-        lam, mu: least and largest Lamé constant of every layer [Pa], (layers, 2).
-        load: least and largest a_s - g of the hand, by degree of freedom, (n_s, 2) [m/s^2, rad/s^2].
-        reach: largest |a_i| of the training runs, (k,).
-    """
-
+    # lam, mu: least and largest Lamé constant of every layer [Pa], (layers, 2)
     lam: Array
     mu: Array
-    load: Array
-    reach: Array
+    load: Array  # least and largest a_s - g of the hand, by degree of freedom, (n_s, 2) [m/s^2, rad/s^2]
+    reach: Array  # largest |a_i| of the training runs, (k,)
 
     def refuse(self, materials: tuple[LayerMaterial, ...]) -> str:
         """Why materials lie outside; empty inside."""
@@ -75,20 +70,14 @@ class TrainedBox:
 
 @dataclass(frozen=True)
 class StrainRun(ReducedTrajectory):
-    """A reduced run at finite strain, x = [q_s, v_s, a, a'].
+    """A reduced run at finite strain, x = [q_s, v_s, a, a']."""
 
-    Attributes:
-        problem, load: what was stepped.
-        evaluations: of the force, in the mean of a step.
-        restarts: fresh tangents.
-        engine: "C" or "NumPy".
-    """
-
+    # problem, load: what was stepped
     problem: StrainProblem = field(repr=False)
     load: Array = field(repr=False)
-    evaluations: float
-    restarts: int
-    engine: str
+    evaluations: float  # of the force, in the mean of a step
+    restarts: int  # fresh tangents
+    engine: str  # "C" or "NumPy"
 
     @property
     def a(self) -> Array:
@@ -135,8 +124,7 @@ class SmallStrainModel:
     def equilibrium(self) -> Array:
         """The a with dW_r/da = G g, by Newton's method under growing load, (k,).
 
-        Raises:
-            ModelError: there is none within reach.
+        Raises ModelError: there is none within reach.
         """
         potential, full = self.problem.potential, self.model.G @ self.gravity
         a = np.zeros(len(full))
@@ -169,70 +157,56 @@ class SmallStrainModel:
             SolverError: a step did not converge.
         """
         model, dt = self.model, self.problem.dt
-        q, v = (np.asarray(x, dtype=float) for x in hand)
-        n_s = model.G.shape[1]
-        if q.shape != v.shape or q.ndim != 2 or q.shape[1] != n_s or len(q) < 2:
-            raise ModelError(f"the hand's tables have shapes {q.shape} and {v.shape}; both must be (steps + 1, {n_s})")
+        q, v = checked_hand(hand, model.G.shape[1])
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
             raise ModelError("the hand's tables hold numbers that are not finite")
         c = np.diff(v, axis=0) / dt - self.gravity
-        self._check(model.box.refuse_load(c))
+        refuse(model.box.refuse_load(c), self.outside)
         if model.in_space:
             c = c + model.alpha * (v[1:] + v[:-1]) / 2
         load = -c @ model.G.T
         start = np.zeros(model.k) if a0 is None else a0
         done = march(self.problem, load, start, np.zeros(model.k), tol, engine)
-        self._check(model.box.refuse_states(done.a))
+        refuse(model.box.refuse_states(done.a), self.outside)
         y = done.a @ model.outputs.C_z.T + q @ model.outputs.C_s.T
         times = dt * np.arange(float(len(q)))
         x = np.hstack([q, v, done.a, done.v])
         counts = done.evaluations, done.restarts, done.engine
         return StrainRun(times, x, q, v, y, model.outputs.names, self.problem, load, *counts)
 
-    def _check(self, reason: str) -> None:
-        if reason and not self.outside:
-            raise ModelError(f"{reason}; train the model there, or allow it with outside=True and check the result")
+
+def refuse(reason: str, outside: bool) -> None:
+    """Raise ModelError where there is a reason, unless what the model was not trained on is allowed."""
+    if reason and not outside:
+        raise ModelError(f"{reason}; train the model there, or allow it with outside=True and check the result")
 
 
 @dataclass(frozen=True)
 class StrainModel:
-    """Reduced model of tissue at finite strain for all lambda and mu of its training box.
+    """Reduced model of tissue at finite strain for all lambda and mu of its training box."""
 
-    Attributes:
-        cells: sampled cells, in reduced coordinates.
-        K_mu, K_lambda: linear stiffness of every layer at 1 Pa, (layers, k, k).
-        G: Phi' G at the densities of the projection, (k, n_s).
-        materials: of the projection, one a layer.
-        outputs: y = C_z a + C_s q_s.
-        box: what it was trained on.
-        cells_full: number of cells of the body.
-        alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
-        gravity: acceleration of free fall (n_s,), or None.
-        tau, residual: of the weights, asked for and reached; 0 where no cell is left out.
-        error_galerkin: in z of the model with all cells, over the training runs.
-        layout, Phi: local rows of the lift (n_local, k), or None.
-        scene_hash: of the scene it was made for.
-        seconds: offline, by stage.
-    """
-
-    cells: Cells
+    cells: Cells  # sampled cells, in reduced coordinates
+    # K_mu, K_lambda: linear stiffness of every layer at 1 Pa, (layers, k, k)
     K_mu: Array
     K_lambda: Array
-    G: Array
-    materials: tuple[LayerMaterial, ...]
-    outputs: Outputs
-    box: TrainedBox
-    cells_full: int
+    G: Array  # Phi' G at the densities of the projection, (k, n_s)
+    materials: tuple[LayerMaterial, ...]  # of the projection, one a layer
+    outputs: Outputs  # y = C_z a + C_s q_s
+    box: TrainedBox  # what it was trained on
+    cells_full: int  # number of cells of the body
+    # alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion
     alpha: float = 0.0
     in_space: bool = False
-    gravity: Array | None = None
+    gravity: Array | None = None  # acceleration of free fall (n_s,), or None
+    # tau, residual: of the weights, asked for and reached; 0 where no cell is left out
     tau: float = 0.0
     residual: float = 0.0
-    error_galerkin: float = 0.0
+    error_galerkin: float = 0.0  # in z of the model with all cells, over the training runs
+    # layout, Phi: local rows of the lift (n_local, k), or None
     layout: BlockLayout | None = None
     Phi: Array | None = None
-    scene_hash: str = ""
-    seconds: dict[str, float] = field(default_factory=dict)
+    scene_hash: str = ""  # of the scene it was made for
+    seconds: dict[str, float] = field(default_factory=dict)  # offline, by stage
 
     @property
     def k(self) -> int:
@@ -270,9 +244,7 @@ class StrainModel:
             raise ModelError(f"{len(materials)} materials are given; the model has {len(self.materials)} layers")
         if any(m.rho != old.rho for m, old in zip(materials, self.materials, strict=True)):
             raise ModelError("a model at finite strain keeps the densities it was made with; reduce the scene again")
-        reason = self.box.refuse(materials)
-        if reason and not outside:
-            raise ModelError(f"{reason}; train the model there, or allow it with outside=True and check the result")
+        refuse(self.box.refuse(materials), outside)
         own = self.gravity if gravity is None else np.asarray(gravity, dtype=float)
         g = np.zeros(self.G.shape[1]) if own is None else own
         K = [m.mu * a + m.lam * b for m, a, b in zip(materials, self.K_mu, self.K_lambda, strict=True)]
@@ -282,8 +254,7 @@ class StrainModel:
     def displacement(self, a: Array) -> Array:
         """Deformation z = Phi a, local rows (n_local, m), of coordinates (m, k).
 
-        Raises:
-            ModelError: the model was loaded without its lift.
+        Raises ModelError: the model was loaded without its lift.
         """
         if self.Phi is None:
             raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh")

@@ -26,11 +26,6 @@ class Weights:
     residual: float  # |G x - b| / |b|
     rounds: int  # columns that were added one after the other
 
-    @property
-    def support(self) -> np.ndarray:
-        """Columns with a weight."""
-        return np.flatnonzero(self.x)
-
 
 def nnls(G: Array, b: Array, tau: float) -> Weights:
     """Columns added by largest gradient G'(b - G x) until |G x - b| <= tau |b|, x >= 0 throughout. Serial.
@@ -96,12 +91,9 @@ def on_one_rank(comm: MPI.Intracomm, G: Array) -> tuple[Array, Array]:
 
     With more rows than columns, the triangle of G = Q R and Q'b instead: the same least squares problem.
 
-    Args:
-        comm: ranks that share the columns.
-        G: all rows of this rank's columns, (m, n_local).
+    ``G``: all rows of this rank's columns, (m, n_local).
 
-    Returns:
-        G or R, and b or Q'b, on rank 0; empty elsewhere.
+    Returns G or R, and b or Q'b, on rank 0; empty elsewhere.
     """
     columns = rows_on_root(comm, G.T)
     if columns is None:

@@ -156,14 +156,14 @@ class _March:
         iteration, renewed = 0, 0
         while not size <= max(self.tol * self.scale, self.floor):
             iteration += 1
-            found = None if iteration % MOST == 0 else self._correct(w, R, -(self.J @ R), renewed > 0)
-            if found is None:
+            correction = None if iteration % MOST == 0 else self._correct(w, R, -(self.J @ R), renewed > 0)
+            if correction is None:
                 if renewed == RENEWALS or not self._renew(w, R):
                     return None
                 renewed += 1
                 self.counts[1] += 1
                 continue
-            p, rest = found
+            p, rest = correction
             J_y, y = self.J @ (rest - R), p @ self.J
             den = p @ J_y
             if abs(den) > 0.1 * (p @ p):

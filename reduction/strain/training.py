@@ -110,8 +110,7 @@ class Training:
     def galerkin(self, k: int) -> tuple[StrainRun, ...]:
         """All training runs of the model on all cells; made once for each k. Collective.
 
-        Raises:
-            SolverError: a run did not converge.
+        Raises SolverError: a run did not converge.
         """
         if k not in self._galerkin:
             with self._stage(k, "galerkin"):
@@ -160,8 +159,8 @@ class Training:
                 weights = on_root(comm, partial(nnls, C, c, goal))
                 xi = weights.x[sum(counts[: comm.rank]) :][: counts[comm.rank]]
                 cells = gathered(comm, all_cells.cells.sampled(xi), self.offset)
-            found = replace(all_cells, cells=cells, tau=goal, residual=weights.residual, error_galerkin=error)
-            models.append(replace(found, seconds={"basis": self.seconds, **self._spent[k]}))
+            model = replace(all_cells, cells=cells, tau=goal, residual=weights.residual, error_galerkin=error)
+            models.append(replace(model, seconds={"basis": self.seconds, **self._spent[k]}))
         return models
 
     def _forces(self, k: int) -> Array:
@@ -186,11 +185,7 @@ class Training:
 
 
 def displacements(system: BlockSystem, N: int) -> int:
-    """Number k of a model of dimension N = 2 n_s + 2 k.
-
-    Raises:
-        ReductionError: there is none.
-    """
+    """Number k of a model of dimension N = 2 n_s + 2 k. Raises ReductionError: there is none."""
     hand = 2 * system.layout.n_s
     if hand + 2 > N or N % 2:
         raise ReductionError(f"N = {N} does not fit; it must be the {hand} columns of the hand plus an even number")
@@ -203,8 +198,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
     Both weigh the same. The velocities of one run hold shapes that its displacements pass too fast; several runs
     have these shapes, and their velocities would only crowd out the soft ones.
 
-    Raises:
-        BasisError: the snapshots carry fewer columns, or are zero or not finite.
+    Raises BasisError: the snapshots carry fewer columns, or are zero or not finite.
     """
     layout, n = system.layout, system.layout.n_local
     parts = [thinned(run, -(-SNAPSHOTS // len(runs))).Z for run in runs]
@@ -257,14 +251,7 @@ def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
 
 
 def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False, engine: str = "") -> StrainRun:
-    """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective.
-
-    Args:
-        rom: which.
-        full: run to repeat, at its own materials.
-        outside: allow what the model was not trained on.
-        engine: see :func:`softgrasp.reduction.strain.stepper.march`.
-    """
+    """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
     return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full, engine)
 
 

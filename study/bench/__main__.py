@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import typer
+from mpi4py import MPI
 
 from softgrasp.study.bench import (
     accuracy,
@@ -20,14 +23,15 @@ from softgrasp.study.bench import (
     switches,
 )
 from softgrasp.study.shell.ending import run_command
-from softgrasp.study.shell.jobs import leave_result
 
-ROWS: dict[str, Callable[..., dict[str, Any]]] = {
-    "forward": forward_rows.measure_row,
-    "riccati": riccati_rows.measure_row,
-    "bases": bases.measure,
+COMMANDS = {
+    "forward": forward, "riccati": riccati, "bases": bases, "switches": switches, "meshes": meshes,
+    "accuracy": accuracy, "certified": certified,
+}  # fmt: skip
+WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
+    "forward": forward_rows.measure_row, "riccati": riccati_rows.measure_row, "bases": bases.measure,
     "switches": switches.measure,
-}
+}  # fmt: skip
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -36,23 +40,19 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="What runs, Riccati equations and bases cost, beside other codes. Keep the machine quiet.",
 )
-for _name, _module in (
-    ("forward", forward),
-    ("riccati", riccati),
-    ("bases", bases),
-    ("switches", switches),
-    ("meshes", meshes),
-    ("accuracy", accuracy),
-    ("certified", certified),
-):
+for _name, _module in COMMANDS.items():
     app.command(name=_name, help=_module.HELP)(_module.main)
 
 
 @app.command(hidden=True)
 def worker(name: str, spec: str) -> None:
-    """Measure one row of a benchmark and leave it where the launcher looks, see `launch_worker`. Collective."""
+    """Measure points of a benchmark and leave each where the launcher looks, see `launch_worker`. Collective."""
     arguments = json.loads(spec)
-    leave_result(arguments.pop("file"), lambda: ROWS[name](**arguments))
+    file = Path(arguments.pop("file"))
+    for point in WORKERS[name](**arguments):
+        if MPI.COMM_WORLD.rank == 0:
+            with file.open("a") as lines:
+                lines.write(json.dumps(asdict(point)) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,8 +17,7 @@ from numpy.typing import NDArray
 from softgrasp.fem.petsc import Array, total
 from softgrasp.reduction.bases.engines import factor, small_svd
 from softgrasp.study.bench import driver
-from softgrasp.study.bench.driver import Row
-from softgrasp.study.shell.jobs import launch_worker
+from softgrasp.study.bench.driver import Failure, Goal
 from softgrasp.study.shell.timing import interleave, medians, timed
 
 SIZES = "10000x600,100000x600"
@@ -46,6 +47,36 @@ all that are computed are right to {RIGHT:g}, and to {ROUGH:g}; largest entry of
 matrix stands beside them on one rank.
 
 Keep the machine quiet while it runs. A fast look: --sizes 2000x100 --ranks 1 --repeats 3."""
+
+
+COLUMNS = {
+    "engine": "title", "rows": "rows", "columns": "columns", "ranks": "ranks", "s": "seconds .3g",
+    "/ default": "slower .2f", f"right to {RIGHT:g}": "right .0e", f"to {ROUGH:g}": "rough .0e",
+    "|U'U - I|": "orthonormality .0e",
+}  # fmt: skip
+CSV = {name: name for name in ("engine", "rows", "columns", "ranks", "seconds", "right", "rough", "orthonormality")}
+
+
+@dataclass(frozen=True)
+class EnginePoint:
+    """One engine at one size."""
+
+    engine: str
+    rows: int
+    columns: int
+    ranks: int
+    # right, rough: sigma / sigma_1 down to which all values are right to these tolerances
+    right: float
+    rough: float
+    orthonormality: float  # largest entry of U' U - I
+    seconds: float  # median
+    slower: float  # over the seconds of the default
+    samples: list[float]
+
+    @property
+    def title(self) -> str:
+        """The engine in words."""
+        return TITLES[self.engine]
 
 
 def parse_shapes(text: str) -> list[tuple[int, int]]:
@@ -143,91 +174,53 @@ def methods_for(comm: MPI.Intracomm, n: int, m: int) -> dict[str, tuple[Callable
     return result
 
 
-def measure(n: int, m: int, repeats: int, comm: MPI.Intracomm = MPI.COMM_WORLD) -> Row:
+def measure(n: int, m: int, repeats: int, comm: MPI.Intracomm = MPI.COMM_WORLD) -> list[EnginePoint]:
     """One size on this many ranks: seconds, accuracy and orthonormality of every engine. Collective."""
     methods = methods_for(comm, n, m)
-    rows: dict[str, Row] = {}
+    accuracy = {}
     for name, (call, true) in methods.items():
         sigma, U = call()  # also warms up
         gram = total(comm, np.array([(U.conj().T @ U).real, (U.conj().T @ U).imag]))
-        off = np.abs(gram[0] + 1j * gram[1] - np.eye(U.shape[1])).max()
-        rows[name] = {
-            "right": right_down_to(sigma, true, RIGHT),
-            "rough": right_down_to(sigma, true, ROUGH),
-            "off": float(off),
-        }
+        defect = float(np.abs(gram[0] + 1j * gram[1] - np.eye(U.shape[1])).max())
+        accuracy[name] = right_down_to(sigma, true, RIGHT), right_down_to(sigma, true, ROUGH), defect
     samples = interleave({name: partial(timed, comm, call) for name, (call, _) in methods.items()}, repeats)
-    for name, seconds in medians(samples).items():
-        rows[name] |= {"seconds": seconds, "samples": samples[name]}
-    return {"rows": n, "columns": m, "ranks": comm.size, "repeats": repeats, "engines": rows}
-
-
-COLUMNS = {
-    "engine": "title", "rows": "rows", "columns": "columns", "ranks": "ranks", "s": "seconds .3g",
-    "/ default": "slower .2f", f"right to {RIGHT:g}": "right .0e", f"to {ROUGH:g}": "rough .0e", "|U'U - I|": "off .0e",
-}  # fmt: skip
-CSV = {name: name for name in ("engine", "rows", "columns", "ranks", "seconds", "right", "rough")}
-CSV |= {"orthonormality": "off"}
-
-
-def flat(results: Sequence[Row]) -> list[Row]:
-    """One entry an engine."""
-    entries = []
-    for row in results:
-        size = {key: row[key] for key in ("rows", "columns", "ranks")}
-        if "error" in row:
-            entries.append(size | {"title": "failed", "error": row["error"]})
-        for name, engine in row.get("engines", {}).items():
-            default = row["engines"]["psd_tsqr" if name.startswith("psd") else "tsqr"]["seconds"]
-            more = {"engine": name, "title": TITLES[name], "slower": engine["seconds"] / default}
-            entries.append(size | engine | more)
-    return entries
-
-
-def missed(results: Sequence[Row]) -> list[str]:
-    """Sentences for defaults that are not right down to the goal."""
-
-    def last(m: int) -> float:
-        """Smallest value of the spectrum that the goal speaks of, with room for rounding."""
-        sigma = spectrum_of(m)
-        return 1.001 * float(sigma[sigma >= GOAL].min())
-
-    columns = {"tsqr": 1, "psd_tsqr": 2}
+    seconds = medians(samples)
+    default = {name: seconds["psd_tsqr" if name.startswith("psd") else "tsqr"] for name in methods}
     return [
-        f"{TITLES[name]}, {row['rows']} x {row['columns']}, {row['ranks']} rank(s): "
-        f"right down to {row['engines'][name]['right']:.1e}, goal {GOAL:g}"
-        for row in driver.measured(results)
-        for name, halves in columns.items()
-        if row["engines"][name]["right"] > last(row["columns"] // halves)
+        EnginePoint(name, n, m, comm.size, *numbers, seconds[name], seconds[name] / default[name], samples[name])
+        for name, numbers in accuracy.items()
     ]
+
+
+def goals(points: Sequence[EnginePoint]) -> list[Goal]:
+    """How far down the defaults are right; the goal is the last value of the spectrum above ``GOAL``."""
+    result = []
+    for p in points:
+        if p.engine in ("tsqr", "psd_tsqr"):
+            sigma = spectrum_of(p.columns if p.engine == "tsqr" else p.columns // 2)
+            text = f"{p.title}, {p.rows} x {p.columns}, {p.ranks} rank(s): right to {RIGHT:g} down to sigma / sigma_1"
+            result.append(Goal(text, p.right, 1.001 * float(sigma[sigma >= GOAL].min())))  # room for rounding
+    return result
 
 
 def main(
     sizes: Annotated[str, typer.Option(help="rows x columns")] = SIZES,
-    ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
-    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 3,
+    ranks: driver.Ranks = "1,2",
+    repeats: driver.Repeats = 3,
     out: Annotated[Path, typer.Option(help="folder for bench_bases.json and bench_bases.csv")] = Path("out"),
 ) -> None:
     """See HELP."""
     shapes, counts = parse_shapes(sizes), driver.parse_ranks(ranks)
-    console = driver.open_console(130)
-    results = []
-    for n, m in shapes:
-        for k in counts:
-            with console.status(f"{n} x {m}, {k} rank(s)"):
-                row = launch_worker("bases", {"n": n, "m": m, "repeats": repeats}, k)
-            results.append({"rows": n, "columns": m, "ranks": k} | row)
-    entries = flat(results)
-    title = f"factoring snapshots: {KEPT} vectors, median seconds"
-    console.print(driver.table_of(entries, COLUMNS, title).terminal())
-    for row in results:
-        if "error" in row:
-            console.print(f"{row['rows']} x {row['columns']}, {row['ranks']} rank(s): {row['error']}", markup=False)
-    late = missed(results)
-    for sentence in late:
-        console.print(f"goal [red]missed[/red]: {sentence}")
-    if not late and not any("error" in row for row in results):
-        console.print(f"goal [green]ok[/green]: the defaults are right to {RIGHT:g} down to sigma / sigma_1 = {GOAL:g}")
-    table = driver.table_of(driver.measured(entries), CSV)
-    files = driver.write_bench(out, "bench_bases", {"command": "bench_bases", "results": results}, table)
-    driver.list_bench(console, files, bool(late) or any("error" in row for row in results))
+    console, rows = driver.open_console(130), list[EnginePoint | Failure]()
+    for (n, m), k in itertools.product(shapes, counts):
+        spec = {"n": n, "m": m, "repeats": repeats}
+        rows += driver.measure(console, EnginePoint, "bases", spec, k, f"{n} x {m}")
+    points, failed = driver.of(EnginePoint, rows), driver.failures(rows)
+    console.print(driver.table_of(points, COLUMNS, f"factoring snapshots: {KEPT} vectors, median seconds").terminal())
+    driver.show_goals(console, goals(points))
+    content = {"command": "bench_bases", "rows": driver.as_rows(points), "failed": driver.as_rows(failed)}
+    content |= {"goals": driver.goal_rows(goals(points))}
+    files = driver.write_bench(out, "bench_bases", content, driver.table_of(points, CSV))
+    driver.list_bench(console, files, failed)
+    if not all(goal.ok for goal in goals(points)):
+        raise typer.Exit(1)

@@ -150,4 +150,4 @@ def main(
     goals = goals_of(rows)
     show_goals(console, goals)
     content = {"command": "bench_certified", "repeats": repeats, "rows": rows, "goals": goal_rows(goals)}
-    list_bench(console, write_bench(out, "bench_certified", content, table), False)
+    list_bench(console, write_bench(out, "bench_certified", content, table))

@@ -1,23 +1,91 @@
-"""What every benchmark does alike: ranks, goals, its console, and the files at the end."""
+"""What every benchmark does alike: options, rows measured by workers, goals, tables, and the files at the end."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import subprocess
+import sys
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from pydantic import TypeAdapter
 from rich.console import Console
 
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.processes import IN_MPI_JOB
+from softgrasp.study.shell.processes import IN_MPI_JOB, child_environment, find_mpiexec
 
-Row = dict[str, Any]  # what a worker measured, as JSON has it
+Row = dict[str, Any]
+Ranks = Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")]
+Repeats = Annotated[int, typer.Option(help="repeats behind each median", min=1)]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A row without numbers."""
+
+    label: str  # what was to be measured
+    ranks: int
+    error: str  # why there is nothing
+
+
+def launch_worker(name: str, spec: Row, ranks: int, limit: float = 3600.0) -> Row:
+    """Run ``python -m softgrasp.study.bench worker NAME SPEC``, so that no row inherits memory or caches from another.
+
+    Args:
+        name: of the benchmark.
+        spec: arguments of the function that measures, fit for JSON.
+        ranks: MPI ranks.
+        limit: longest time [s].
+
+    Returns:
+        ``points`` measured until the end, or until the ``error`` that came before it.
+    """
+    mpiexec = find_mpiexec()
+    if mpiexec is None:
+        return {"points": [], "error": "no mpiexec found; `softgrasp doctor` says what to do"}
+    environment = child_environment() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "points.jsonl"
+        text = json.dumps(spec | {"file": str(file)})
+        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "softgrasp.study.bench", "worker", name, text]
+        error = {}
+        try:
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
+        except subprocess.TimeoutExpired:
+            error = {"error": f"no result after {limit:g} s"}
+        else:
+            if done.returncode:
+                lines = (done.stderr + done.stdout).strip().splitlines() or ["no output"]
+                said = next((line for line in lines if "Error: " in line and not line.startswith(" ")), lines[-1])
+                error = {"error": f"exit status {done.returncode}: {said}"}
+        lines = file.read_text().splitlines() if file.is_file() else []
+    return {"points": [json.loads(line) for line in lines], **error}
+
+
+def measure[P](console: Console, kind: type[P], name: str, spec: Row, ranks: int, label: str) -> list[P | Failure]:
+    """The points of one worker, and the reason where it failed."""
+    with console.status(f"{label}, {ranks} rank(s)"):
+        result = launch_worker(name, spec, ranks)
+    points = TypeAdapter(list[kind | Failure]).validate_python(result["points"])  # type: ignore[valid-type]
+    return [*points, *([Failure(label, ranks, result["error"])] if "error" in result else [])]
+
+
+def failures(rows: Sequence[Any]) -> list[Failure]:
+    """Rows without numbers."""
+    return [row for row in rows if isinstance(row, Failure)]
+
+
+def of[P](kind: type[P], rows: Sequence[Any]) -> list[P]:
+    """Rows that were measured."""
+    return [row for row in rows if isinstance(row, kind)]
 
 
 @dataclass(frozen=True)
@@ -43,14 +111,14 @@ def parse_list(text: str, pattern: str, advice: str) -> list[Any]:
     return [groups for part in parts for groups in re.findall(f"^{pattern}$", part)]
 
 
-def parse_ranks(text: str) -> list[int]:
-    """``1,2`` as numbers. Raises typer.BadParameter: anything else."""
-    return parse_numbers(text, r"([1-9]\d*)", "number of ranks; write 1,2")
-
-
 def parse_numbers(text: str, pattern: str, advice: str) -> list[int]:
     """Whole numbers, see :func:`parse_list`."""
     return [int(part) for part in parse_list(text, pattern, advice)]
+
+
+def parse_ranks(text: str) -> list[int]:
+    """``1,2`` as numbers. Raises typer.BadParameter: anything else."""
+    return parse_numbers(text, r"([1-9]\d*)", "number of ranks; write 1,2")
 
 
 def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
@@ -62,32 +130,27 @@ def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def number(value: float | None, digits: int = 3) -> str:
+def number(value: float | None) -> str:
     """Three digits, or all before the point; a dash for None."""
     if value is None:
         return "-"
-    return f"{value:.0f}" if value >= 10**digits else f"{value:.{digits}g}"
-
-
-def measured(rows: Sequence[Row]) -> list[Row]:
-    """Rows that did not fail."""
-    return [row for row in rows if "error" not in row]
+    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
 
 
 def entry(row: Any, path: str) -> Any:
-    """What a row has at a path of keys, "step_us.ts"; None where it has nothing."""
+    """What a row has at a path of attributes or keys, "step_us.ts"; None where it has nothing."""
     for key in path.split("."):
-        row = row.get(key) if isinstance(row, dict) else None
+        row = row.get(key) if isinstance(row, dict) else getattr(row, key, None)
     return row
 
 
-def table_of(rows: Sequence[Row], columns: Mapping[str, str], title: str = "") -> Table:
+def table_of(rows: Sequence[Any], columns: Mapping[str, str], title: str = "") -> Table:
     """One line a row: for each heading the entry at a path, formatted as behind a blank it says, ``drift .0e``.
 
     The format 3 is that of :func:`number`; without one the entry stands as it is.
     """
 
-    def cell(row: Row, column: str) -> Any:
+    def cell(row: Any, column: str) -> Any:
         path, _, form = column.partition(" ")
         value = entry(row, path)
         if not form:
@@ -131,12 +194,12 @@ def show_goals(console: Console, goals: Sequence[Goal]) -> None:
         console.print(f"goal {verdict}: {goal.text} {number(goal.value)} <= {goal.limit:g}")
 
 
-def goal_rows(goals: Sequence[Goal]) -> list[dict[str, Any]]:
+def goal_rows(goals: Sequence[Goal]) -> list[Row]:
     """Goals as the JSON file has them."""
     return [{"goal": g.text, "value": g.value, "limit": g.limit, "ok": g.ok} for g in goals]
 
 
-def write_bench(out: Path, name: str, content: dict[str, Any], table: Table, markdown: str = "") -> list[Path]:
+def write_bench(out: Path, name: str, content: Row, table: Table, markdown: str = "") -> list[Path]:
     """NAME.json, NAME.csv and NAME.md; returns what was written."""
     out.mkdir(parents=True, exist_ok=True)
     files = [write_json(out / f"{name}.json", content), table.write_csv(out / f"{name}.csv")]
@@ -146,8 +209,15 @@ def write_bench(out: Path, name: str, content: dict[str, Any], table: Table, mar
     return files
 
 
-def list_bench(console: Console, files: Sequence[Path], failed: bool) -> None:
-    """Print the files and leave with status 1 where a row failed. Raises typer.Exit: a row failed."""
+def as_rows(points: Sequence[Any]) -> list[Row]:
+    """Points as the JSON file has them."""
+    return [asdict(point) for point in points]
+
+
+def list_bench(console: Console, files: Sequence[Path], failed: Sequence[Failure] = ()) -> None:
+    """Print the files and what failed. Raises typer.Exit: a row failed, the status is 1."""
+    for row in failed:
+        console.print(f"{row.label}, {row.ranks} rank(s) failed: {row.error}", markup=False)
     for file in files:
         console.print(f"  {file}")
     if failed:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
-import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,46 @@ REPEAT_SECONDS = 0.1  # of the TS steps: long against the timer, short against t
 BUILD_SECONDS = 20.0  # assembly and factor are repeated at most this long
 PYMOR_LIMIT = 12_000  # [n_e]; its LU of size 2 n_e takes minutes beyond
 PEER_SHARE = 3  # SciPy and pyMOR need about so many times longer a step
+
+
+@dataclass(frozen=True)
+class WholeRun:
+    """The paper's run from the assembled model on, factor included."""
+
+    steps: int
+    seconds: dict[str, float]  # by method, medians
+    samples: dict[str, list[float]]
+    drift: float  # of the energy, the largest
+
+
+@dataclass(frozen=True)
+class ForwardPoint:
+    """One mesh on so many ranks; what a large run leaves out is empty."""
+
+    problem: str
+    large: bool
+    dimension: int
+    cells: list[int]
+    n_e: int
+    states: int
+    ranks: int
+    solver: str
+    seconds: dict[str, float]  # mesh, assembly, factor
+    step_us: dict[str, float]  # microseconds of a step by method
+    drift: float  # of the energy after drift_steps
+    drift_steps: int
+    residual: float
+    # memory_mb, memory_base_mb: peak of all ranks, and that of the libraries [MiB]
+    memory_mb: float
+    memory_base_mb: float
+    repeats: int
+    steps_per_repeat: int
+    samples_us: dict[str, list[float]] = field(default_factory=dict)
+    # ratio, ratio_own: median of a TS step over the bare solves, PETSc's and those of the step
+    ratio: float | None = None
+    ratio_own: float | None = None
+    factor_peer_s: dict[str, float] = field(default_factory=dict)
+    whole: WholeRun | None = None
 
 
 def cells_for(dimension: int, size: int) -> list[int]:
@@ -84,45 +123,45 @@ def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dic
     return model, seconds, memory, float(comm.bcast(pace))
 
 
-def _steps(comm: MPI.Intracomm, model: Model, k: int, peer_k: int, repeats: int, peers: bool) -> dict[str, Any]:
+def _repeated(comm: MPI.Intracomm, loop: Any, count: int) -> Callable[[], float]:
+    """Microseconds of a step, over so many of them."""
+
+    def steps() -> float:
+        loop.advance(warm(count))
+        return 1e6 * timed(comm, lambda: loop.advance(count)) / count
+
+    return steps
+
+
+def _steps(comm: MPI.Intracomm, model: Model, k: int, repeats: int, peers: bool) -> dict[str, Any]:
     """Per-step times of all methods [us] and the energy drift of the TS run."""
     run = Run(model, RunOptions())
     ts = make_ts(run)
     run.start()
     run.advance_to(ts, 2)
 
-    def advance() -> None:
-        run.advance_to(ts, run.reached + k)
-
     def of_ts() -> float:
         run.advance_to(ts, run.reached + warm(k))
-        seconds = timed(comm, advance)
+        seconds = timed(comm, lambda: run.advance_to(ts, run.reached + k))
         run.watch_energy()
         return 1e6 * seconds / k
 
-    def of(loop: Any, count: int) -> Callable[[], float]:
-        def steps() -> float:
-            loop.advance(warm(count))
-            return 1e6 * timed(comm, lambda: loop.advance(count)) / count
-
-        return steps
-
     factor: dict[str, float] = {}
     loops, solvers = _loops(run, factor)
-    methods = {"ts": of_ts} | {name: of(loop, k) for name, loop in loops.items()}
+    methods = {"ts": of_ts} | {name: _repeated(comm, loop, k) for name, loop in loops.items()}
     if peers and comm.size == 1:
-        methods |= {name: of(loop, peer_k) for name, loop in _peers(run, factor).items()}
+        few = max(2, k // PEER_SHARE)
+        methods |= {name: _repeated(comm, loop, few) for name, loop in _peers(run, factor).items()}
     samples = interleave(methods, repeats)
 
     def ratio(name: str) -> float | None:
-        if name not in samples:
-            return None
-        return statistics.median(a / b for a, b in zip(samples["ts"], samples[name], strict=True))
+        return float(np.median(np.divide(samples["ts"], samples[name]))) if name in samples else None
 
-    residual = run.check_step(ts, run.reached + 1)
-    result = {"step_us": medians(samples), "samples_us": samples, "ratio": ratio("solve"), "ratio_own": ratio("own")}
-    result |= {"factor_peer_s": factor, "drift": run.drift(), "drift_steps": run.reached, "residual": residual}
-    result |= {"solver": run.solver[0]}
+    result = {
+        "step_us": medians(samples), "samples_us": samples, "ratio": ratio("solve"), "ratio_own": ratio("own"),
+        "residual": run.check_step(ts, run.reached + 1), "factor_peer_s": factor, "drift": run.drift(),
+        "drift_steps": run.reached, "solver": run.solver[0],
+    }  # fmt: skip
     ts.destroy()
     for solver in (run.midpoint, *solvers):
         solver.destroy()
@@ -171,16 +210,15 @@ def _peers(run: Run, factor: dict[str, float]) -> dict[str, Any]:
     return loops
 
 
-def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repeats: int) -> dict[str, Any]:
-    """Seconds of the whole run from the assembled model on, factor included."""
+def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repeats: int) -> WholeRun:
     scenes = {kind: bench_scene(comm, 2, cells, steps, kind) for kind in ("none", "memory")}
-    system, table = model.system, Run(dataclasses.replace(model, scene=scenes["none"]), RunOptions())
+    system, table = model.system, Run(replace(model, scene=scenes["none"]), RunOptions())
     drive = table.drive
     table.midpoint.destroy()
     drifts: list[float] = []
 
     def of_ts(kind: str) -> Callable[[], float]:
-        of_kind = dataclasses.replace(model, scene=scenes[kind])
+        of_kind = replace(model, scene=scenes[kind])
         return lambda: timed(comm, lambda: drifts.append(simulate(of_kind).energy_drift))
 
     methods = {"ts_none": of_ts("none"), "ts_memory": of_ts("memory")}
@@ -191,7 +229,7 @@ def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repe
             methods["pymor"] = lambda: timed(comm, lambda: PymorLoop(K, M, system.G, DT, loads).advance(steps))
     interleave(methods, 1)  # warm up
     samples = interleave(methods, repeats)
-    return {"steps": steps, "seconds": medians(samples), "samples": samples, "drift": max(drifts)}
+    return WholeRun(steps, medians(samples), samples, max(drifts))
 
 
 def measure(
@@ -202,53 +240,47 @@ def measure(
     repeat_seconds: float = REPEAT_SECONDS,
     whole: bool = False,
     peers: bool = True,
-) -> dict[str, Any]:
-    """One row of the table, each number taken ``repeats`` times. Collective.
+    problem: str = "",
+) -> ForwardPoint:
+    """One point, each number taken ``repeats`` times. Collective.
 
     One repeat takes about ``repeat_seconds``; ``whole``: also the paper's 600 steps; ``peers``: SciPy and pyMOR too.
     """
     cells = cells_for(dimension, size)
     build(bench_scene(comm, dimension, [2] * (dimension - 1) + [4], 1), comm=comm)  # compiles the forms
     base = peak_memory_mb(comm)
-    model, seconds, memory, pace = _builds(comm, bench_scene(comm, dimension, cells, PAPER_STEPS), repeats)
+    model, samples, memory, pace = _builds(comm, bench_scene(comm, dimension, cells, PAPER_STEPS), repeats)
     k = int(np.clip(repeat_seconds / pace, 3, 50_000))
-    scene = bench_scene(comm, dimension, cells, repeats * (k + warm(k)) + 10)
-    result = _row(comm, model, cells, {name: statistics.median(values) for name, values in seconds.items()})
-    result |= {"memory_mb": memory, "memory_base_mb": base, "repeats": repeats, "steps_per_repeat": k}
-    result |= _steps(comm, dataclasses.replace(model, scene=scene), k, max(2, k // PEER_SHARE), repeats, peers)
-    result["whole"] = _whole(comm, model, cells, PAPER_STEPS, repeats) if whole else None
-    return result
+    stepped = replace(model, scene=bench_scene(comm, dimension, cells, repeats * (k + warm(k)) + 10))
+    return ForwardPoint(
+        **_sizes(model, cells), problem=problem, large=False, seconds=medians(samples), memory_mb=memory,
+        memory_base_mb=base, repeats=repeats, steps_per_repeat=k, **_steps(comm, stepped, k, repeats, peers),
+        whole=_whole(comm, model, cells, PAPER_STEPS, repeats) if whole else None,
+    )  # fmt: skip
 
 
-def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int) -> dict[str, Any]:
+def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int, problem: str = "") -> ForwardPoint:
     """A large scene once, from the mesh to the end, nothing stored. Collective."""
     cells = cells_for(dimension, size)
     base = peak_memory_mb(comm)
     begin = time.perf_counter()
     model = build(bench_scene(comm, dimension, cells, steps), comm=comm)
     run = simulate(model)
-    result = _row(comm, model, cells, {name: run.seconds[name] for name in ("mesh", "assembly", "factor")})
-    return result | {
-        "memory_mb": peak_memory_mb(comm),
-        "memory_base_mb": base,
-        "repeats": 1,
-        "steps_per_repeat": steps,
-        "step_us": {"ts": 1e6 * run.seconds["steps"] / steps},
-        "drift": run.energy_drift,
-        "drift_steps": steps,
-        "residual": run.residuals[1],
-        "solver": run.solver[0],
-        "total_s": comm.allreduce(time.perf_counter() - begin, MPI.MAX),
-        "whole": None,
-    }
+    seconds = {name: run.seconds[name] for name in ("mesh", "assembly", "factor")}
+    seconds["total"] = comm.allreduce(time.perf_counter() - begin, MPI.MAX)
+    return ForwardPoint(
+        **_sizes(model, cells), problem=problem, large=True, seconds=seconds, memory_mb=peak_memory_mb(comm),
+        memory_base_mb=base, repeats=1, steps_per_repeat=steps, step_us={"ts": 1e6 * run.seconds["steps"] / steps},
+        drift=run.energy_drift, drift_steps=steps, residual=run.residuals[1], solver=run.solver[0],
+    )  # fmt: skip
 
 
-def _row(comm: MPI.Intracomm, model: Model, cells: list[int], seconds: dict[str, float]) -> dict[str, Any]:
+def _sizes(model: Model, cells: list[int]) -> dict[str, Any]:
     layout = model.system.layout
-    sizes = {"n_e": layout.n_e, "states": layout.states, "ranks": comm.size}
-    return {"dimension": layout.dimension, "cells": cells, **sizes, "seconds": seconds}
+    names = {"dimension": layout.dimension, "n_e": layout.n_e, "states": layout.states, "ranks": layout.comm.size}
+    return names | {"cells": cells}
 
 
-def measure_row(*, large: bool, **arguments: Any) -> dict[str, Any]:
-    """A row that :mod:`softgrasp.study.bench.forward` launches. Collective."""
-    return (measure_large if large else measure)(MPI.COMM_WORLD, **arguments)
+def measure_row(*, large: bool, **arguments: Any) -> list[ForwardPoint]:
+    """The point that :mod:`softgrasp.study.bench.forward` asks for. Collective."""
+    return [(measure_large if large else measure)(MPI.COMM_WORLD, **arguments)]

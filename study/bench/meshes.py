@@ -18,6 +18,7 @@ from softgrasp.fem import _stack as _stack  # threads and MPI before anything nu
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
+from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
@@ -62,19 +63,8 @@ class MeshRow:
 def block(n_e: int, steps: int, method: str, N: int) -> Scene:
     """The paper's block with about n_e tissue unknowns, 4 nx^2 on nx x 2 nx cells."""
     nx = max(4, round(math.sqrt(n_e / 4)))
-    return Scene.model_validate(
-        {
-            "name": f"mesh_study_{nx}",
-            "description": "The paper's block on another mesh.",
-            "tissue": {"size": [1.0, 2.0], "cells": [nx, 2 * nx], "material": {"lambda": 50.0, "mu": 50.0, "rho": 1.0}},
-            "contact": {"sides": ["left", "right"], "box": [[0.0, 1.5], [1.0, 2.0]]},
-            "hand": {"mass": 20.0},
-            "motion": {"target": [5.0, 3.0], "duration": 3.0},
-            "time": {"steps": steps},
-            "output": {"every": max(1, steps // KEPT)},
-            "reduction": {"methods": [method], "N": [N]},
-        }
-    )
+    keys = [f"tissue.cells=[{nx}, {2 * nx}]", f"time.steps={steps}", f"output.every={max(1, steps // KEPT)}"]
+    return load_scene(shipped_scenes()["paper_forward"], [*keys, f"reduction={{methods=['{method}'], N=[{N}]}}"])
 
 
 def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,10 +26,11 @@ from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_to_relative
+from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
+from softgrasp.study.bench.driver import Failure
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.timing import repeated
 
@@ -47,12 +46,23 @@ STAGES = {
 
 
 @dataclass(frozen=True)
-class Answer:
-    """Factor and gain of a peer in hand-relative coordinates, with its time."""
+class RiccatiPoint:
+    """One method on nx x 2 nx cells; a peer has fewer numbers."""
 
-    Z: Block
-    K: Block
-    seconds: float
+    nx: int
+    ranks: int
+    method: str
+    states: int
+    seconds: float  # median
+    rank: int  # of Z
+    residual: float  # relative, recomputed from Z
+    gain_difference: float | None  # relative, to the gain of the first method
+    split: dict[str, float] = field(default_factory=dict)  # seconds by stage
+    solves: int = 0
+    newton_steps: int = 0
+    # memory_mb, memory_base_mb: peak of all ranks, and that before the first method [MiB]
+    memory_mb: float = 0.0
+    memory_base_mb: float = 0.0
 
 
 def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
@@ -61,59 +71,41 @@ def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
     return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm=comm))
 
 
-def run_method(comm: MPI.Intracomm, problem: RiccatiProblem, name: str, repeats: int) -> tuple[RiccatiSolution, float]:
-    """The solution and the median time of a few runs [s]. Collective."""
-    solution: list[RiccatiSolution] = []
-
-    def solve() -> None:
-        solution[:] = [METHODS[name]().solve(problem)]
-
-    seconds = float(np.median(repeated(comm, solve, repeats, REPEAT_SECONDS)))
-    return solution[0], seconds
-
-
-def measure(nx: int, beta: float, methods: list[str], repeats: int, partial: str = "") -> dict[str, Any]:
+def measure(nx: int, beta: float, methods: Sequence[str], repeats: int) -> Iterator[RiccatiPoint | Failure]:
     """All methods on nx x 2 nx cells; gains are compared with the first one. Collective.
 
-    ``beta`` is the Kelvin-Voigt time [s]; the file ``partial`` keeps the methods done so far.
+    ``beta`` is the Kelvin-Voigt time [s].
     """
     comm = MPI.COMM_WORLD
     problem = problem_for(comm, nx, beta)
     base = peak_memory_mb(comm)
-    result: dict[str, Any] = {"states": problem.layout.states, "n_e": problem.layout.n_e, "ranks": comm.size}
-    rows: dict[str, Any] = {}
     reference: Gain | None = None
     for name in methods:
+        solved: list[RiccatiSolution] = []
+        solve = partial(lambda name, to: to.append(METHODS[name]().solve(problem)), name, solved)
         try:
-            solution, seconds = run_method(comm, problem, name, repeats)
+            seconds = float(np.median(repeated(comm, solve, repeats, REPEAT_SECONDS)))
         except SoftgraspError as error:
-            rows[name] = {"error": str(error)}
+            yield Failure(f"nx = {nx}, {name}", comm.size, str(error))
             continue
-        rows[name] = {
-            "seconds": seconds,
-            "split": {part: sum(solution.seconds.get(key, 0.0) for key in keys) for part, keys in STAGES.items()},
-            "solves": solution.counts["solves"],
-            "newton_steps": solution.counts["newton_steps"],
-            "rank": solution.rank,
-            "residual": solution.residual,
-            "memory_mb": peak_memory_mb(comm),
-            "memory_base_mb": base,
-        }
-        gain = solution.gain
-        if reference is None:
-            reference = gain
-        else:
-            rows[name]["gain_difference"] = gain_error(problem, reference, gain)
-        if partial and comm.rank == 0:
-            Path(partial).write_text(json.dumps(result | {"methods": rows}))
-    return result | {"methods": rows}
+        s = solved[-1]
+        yield RiccatiPoint(
+            nx, comm.size, name, problem.layout.states, seconds, s.rank, s.residual,
+            None if reference is None else gain_error(problem, reference, s.gain),
+            {part: sum(s.seconds.get(key, 0.0) for key in keys) for part, keys in STAGES.items()},
+            s.counts["solves"], s.counts["newton_steps"], peak_memory_mb(comm), base,
+        )  # fmt: skip
+        reference = reference or s.gain
+
+
+Answer = tuple[Block, Gain, float]  # Z and gain of a peer in hand-relative coordinates, and its seconds
 
 
 def _answer(problem: RiccatiProblem, E: Any, B: Array, Z: Array, seconds: float) -> Answer:
     s = 2 * problem.layout.n_s
     gain = -np.linalg.solve(problem.R, (B.T @ Z) @ (E.T @ Z).T).T
     relative = costates_to_relative(problem.system, Block(Z[:s], Z[s:]))
-    return Answer(relative, gain_to_relative(problem.system, Block(gain[:s], gain[s:])), seconds)
+    return relative, Gain.of_block(gain_to_absolute(problem.system, Block(gain[:s], gain[s:]), -1)), seconds
 
 
 def scipy_answer(problem: RiccatiProblem) -> Answer:
@@ -163,26 +155,19 @@ def pymor_answer(problem: RiccatiProblem) -> Answer:
 PEERS = {"scipy": scipy_answer, "slycot": slycot_answer, "pymor": pymor_answer}
 
 
-def measure_peer(nx: int, beta: float, peer: str) -> dict[str, Any]:
+def measure_peer(nx: int, beta: float, peer: str) -> Iterator[RiccatiPoint | Failure]:
     """One peer against our Newton-ADI, on one rank."""
-    if importlib.util.find_spec(peer) is None:
-        return {"missing": True}
     problem = problem_for(MPI.COMM_WORLD, nx, beta)
     reference = NewtonADI().solve(problem).gain
-    begin = time.perf_counter()
     try:
-        answer = PEERS[peer](problem)
+        Z, gain, seconds = PEERS[peer](problem)
     except Exception as error:  # a peer's failure is a result of the comparison
-        return {"error": f"{type(error).__name__}: {error}"[:200], "seconds": time.perf_counter() - begin}
-    return {
-        "seconds": answer.seconds,
-        "rank": answer.Z.columns,
-        "residual": residual(problem, answer.Z),
-        "gain_difference": gain_error(problem, reference, Gain.of_block(answer.K)),
-        "states": problem.layout.states,
-    }
+        yield Failure(f"{peer}, nx = {nx}", 1, f"failed, {type(error).__name__}: {error}"[:200])
+        return
+    accuracy = residual(problem, Z), gain_error(problem, reference, gain)
+    yield RiccatiPoint(nx, 1, peer, problem.layout.states, seconds, Z.columns, *accuracy)
 
 
-def measure_row(**arguments: Any) -> dict[str, Any]:
-    """A row that :mod:`softgrasp.study.bench.riccati` launches. Collective."""
+def measure_row(**arguments: Any) -> Iterator[RiccatiPoint | Failure]:
+    """The points that :mod:`softgrasp.study.bench.riccati` asks for. Collective."""
     return (measure_peer if "peer" in arguments else measure)(**arguments)

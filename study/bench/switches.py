@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import operator
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import astuple, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +22,7 @@ import softgrasp.lqr.lowrank.modal_start
 import softgrasp.lqr.lowrank.shifted
 import softgrasp.lqr.riccati
 import softgrasp.reduction.online
-from softgrasp.fem.model.build import build
+from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, PETSc, times_columns, to_scipy
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
@@ -39,11 +39,11 @@ from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project as project_model
 from softgrasp.reduction.propagator import propagator
-from softgrasp.study.bench.driver import list_bench, open_console, parse_ranks, write_bench
+from softgrasp.study.bench import driver
+from softgrasp.study.bench.driver import Failure
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
 from softgrasp.study.bench.riccati_rows import problem_for
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.timing import interleave, medians, timed
 
 BATCH = 100  # models of a batch
@@ -74,37 +74,43 @@ Keep the machine quiet. A fast look: --switches batch,start --repeats 3."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """Two methods at one size.
-
-    Attributes:
-        switch: which one.
-        limit: the constant and its value.
-        setting: the size.
-        ranks: MPI ranks.
-        first, second: median seconds.
-    """
+class SwitchPoint:
+    """Two methods at one size."""
 
     switch: str
-    limit: str
-    setting: str
+    limit: str  # the constant and its value
+    setting: str  # the size
     ranks: int
-    first: float
+    first: float  # first, second: median seconds
     second: float
 
 
-def compare(
-    comm: MPI.Intracomm,
-    names: tuple[str, str],
-    setting: str,
-    calls: tuple[Callable[[], Any], Callable[[], Any]],
-    n: int,
-) -> Row:
-    """Time two calls in turn, after one run of each. Collective."""
-    for call in calls:
-        call()
-    seconds = medians(interleave({str(i): partial(timed, comm, call) for i, call in enumerate(calls)}, n))
-    return Row(*names, setting, comm.size, seconds["0"], seconds["1"])
+@dataclass(frozen=True)
+class Setup:
+    """What every switch is measured with."""
+
+    comm: MPI.Intracomm
+    repeats: int
+    large: bool  # also the sizes that take minutes
+
+    def point(self, switch: str, limit: str, setting: str, first: float, second: float) -> SwitchPoint:
+        """Two times on these ranks."""
+        return SwitchPoint(switch, limit, setting, self.comm.size, first, second)
+
+    def compare(
+        self, switch: str, limit: str, setting: str, calls: Sequence[Callable[[], Any]], repeats: int = 0
+    ) -> SwitchPoint:
+        """Time two calls in turn, after one run of each. Collective."""
+        for call in calls:
+            call()
+        tasks = {str(i): partial(timed, self.comm, call) for i, call in enumerate(calls)}
+        seconds = medians(interleave(tasks, repeats or self.repeats))
+        return self.point(switch, limit, setting, seconds["0"], seconds["1"])
+
+    def models(self, sizes: Sequence[tuple[int, int]], large: Sequence[tuple[int, int]] = ()) -> Iterator[Model]:
+        """The bench's scene at dimensions and sizes, one after the other. Collective."""
+        for d, size in (*sizes, *(large if self.large else ())):
+            yield build(bench_scene(self.comm, d, cells_for(d, size), 1), comm=self.comm)
 
 
 def under(module: ModuleType, name: str, value: float, call: Callable[..., Any], *args: Any) -> Any:
@@ -117,10 +123,10 @@ def under(module: ModuleType, name: str, value: float, call: Callable[..., Any],
         setattr(module, name, before)
 
 
-def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def batch(setup: Setup) -> Iterator[SwitchPoint]:
     """Reduced models of random materials, together and one by one. One rank."""
     changes = ["effects.damping={kind='kelvin-voigt', beta=0.002}", "motion={drive='force', profile='hold'}"]
-    model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm=comm)
+    model = build(load_scene_collective(setup.comm, shipped_scenes()["paper_forward"], changes), comm=setup.comm)
     system = model.system
     material, rng = system.materials[0], np.random.default_rng(0)
     force = np.ones((STEPS, system.layout.n_s))
@@ -134,94 +140,86 @@ def batch(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
         size = sum(p.block.nbytes for p in many)
         together = partial(under, softgrasp.reduction.online, "TOGETHER", 2**62, run_batch, many, DT, force)
 
-        def alone(many: list[Any] = many) -> None:
-            for p in many:
-                run(p, None, force)
-
+        alone = partial(lambda many: [run(p, None, force) for p in many], many)
         limit = f"TOGETHER = {softgrasp.reduction.online.TOGETHER / 1e6:g} MB"
-        yield compare(
-            comm, ("batch", limit), f"{BATCH} models, N = {N}, {size / 1e6:.1f} MB", (together, alone), repeats
-        )
+        yield setup.compare("batch", limit, f"{BATCH} models, N = {N}, {size / 1e6:.1f} MB", (together, alone))
 
 
-def start(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def start(setup: Setup) -> Iterator[SwitchPoint]:
     """The Riccati equation of the modal start. One rank."""
     few = softgrasp.lqr.lowrank.modal_start.FEW_MODES
-    plant = Plant(problem_for(comm, 10, 0.002))
+    plant = Plant(problem_for(setup.comm, 10, 0.002))
     for k in (15, 16, 30, 60):
         omega, V = plant_modes(plant, k)
         solve = partial(solve_small, plant, restrict(plant, V, omega, plant.mass(V)))
         calls = (solve, partial(under, softgrasp.lqr.lowrank.modal_start, "FEW_MODES", 2**30, solve))
-        yield compare(comm, ("start", f"FEW_MODES = {few}"), f"2D, {k} modes", calls, repeats)
+        yield setup.compare("start", f"FEW_MODES = {few}", f"2D, {k} modes", calls)
 
 
-def dense(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def dense(setup: Setup) -> Iterator[SwitchPoint]:
     """All modes against low rank. One rank."""
     for nx in (2, 3, 4, 5, 8):
-        problem = problem_for(comm, nx, 0.002)
-        calls = (lambda p=problem: DenseRiccati().solve(p), lambda p=problem: NewtonADI().solve(p))
+        problem = problem_for(setup.comm, nx, 0.002)
+        calls = partial(DenseRiccati().solve, problem), partial(NewtonADI().solve, problem)
         limit = f"DENSE_STATES = {softgrasp.lqr.riccati.DENSE_STATES}"
-        yield compare(comm, ("dense", limit), f"2D, {problem.layout.states} states", calls, repeats)
+        yield setup.compare("dense", limit, f"2D, {problem.layout.states} states", calls)
 
 
-def shift(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def shift(setup: Setup) -> Iterator[SwitchPoint]:
     """Factor and solve at one shift a rank, with whole matrices and spread ones."""
-    for d, size in ((2, 10_000), (2, 100_000), (3, 8_000), (3, 20_000), *(((3, 39_000),) if large else ())):
-        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
+    turn, p = itertools.count(), setup.comm.size
+
+    def once(solver: Any, F: Array) -> None:
+        """As many shifts as there are ranks, new ones each time."""
+        first = next(turn) * p
+        shifts = [SHIFT * (1 + 1e-3 * (first + i)) for i in range(p)]
+        for i, s in enumerate(shifts):
+            solver.solve(s, F, shifts[i + 1 :])
+
+    for model in setup.models(((2, 10_000), (2, 100_000), (3, 8_000), (3, 20_000)), ((3, 39_000),)):
         layout = model.system.layout
-        F = np.ones((layout.n_local, 3))
+        d, F = layout.dimension, np.ones((layout.n_local, 3))
         solvers = [make_shifted(model.system, name) for name in ("gathered", "distributed")]
-        turn = [0]
-
-        def once(solver: Any, F: np.ndarray = F, turn: list[int] = turn, p: int = comm.size) -> None:
-            """As many shifts as there are ranks, new ones each time."""
-            shifts = [SHIFT * (1 + 1e-3 * (turn[0] * p + i)) for i in range(p)]
-            turn[0] += 1
-            for i, s in enumerate(shifts):
-                solver.solve(s, F, shifts[i + 1 :])
-
-        calls = (lambda s=solvers[0]: once(s), lambda s=solvers[1]: once(s))
         limit = f"GATHER_LIMIT = {softgrasp.lqr.lowrank.shifted.GATHER_LIMIT[d]}"
-        yield compare(comm, ("shift", limit), f"{d}D, n_e = {layout.n_e}", calls, 1 if layout.n_e > 30_000 else repeats)
+        calls, repeats = [partial(once, solver, F) for solver in solvers], 1 if layout.n_e > 30_000 else 0
+        yield setup.compare("shift", limit, f"{d}D, n_e = {layout.n_e}", calls, repeats)
         for solver in solvers:
             solver.destroy()
 
 
-def step_and_set_up(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def step_and_set_up(setup: Setup) -> Iterator[SwitchPoint]:
     """Set-up and step of the forward run with PETSc's Cholesky and with MUMPS."""
-    for d, size in ((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000), (3, 20_000)):
-        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
-        names = f"CHOLESKY_LIMIT = {softgrasp.fem.solve.solvers.CHOLESKY_LIMIT[d]}"
-        yield from _two(comm, model, ("cholesky", "auto"), ("mumps", "auto"), ("set-up", "step"), names, repeats)
+    for model in setup.models(((2, 10_000), (2, 100_000), (3, 4_000), (3, 10_000), (3, 20_000))):
+        limit = f"CHOLESKY_LIMIT = {softgrasp.fem.solve.solvers.CHOLESKY_LIMIT[model.system.layout.dimension]}"
+        yield from _two(setup, model, (("cholesky", "auto"), ("mumps", "auto")), "", limit)
 
 
-def whole(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def whole(setup: Setup) -> Iterator[SwitchPoint]:
     """Set-up and step with MUMPS, its factor whole on every rank or spread. Two ranks or more."""
-    if comm.size == 1:
+    if setup.comm.size == 1:
         return
-    for d, size in ((3, 10_000), (3, 50_000), *(((3, 200_000), (2, 1_000_000)) if large else ())):
-        model = build(bench_scene(comm, d, cells_for(d, size), 1), comm=comm)
-        names = f"REPEATED_LIMIT = {softgrasp.fem.solve.solvers.REPEATED_LIMIT[d]} / ranks"
-        heads = ("whole, set-up", "whole, step")
-        yield from _two(comm, model, ("mumps", True), ("mumps", False), heads, names, 1 if size > 60_000 else repeats)
+    for model in setup.models(((3, 10_000), (3, 50_000)), ((3, 200_000), (2, 1_000_000))):
+        limit = softgrasp.fem.solve.solvers.REPEATED_LIMIT[model.system.layout.dimension]
+        ways: tuple[tuple[SolverName, Any], ...] = ("mumps", True), ("mumps", False)
+        yield from _two(setup, model, ways, "whole, ", f"REPEATED_LIMIT = {limit} / ranks")
 
 
-def product(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def product(setup: Setup) -> Iterator[SwitchPoint]:
     """K_ee times columns stored by rows and by columns. CPU seconds; a sample is a mean of calls in a row. One rank."""
     rng = np.random.default_rng(0)
     np.ones(FREED)  # given back at once: from now on the C library keeps arrays up to this size, as in any longer run
-    for size in (1_000, 14_638, *((100_000,) if large else ())):
-        A = build(bench_scene(comm, 2, cells_for(2, size), 1), comm=comm).system.K_ee
+    for model in setup.models(((2, 1_000), (2, 14_638)), ((2, 100_000),)):
+        A = model.system.K_ee
         rows, n = to_scipy(A), A.getSize()[0]
         limit = f"BLOCK_ENTRIES = {softgrasp.fem.petsc.BLOCK_ENTRIES}"
         for k, storage in itertools.product((10, 30, 120), ("rows", "columns")):
             X = np.asarray(rng.standard_normal((n, k)), order="C" if storage == "rows" else "F")
             calls = (partial(times_columns, A, X), partial(operator.matmul, rows, X), partial(by_petsc, A, X))
             ways = zip(("ours", "SciPy", "PETSc"), (partial(cpu_seconds, call) for call in calls), strict=True)
-            seconds = medians(interleave(dict(ways), 3 * repeats))
+            seconds = medians(interleave(dict(ways), 3 * setup.repeats))
             for way in ("SciPy", "PETSc"):
                 setting = f"n_e = {n}, {k} columns by {storage}"
-                yield Row(f"product, {way}", limit, setting, comm.size, seconds["ours"], seconds[way])
+                yield setup.point(f"product, {way}", limit, setting, seconds["ours"], seconds[way])
 
 
 def by_petsc(A: PETSc.Mat, X: Array) -> Any:
@@ -238,11 +236,11 @@ def cpu_seconds(call: Callable[[], Any]) -> float:
     return (time.process_time() - begin) / CALLS
 
 
-def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
+def finite(setup: Setup) -> Iterator[SwitchPoint]:
     """Whole runs with linear elasticity and with finite strain, CPU seconds. One rank."""
 
     def run_of(changes: list[str]) -> Callable[[], float]:
-        model = build(load_scene_collective(comm, shipped_scenes()["paper_forward"], changes), comm=comm)
+        model = build(load_scene_collective(setup.comm, shipped_scenes()["paper_forward"], changes), comm=setup.comm)
 
         def seconds() -> float:
             begin = time.process_time()
@@ -254,29 +252,23 @@ def finite(comm: MPI.Intracomm, repeats: int, large: bool) -> Iterator[Row]:
     for nx in (15, 60):
         cells = f"tissue.cells=[{nx}, {2 * nx}]"
         runs = {"off": run_of([cells]), "on": run_of([cells, "effects.finite_strain={}"])}
-        seconds = medians(interleave(runs, repeats))
-        yield Row("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", comm.size, seconds["off"], seconds["on"])
+        seconds = medians(interleave(runs, setup.repeats))
+        yield setup.point("finite", "effects.finite_strain off, on", f"2D, nx = {nx}", seconds["off"], seconds["on"])
 
 
 def _two(
-    comm: MPI.Intracomm,
-    model: Any,
-    one: tuple[SolverName, Any],
-    other: tuple[SolverName, Any],
-    heads: tuple[str, str],
-    limit: str,
-    repeats: int,
-) -> Iterator[Row]:
+    setup: Setup, model: Model, ways: Sequence[tuple[SolverName, Any]], head: str, limit: str
+) -> Iterator[SwitchPoint]:
     """Set-up and step with two solvers."""
-    system = model.system
+    system, comm = model.system, setup.comm
     setting = f"{system.layout.dimension}D, n_e = {system.layout.n_e}"
     seconds, midpoints = [], []
-    for name, reproducible in (one, other):
+    for name, reproducible in ways:
         comm.Barrier()
         begin = time.perf_counter()
         midpoints.append(TissueMidpoint(system, DT, name, reproducible=reproducible))
         seconds.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
-    yield Row(heads[0], limit, setting, comm.size, *seconds)
+    yield setup.point(f"{head}set-up", limit, setting, *seconds)
     c = np.ones(system.layout.n_s)
     states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in midpoints]
     for midpoint, state in zip(midpoints, states, strict=True):
@@ -286,68 +278,52 @@ def _two(
         midpoints[i].solve_midpoint(c)
         midpoints[i].advance(states[i], states[i])
 
-    yield compare(comm, (heads[1], limit), setting, (partial(step, 0), partial(step, 1)), max(repeats, 3))
+    repeats = 3 if system.layout.n_e > 60_000 else max(setup.repeats, 3)
+    yield setup.compare(f"{head}step", limit, setting, (partial(step, 0), partial(step, 1)), repeats)
     for midpoint in midpoints:
         midpoint.destroy()
 
 
-SWITCHES: dict[str, Callable[[MPI.Intracomm, int, bool], Iterator[Row]]] = {
-    "batch": batch,
-    "start": start,
-    "dense": dense,
-    "shift": shift,
-    "step": step_and_set_up,
-    "whole": whole,
-    "product": product,
-    "finite": finite,
-}
+SWITCHES: dict[str, Callable[[Setup], Iterator[SwitchPoint]]] = {
+    "batch": batch, "start": start, "dense": dense, "shift": shift, "step": step_and_set_up, "whole": whole,
+    "product": product, "finite": finite,
+}  # fmt: skip
 SERIAL = ("batch", "start", "dense", "product", "finite")
-
-
-def measure(switch: str, repeats: int, large: bool) -> dict[str, Any]:
-    """The rows of one switch. Collective."""
-    return {"rows": [asdict(row) for row in SWITCHES[switch](MPI.COMM_WORLD, repeats, large)]}
-
-
 HEADER = ("switch", "constant", "size", "ranks", "first s", "second s", "second / first")
 
 
-def table_of(rows: list[Row]) -> Table:
+def measure(switch: str, repeats: int, large: bool) -> Iterator[SwitchPoint]:
+    """The points of one switch. Collective."""
+    return SWITCHES[switch](Setup(MPI.COMM_WORLD, repeats, large))
+
+
+def table_of(points: list[SwitchPoint]) -> Table:
     """The one table."""
-    cells = [
-        (r.switch, r.limit, r.setting, r.ranks, f"{r.first:.3g}", f"{r.second:.3g}", f"{r.second / r.first:.2f}")
-        for r in rows
-    ]
+    cells = [(*astuple(p)[:4], f"{p.first:.3g}", f"{p.second:.3g}", f"{p.second / p.first:.2f}") for p in points]
     return Table(HEADER, cells, "two methods around the sizes of a switch, median seconds")
 
 
 def main(
     switches: Annotated[str, typer.Option(help="which, with commas")] = ",".join(SWITCHES),
-    ranks: Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")] = "1,2",
-    repeats: Annotated[int, typer.Option(help="repeats behind each median", min=1)] = 5,
+    ranks: driver.Ranks = "1,2",
+    repeats: driver.Repeats = 5,
     large: Annotated[bool, typer.Option("--large", help="also sizes that take minutes")] = False,
     out: Annotated[Path, typer.Option(help="folder for bench_switches.json and bench_switches.csv")] = Path("out"),
 ) -> None:
     """See HELP."""
-    names, counts = [name.strip() for name in switches.split(",")], parse_ranks(ranks)
+    names, counts = [name.strip() for name in switches.split(",")], driver.parse_ranks(ranks)
     for name in names:
         if name not in SWITCHES:
             raise typer.BadParameter(f"'{name}' is no switch; choose from {', '.join(SWITCHES)}")
         if name == "whole" and max(counts) == 1 and len(names) == 1:
             raise typer.BadParameter("whole and spread factors are the same on one rank; add --ranks 2")
-    console = open_console(130)
-    rows: list[Row] = []
-    failed = False
+    console, rows = driver.open_console(130), list[SwitchPoint | Failure]()
     for name in names:
         for k in [k for k in counts if k == 1 or name not in SERIAL]:
-            with console.status(f"{name}, {k} rank(s)"):
-                spec = {"switch": name, "repeats": repeats, "large": large}
-                answer = launch_worker("switches", spec, k)
-            if "error" in answer:
-                failed = True
-                console.print(f"{name}, {k} rank(s): {answer['error']}", markup=False)
-            rows += [Row(**row) for row in answer.get("rows", [])]
-    console.print(table_of(rows).terminal())
-    content = {"command": "bench_switches", "rows": [asdict(row) for row in rows]}
-    table = Table(tuple(Row.__dataclass_fields__), [tuple(asdict(row).values()) for row in rows])
-    list_bench(console, write_bench(out, "bench_switches", content, table), failed)
+            spec = {"switch": name, "repeats": repeats, "large": large}
+            rows += driver.measure(console, SwitchPoint, "switches", spec, k, name)
+    points, failed = driver.of(SwitchPoint, rows), driver.failures(rows)
+    console.print(table_of(points).terminal())
+    content = {"command": "bench_switches", "rows": driver.as_rows(points), "failed": driver.as_rows(failed)}
+    table = Table(tuple(f.name for f in fields(SwitchPoint)), [astuple(point) for point in points])
+    driver.list_bench(console, driver.write_bench(out, "bench_switches", content, table), failed)

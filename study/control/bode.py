@@ -10,6 +10,7 @@ from matplotlib.ticker import MultipleLocator
 
 from softgrasp.lqr.loop.margins import LoopMargins
 from softgrasp.study.pictures.style import CYCLE, OUTLINE, WIDTH, paper_style, save
+from softgrasp.study.report.tables import Table
 
 SHOWN = 1e-4  # gains below are not drawn
 STYLES = ("-", "--", ":", "-.")
@@ -40,21 +41,15 @@ def figure_bode(margins: LoopMargins, out_png: Path) -> tuple[Path, ...]:
         return save(figure, out_png)
 
 
-def margin_rows(margins: LoopMargins) -> list[tuple[str, str, str, str, str]]:
+def margin_table(margins: LoopMargins) -> Table:
     """One row an input: gain factors, phase margin, crossover, delay."""
-    return [
-        (
-            a.name,
-            f"{a.gain_down:.3g} to {_number(a.gain_up)}",
-            f"{_number(a.phase)} deg",
-            f"{_number(a.crossover)} rad/s",
-            f"{_number(a.delay)} s",
-        )
+    rows = [
+        (a.name, f"{a.gain_down:.3g} to {_number(a.gain_up)}", f"{_number(a.phase)} deg",
+         f"{_number(a.crossover)} rad/s", f"{_number(a.delay)} s")
         for a in margins.axes
-    ]
-
-
-MARGIN_HEADER = ("input", "gain may change by a factor", "phase margin", "at", "delay it bears")
+    ]  # fmt: skip
+    header = ("input", "gain may change by a factor", "phase margin", "at", "delay it bears")
+    return Table(header, rows, "Margins of the small controller")
 
 
 def margin_text(margins: LoopMargins) -> str:

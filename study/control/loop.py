@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
@@ -25,6 +25,7 @@ from softgrasp.lqr.plant.target import rest
 from softgrasp.study.control.result import ControlStudy, FiniteLoop, LoopRuns, ReducedLoopRun, a_priori
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import move_steps
+from softgrasp.study.shell.timing import repeated
 
 NEAR = 0.01  # of the way, which a loop that settles comes to
 SHOWN_MODES = 20  # whose poles are drawn
@@ -33,15 +34,10 @@ TICKS = 1000  # behind the time of one tick of the controller
 
 def tick_seconds(controller: Controller) -> float:
     """Median seconds of a tick of ten."""
-    q, v = np.zeros(controller.n_s), np.zeros(controller.n_s)
-    times = []
-    for _ in range(TICKS // 10):
-        begin = time.perf_counter()
-        for _ in range(10):
-            controller.step(q, v)
-        times.append((time.perf_counter() - begin) / 10)
+    rest = np.zeros(controller.n_s)
+    times = repeated(MPI.COMM_SELF, lambda: [controller.step(rest, rest) for _ in range(10)], TICKS // 10, np.inf)
     controller.reset()
-    return float(np.median(times))
+    return float(np.median(times)) / 10
 
 
 def save_controllers(

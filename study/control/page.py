@@ -11,7 +11,7 @@ from softgrasp.study.control.result import TITLES, ControlStudy
 from softgrasp.study.control.tables import BOX_HEADER, box_rows, loop_table, reduced_table, summary_rows
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation_control import control_text
-from softgrasp.study.report.page import Section
+from softgrasp.study.report.page import Section, captioned
 
 CAPTIONS = {
     "move.png": "The move to the target at some instants, full plant under the optimal gain.",
@@ -31,10 +31,9 @@ CAPTIONS = {
 
 def captions(drawn: Sequence[Path], settle: float) -> dict[str, tuple[Path, str]]:
     """Pictures by name with their captions, in the order of :data:`CAPTIONS`."""
-    files = {file.name: file for file in drawn}
     faster = speed_up(np.array([0.0, settle]))
     speed = "" if faster == 1 else f" at {faster:g} times its speed"
-    return {name: (files[name], text.format(speed=speed)) for name, text in CAPTIONS.items() if name in files}
+    return {file.name: (file, text.format(speed=speed)) for file, text in captioned(drawn, CAPTIONS)}
 
 
 def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[Path]) -> list[Section]:
@@ -54,12 +53,9 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     if study.bases:
         parts += _reduced(study, pick("errors.png"))
     if study.margins is not None:
-        from softgrasp.study.control.bode import MARGIN_HEADER, margin_rows, margin_text  # brings Matplotlib
+        from softgrasp.study.control.bode import margin_table, margin_text  # brings Matplotlib
 
-        rows, text = margin_rows(study.margins), margin_text(study.margins)
-        parts.append(
-            Section("Margins of the small controller", text, header=MARGIN_HEADER, rows=rows, figures=pick("bode.png"))
-        )
+        parts.append(margin_table(study.margins).section(margin_text(study.margins), figures=pick("bode.png")))
     for i, r in enumerate(study.retuned):
         text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
         own = [] if i else pick("retune.png")
@@ -70,7 +66,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
 def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:
     plan = study.loops.plan
     text = (
-        "Each equation is projected on N basis vectors and solved; its gain is judged on the full plant. The bases "
+        "Each equation is projected on N basis vectors and solved; its gain is tested on the full plant. The bases "
         "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
         "The excess cost is J/J* - 1 on the modes kept. The first bound beside it is proved for the whole plant, by "
         f"the duality gap, for the run to t = {plan.dt * plan.steps:.4g} s and the optimal feedback after it; the "

@@ -10,36 +10,24 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.bode import figure_bode
 from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned
+from softgrasp.study.pictures import style
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories, figure_loop_move
-from softgrasp.study.pictures.style import (
-    BLUE,
-    COLUMN,
-    GREEN,
-    HAND,
-    ORANGE,
-    PURPLE,
-    SKY,
-    UNSTABLE,
-    direct_labels,
-    paper_style,
-    save,
-)
 
 LOOKS = {
-    "pod": (BLUE, "-", "o"),
-    "weighted_pod": (SKY, "--", "s"),
-    "pod_fixed_solid": (ORANGE, "-", "^"),
-    "componentwise_pod": (PURPLE, "--", "D"),
-    "pod_decomposed": (GREEN, "-", "v"),
-    "structured": (HAND, "-", "P"),
+    "pod": (style.BLUE, "-", "o"),
+    "weighted_pod": (style.SKY, "--", "s"),
+    "pod_fixed_solid": (style.ORANGE, "-", "^"),
+    "componentwise_pod": (style.PURPLE, "--", "D"),
+    "pod_decomposed": (style.GREEN, "-", "v"),
+    "structured": (style.HAND, "-", "P"),
 }
 QUANTITIES = (
     ("error_P", "error of $P$"),
@@ -48,7 +36,7 @@ QUANTITIES = (
 )
 TOP = 1.0  # errors above 100 % are not drawn
 LOWEST = 1e-12  # smaller excess cost is rounding
-CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.2, "color": UNSTABLE}
+CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.2, "color": style.UNSTABLE}
 
 
 def drawn(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
@@ -67,8 +55,8 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ..
     """Relative error of P, of K, and excess cost against N for all methods; unstable gains marked; PNG and PDF."""
     ran = [s for s in bases if s.reports]
     bad = False
-    with paper_style():
-        figure, axes = plt.subplots(3, 1, figsize=(COLUMN + 1.8, 6.6), sharex=True)
+    with style.paper_style():
+        figure, axes = plt.subplots(3, 1, figsize=(style.COLUMN + 1.8, 6.6), sharex=True)
         figure.subplots_adjust(left=0.13, right=0.66, bottom=0.07, top=0.93, hspace=0.16)
         for ax, (key, label) in zip(axes, QUANTITIES, strict=True):
             for j, s in enumerate(ran):
@@ -80,16 +68,11 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ..
                 place = {"transform": ax.get_xaxis_transform(), "clip_on": False, "in_layout": False}
                 for look in (_look(s) | {"ls": ""}, CROSS) if edge else ():
                     ax.plot(edge, [1.0] * len(edge), **place, **look)
-            ax.set_yscale("log")
-            ax.set_ylim(top=2.5 * TOP)
-            ax.yaxis.set_major_locator(LogLocator(numticks=12))
-            ax.yaxis.set_minor_formatter(NullFormatter())
+            style.log_axis(ax, 2.5 * TOP)
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-            ax.grid(axis="y", color="#e6e6e6", lw=0.5)
-            ax.set_axisbelow(True)
             ax.set_ylabel(label)
             ends = [(drawn(s, key), s) for s in ran]
-            direct_labels(
+            style.direct_labels(
                 ax,
                 [
                     (*[(n, x) for n, x in zip(N, v, strict=True) if x > 0][-1], TITLES[s.name], LOOKS[s.name][0])
@@ -101,7 +84,7 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ..
         if bad:
             text = "unstable loop; on the edge: error above 1"
             figure.legend(handles=[Line2D([], [], label=text, **CROSS)], loc="upper left", borderaxespad=0.2)
-        return save(figure, out_png)
+        return style.save(figure, out_png)
 
 
 def _look(basis: BasisGains) -> dict[str, Any]:
@@ -111,10 +94,10 @@ def _look(basis: BasisGains) -> dict[str, Any]:
 
 def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]:
     """Excess cost of the re-tuned gains over the box of lambda and mu, one panel a basis; PNG and PDF."""
-    with paper_style():
+    with style.paper_style():
         count = len(retuned)
         figure, axes = plt.subplots(
-            count, 1, figsize=(COLUMN + 0.8, 0.4 + 2.3 * count), squeeze=False, sharex=True, layout="constrained"
+            count, 1, figsize=(style.COLUMN + 0.8, 0.4 + 2.3 * count), squeeze=False, sharex=True, layout="constrained"
         )
         values = [p.cost_excess for r in retuned for p in r.points if p.stable]
         low, high = min(values, default=LOWEST), max(values, default=TOP)
@@ -134,7 +117,7 @@ def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]
                 ink = "white" if norm(value) > 0.45 else "black"
                 ax.text(lam[i], mu[i], f"{value:.0e}", ha="center", va="center", fontsize=6.5, color=ink)
             rest = [i for i in range(len(lam)) if i not in fine]
-            ax.plot([lam[i] for i in rest], [mu[i] for i in rest], "x", color=UNSTABLE, ms=8, mew=1.6)
+            ax.plot([lam[i] for i in rest], [mu[i] for i in rest], "x", color=style.UNSTABLE, ms=8, mew=1.6)
             ax.set(xscale="log", yscale="log", ylabel=r"$\mu$ [Pa]")
             ax.margins(0.25)
             _few_ticks(ax, sorted(set(lam)), sorted(set(mu)))
@@ -142,7 +125,7 @@ def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]
         axes[-1, 0].set_xlabel(r"$\lambda$ [Pa]")
         if picture is not None:
             figure.colorbar(picture, ax=axes[:, 0].tolist(), label=QUANTITIES[2][1])
-        return save(figure, out_png)
+        return style.save(figure, out_png)
 
 
 def _few_ticks(ax: Any, lam: Sequence[float], mu: Sequence[float]) -> None:

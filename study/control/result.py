@@ -17,11 +17,11 @@ from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
-from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation, translation_defect, velocity_defect
+from softgrasp.lqr.plant.identities import rigid_gains, translation_defect, velocity_defect
 from softgrasp.lqr.plant.target import Target
 from softgrasp.lqr.reduced.bases import A_PRIORI
-from softgrasp.lqr.reduced.retune import BoxPoint
-from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.lqr.reduced.retune import RetunedGain
+from softgrasp.lqr.reduced.riccati import GainQuality, GainReport
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
@@ -49,7 +49,7 @@ class Retuned:
 
     name: str  # basis
     N: int  # order
-    points: tuple[BoxPoint, ...]  # gains at the settings
+    points: tuple[RetunedGain, ...]  # gains at the settings
 
     @property
     def slowest(self) -> float:
@@ -144,6 +144,7 @@ def gain_result(
 ) -> dict[str, Any]:
     """The keys of ``result.json`` that need no closed loop. Collective."""
     problem, solution, quality, layout = d.problem, d.solution, d.quality, d.problem.layout
+    displaced, moving = rigid_gains(problem, solution)
     return {
         "command": "control",
         **origin(d.model.scene, layout.comm.size),
@@ -155,8 +156,8 @@ def gain_result(
         **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
         "residual": solution.residual,
         "optimal_cost": d.judge.optimal,
-        "gain_translation": gain_translation(problem, solution).tolist(),
-        "gain_rigid_velocity": gain_rigid_velocity(problem, solution).tolist(),
+        "gain_translation": displaced.tolist(),
+        "gain_rigid_velocity": moving.tolist(),
         "identity_translation": translation_defect(problem, solution),
         "identity_velocity": velocity_defect(problem, solution),
         "closed_loop_abscissa": quality.abscissa,
@@ -181,12 +182,12 @@ def report_dict(report: GainReport) -> dict[str, Any]:
     return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
 
 
-def bounds_dict(report: GainReport | BoxPoint) -> dict[str, Any]:
+def bounds_dict(report: GainQuality) -> dict[str, Any]:
     """Bounds on the excess cost, and why there is none."""
     return {key: getattr(report, key) for key in ("cost_excess_proved", "cost_excess_at_most", "unbounded")}
 
 
-def radius_of(report: GainReport | BoxPoint) -> float:
+def radius_of(report: GainQuality) -> float:
     """Spectral radius from tick to tick; nan where there is no gain."""
     return float("nan") if report.sampled is None else report.sampled.value
 

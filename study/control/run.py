@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from rich.console import Console
@@ -30,22 +30,14 @@ from softgrasp.study.control.tables import best_table, summary, summary_rows, ta
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.tables import pairs
-from softgrasp.study.shell.session import Page, Session, list_files
+from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 GOAL = 1e-10  # of the solver when the scene names none: the right end of its progress bar
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
 
 def run_control(
-    path: Path,
-    out: Path,
-    overrides: list[str],
-    console: Console,
-    *,
-    quiet: bool = False,
-    pictures: bool = True,
-    empty: bool = False,
-    gain_only: bool = False,
+    path: Path, out: Path, overrides: list[str], console: Console, *, gain_only: bool = False, **flags: Unpack[Flags]
 ) -> dict[str, Any]:
     """Design the optimal feedback of a scene file, reduce it, close the loop and write the results. Collective.
 
@@ -53,7 +45,7 @@ def run_control(
     the same scene, folder and rank count goes on from them; they are removed at the end. ``gain_only`` writes the
     controllers, without closed loop and pictures.
     """
-    session = Session("control", path, overrides, out, console, quiet, pictures, empty)
+    session = Session("control", path, overrides, out, console, **flags)
     model, sentence = with_control(session.model(session.scene(), steps=False))
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
@@ -76,7 +68,7 @@ def run_control(
 
     def page() -> Page:
         drawn: list[Path] = []
-        if pictures and study.retuned:
+        if session.pictures and study.retuned:
             from softgrasp.study.control.plots import figure_retune  # brings Matplotlib
 
             drawn += figure_retune(study.retuned, out / "retune.png")
@@ -211,4 +203,4 @@ def show(console: Console, study: ControlStudy, seconds: dict[str, float]) -> No
         console.print(f"note: {sentence}", soft_wrap=True, markup=False)
     console.print(pairs(summary_rows(study, seconds)))
     if study.bases:
-        console.print(best_table(study.bases).terminal(wrap=[0]))
+        console.print(best_table(study.bases).terminal(wrap=[0], width=console.width))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+
+import numpy as np
+from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import on_root
@@ -16,12 +18,13 @@ from softgrasp.lqr.design.orders import BasisGains, Notify, fast_order, reduce_g
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
-from softgrasp.lqr.reduced.retune import BoxPoint, Materials, Retuner, over_box
+from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
 from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES
-from softgrasp.reduction.parameters import box_materials, outside
+from softgrasp.reduction.parameters import grid_of, materials_at, outside
 from softgrasp.study.control.result import Retuned
+from softgrasp.study.shell.timing import repeated
 
 SOLUTIONS = 3  # of a reduced equation, the fastest counts
 REPEATS = 5  # of a re-tuning, the best counts
@@ -39,16 +42,10 @@ def with_time(problem: RiccatiProblem, report: GainReport) -> GainReport:
     matrices = report.matrices
     if matrices is None:
         return report
-
-    def fastest() -> float:
-        seconds = float("inf")
-        for _ in range(SOLUTIONS):
-            begin = time.perf_counter()
-            solve_reduced(matrices)
-            seconds = min(seconds, time.perf_counter() - begin)
-        return seconds
-
-    return replace(report, time_are=on_root(problem.layout.comm, fastest))
+    seconds = on_root(
+        problem.layout.comm, lambda: repeated(MPI.COMM_SELF, lambda: solve_reduced(matrices), SOLUTIONS, np.inf)
+    )
+    return replace(report, time_are=min(seconds))
 
 
 def retune(
@@ -69,7 +66,7 @@ def retune(
         reason = f"no basis has a stable gain of order N <= {fast_order(layout.n_s)}"
     if reason:
         return (), reason
-    settings = box_materials(design.model)
+    settings = [materials_at(design.model, *place) for place in grid_of(design.model)]
     solutions: dict[Materials, RiccatiSolution] = {}
 
     def full(problem: RiccatiProblem) -> RiccatiSolution:
@@ -79,7 +76,7 @@ def retune(
         return solutions[key]
 
     tuners = [Retuner(design.problem, family.at(N)) for family, N in chosen]
-    columns = list[list[BoxPoint]]()
+    columns = list[list[RetunedGain]]()
     for materials in settings:
         points = [_at(tuner, materials, full, design) for tuner in tuners]
         if materials in solutions:
@@ -94,13 +91,12 @@ def retune(
 
 def _at(
     tuner: Retuner, materials: Materials, full: Callable[[RiccatiProblem], RiccatiSolution], design: Design
-) -> BoxPoint:
+) -> RetunedGain:
     comm, modes = tuner.problem.layout.comm, min(SOME_MODES, tuner.problem.layout.n_e)
     try:
-        (point,) = over_box(tuner, [materials], full, design.error, modes, design.judge.law)
+        point = retuned_gain(tuner, materials, full, design.error, modes, design.judge.law)
     except (ControlError, SolverError) as failed:  # the full solution, not the re-tuned one
-        nan = float("nan")
-        return BoxPoint(materials, nan, nan, nan, nan, f"no reference: {failed}")
+        return RetunedGain(materials, reason=f"no reference: {failed}")
     if point.reason:
         return point
     # the first solution of a size pays for memory and caches, which a running controller does not

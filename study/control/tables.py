@@ -12,9 +12,8 @@ from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
-from softgrasp.lqr.plant.identities import gain_rigid_velocity, gain_translation
-from softgrasp.lqr.reduced.retune import BoxPoint
-from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.lqr.plant.identities import rigid_gains
+from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.control.result import TITLES, ControlStudy, Retuned, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.report.tables import Table
@@ -95,7 +94,7 @@ def _controller(controller: CertifiedController | None, tick: float) -> str:
 
 def gain_rows(design: Design) -> list[tuple[str, str]]:
     """The solution of the Riccati equation and its closed loop as label and text."""
-    solution = design.solution
+    solution, (displaced, moving) = design.solution, rigid_gains(design.problem, design.solution)
     counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
     return [
         ("method", solution.summary),
@@ -103,8 +102,8 @@ def gain_rows(design: Design) -> list[tuple[str, str]]:
         ("true relative residual", f"{solution.residual:.1e}"),
         ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
         *_spectrum(design),
-        ("gain, body displaced", _matrix(gain_translation(design.problem, solution))),
-        ("gain, body moving", _matrix(gain_rigid_velocity(design.problem, solution))),
+        ("gain, body displaced", _matrix(displaced)),
+        ("gain, body moving", _matrix(moving)),
     ]
 
 
@@ -150,7 +149,7 @@ def _fast(r: Retuned) -> str:
     )
 
 
-def _mark(gain: GainReport | BoxPoint) -> str:
+def _mark(gain: GainQuality) -> str:
     if gain.reason:
         return "none"
     if gain.stable or not gain.certified:
@@ -160,12 +159,12 @@ def _mark(gain: GainReport | BoxPoint) -> str:
     return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
 
 
-def _cells(gain: GainReport | BoxPoint, *values: float) -> list[float | None]:
+def _cells(gain: GainQuality, *values: float) -> list[float | None]:
     """Nothing where there is no gain, or no finite number."""
     return [None if gain.reason or not np.isfinite(x) else float(x) for x in values]
 
 
-def _excess(gain: GainReport | BoxPoint) -> tuple[float, float, float]:
+def _excess(gain: GainQuality) -> tuple[float, float, float]:
     return gain.cost_excess, gain.cost_excess_proved, gain.cost_excess_at_most
 
 
@@ -216,11 +215,6 @@ def box_rows(r: Retuned) -> list[Row]:
     ]
 
 
-def retune_table(retuned: Sequence[Retuned]) -> Table:
-    """All settings of all bases."""
-    return Table(("basis", "N", *BOX_HEADER), [(TITLES[r.name], r.N, *row) for r in retuned for row in box_rows(r)])
-
-
 def loop_table(study: ControlStudy) -> Table:
     """Full plant under every gain."""
     full = study.loops.full
@@ -251,5 +245,6 @@ def tables(study: ControlStudy) -> dict[str, Table]:
     if study.bases:
         files["reduced.csv"] = reduced_table(study.bases)
     if study.retuned:
-        files["retune.csv"] = retune_table(study.retuned)
+        rows = [(TITLES[r.name], r.N, *row) for r in study.retuned for row in box_rows(r)]
+        files["retune.csv"] = Table(("basis", "N", *BOX_HEADER), rows)
     return files

@@ -74,11 +74,7 @@ class Experiments:
     """Runs of one scene with any set of its effects on, each made once. Collective.
 
     Where a control problem lets a force move the hand that the run moves by itself, every run has a second one under
-    the force that would make that motion.
-
-    Args:
-        scales: what trial values rest on.
-        models: already built, by the set of effects that are on; the scene's own among them.
+    the force that would make that motion. ``models`` are built already, the scene's own among them.
     """
 
     def __init__(self, scene: Scene, scales: Scales, models: dict[Names, Model]) -> None:
@@ -128,8 +124,7 @@ class Experiments:
 
     def shows(self, a: Names, b: Names, tolerance: float) -> tuple[float, bool] | None:
         """A change of the outputs above the tolerance, and whether only a force brings it out. Collective."""
-        change = self.change(a, b).outputs
-        if change > tolerance:
+        if (change := self.change(a, b).outputs) > tolerance:
             return change, False
         control = self.control(a, b)
         return None if control is None or control <= tolerance else (control, True)

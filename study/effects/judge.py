@@ -11,7 +11,6 @@ from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import Changes, Together
 from softgrasp.study.effects.measure import AGAIN, SCENE, Case, fingerprint, objects_of
-from softgrasp.study.effects.objects import difference
 from softgrasp.study.effects.result import Change, Company, Cost, Finding, OffProof
 from softgrasp.study.effects.switch import Switch, neutral
 from softgrasp.study.forward.accuracy import percent
@@ -30,9 +29,9 @@ def judge(change: float, controls: bool, costs: bool, tolerance: float) -> str:
     return "wasted" if costs and not controls else "optional"
 
 
-def quartiles(samples: Array) -> tuple[float, float]:
-    """Lower and upper quartile."""
-    low, high = np.quantile(samples, [0.25, 0.75])
+def ends(samples: Array, share: float = 0.0) -> tuple[float, float]:
+    """Smallest and largest sample, or the two with a share of the samples beyond."""
+    low, high = np.quantile(samples, [share, 1 - share])
     return float(low), float(high)
 
 
@@ -45,17 +44,18 @@ def cost_of(with_: Case, without: Case, noise: float) -> Cost:
     assembly, setup, step = added("assembly"), added("setup"), added("step")
     shares = step / np.array(without.seconds["step"])
     more, less = sum(with_.bytes.values()), sum(without.bytes.values())
+    low, high = ends(shares)
     return Cost(
         assembly=float(np.median(assembly)),
         setup=float(np.median(setup)),
-        assembly_range=(float(assembly.min()), float(assembly.max())),
-        setup_range=(float(setup.min()), float(setup.max())),
+        assembly_range=ends(assembly),
+        setup_range=ends(setup),
         step=float(np.median(step)),
         step_relative=float(np.median(shares)),
-        step_low=float(shares.min()),
-        step_high=float(shares.max()),
+        step_low=low,
+        step_high=high,
         step_noise=noise,
-        step_quartiles=quartiles(shares),
+        step_quartiles=ends(shares, 0.25),
         flops=with_.flops - without.flops,
         flops_relative=with_.flops / without.flops - 1 if without.flops else 0.0,
         memory=more - less,
@@ -63,6 +63,11 @@ def cost_of(with_: Case, without: Case, noise: float) -> Cost:
         holds=tuple(sorted(set(with_.bytes) - set(without.bytes))),
         objects=difference(with_.objects, without.objects),
     )
+
+
+def difference(more: dict[str, int], less: dict[str, int]) -> dict[str, int]:
+    """What the one has more, or less, of each class than the other."""
+    return {name: d for name in sorted({*more, *less}) if (d := more.get(name, 0) - less.get(name, 0))}
 
 
 def prove_off(name: str, before: Case, again: Case) -> OffProof:

@@ -7,9 +7,13 @@ PETSc counts the operations of a step, and every matrix, vector and array that a
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,14 +25,15 @@ from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import digest
-from softgrasp.study.effects.objects import STEPS, counting
 from softgrasp.study.effects.switch import changed
-from softgrasp.study.shell.timing import interleave, medians
+from softgrasp.study.shell.timing import interleave, medians, rotated
 
 BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
 BURST_SECONDS = 0.02  # of the steps of one; long against the timer
 BUILD_SECONDS = 6.0  # the builds are repeated at most about this long
 MOST_STEPS = 20_000  # in one sample
+STEPS = 10  # in which nothing may be created
+OWN = "Viewer"  # made by the count itself
 SCENE, AGAIN = "scene", "scene again"  # cases: as it is, before and after its effects are switched
 
 
@@ -48,7 +53,7 @@ class Case:
 
 
 class Stepper:
-    """A run that can be taken back to its start, to time its steps as often as wanted. Collective."""
+    """A run that can be taken back to its start, to time its steps any number of times. Collective."""
 
     def __init__(self, model: Model) -> None:
         self.comm: MPI.Intracomm = model.system.layout.comm
@@ -86,12 +91,7 @@ class Stepper:
         self.run.advance_to(self.ts, few)
         before = PETSc.Log.getFlops()
         self.run.advance_to(self.ts, many)
-        local = PETSc.Log.getFlops() - before
-        return float(self.comm.allreduce(local)) / max(many - few, 1)
-
-    def advance(self, count: int) -> None:
-        """Go on by so many steps, or to the end. Collective."""
-        self.run.advance_to(self.ts, min(self.run.reached + count, self.run.steps))
+        return float(self.comm.allreduce(PETSc.Log.getFlops() - before)) / max(many - few, 1)
 
     def destroy(self) -> None:
         """Free the PETSc objects. Collective."""
@@ -136,35 +136,32 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     Found by looking through the objects, so that nothing an effect allocates can be forgotten. Views count once; what
     every rank holds for itself counts on each.
     """
-    system, comm = model.system, model.system.layout.comm
-    holders: list[tuple[str, Any]] = [("", system), ("", system.damping), ("step.", run.midpoint), ("hand.", run.drive)]
-    holders.append(("step.", run.midpoint.held))
-    if run.midpoint.held.order is not None:
-        holders.append(("step.order.", run.midpoint.held.order))
-    holders += [("points.", p) for p in (system.points, getattr(run.midpoint, "body", None)) if p is not None]
+    system, comm, midpoint = model.system, model.system.layout.comm, run.midpoint
+    holders: list[tuple[str, Any]] = [("", system), ("", system.damping), ("step.", midpoint), ("hand.", run.drive)]
+    holders += [("step.", midpoint.held), ("step.order.", midpoint.held.order)]
+    holders += [("points.", system.points), ("points.", getattr(midpoint, "body", None))]
     for layer in system.layers:
         holders += [(f"{key}[{layer.name}].", getattr(layer, key)) for key in ("K_mu", "K_lambda", "M_1")]
+    held = [(prefix + name, v) for prefix, at in holders if at is not None for name, v in vars(at).items()]
     seen: set[int] = set()
     sizes: dict[str, float] = {}
 
     def everywhere(size: float, obj: PETSc.Object) -> float:
         return float(comm.allreduce(size)) if obj.comm.size < comm.size else size
 
-    for prefix, holder in holders:
-        for name, value in vars(holder).items():
-            if isinstance(value, PETSc.Mat) and value.handle not in seen:
-                seen.add(value.handle)
-                sizes[prefix + name] = everywhere(matrix_memory(value), value)
-            elif isinstance(value, PETSc.Vec):
-                seen.add(value.array_r.ctypes.data)
-                sizes[prefix + name] = everywhere(8.0 * value.getSize(), value)
-    for prefix, holder in holders:
-        for name, value in vars(holder).items():
-            if isinstance(value, np.ndarray):
-                new = value.ctypes.data not in seen or value.size == 0
-                seen.add(value.ctypes.data)
-                sizes[prefix + name] = sizes.get(prefix + name, 0.0) + float(comm.allreduce(value.nbytes * new))
-    solver = run.midpoint.solver
+    for name, value in held:
+        if isinstance(value, PETSc.Mat) and value.handle not in seen:
+            seen.add(value.handle)
+            sizes[name] = everywhere(matrix_memory(value), value)
+        elif isinstance(value, PETSc.Vec):
+            seen.add(value.array_r.ctypes.data)
+            sizes[name] = everywhere(8.0 * value.getSize(), value)
+    for name, value in held:  # last, for some are views of vectors
+        if isinstance(value, np.ndarray):
+            new = value.ctypes.data not in seen or value.size == 0
+            seen.add(value.ctypes.data)
+            sizes[name] = sizes.get(name, 0.0) + float(comm.allreduce(value.nbytes * new))
+    solver = midpoint.solver
     sizes["S"] = everywhere(matrix_memory(solver.S), solver.S)
     factored = solver.ksp.getOperators()[0]
     if factored.handle != solver.S.handle:
@@ -182,23 +179,24 @@ def measure_builds(
 ) -> dict[str, Case]:
     """Build and factor every scene in rotated order, ``repeats`` times or for `BUILD_SECONDS`. Collective."""
     cases: dict[str, Case] = {}
-    names = list(scenes)
     spent = 0.0
+
+    def once(name: str) -> None:
+        nonlocal spent
+        model = build(scenes[name], comm=comm)
+        with model.watch.stage("setup"):
+            run = Run(model, RunOptions())
+        case = cases.setdefault(name, Case(model))
+        for stage in ("mesh", "assembly", "setup"):
+            case.seconds.setdefault(stage, []).append(model.watch.seconds[stage])
+            spent += model.watch.seconds[stage]
+        run.midpoint.destroy()
+        tick()
+
     for i in range(repeats):
-        shift = i % len(names)
         gc.collect()
-        for name in names[shift:] + names[:shift]:
-            model = build(scenes[name], comm=comm)
-            with model.watch.stage("setup"):
-                run = Run(model, RunOptions())
-            seconds = cases[name].seconds if name in cases else {}
-            for stage in ("mesh", "assembly", "setup"):
-                seconds.setdefault(stage, []).append(model.watch.seconds[stage])
-                spent += model.watch.seconds[stage]
-            if name not in cases:
-                cases[name] = Case(model, seconds)
-            run.midpoint.destroy()
-            tick()
+        for name in rotated(scenes, i):
+            once(name)
         if comm.bcast(spent) > BUILD_SECONDS * (i + 1) / (i + 2):  # one round more would be too long
             break
     return cases
@@ -226,6 +224,43 @@ def measure_steps(comm: MPI.Intracomm, cases: dict[str, Case], repeats: int, tic
             stepper.destroy()
 
 
+# --- objects
+
+
+def created(comm: MPI.Intracomm) -> Counter[str]:
+    """Objects created so far, by class, from the table "Object Type Creations" of PETSc's log on rank 0. Collective.
+
+    The log counts from the first ``PETSc.Log.begin()`` of the process; numpy arrays are not in it.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        name = comm.bcast(str(Path(folder) / "log.txt"))
+        viewer = PETSc.Viewer().createASCII(name, "w", comm=comm)
+        PETSc.Log.view(viewer)
+        viewer.destroy()
+        text = Path(name).read_text() if comm.rank == 0 else ""
+        return Counter(comm.bcast(read_table(text)))
+
+
+def read_table(text: str) -> dict[str, int]:
+    """Class and number of creations from the text of PETSc's log."""
+    counts: Counter[str] = Counter()
+    table = f"\n{text}".partition("\nObject Type")[2].partition("\n===")[0]
+    for line in table.splitlines():
+        parts = line.rsplit(None, 2)
+        if len(parts) == 3 and parts[1].isdigit() and parts[2].isdigit() and parts[0].strip() != OWN:
+            counts[parts[0].strip()] += int(parts[1])  # one row a stage
+    return dict(counts)
+
+
+@contextmanager
+def counting(comm: MPI.Intracomm) -> Iterator[dict[str, int]]:
+    """Fills the dictionary with what is created inside. Collective."""
+    PETSc.Log.begin()
+    before, counts = created(comm), dict[str, int]()
+    yield counts
+    counts.update(created(comm) - before)
+
+
 def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[str, int]]:
     """Objects that PETSc's log sees created up to the first step, and in the next ones. Collective.
 
@@ -233,14 +268,8 @@ def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[
     """
     with counting(comm) as at_first:
         stepper = Stepper(build(scene, comm=comm))
-        stepper.advance(1)
+        stepper.run.advance_to(stepper.ts, min(1, stepper.run.steps))
     with counting(comm) as in_steps:
-        stepper.advance(STEPS)
+        stepper.run.advance_to(stepper.ts, min(1 + STEPS, stepper.run.steps))
     stepper.destroy()
     return at_first, in_steps
-
-
-def count_objects(comm: MPI.Intracomm, cases: dict[str, Case], scenes: dict[str, Scene]) -> None:
-    """Let PETSc count what each case creates, in order. Collective."""
-    for name, case in cases.items():
-        case.objects, case.objects_in_steps = objects_of(comm, scenes[name])

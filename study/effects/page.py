@@ -10,7 +10,6 @@ from rich.markup import escape
 from rich.padding import Padding
 
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.objects import in_words
 from softgrasp.study.effects.plots import figure_effects
 from softgrasp.study.effects.result import EffectsStudy, Finding
 from softgrasp.study.forward.accuracy import percent
@@ -59,7 +58,11 @@ def compose(study: EffectsStudy, scene: Scene, session: Session) -> Page:
         *PROOFS.items(),
     ]
     text = "PETSc's own log counts these objects more with the effect, up to the first step:"
-    objects = [(f.name, in_words(f.cost.objects)) for f in study.findings if f.cost is not None]
+    objects = [
+        (f.name, ", ".join(f"{n:+d} {name.lower()}" for name, n in f.cost.objects.items()) or "none")
+        for f in study.findings
+        if f.cost is not None
+    ]
     files = figure_effects(study.findings, study.tolerance, study.noise_quartiles, session.out / "effects.png")
     proofs = proof_table(study)
     sections = [
@@ -69,7 +72,7 @@ def compose(study: EffectsStudy, scene: Scene, session: Session) -> Page:
         cost_table(study).section(),
         Section("", text, rows=objects),
         *([proofs.section()] if proofs.rows else []),
-        Section("How it is judged", rows=how),
+        Section("How an effect is tested", rows=how),
     ]
     return Page(f"{scene.name}: effects", summary(study), sections, {"effects.csv": csv_table(study)}, files)
 
@@ -103,14 +106,14 @@ def in_company(study: EffectsStudy) -> str:
 
 def csv_table(study: EffectsStudy) -> Table:
     """One row an effect, numbers in full; empty where nothing was tried."""
+    costs = (
+        "assembly [s]", "setup [s]", "step [s]", "step_relative", "step_low", "step_high", "flops", "memory [byte]",
+        "memory_relative",
+    )  # fmt: skip
     header = (
         "effect", "on", "value", "verdict", "gate", "gate_threshold", "gate_matters", "change_outputs",
         "change_deformation", "change_absolute [m]", "change_under_force", "change_advised",
-        "change_advised_under_force", "partners", "assembly [s]", "setup [s]", "step [s]",
-        "step_relative", "step_low", "step_high", "flops", "memory [byte]", "memory_relative", "off_is_free",
-    )  # fmt: skip
-    costs = (
-        "assembly", "setup", "step", "step_relative", "step_low", "step_high", "flops", "memory", "memory_relative",
+        "change_advised_under_force", "partners", *costs, "off_is_free",
     )  # fmt: skip
 
     def cells(f: Finding) -> list[Any]:
@@ -119,7 +122,8 @@ def csv_table(study: EffectsStudy) -> Table:
             f.name, int(f.on), f.value, f.verdict, gate.number, gate.threshold, int(gate.matters),
             *(astuple(f.change) if f.change else [None] * 3), f.control,
             *([beside.change.outputs, beside.control, " ".join(beside.partners)] if beside else [None] * 3),
-            *(getattr(f.cost, name, None) for name in costs), None if f.proof is None else int(f.proof.holds),
+            *(getattr(f.cost, name.split()[0], None) for name in costs),
+            None if f.proof is None else int(f.proof.holds),
         ]  # fmt: skip
 
     return Table(header, [cells(f) for f in study.findings])

@@ -79,14 +79,13 @@ def _changes(ax: Any, marks: Sequence[Tried], rows: Any, tolerance: float) -> No
     ax.xaxis.set_major_locator(LogLocator(numticks=6))
     ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel("relative change of the outputs")
-    grey: dict[str, Any] = {"color": OUTLINE, "ls": "none", "mew": 1.3}
-    entries = [Line2D([], [], marker="o", ms=6, label="this run", **grey)]
+    entries = [_grey("this run", "o", 6)]
     if any(f.control is not None and f.control > ROUNDING for f, _, _ in marks):
-        entries.append(Line2D([], [], marker="D", ms=4.5, label="under a force", **grey))
+        entries.append(_grey("under a force", "D", 4.5))
     if any(f.together is not None for f, _, _ in marks):
-        entries.append(Line2D([], [], marker="^", ms=6, label="with a partner", **grey))
+        entries.append(_grey("with a partner", "^", 6))
     if not all(f.on for f, _, _ in marks):
-        entries.append(Line2D([], [], marker="o", ms=6, mfc="white", label="off, tried", **grey))
+        entries.append(_grey("off, tried", "o", 6, mfc="white"))
     _legend(ax, entries)
 
 
@@ -115,10 +114,12 @@ def _costs(ax: Any, marks: Sequence[Tried], rows: Any, noise: tuple[float, float
         ax.xaxis.set_major_locator(MaxNLocator(6, steps=STEPS))
     ax.margins(x=0.08)
     ax.set_xlabel("added cost [%]")
-    grey: dict[str, Any] = {"color": OUTLINE, "ls": "none", "mew": 1.3}
-    entries: list[Any] = [Line2D([], [], marker="o", ms=5.5, label="time of a step", **grey)]
-    entries.append(Line2D([], [], marker="s", ms=4.5, label="memory", **grey))
+    entries = [_grey("time of a step", "o", 5.5), _grey("memory", "s", 4.5)]
     _legend(ax, [*entries, Patch(color=BAND, label="noise of the time")])
+
+
+def _grey(label: str, marker: str, size: float, **look: Any) -> Any:
+    return Line2D([], [], marker=marker, ms=size, label=label, color=OUTLINE, ls="none", mew=1.3, **look)
 
 
 def _legend(ax: Any, entries: list[Any]) -> None:

@@ -156,18 +156,11 @@ class EffectsStudy:
 
     def to_dict(self) -> dict[str, Any]:
         """What result.json holds."""
-        return {
-            "tolerance": self.tolerance,
-            "repeats": self.repeats,
-            "builds": self.builds,
-            "noise": list(self.noise),
-            "base": self.base,
+        own = ("tolerance", "repeats", "builds", "noise", "base", "advised", "warnings", "sizes")
+        return {name: getattr(self, name) for name in own} | {
             "effects": {f.name: f.to_dict() for f in self.findings},
-            "advised": list(self.advised),
             "off_is_free": all(f.proof.holds for f in self.findings if f.proof is not None),
-            "missing": list(self.explanation.missing),
-            "idle": list(self.explanation.idle),
-            "warnings": list(self.warnings),
+            "missing": self.explanation.missing,
+            "idle": self.explanation.idle,
             "elements": None if self.elements is None else asdict(self.elements),
-            "sizes": self.sizes,
         }

@@ -20,11 +20,11 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import Changes, Experiments, judge_together
 from softgrasp.study.effects.elements import judge_elements
-from softgrasp.study.effects.judge import find, quartiles, shows
-from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, count_objects, measure_builds, measure_steps
+from softgrasp.study.effects.judge import ends, find, shows
+from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, measure_builds, measure_steps, objects_of
 from softgrasp.study.effects.page import compose, show
 from softgrasp.study.effects.result import Change, Company, EffectsStudy
-from softgrasp.study.effects.switch import Switch, scales_of, switches
+from softgrasp.study.effects.switch import Scales, Switch, switches
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.session import Session, list_files
@@ -35,11 +35,9 @@ TIMER = 0.03  # relative difference of two equal runs that cache and page placem
 def study_effects(
     scene: Scene, comm: MPI.Intracomm, progress: Callable[[int, int], None] | None = None
 ) -> EffectsStudy:
-    """Measure every effect of a scene on and off. Collective.
+    """Measure every effect of a scene on and off, as its section study asks. Collective.
 
-    Args:
-        scene: the scene; tolerance and repeats are those of its section study.
-        progress: called with steps of work done and in all.
+    ``progress`` is called with steps of work done and in all.
 
     Raises:
         SceneError, MeshError: the scene cannot be built.
@@ -49,7 +47,9 @@ def study_effects(
     scene = bare_output(scene)
     model = build(scene, comm=comm)  # also compiles the forms
     explanation = explain_model(model)
-    scales = scales_of(model.system.layout, rigid_inertia(model), explanation.time.omega)
+    omega = explanation.time.omega
+    first = float(omega[0]) if len(omega) else None
+    scales = Scales(model.system.layout.dimension, *rigid_inertia(model), first)
     effects = tuple(_runnable(s, comm) for s in switches(scene, scales))
     tried = [s for s in effects if s.other is not None]
     scenes = {SCENE: scene} | {s.name: s.other for s in tried if s.other is not None} | {AGAIN: scene}
@@ -83,7 +83,8 @@ def study_effects(
     elements = judge_elements(runs.models[on], runs.first, scene.study.tolerance)
     done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
-    count_objects(comm, cases, scenes)
+    for name, case in cases.items():
+        case.objects, case.objects_in_steps = objects_of(comm, scenes[name])
     base, again = cases[SCENE], cases[AGAIN]
     ratio = np.array(again.seconds["step"]) / np.array(base.seconds["step"]) - 1
     noise = max(TIMER, float(np.abs(ratio).max()))
@@ -95,8 +96,8 @@ def study_effects(
         tolerance=scene.study.tolerance,
         repeats=repeats,
         builds=len(base.seconds["setup"]),
-        noise=(float(ratio.min()), float(ratio.max())),
-        noise_quartiles=quartiles(ratio),
+        noise=ends(ratio),
+        noise_quartiles=ends(ratio, 0.25),
         base={stage: float(np.median(base.seconds[stage])) for stage in ("mesh", "assembly", "setup", "step")}
         | {"memory": sum(base.bytes.values()), "flops": base.flops},
         sizes={name: getattr(layout, name) for name in ("n_s", "n_e", "states")}

@@ -6,18 +6,13 @@ An effect that is on is taken out; one that is off is put in with a trial value 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.effects.gravity import EARTH
 from softgrasp.fem.scene.scene import Scene
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from softgrasp.fem.layout import BlockLayout
 
 TRIAL_ZETA = 0.01  # ratio of the first mode; silicone and passive tissue lie above, so it is a careful guess
 TRIAL_LAW = "neo-hooke"
@@ -57,11 +52,6 @@ def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
     return result
 
 
-def scales_of(layout: BlockLayout, rigid: tuple[float, tuple[float, ...]], omega: Sequence[float]) -> Scales:
-    """Collect the scales of a model: ``rigid`` is mass and inertia of the tissue."""
-    return Scales(layout.dimension, rigid[0], rigid[1], float(omega[0]) if len(omega) else None)
-
-
 def switches(scene: Scene, scales: Scales) -> tuple[Switch, ...]:
     """Every effect with the scene in which it is switched the other way."""
     return tuple(switch(scene, name, scales) for name in EFFECTS)
@@ -69,8 +59,7 @@ def switches(scene: Scene, scales: Scales) -> tuple[Switch, ...]:
 
 def switch(scene: Scene, name: str, scales: Scales) -> Switch:
     """One effect with the scene in which it is switched the other way."""
-    active = EFFECTS[name].active(scene)
-    return _without(scene, name, scales.dimension) if active else _with(scene, name, scales)
+    return (_without if EFFECTS[name].active(scene) else _with)(scene, name, scales)
 
 
 def neutral(scene: Scene, name: str, d: int) -> Scene | None:
@@ -85,27 +74,23 @@ def neutral(scene: Scene, name: str, d: int) -> Scene | None:
 # --- an effect that is on, taken out
 
 
-def _without(scene: Scene, name: str, d: int) -> Switch:
+def _without(scene: Scene, name: str, scales: Scales) -> Switch:
     if name == "rotation" and scene.motion.profile == "csv":
         return Switch(name, True, "on", None, "the columns of motion.csv hold the angles")
-    value, strength, unit = _value(scene, name)
+    d, (value, strength, unit) = scales.dimension, _value(scene, name)
 
     def edit(table: Table) -> None:
-        effects = table["effects"]
+        if name == "layers":
+            table["tissue"]["layers"] = {}
+            return
+        table["effects"][name] = False
         if name == "gravity":
-            del effects["gravity"]
             table["time"]["start"] = "rest"
         elif name == "damping":
-            del effects["damping"]
             for layer in table["tissue"]["layers"].values():
                 layer.pop("beta", None)
         elif name == "rotation":
-            effects["rotation"] = False
             _resize(table, d, d)
-        elif name == "layers":
-            table["tissue"]["layers"] = {}
-        else:
-            effects[name] = False
 
     return Switch(name, True, value, changed(scene, edit), "", strength, unit)
 
@@ -147,7 +132,7 @@ def _with(scene: Scene, name: str, scales: Scales) -> Switch:
         law = {"kind": "kelvin-voigt", "beta": beta}
         other = changed(scene, lambda table: table["effects"].update(damping=law))
         return Switch(name, False, f"beta = {beta:.3g} s: zeta_1 = {TRIAL_ZETA:g}", other, "", beta, "s")
-    if {name, *_named(scene)} >= {"rotation", "finite_strain"}:
+    if {name, *(other for other, effect in EFFECTS.items() if effect.active(scene))} >= {"rotation", "finite_strain"}:
         return Switch(name, False, "", None, "effects.rotation and effects.finite_strain exclude each other")
     if name == "rotation":
         return _turning(scene, scales)
@@ -155,10 +140,6 @@ def _with(scene: Scene, name: str, scales: Scales) -> Switch:
         other = changed(scene, lambda table: table["effects"].update(finite_strain={"law": TRIAL_LAW}))
         return Switch(name, False, TRIAL_LAW, other)
     return Switch(name, False, "on", changed(scene, lambda table: table["effects"].update({name: True})))
-
-
-def _named(scene: Scene) -> list[str]:
-    return [name for name, effect in EFFECTS.items() if effect.active(scene)]
 
 
 def _turning(scene: Scene, scales: Scales) -> Switch:
@@ -190,11 +171,9 @@ def _resize(table: Table, d: int, n_s: int) -> None:
         ]
 
 
-def _vector(values: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{v:g}" for v in values) + ")"
+def _vector(values: Sequence[float], form: str = "g") -> str:
+    return "(" + ", ".join(f"{v:{form}}" for v in values) + ")"
 
 
 def _inertia(value: float | list[float] | None) -> str:
-    if isinstance(value, list):
-        return "(" + ", ".join(f"{v:.3g}" for v in value) + ")"
-    return "none" if value is None else f"{value:.3g}"
+    return "none" if value is None else _vector(value, ".3g") if isinstance(value, list) else f"{value:.3g}"

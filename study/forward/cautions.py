@@ -85,8 +85,7 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     Strain is that of the largest of at most `LOOKED_AT` stored displacements, the last one and ``most``; the period is
     that of :func:`slowest`, which needs snapshots in memory.
 
-    Args:
-        most: time [s] and local rows (n_local,) [m] of a large displacement that was seen on the way.
+    ``most``: time [s] and local rows (n_local,) [m] of a large displacement that was seen on the way.
     """
     scene, system, d = model.scene, model.system, model.space.mesh.dimension
     poisson = poisson_ratios(system)

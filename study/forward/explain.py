@@ -20,7 +20,7 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
 from softgrasp.study.forward.cautions import coarse, locking, poisson_ratios, turned
 from softgrasp.study.forward.explain_mesh import MeshReport, mesh_report
-from softgrasp.study.forward.result import Sizes, model_sizes, output_places
+from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
 
@@ -65,7 +65,7 @@ class Explanation:
 
     name: str  # of the scene
     equation: Equation  # with exactly the terms of this scene
-    sizes: Sizes  # unknowns and entities
+    sizes: ModelSizes  # unknowns and entities
     solver: SolverPlan  # choice and cost
     time: TimePlan  # step against periods
     effects: dict[str, EffectReport]  # by name

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Sizes:
+class ModelSizes:
     """Numbers of unknowns and entities; ``states`` is 2n of the first-order system."""
 
     n_s: int
@@ -35,10 +35,10 @@ class Sizes:
     ranks: int
 
 
-def model_sizes(model: Model) -> Sizes:
+def model_sizes(model: Model) -> ModelSizes:
     """Sizes of a built model. Collective."""
     layout, space = model.system.layout, model.space
-    return Sizes(
+    return ModelSizes(
         n_s=layout.n_s,
         n_e=layout.n_e,
         states=layout.states,
@@ -59,7 +59,7 @@ class Simulation:
     """A run of the full model."""
 
     scene: Scene  # as it was run
-    sizes: Sizes  # unknowns and entities
+    sizes: ModelSizes  # unknowns and entities
     dimension: int  # 2 or 3
     run: Trajectory  # the trajectory
     places: dict[str, str]  # where each output is taken, in words

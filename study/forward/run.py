@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from rich.console import Console
@@ -20,9 +20,9 @@ from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
 from softgrasp.study.report.equation import equation
-from softgrasp.study.report.page import Section, equation_text
+from softgrasp.study.report.page import Section, captioned, equation_text
 from softgrasp.study.report.tables import pairs
-from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
+from softgrasp.study.shell.session import Flags, Page, Session, list_files, show_warnings
 
 CAPTIONS = {
     "move.png": "The body at some instants of the move.",
@@ -38,19 +38,17 @@ def run_simulate(
     overrides: list[str],
     console: Console,
     *,
-    quiet: bool = False,
     resume: bool = False,
     until: int | None = None,
-    pictures: bool = True,
     certify: bool = False,
-    empty: bool = False,
+    **flags: Unpack[Flags],
 ) -> dict[str, Any]:
     """Simulate a scene file and write its results. Collective."""
-    if resume and empty:
+    if resume and flags.get("empty"):
         raise SceneError("--empty removes what --resume goes on from; give one of them")
-    session = Session("simulate", path, overrides, out, console, quiet, pictures, empty)
+    session = Session("simulate", path, overrides, out, console, **flags)
     model = session.model(session.scene())
-    scene, frames = model.scene, Frames(model, out, pictures)
+    scene, frames = model.scene, Frames(model, out, session.pictures)
 
     def join(run: Run) -> None:
         frames.begin(run)
@@ -80,7 +78,7 @@ def run_simulate(
 
     def page() -> Page:
         drawn = frames.draw(out, run)
-        if pictures and mesh_error is not None:
+        if session.pictures and mesh_error is not None:
             drawn += accuracy.draw(out / "mesh_error.png", run, mesh_error)
         sections = _sections(result, rows, drawn)
         told = [*result.summary(), *accuracy.summary(mesh_error)]
@@ -108,14 +106,12 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
     scene = result.scene
     faster = speed_up(np.array([0.0, scene.time_end]))
     move = "The move in real time." if faster == 1 else f"The move at {faster:g} times its speed."
-    shown = {path.name: path for path in drawn}
-    figures = [(shown[name], text or move) for name, text in CAPTIONS.items() if name in shown]
     effects = [
         (name, effect.active(scene), *((effect.term, effect.cost) if effect.active(scene) else ("", "")))
         for name, effect in EFFECTS.items()
     ]
     return [
-        Section("", figures=figures),
+        Section("", figures=captioned(drawn, CAPTIONS | {"move.gif": move})),
         Section("Result", rows=numbers),
         *([Section("Warnings", text="\n\n".join(result.warnings))] if result.warnings else []),
         Section("Equation", code=equation_text(equation(scene))),

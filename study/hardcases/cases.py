@@ -86,18 +86,10 @@ class HardCase:
     def to_dict(self) -> dict[str, Any]:
         """Its entry in result.json."""
         return {
-            "case": self.case,
-            "x": self.x,
-            "group": self.group,
-            "bound": self.bound,
-            "must_be_refused": self.bound is None,
-            "may_be_refused": self.may_refuse,
-            "reason": self.reason,
-            "ours": asdict(self.here),
-            "plain": asdict(self.textbook),
-            "verdict": self.verdict_text,
-            "ok": self.ok,
-        }
+            "case": self.case, "x": self.x, "group": self.group, "bound": self.bound,
+            "must_be_refused": self.bound is None, "may_be_refused": self.may_refuse, "reason": self.reason,
+            "ours": asdict(self.here), "plain": asdict(self.textbook), "verdict": self.verdict_text, "ok": self.ok,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -140,17 +140,17 @@ def question_row(i: int, q: Question) -> HardCase:
             certified.run(materials, drive)
         return share(error, c.energy.values)
 
-    ours = here(answer)
-    if not ours.refused:
+    answered = here(answer)
+    if not answered.refused:
         factor = certified.norms.static_factor(materials)
-        ours = replace(ours, text=f"relative bound {c.reduction:.2g}, static factor {factor:.2g}")
+        answered = replace(answered, text=f"relative bound {c.reduction:.2g}, static factor {factor:.2g}")
     plain = Outcome(None, "no second basis")
     if c.estimate is not None:
         plain = textbook(share, error, c.estimate.values)
     reason = "a bound holds at every step"
     if q.refuse:
         reason = f"the bound {c.reduction:.2g} is above the tolerance {TOLERANCE:g}"
-    return HardCase(q.case, i + 1, ours, plain, None if q.refuse else 1.0, reason)
+    return HardCase(q.case, i + 1, answered, plain, None if q.refuse else 1.0, reason)
 
 
 GREEDY = (
@@ -171,10 +171,10 @@ def greedy_row(i: int, case: str, grid: int, tolerance: float) -> HardCase:
     first, run = model.system.materials[0], certified.run(allow=True)
     system, snapshots = full(model, first.lam, first.mu)
     error, c = true_error(system, snapshots, certified, run, False), run.certificate
-    rounds, reason = certified.training["rounds"], certified.training["reason"]
-    ours = Outcome(share(error, c.energy.values), f"{len(rounds)} rounds, ends by {reason}, bound {c.reduction:.1g}")
+    text = f"{len(certified.training['rounds'])} rounds, ends by {certified.training['reason']}, "
+    proved = Outcome(share(error, c.energy.values), f"{text}bound {c.reduction:.1g}")
     plain = Outcome(None, "no second basis") if c.estimate is None else textbook(share, error, c.estimate.values)
-    return HardCase(case, i, ours, plain, 1.0, "a bound holds at every step")
+    return HardCase(case, i, proved, plain, 1.0, "a bound holds at every step")
 
 
 def file_rows(first: int) -> Iterator[HardCase]:
@@ -237,11 +237,9 @@ def residual_rows(quick: bool) -> Iterator[HardCase]:
         def off(norm: float, exact: float = small * length) -> float:
             return abs(norm / exact - 1)
 
-        ours = here(off, float(np.linalg.norm(T @ c)))
-        plain = textbook(off, float(np.sqrt(np.maximum(c @ gram @ c, 0.0))))
-        part = small * length / scale
-        reason = "a thousand roundings of its terms"
-        yield HardCase(f"{part:.0e} of its terms", part, ours, plain, 1e3 * EPS / part, reason)
+        norms_of = here(off, float(np.linalg.norm(T @ c))), textbook(off, float(np.sqrt(max(c @ gram @ c, 0.0))))
+        part, reason = small * length / scale, "a thousand roundings of its terms"
+        yield HardCase(f"{part:.0e} of its terms", part, *norms_of, 1e3 * EPS / part, reason)
 
 
 FAMILIES = (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from softgrasp.study.hardcases.cases import Family, HardCase
+from softgrasp.study.hardcases.cases import HardCase
 from softgrasp.study.hardcases.plots import figure_family
 from softgrasp.study.hardcases.result import FamilyResult, HardCaseResult, bare_label
 from softgrasp.study.report.files import write_json
@@ -47,15 +47,18 @@ def write_files(out: Path, result: HardCaseResult, family: str | None, pictures:
         if pictures and f.cases
     }
     options = (" --quick" if result.quick else "") + (f" --family {family}" if family else "")
-    files = [
-        write_json(out / "result.json", result.to_dict()),
-        csv_table(result).write_csv(out / "hardcases.csv"),
-        *(file for pair in figures.values() for file in pair),
-    ]
+    files = [write_json(out / "result.json", result.to_dict()), csv_table(result).write_csv(out / "hardcases.csv")]
+    files += [file for pair in figures.values() for file in pair]
+    cases = [case for f in result.families for case in f.cases]
+    kept = [c for c in cases if c.textbook.value is not None and (c.bound is None or c.textbook.value <= c.bound)]
     page = write_report(
         out / "report.html",
         title="Hard cases",
-        summary=summary(result),
+        summary=[
+            f"{result.summary}.",
+            f"The textbook way keeps the same bound in {len(kept)} of them.",
+            f"All took {result.seconds:.3g} s.",
+        ],
         sections=sections(result, {name: pair[0] for name, pair in figures.items()}),
         reproduce=f"softgrasp hardcases{options}",
         numbers="result.json and hardcases.csv",
@@ -64,51 +67,43 @@ def write_files(out: Path, result: HardCaseResult, family: str | None, pictures:
     return [*files, page]
 
 
-def summary(result: HardCaseResult) -> list[str]:
-    """What came out, in three sentences."""
-    cases = [case for f in result.families for case in f.cases]
-    broken = [c for c in cases if c.textbook.value is None or (c.bound is not None and not c.textbook.value <= c.bound)]
-    return [
-        f"{result.summary}.",
-        f"The textbook way keeps the same bound in {len(cases) - len(broken)} of them.",
-        f"All took {sum(f.seconds for f in result.families):.3g} s.",
-    ]
-
-
 def csv_table(result: HardCaseResult) -> Table:
     """One line a case, numbers in full."""
+    header = ("family", "quantity", "case", "bound", "ours value", "textbook value", "ours", "textbook", "verdict")
     rows = []
     for f in result.families:
         for case in f.cases:
             name, bound, *texts = cells_of(case)
-            values = case.here.value, case.textbook.value
             first = f.family.name, bare_label(f.family.quantity), name, bound
-            rows.append((*first, *values, *texts, case.reason, case.ok))
-    header = ("family", "quantity", "case", "bound", "ours value", "textbook value", "ours", "textbook", "verdict")
+            rows.append((*first, case.here.value, case.textbook.value, *texts, case.reason, case.ok))
     return Table((*header, "reason of the bound", "ok"), rows)
 
 
 def sections(result: HardCaseResult, pictures: Mapping[str, Path]) -> list[Section]:
     """An overview, and one section a family with what was said at length below it."""
-    overview = [
-        (f.family.title, len(f.cases), f.passed, f.refused, len(f.failed), round(f.seconds, 1)) for f in result.families
-    ]
+    overview = [(f.family.title, *f.counts.values(), len(f.failed), round(f.seconds, 1)) for f in result.families]
     header = ("family", "cases", "pass", "refused", "fail", "seconds")
     parts = [Table(header, overview, "Overview").section(INTRO)]
     for f in result.families:
         family, reasons = f.family, "; ".join(dict.fromkeys(case.reason for case in f.cases))
         text = f"{family.lesson}\n\nMeasured: {bare_label(family.quantity)}. Textbook way: {family.textbook}."
         text += f" Why these bounds: {reasons}." if reasons else ""
-        figures = [(pictures[family.name], caption(family))] if family.name in pictures else []
+        beside = "beside the frame" if family.axis == "listed" else "in the lanes above"
+        caption = (
+            f"{family.title}: {bare_label(family.quantity)}. Blue: here; orange: {family.textbook}; short grey lines: "
+            f"the bound; marks {beside}: refused, or no number."
+        )
+        figures = [(pictures[family.name], caption)] if family.name in pictures else []
         table = Table(("case", "bound", "here", "textbook", "verdict"), [brief(case) for case in f.cases])
         parts.append(table.section(text, family.title, figures))
-        if texts := sentences(f):
+        texts = [line for case in f.cases for line in at_length(case)]
+        if texts:
             parts.append(Section("", "Refusals and remarks in full:", rows=texts))
     return parts
 
 
 def brief(case: HardCase) -> tuple[str, str, str, str, str]:
-    """A case in few letters; `sentences` has the rest."""
+    """A case in few letters; `at_length` has the rest."""
     name, bound, here, textbook, _ = cells_of(case)
     verdict = case.verdict if case.ok else "fail, refused" if case.verdict == "refused" else "fail"
     if len(textbook) > WORDS:
@@ -119,21 +114,7 @@ def brief(case: HardCase) -> tuple[str, str, str, str, str]:
     return name, bound, here, textbook, verdict
 
 
-def sentences(result: FamilyResult) -> list[tuple[str, str]]:
-    """What was said at length: refusals, errors, remarks on a number; with the case and who said it."""
-    texts = []
-    for case in result.cases:
-        if case.here.refused or len(str(case.here)) > WORDS:
-            texts.append((f"{case.case}: here", case.here.text))
-        if len(str(case.textbook)) > WORDS:
-            texts.append((f"{case.case}: textbook", case.textbook.text))
-    return texts
-
-
-def caption(family: Family) -> str:
-    """What the picture of a family shows."""
-    beside = "beside the frame" if family.axis == "listed" else "in the lanes above"
-    return (
-        f"{family.title}: {bare_label(family.quantity)}. Blue: here; orange: {family.textbook}; short grey lines: the "
-        f"bound; marks {beside}: refused, or no number."
-    )
+def at_length(case: HardCase) -> list[tuple[str, str]]:
+    """What `brief` has no room for: refusals, errors, remarks on a number; with the case and who said it."""
+    texts = [(f"{case.case}: here", case.here.text)] if case.here.refused or len(str(case.here)) > WORDS else []
+    return [*texts, *([(f"{case.case}: textbook", case.textbook.text)] if len(str(case.textbook)) > WORDS else [])]

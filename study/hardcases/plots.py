@@ -15,8 +15,8 @@ from matplotlib.ticker import MaxNLocator
 from softgrasp.study.hardcases.cases import Family, HardCase, Outcome
 from softgrasp.study.pictures.style import BLUE, COLUMN, ORANGE, OUTLINE, WIDTH, paper_style, save
 
-FLOOR = 1e-17  # smaller numbers, and zero, are drawn here
-CEILING = 1e12  # larger numbers are drawn as none
+SMALLEST = 1e-17  # smaller numbers, and zero, are drawn here
+LARGEST = 1e12  # larger numbers are drawn as none
 GAP = 0.6  # [decades] around the numbers
 WORDS = 42  # [letters] of a failure that fit beside the frame
 SIZE = 4.5  # of a mark
@@ -32,15 +32,19 @@ def figure_family(family: Family, rows: Sequence[HardCase], out_png: Path) -> tu
 def _drawn(outcome: Outcome) -> float:
     """Logarithm of the value as it is drawn; NaN for one of the lanes."""
     value = outcome.value
-    if outcome.refused or value is None or not math.isfinite(value) or value > CEILING:
+    if outcome.refused or value is None or not math.isfinite(value) or value > LARGEST:
         return math.nan
-    return math.log10(max(value, FLOOR))
+    return _log(value)
+
+
+def _log(value: float) -> float:
+    return math.log10(max(value, SMALLEST))
 
 
 def _range(rows: Sequence[HardCase]) -> tuple[float, float]:
     """Decades that hold all numbers and bounds."""
     values = [v for r in rows for o in (r.here, r.textbook) if math.isfinite(v := _drawn(o))]
-    values += [math.log10(max(r.bound, FLOOR)) for r in rows if r.bound is not None]
+    values += [_log(r.bound) for r in rows if r.bound is not None]
     return (min(values) - GAP, max(values) + GAP) if values else (-1.0, 1.0)
 
 
@@ -91,7 +95,7 @@ def _curves(family: Family, rows: Sequence[HardCase]) -> Any:
                 )
                 ax.plot(at[r.x], height, marker, color=colour, ms=SIZE)
         marks[name] = Line2D([], [], color=colour, marker=marker, ms=SIZE, lw=1.0, ls=line)
-    bounds = [(at[r.x], math.log10(max(r.bound, FLOOR))) for r in rows if r.bound is not None]
+    bounds = [(at[r.x], _log(r.bound)) for r in rows if r.bound is not None]
     if bounds:
         ax.plot(*zip(*bounds, strict=True), ls="", marker="_", ms=13, mew=1.6, color=OUTLINE)
         marks["bound"] = Line2D([], [], color=OUTLINE, lw=1.6)
@@ -123,7 +127,7 @@ def _listed(family: Family, rows: Sequence[HardCase]) -> Any:
     span = high - low
     for i, row in enumerate(rows):
         if row.bound is not None:
-            at = math.log10(max(row.bound, FLOOR)) if scaled else row.bound
+            at = _log(row.bound) if scaled else row.bound
             ax.plot([at, at], [i - 0.36, i + 0.36], color=OUTLINE, lw=1.6)
         for outcome, colour, marker, shift in ((row.here, BLUE, "o", -0.2), (row.textbook, ORANGE, "x", 0.2)):
             place = _drawn(outcome)

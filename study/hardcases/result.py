@@ -20,14 +20,10 @@ class FamilyResult:
     seconds: float
 
     @property
-    def passed(self) -> int:
-        """Cases that keep their bound."""
-        return sum(case.verdict == "pass" for case in self.cases)
-
-    @property
-    def refused(self) -> int:
-        """Cases that are refused as they may be."""
-        return sum(case.verdict == "refused" and case.ok for case in self.cases)
+    def counts(self) -> dict[str, int]:
+        """Number of cases, of those that keep their bound, and of those that are refused as they may be."""
+        verdicts = [case.verdict if case.ok else "fail" for case in self.cases]
+        return {"cases": len(verdicts), "passed": verdicts.count("pass"), "refused": verdicts.count("refused")}
 
     @property
     def failed(self) -> list[str]:
@@ -37,16 +33,10 @@ class FamilyResult:
     def to_dict(self) -> dict[str, Any]:
         """Its entry in result.json."""
         family = self.family
-        return {
-            "title": family.title,
-            "varied": bare_label(family.varied),
-            "quantity": bare_label(family.quantity),
-            "plain": family.textbook,
-            "lesson": family.lesson,
-            "ok": not self.failed,
-            "seconds": self.seconds,
-            "rows": [case.to_dict() for case in self.cases],
-        }
+        labels = {"varied": bare_label(family.varied), "quantity": bare_label(family.quantity)}
+        texts = {"title": family.title, **labels, "plain": family.textbook, "lesson": family.lesson}
+        rows = [case.to_dict() for case in self.cases]
+        return {**texts, "ok": not self.failed, "seconds": self.seconds, "rows": rows}
 
 
 @dataclass(frozen=True)
@@ -58,9 +48,9 @@ class HardCaseResult:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of cases, of those that keep their bound, and of those that are refused as they may be."""
-        names = {"cases": lambda f: len(f.cases), "passed": lambda f: f.passed, "refused": lambda f: f.refused}
-        return {name: sum(map(count, self.families)) for name, count in names.items()}
+        """The counts of all families together."""
+        each = [f.counts for f in self.families]
+        return {name: sum(count[name] for count in each) for name in ("cases", "passed", "refused")}
 
     @property
     def failed(self) -> list[str]:
@@ -68,30 +58,23 @@ class HardCaseResult:
         return [f"{f.family.name}: {case}" for f in self.families for case in f.failed]
 
     @property
+    def seconds(self) -> float:
+        """What all took."""
+        return sum(f.seconds for f in self.families)
+
+    @property
     def summary(self) -> str:
         """One sentence on the whole suite."""
         cases, passed, refused = self.counts.values()
-        text = (
-            f"{cases} cases: {passed} keep their bound, {refused} are refused as they may be, {len(self.failed)} fail"
-        )
-        return text + (f": {'; '.join(self.failed)}" if self.failed else "")
+        text = f"{cases} cases: {passed} keep their bound, {refused} are refused as they may be, "
+        return f"{text}{len(self.failed)} fail" + (f": {'; '.join(self.failed)}" if self.failed else "")
 
     def to_dict(self) -> dict[str, Any]:
         """What result.json holds."""
-        result: dict[str, Any] = to_json(
-            {
-                "command": "hardcases",
-                "version": package_version(),
-                "machine": machine(),
-                "quick": self.quick,
-                "ok": not self.failed,
-                **self.counts,
-                "failed": self.failed,
-                "families": {f.family.name: f.to_dict() for f in self.families},
-                "time": {"total": sum(f.seconds for f in self.families)},
-            }
-        )
-        return result
+        head = {"command": "hardcases", "version": package_version(), "machine": machine(), "quick": self.quick}
+        verdict = {"ok": not self.failed, **self.counts, "failed": self.failed}
+        families = {f.family.name: f.to_dict() for f in self.families}
+        return dict(to_json({**head, **verdict, "families": families, "time": {"total": self.seconds}}))
 
 
 def bare_label(text: str) -> str:

@@ -24,11 +24,9 @@ FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for fam
 
 def choose(family: str | None) -> list[Family]:
     """The families to run. Raises SoftgraspError: there is no family of this name."""
-    if family is None:
-        return list(FAMILIES.values())
-    if family not in FAMILIES:
+    if family is not None and family not in FAMILIES:
         raise SoftgraspError(f"'{family}' is no family of hard cases; there are {', '.join(FAMILIES)}")
-    return [FAMILIES[family]]
+    return [chosen for name, chosen in FAMILIES.items() if family in (None, name)]
 
 
 def run_hardcases(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse.linalg
+from numpy.typing import NDArray
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
@@ -140,27 +142,19 @@ def slender_rows(quick: bool) -> Iterator[HardCase]:
         yield HardCase(f"length / height = {slender:g}", slender, p2, locked, bound, reason, may_refuse=may)
 
 
-def _medit(path: Path, gap: float, columns: int = 4) -> None:
-    """A column of 1 x 2 with two rows of nodes ``gap`` apart at mid height, as a Medit file."""
+def sliver_mesh(gap: float, columns: int = 4) -> tuple[Array, NDArray[np.int64]]:
+    """Nodes and cells of a column of 1 x 2 with two rows of nodes ``gap`` apart at mid height."""
     heights = [0.0, 0.5, 1.0 - gap / 2, 1.0 + gap / 2, 1.5, 2.0]
     nodes = [(i / columns, y) for y in heights for i in range(columns + 1)]
     cells = []
-    for row in range(len(heights) - 1):
-        for i in range(columns):
-            a, b = row * (columns + 1) + i + 1, (row + 1) * (columns + 1) + i + 1
-            cells += [(a, a + 1, b + 1), (a, b + 1, b)]
-    lines = ["MeshVersionFormatted 2", "Dimension 2", f"Vertices\n{len(nodes)}"]
-    lines += [f"{x!r} {y!r} 0" for x, y in nodes] + [f"Triangles\n{len(cells)}"]
-    lines += [f"{a} {b} {c} 0" for a, b, c in cells] + ["End", ""]
-    path.write_text("\n".join(lines))
+    for row, i in itertools.product(range(len(heights) - 1), range(columns)):
+        a, b = row * (columns + 1) + i, (row + 1) * (columns + 1) + i
+        cells += [(a, a + 1, b + 1), (a, b + 1, b)]
+    return np.array(nodes), np.array(cells)
 
 
-def by_hand(path: Path) -> Outcome:
+def by_hand(nodes: Array, cells: NDArray[np.int64]) -> Outcome:
     """P1 assembled by hand from the same cells, solved by SciPy, for meshes that the reader refuses."""
-    lines = path.read_text().split("\n")
-    at, to, end = (next(i for i, x in enumerate(lines) if x.startswith(w)) for w in ("Vertices", "Triangles", "End"))
-    nodes = np.array([[float(x) for x in line.split()[:2]] for line in lines[at + 2 : to]])
-    cells = np.array([[int(x) - 1 for x in line.split()[:3]] for line in lines[to + 2 : end]])
     K, f = linear_triangles(nodes, cells, 50.0)
     free = np.repeat(nodes[:, 1] < 2.0, 2)
 
@@ -173,27 +167,29 @@ def by_hand(path: Path) -> Outcome:
     return replace(outcome, text=f"P1 by hand; {outcome.text}")
 
 
-def _sliver(mesh: str) -> Model:
-    return make("paper_forward", mesh, *COLUMN[1:], "control=false")
-
-
 def sliver_rows(quick: bool) -> Iterator[HardCase]:
     """A row of ever flatter cells through a hanging column whose displacement is known exactly."""
     with tempfile.TemporaryDirectory() as folder:
         for power in thin([-1, -3, -5, -7, -9, -11, -13, -15], quick):
             gap, path = 10.0**power, Path(folder) / f"sliver{-power:g}.mesh"
-            _medit(path, gap)
+            nodes, cells = sliver_mesh(gap)
+            lines = ["MeshVersionFormatted 2", "Dimension 2", f"Vertices\n{len(nodes)}"]
+            lines += [f"{x!r} {y!r} 0" for x, y in nodes.tolist()] + [f"Triangles\n{len(cells)}"]
+            lines += [f"{a} {b} {c} 0" for a, b, c in (cells + 1).tolist()] + ["End", ""]
+            path.write_text("\n".join(lines))
             mesh = f"tissue={{mesh='{path}', order=2, material={{lambda=0.0, mu=50.0, rho=1.0}}}}"
-            answer = here(lambda m: _stretch_here(_sliver(m), 0.5, 1.0), mesh)
+            scene = (mesh, *COLUMN[1:], "control=false")
+            answer = here(lambda s: _stretch_here(make("paper_forward", *s), 0.5, 1.0), scene)
             read = power > -12  # flatter than 1e-12 must be refused
-            assembled = textbook(lambda m: _stretch_scipy(_sliver(m), 0.5, 1.0), mesh) if read else None
-            condition = scaled_condition(_sliver(mesh).system.K_ee) if read else 0.0
+            model = make("paper_forward", *scene) if read else None
+            assembled = None if model is None else textbook(_stretch_scipy, model, 0.5, 1.0)
+            condition = 0.0 if model is None else scaled_condition(model.system.K_ee)
             bound = min(EPS * condition, 10 * REFUSED) if read else None
             reason = (
                 "eps times the condition of K scaled to a unit diagonal [VDS69], which grows as 1 / height, but at "
                 "most ten times the estimate at which a solve is refused; below 1e-12 the cells have no area in doubles"
             )
-            answers = answer, assembled or textbook(by_hand, path)
+            answers = answer, assembled or textbook(by_hand, nodes, cells)
             yield HardCase(f"cells of height {gap:.0e}", gap, *answers, bound, reason, may_refuse=power < -6)
 
 

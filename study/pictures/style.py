@@ -82,6 +82,16 @@ def few_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def log_axis(ax: Any, top: float | None) -> None:
+    """A logarithmic axis of errors, a line at every power of ten."""
+    ax.set_yscale("log")
+    ax.set_ylim(top=top)
+    ax.yaxis.set_major_locator(LogLocator(numticks=12))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.grid(axis="y", color="#e6e6e6", lw=0.5, zorder=0)
+    ax.set_axisbelow(True)
+
+
 def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: float = 7.0) -> None:
     """Names of curves right of the axes, each beside the end of its own, moved apart where they would touch.
 

@@ -49,15 +49,10 @@ GONE = 10.0  # times the way to go: a run that is farther from the reference is 
 
 @dataclass(frozen=True)
 class Feedback:
-    """A gain: optimal, or of a reduced equation.
+    """A gain: optimal, or of a reduced equation."""
 
-    Attributes:
-        basis: key of :data:`softgrasp.lqr.reduced.bases.BASES`; empty for the optimal gain.
-        N: order of the reduced equation.
-    """
-
-    basis: str = ""
-    N: int = 0
+    basis: str = ""  # key of softgrasp.lqr.reduced.bases.BASES; empty for the optimal gain
+    N: int = 0  # order of the reduced equation
 
     @property
     def label(self) -> str:
@@ -69,17 +64,11 @@ class Feedback:
 
 @dataclass(frozen=True)
 class LoopSetting:
-    """What closes the loop.
+    """What closes the loop."""
 
-    Attributes:
-        gain: which.
-        held: sampled at the start of every step and held, else inside the midpoint rule.
-        reduced: on the reduced plant that the gain was made for, else on the full one.
-    """
-
-    gain: Feedback
-    held: bool = False
-    reduced: bool = False
+    gain: Feedback  # which
+    held: bool = False  # sampled at the start of every step and held, else inside the midpoint rule
+    reduced: bool = False  # on the reduced plant that the gain was made for, else on the full one
 
     @property
     def label(self) -> str:

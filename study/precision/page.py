@@ -138,14 +138,14 @@ def show(console: Console, study: WorkStudy, commands: list[dict[str, str]]) -> 
             text = reference_text(question, paper_of(study.scene) == "control")
             if text:
                 console.print(text, markup=False)
-            console.print(_narrow(question_table(name, question.points, front_only=True)))
-    console.print(_narrow(slope_table(study)))
+            console.print(_narrow(question_table(name, question.points, front_only=True), console.width))
+    console.print(_narrow(slope_table(study), console.width))
     for titles, reason in _left_out(study):
         console.print(f"{titles}: left out, {reason}", markup=False)
     for full in _paper_run(study):
         console.print(f"The paper: {PAPER_FULL} s for the full run, here {full.seconds:.3g} s; {PAPER}.", markup=False)
     for budget in study.error_budgets:
-        console.print(_narrow(budget_table(budget)))
+        console.print(_narrow(budget_table(budget), console.width))
         console.print(budget.sentence, markup=False, soft_wrap=True)
     for answer, lines in zip(study.answers, commands, strict=True):
         style = "bold" if answer.met else "bold red"
@@ -156,10 +156,10 @@ def show(console: Console, study: WorkStudy, commands: list[dict[str, str]]) -> 
     console.print(f"{study.measured} runs measured, {study.cached} from the cache", style="dim")
 
 
-def _narrow(table: Table) -> rich.table.Table:
+def _narrow(table: Table, width: int) -> rich.table.Table:
     """Three digits, and lines that a narrow terminal may break."""
     rows = [[f"{cell:.3g}" if isinstance(cell, float) else cell for cell in row] for row in table.rows]
-    return replace(table, rows=rows).terminal(wrap=range(len(table.header)))
+    return replace(table, rows=rows).terminal(wrap=range(len(table.header)), width=width)
 
 
 def _paper_run(study: WorkStudy) -> list[TimedRun]:

@@ -23,16 +23,11 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Request:
-    """What a study shall answer.
+    """What a study shall answer."""
 
-    Attributes:
-        tolerance: relative error of the deformation to answer for, or None.
-        budget: seconds of a step to answer for, or None.
-        names: arguments of ``--question``, each one or several with commas; empty stands for all questions.
-    """
-
-    tolerance: float | None = None
-    budget: float | None = None
+    tolerance: float | None = None  # relative error of the deformation to answer for, or None
+    budget: float | None = None  # seconds of a step to answer for, or None
+    # arguments of ``--question``, each one or several with commas; empty stands for all questions
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -59,22 +54,14 @@ class Request:
 
 @dataclass(frozen=True)
 class WorkPoint:
-    """One point of a diagram.
-
-    Attributes:
-        series: points that are one line.
-        label: the setting in words.
-        seconds: what it costs.
-        error: relative, of what the question is about.
-        ok: a setting that may be used; unstable models may not.
-    """
+    """One point of a diagram."""
 
     question: ClassVar[str] = ""
-    series: str
-    label: str
-    seconds: float
-    error: float
-    ok: bool = True
+    series: str  # points that are one line
+    label: str  # the setting in words
+    seconds: float  # what it costs
+    error: float  # relative, of what the question is about
+    ok: bool = True  # a setting that may be used; unstable models may not
 
     def to_row(self) -> dict[str, Any]:
         """A flat table row; what is not finite becomes None, and None of an optional attribute is left out."""
@@ -86,23 +73,18 @@ class WorkPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class RunPoint(WorkPoint):
-    """A run of the full model, or of a reduced one that was made of it.
+    """A run of the full model, or of a reduced one that was made of it."""
 
-    Attributes:
-        error_displacement: largest error of the outputs over the largest one; ``error`` is that against the hand.
-        error_range: between what ``error`` lies, given that of the reference.
-        p50, p99, max: quantiles of the seconds of a step; inf for an unstable model.
-        cells, order, steps, solver, rtol, refine: of the full model, see :class:`Setting`.
-    """
-
+    # cells, order, steps, solver, rtol, refine: of the full model, see Setting
     cells: tuple[int, ...] | None
     order: int
     steps: int
     solver: str
     rtol: float | None
     refine: Refine
-    error_displacement: float
-    error_range: tuple[float, float]
+    error_displacement: float  # largest error of the outputs over the largest one; ``error`` is that against the hand
+    error_range: tuple[float, float]  # between what ``error`` lies, given that of the reference
+    # p50, p99, max: quantiles of the seconds of a step; inf for an unstable model
     p50: float
     p99: float
     max: float
@@ -120,37 +102,26 @@ class RunPoint(WorkPoint):
 
 @dataclass(frozen=True, kw_only=True)
 class ForwardPoint(RunPoint):
-    """A run of the full model.
-
-    Attributes:
-        n_e, states: unknowns.
-        dt, mesh, assembly, factor, per_step: step of the scheme, and seconds of the stages [s].
-        error_time: change of the deformation against the most steps on the same mesh; None for the most steps.
-        error_solver: against the usual solver on the same mesh and steps; None for that.
-    """
+    """A run of the full model."""
 
     question: ClassVar[str] = "forward"
+    # n_e, states: unknowns
     n_e: int
     states: int
+    # dt, mesh, assembly, factor, per_step: step of the scheme, and seconds of the stages [s]
     dt: float
     mesh: float
     assembly: float
     factor: float
     per_step: float
+    # change of the deformation against the most steps on the same mesh; None for the most steps
     error_time: float | None = None
-    error_solver: float | None = None
+    error_solver: float | None = None  # against the usual solver on the same mesh and steps; None for that
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedPoint(RunPoint):
-    """A run of a reduced model; the attributes not named here are those of :class:`softgrasp.study.reduce.sweep.Point`.
-
-    Attributes:
-        error_full, error_full_deformation: of the states against the full run behind the model.
-        error_outputs_full: of the deformation of the outputs against that run.
-        scratch: seconds with everything before it.
-        mesh: mesh and order of the full run in words.
-    """
+    """A run of a reduced model; what is not named here is as in :class:`softgrasp.study.reduce.sweep.Point`."""
 
     question: ClassVar[str] = "reduced"
     method: str
@@ -166,11 +137,12 @@ class ReducedPoint(RunPoint):
     time_online: float
     spectral_abscissa: float
     stable: bool
+    # error_full, error_full_deformation: of the states against the full run behind the model
     error_full: float
     error_full_deformation: float
-    error_outputs_full: float
-    scratch: float
-    mesh: str
+    error_outputs_full: float  # of the deformation of the outputs against that run
+    scratch: float  # seconds with everything before it
+    mesh: str  # mesh and order of the full run in words
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -206,13 +178,7 @@ class RiccatiPoint(WorkPoint):
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedRiccatiPoint(WorkPoint):
-    """A reduced gain on the full plant; what is not named here is as in the GainReport of ``lqr``, without its bounds.
-
-    Attributes:
-        time_lift: seconds to project the equation and to lift its gain.
-        time_basis: seconds of the basis, all orders together.
-        scratch: seconds with everything before it.
-    """
+    """A reduced gain on the full plant; what is not named is as in the GainReport of ``lqr``, without its bounds."""
 
     question: ClassVar[str] = "reduced_riccati"
     method: str
@@ -226,38 +192,30 @@ class ReducedRiccatiPoint(WorkPoint):
     certified: bool
     reason: str
     sampled_radius: float
-    time_lift: float
-    time_basis: float
-    scratch: float
+    time_lift: float  # seconds to project the equation and to lift its gain
+    time_basis: float  # seconds of the basis, all orders together
+    scratch: float  # seconds with everything before it
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopPoint(WorkPoint):
-    """A closed loop with one controller and step.
-
-    Attributes:
-        steps, dt: of the run.
-        basis, N: of the gain; an empty basis is the optimal gain.
-        held: sampled at the start of every step and held, else inside the midpoint rule.
-        reduced_plant: on the reduced plant that the gain was made for.
-        reason: why the loop has no error.
-        per_step, setup: seconds.
-        error_displacement: of the outputs against the optimal loop, over the way to go.
-        error_time: of the deformation against the same gain without time step.
-        cost, cost_error: of the run, and how far from the optimal one [1].
-    """
+    """A closed loop with one controller and step."""
 
     question: ClassVar[str] = "loop"
+    # steps, dt: of the run
     steps: int
     dt: float
+    # basis, N: of the gain; an empty basis is the optimal gain
     basis: str
     N: int
-    held: bool
-    reduced_plant: bool
-    reason: str = ""
+    held: bool  # sampled at the start of every step and held, else inside the midpoint rule
+    reduced_plant: bool  # on the reduced plant that the gain was made for
+    reason: str = ""  # why the loop has no error
+    # per_step, setup: seconds
     per_step: float
-    error_displacement: float
-    error_time: float
+    error_displacement: float  # of the outputs against the optimal loop, over the way to go
+    error_time: float  # of the deformation against the same gain without time step
     cost_error: float
     setup: float | None = None
+    # cost, cost_error: of the run, and how far from the optimal one [1]
     cost: float | None = None

@@ -23,21 +23,13 @@ BEYOND = 100.0  # below the smallest one of the diagram
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a setting is expected to give.
+    """What a setting is expected to give."""
 
-    Attributes:
-        setting: which.
-        n_e: unknowns.
-        error: relative error of the deformation.
-        seconds: of a whole run.
-        point: of the diagram, when the setting was run for it.
-    """
-
-    setting: Setting
-    n_e: float
-    error: float
-    seconds: float
-    point: ForwardPoint | None = None
+    setting: Setting  # which
+    n_e: float  # unknowns
+    error: float  # relative error of the deformation
+    seconds: float  # of a whole run
+    point: ForwardPoint | None = None  # of the diagram, when the setting was run for it
 
 
 class Predictor:

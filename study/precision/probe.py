@@ -27,15 +27,10 @@ REGION_POINTS = 4  # along each axis of the box of a region output
 
 @dataclass(frozen=True)
 class Places:
-    """Where the outputs of a scene are, the same on every mesh.
+    """Where the outputs of a scene are, the same on every mesh."""
 
-    Attributes:
-        names: of the outputs.
-        points: places [m] whose mean each output is, one array (k, d) an output; empty for the hand.
-    """
-
-    names: tuple[str, ...]
-    points: tuple[Array, ...]
+    names: tuple[str, ...]  # of the outputs
+    points: tuple[Array, ...]  # places [m] whose mean each output is, one array (k, d) an output; empty for the hand
 
     @property
     def dimension(self) -> int:
@@ -45,21 +40,13 @@ class Places:
 
 @dataclass(frozen=True)
 class Probed:
-    """One run of the full model at fixed places.
+    """One run of the full model at fixed places."""
 
-    Attributes:
-        times: (steps + 1,) [s].
-        own: displacements against the hand, (steps + 1, p) [m], on every rank.
-        rigid: the part that moves with the hand, same shape.
-        stamps: seconds of every step on the slowest rank, (steps,).
-        factor: seconds of the factorisation.
-    """
-
-    times: Array
-    own: Array
-    rigid: Array
-    stamps: Array
-    factor: float
+    times: Array  # (steps + 1,) [s]
+    own: Array  # displacements against the hand, (steps + 1, p) [m], on every rank
+    rigid: Array  # the part that moves with the hand, same shape
+    stamps: Array  # seconds of every step on the slowest rank, (steps,)
+    factor: float  # seconds of the factorisation
 
     @property
     def y(self) -> Array:
@@ -153,17 +140,11 @@ def run_probed(model: Model, probe: Probe, until: int | None = None) -> Probed:
 
 @dataclass(frozen=True)
 class Series:
-    """Outputs over time: deformations y - rigid, what the tissue does, and displacements y, side by side.
+    """Outputs over time: deformations y - rigid, what the tissue does, and displacements y, side by side."""
 
-    Attributes:
-        times: (steps + 1,) [s].
-        values: (steps + 1, 2 p) [m].
-        dimension: d; p is a multiple of it.
-    """
-
-    times: Array
-    values: Array
-    dimension: int
+    times: Array  # (steps + 1,) [s]
+    values: Array  # (steps + 1, 2 p) [m]
+    dimension: int  # d; p is a multiple of it
 
     def at(self, times: Array) -> Array:
         """Values at other times, by cubic splines."""
@@ -174,30 +155,25 @@ class Series:
 
 @dataclass(frozen=True)
 class TimedRun:
-    """One run of the full model.
+    """One run of the full model."""
 
-    Attributes:
-        mesh, assembly, factor, per_step: seconds, medians.
-        n_e, states, dimension, steps: sizes.
-        dt: step [s].
-        p50, p99, max: quantiles of the seconds of a step.
-        seconds: of the whole run.
-        times, values: of its :class:`Series`.
-    """
-
+    # mesh, assembly, factor, per_step: seconds, medians
     mesh: float
     assembly: float
+    # n_e, states, dimension, steps: sizes
     n_e: int
     states: int
     dimension: int
     steps: int
-    dt: float
+    dt: float  # step [s]
     factor: float
     per_step: float
+    # p50, p99, max: quantiles of the seconds of a step
     p50: float
     p99: float
     max: float
-    seconds: float
+    seconds: float  # of the whole run
+    # times, values: of its Series
     times: Array
     values: Array
 

@@ -44,16 +44,13 @@ WIDEST = 2e8  # entries of the snapshots beyond which the slower engines are lef
 
 @dataclass(frozen=True, kw_only=True)
 class TimedModel(Point):
-    """A reduced model with its outputs at the places.
+    """A reduced model with its outputs at the places."""
 
-    Attributes:
-        p50, p99, max: quantiles of the seconds of a step; inf when it is unstable.
-        times, values: of its :class:`Series`.
-    """
-
+    # p50, p99, max: quantiles of the seconds of a step; inf when it is unstable
     p50: float
     p99: float
     max: float
+    # times, values: of its Series
     times: Array
     values: Array
 

@@ -22,21 +22,15 @@ ADVICE = {
 
 @dataclass(frozen=True)
 class Truth:
-    """The reference solution with its error estimate, relative to the largest deformation and displacement.
+    """The reference solution with its error estimate, relative to the largest deformation and displacement."""
 
-    Attributes:
-        series: the solution.
-        space, time, mixed: parts of the estimate, each (deformation, displacement).
-        settings: that were run.
-        note: one sentence or more.
-    """
-
-    series: Series
+    series: Series  # the solution
+    # space, time, mixed: parts of the estimate, each (deformation, displacement)
     space: tuple[float, float]
     time: tuple[float, float]
     mixed: tuple[float, float]
-    settings: tuple[Setting, ...]
-    note: str
+    settings: tuple[Setting, ...]  # that were run
+    note: str  # one sentence or more
 
     @property
     def error(self) -> float:
@@ -74,70 +68,43 @@ class Truth:
 
 @dataclass(frozen=True)
 class RiccatiReference:
-    """What gains are compared with: tight solutions by two methods.
+    """What gains are compared with: tight solutions by two methods."""
 
-    Attributes:
-        names: methods and tolerances in words.
-        error: relative difference of their gains; None with one method.
-        residuals: of both.
-    """
-
-    names: tuple[str, ...]
-    error: float | None
-    residuals: tuple[float, ...]
+    names: tuple[str, ...]  # methods and tolerances in words
+    error: float | None  # relative difference of their gains; None with one method
+    residuals: tuple[float, ...]  # of both
 
 
 @dataclass(frozen=True)
 class ReducedReference:
-    """What reduced gains are compared with.
+    """What reduced gains are compared with."""
 
-    Attributes:
-        method: of the optimal gain.
-        residual: of its solution.
-        error: relative difference to the tightest gain of another method.
-        optimal: cost from the scene's start.
-    """
-
-    method: str
-    residual: float
-    error: float | None
-    optimal: float
+    method: str  # of the optimal gain
+    residual: float  # of its solution
+    error: float | None  # relative difference to the tightest gain of another method
+    optimal: float  # cost from the scene's start
 
 
 @dataclass(frozen=True)
 class LoopReference:
-    """The optimal loop without a time step.
+    """The optimal loop without a time step."""
 
-    Attributes:
-        error: change of the outputs with half of the modes.
-        modes: of the tissue.
-        complete: all there are.
-        optimal: cost from the scene's start.
-        to_come: of it, after the end of the run.
-    """
-
-    error: float | None
-    modes: int
-    complete: bool
-    optimal: float
-    to_come: float
+    error: float | None  # change of the outputs with half of the modes
+    modes: int  # of the tissue
+    complete: bool  # all there are
+    optimal: float  # cost from the scene's start
+    to_come: float  # of it, after the end of the run
 
 
 @dataclass(frozen=True)
 class Question:
-    """One question of a study.
+    """One question of a study."""
 
-    Attributes:
-        points: measured.
-        slopes: fitted to them.
-        reference: what the points are compared with; of reduced models and bases, the full run behind them.
-        skipped: why there are no points; empty when there are some.
-    """
-
-    points: tuple[WorkPoint, ...] = ()
-    slopes: tuple[Slope, ...] = ()
+    points: tuple[WorkPoint, ...] = ()  # measured
+    slopes: tuple[Slope, ...] = ()  # fitted to them
+    # what the points are compared with; of reduced models and bases, the full run behind them
     reference: Truth | TimedRun | RiccatiReference | ReducedReference | LoopReference | None = None
-    skipped: str = ""
+    skipped: str = ""  # why there are no points; empty when there are some
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -148,19 +115,12 @@ class Question:
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting that answers.
+    """A setting that answers."""
 
-    Attributes:
-        point: measured.
-        shares: about how much of its error space, time step and reduced model carry.
-        sets: arguments of ``--set`` that run it again.
-        predicted: error and seconds; None without a prediction.
-    """
-
-    point: RunPoint
-    shares: dict[str, float]
-    sets: tuple[str, ...]
-    predicted: tuple[float, float] | None = None
+    point: RunPoint  # measured
+    shares: dict[str, float]  # about how much of its error space, time step and reduced model carry
+    sets: tuple[str, ...]  # arguments of ``--set`` that run it again
+    predicted: tuple[float, float] | None = None  # error and seconds; None without a prediction
 
     @property
     def command(self) -> str:
@@ -186,22 +146,15 @@ class Choice:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to a tolerance or a budget.
+    """The answer to a tolerance or a budget."""
 
-    Attributes:
-        kind: "tolerance" or "budget".
-        limit: the tolerance [1] or the budget [s].
-        sentences: the answer in words.
-        full, reduced: the best run of the full model and of a reduced one; None where none meets the limit.
-        closest: when nothing does.
-    """
-
-    kind: str
-    limit: float
-    sentences: tuple[str, ...]
+    kind: str  # "tolerance" or "budget"
+    limit: float  # the tolerance [1] or the budget [s]
+    sentences: tuple[str, ...]  # the answer in words
+    # full, reduced: the best run of the full model and of a reduced one; None where none meets the limit
     full: Choice | None = None
     reduced: Choice | None = None
-    closest: Choice | None = None
+    closest: Choice | None = None  # when nothing does
 
     @property
     def met(self) -> bool:
@@ -217,38 +170,23 @@ class Answer:
 
 @dataclass(frozen=True)
 class Part:
-    """One source of error.
+    """One source of error."""
 
-    Attributes:
-        name: of the source.
-        error: that it leaves [1].
-        share: of the sum of all parts [1].
-        wasted: whole digits below a tenth of the largest part, which the largest part hides.
-        halved_by: setting that halves it; empty where none that was tried does.
-        cost: time of that setting over the time now [1]; None without one.
-    """
-
-    name: str
-    error: float
-    share: float = 0.0
-    wasted: int = 0
-    halved_by: str = ""
-    cost: float | None = None
+    name: str  # of the source
+    error: float  # that it leaves [1]
+    share: float = 0.0  # of the sum of all parts [1]
+    wasted: int = 0  # whole digits below a tenth of the largest part, which the largest part hides
+    halved_by: str = ""  # setting that halves it; empty where none that was tried does
+    cost: float | None = None  # time of that setting over the time now [1]; None without one
 
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Where the digits of one setting are lost; the largest part first.
+    """Where the digits of one setting are lost; the largest part first."""
 
-    Attributes:
-        label: the setting in words.
-        parts: sources of error.
-        missing: sources that are no part of it, with the reason.
-    """
-
-    label: str
-    parts: tuple[Part, ...]
-    missing: tuple[tuple[str, str], ...] = ()
+    label: str  # the setting in words
+    parts: tuple[Part, ...]  # sources of error
+    missing: tuple[tuple[str, str], ...] = ()  # sources that are no part of it, with the reason
 
     @property
     def sentence(self) -> str:
@@ -262,24 +200,16 @@ class ErrorBudget:
 
 @dataclass(frozen=True)
 class WorkStudy:
-    """All that one study found.
+    """All that one study found."""
 
-    Attributes:
-        scene: the scene.
-        truth: solution that outputs are compared with; None when no question needed it.
-        questions: by name, in the order of :data:`softgrasp.study.precision.points.QUESTIONS`.
-        answers: to a tolerance and a budget.
-        error_budgets: of the scene's own setting and of the one that answers; none without the forward question.
-        measured_for_the_answers: points beside those of the questions.
-        measured, cached: runs made now and taken from the cache.
-    """
-
-    scene: Scene
-    truth: Truth | None
-    questions: dict[str, Question]
-    answers: tuple[Answer, ...]
+    scene: Scene  # the scene
+    truth: Truth | None  # solution that outputs are compared with; None when no question needed it
+    questions: dict[str, Question]  # by name, in the order of softgrasp.study.precision.points.QUESTIONS
+    answers: tuple[Answer, ...]  # to a tolerance and a budget
+    # of the scene's own setting and of the one that answers; none without the forward question
     error_budgets: tuple[ErrorBudget, ...]
-    measured_for_the_answers: tuple[WorkPoint, ...]
+    measured_for_the_answers: tuple[WorkPoint, ...]  # points beside those of the questions
+    # measured, cached: runs made now and taken from the cache
     measured: int
     cached: int
 

@@ -48,17 +48,11 @@ CLOSE = 10.0  # times the error of the reference; gains nearer to it tell no slo
 
 @dataclass(frozen=True)
 class GainReference:
-    """The two tightest solutions and how far their gains are apart.
+    """The two tightest solutions and how far their gains are apart."""
 
-    Attributes:
-        solutions: by method; the first is what the reduced equations are made of.
-        tolerances: that they reached.
-        error: relative difference of their gains; nan when only one method got through.
-    """
-
-    solutions: dict[str, RiccatiSolution]
-    tolerances: dict[str, float]
-    error: float
+    solutions: dict[str, RiccatiSolution]  # by method; the first is what the reduced equations are made of
+    tolerances: dict[str, float]  # that they reached
+    error: float  # relative difference of their gains; nan when only one method got through
 
     def judge_of(self, method: str) -> RiccatiSolution:
         """The solution that a method is compared with: of another method, where there is one."""

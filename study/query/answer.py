@@ -38,14 +38,28 @@ class Answer:
 
     @property
     def refusal(self) -> str:
-        """Why the reduced model does not answer; empty when its error is within the tolerance."""
+        """Why the reduced model does not answer, and what comes instead; empty when its error is small enough."""
         c = self.certificate
         if c.passed:
             return ""
+        ending = (
+            "--fallback full runs the full model, --allow shows the answer all the same" if self.run is None
+            else "the full model ran instead" if self.full else "it is shown because --allow was given"
+        )  # fmt: skip
         return (
-            f"the error is {c.how} at most {c.reduction:.2g} of the {c.what}, which is above the tolerance "
-            f"{c.tolerance:g}"
+            f"The error is {c.how} to be at most {c.reduction:.2g} of the {c.what}, which is above the tolerance "
+            f"{c.tolerance:g}; {ending}."
         )
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know of the answer, in sentences."""
+        return [text for text in (self.refusal, *(() if self.full else self.certificate.reasons)) if text]
+
+    def deformation(self, C_s: Array) -> Array:
+        """Outputs against the hand, at every step; C_s are those of the hand, (p, n_s)."""
+        assert self.run is not None
+        return np.asarray(self.run.outputs - self.run.q_s @ C_s.T)
 
 
 def parameters(materials: Materials) -> str:
@@ -63,7 +77,7 @@ def answer_rows(answer: Answer, C_s: Array) -> list[tuple[str, str]]:
     """
     run, c = answer.run, answer.certificate
     assert run is not None
-    times, deformation = run.times, np.abs(run.outputs - run.q_s @ C_s.T).max(axis=0)
+    times, deformation = run.times, np.abs(answer.deformation(C_s)).max(axis=0)
     rows = [
         ("parameters", parameters(answer.materials)),
         ("answered by", f"{answer.source}, {len(times) - 1} steps of {1e3 * (times[1] - times[0]):.4g} ms"),
@@ -115,7 +129,7 @@ def _batch_row(answer: Answer, count: int, C_s: Array) -> list[Any]:
     row += ["proof" if c.proved else "estimate", estimate, c.time_step, mesh]
     if run is None:
         return [*row, *[None] * (3 * count)]
-    deformation = np.abs(run.outputs - run.q_s @ C_s.T).max(axis=0)
+    deformation = np.abs(answer.deformation(C_s)).max(axis=0)
     for i in range(count):
         bound = None if answer.full else float(c.outputs.largest[i])
         row += [float(run.outputs[-1, i]), float(deformation[i]), bound]

@@ -33,17 +33,17 @@ def parse_settings(settings: Sequence[str]) -> dict[str, float]:
     Raises:
         SceneError: an unknown key, a key twice, or a value that is no number.
     """
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for text in settings:
         key, equals, value = (part.strip() for part in text.partition("="))
         if not equals or key not in KEYS:
             near = difflib.get_close_matches(key, KEYS, n=1)
             hint = f"did you mean {near[0]}?" if near else "a query sets lambda, mu or rho, for example --set lambda=77"
             raise SceneError(f"--set {text}: {hint}")
-        if key in found:
+        if key in numbers:
             raise SceneError(f"--set {text}: {key} is set twice; give one value, or many in a table with --batch")
-        found[key] = _number(value, f"--set {text}")
-    return found
+        numbers[key] = _number(value, f"--set {text}")
+    return numbers
 
 
 def _number(text: str, where: str) -> float:
@@ -70,8 +70,8 @@ def read_batch(path: Path) -> list[dict[str, float]]:
         raise SceneError(f"--batch {path}: {error}") from error
     header = [name.split("[")[0].strip() for name in lines[0]] if lines else []
     if not header or set(header) - set(KEYS) or len(set(header)) < len(header):
-        found = ", ".join(header) or "nothing"
-        raise SceneError(f"--batch {path}: the first line must name columns (lambda, mu, rho or some); it has {found}")
+        names = ", ".join(header) or "nothing"
+        raise SceneError(f"--batch {path}: the first line must name columns (lambda, mu, rho or some); it has {names}")
     rows = []
     for i, line in enumerate(lines[1:], 1):
         if len(line) != len(header):

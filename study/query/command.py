@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from softgrasp.study.shell.ending import console
+from softgrasp.study.shell.options import Empty, Pdf, check_folder
 
 
 def query(
@@ -37,6 +38,14 @@ def query(
     csv: Annotated[
         Path | None, typer.Option(help="write the trajectory with its bounds, or the answers of a batch, to this file")
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="also write a page, a picture and tables into this folder", callback=check_folder
+        ),
+    ] = None,
+    empty: Empty = False,
+    pdf: Pdf = False,
 ) -> None:
     """Ask a certified reduced model for other materials, motions or steps, and how far the answer can be off.
 
@@ -53,6 +62,6 @@ def query(
 
     status = run_query(
         model, console(), settings=set_ or [], motion=motion, dt=dt, tolerance=tolerance, allow=allow,
-        fallback=fallback, scene=scene, batch=batch, out=csv,
+        fallback=fallback, scene=scene, batch=batch, out=csv, folder=out, empty=empty,
     )  # fmt: skip
     raise typer.Exit(status)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +22,10 @@ from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive, Materials
 from softgrasp.study.query.answer import Answer, answer_rows, batch_table, trajectory_table
 from softgrasp.study.query.asked import drive_of, materials_of, parse_settings, read_batch
+from softgrasp.study.query.page import write_page
+from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.tables import pairs
+from softgrasp.study.shell.folder import claim
 from softgrasp.study.shell.session import list_files, show_warnings
 
 REFUSED = 3  # exit status
@@ -41,6 +45,8 @@ def run_query(
     scene: Path | None = None,
     batch: Path | None = None,
     out: Path | None = None,
+    folder: Path | None = None,
+    empty: bool = False,
 ) -> int:
     """Answer a query and print it. Collective.
 
@@ -56,6 +62,8 @@ def run_query(
         scene: of the full model; None looks for the scene.toml that ``reduce`` has left beside the model.
         batch: CSV table of parameters.
         out: CSV file of the trajectory, or of the answers of a batch.
+        folder: where a page of the answer goes; None: no page.
+        empty: first remove what an earlier command has left in that folder.
 
     Returns:
         Exit status: 0, or 3 when an answer is refused.
@@ -73,11 +81,14 @@ def run_query(
     own = parse_settings(settings)
     asked = [own] if batch is None else [{**own, **row} for row in read_batch(batch)]
     if not h5py.is_hdf5(path):
-        what = "is no HDF5 file" if path.is_file() else "is not there"
+        what = "is no HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "is not there"
         raise SceneError(f"{path} {what}; name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
     many = [materials_of(model, setting) for setting in asked]
     drive = drive_of(model, motion, dt)
+    with agree(MPI.COMM_WORLD):
+        if folder is not None and MPI.COMM_WORLD.rank == 0:
+            claim(folder, "query", model.fine.name, path=path, empty=empty)
     console.print(_about(model, path), soft_wrap=True, markup=False)
     begin = time.perf_counter()
     runs = model.run_batch(many, drive, tolerance=tolerance)
@@ -96,6 +107,14 @@ def run_query(
     if out is not None and any(answer.run is not None for answer in answers):
         _write(model, answers, batch is not None, out)
         list_files(console, [out])
+    if folder is not None:
+        with agree(MPI.COMM_WORLD):
+            if MPI.COMM_WORLD.rank == 0:
+                given = {"motion": motion, "dt": dt, "tolerance": tolerance, "fallback": fallback, "batch": batch}
+                options = [f"--{key} {shlex.quote(str(value))}" for key, value in given.items() if value is not None]
+                words = "".join(f" {option}" for option in [*options, *["--allow"] * allow, f"--out {folder}"])
+                line = command_line("query", path, settings, MPI.COMM_WORLD.size, words)
+                list_files(console, write_page(folder, path, model, answers, seconds, line, batch is not None))
     return REFUSED if any(answer.run is None for answer in answers) else 0
 
 
@@ -111,21 +130,12 @@ def _about(model: CertifiedModel, path: Path) -> str:
 
 def _show_one(console: Console, model: CertifiedModel, answers: Sequence[Answer], seconds: float) -> None:
     (answer,) = answers
-    notes = [] if answer.full else list(answer.certificate.reasons)
-    if answer.refusal:
-        ending = (
-            "; the full model ran instead" if answer.full
-            else "; it is shown because --allow was given" if answer.run is not None
-            else "; --fallback full runs the full model, --allow shows the answer all the same"
-        )  # fmt: skip
-        if answer.run is None:
-            console.print(f"refused: {answer.refusal}{ending}", style="red", soft_wrap=True, markup=False)
-        else:
-            notes.insert(0, answer.refusal + ending)
+    if answer.run is None:
+        console.print(f"refused: {answer.refusal}", style="red", soft_wrap=True, markup=False)
     if answer.run is not None:
         rows = answer_rows(answer, model.fine.outputs.C_s)
         console.print(pairs([*rows, ("time of the reduced answer", f"{1e3 * seconds:.3g} ms")]))
-    show_warnings(console, notes)
+    show_warnings(console, answer.warnings[answer.run is None :])
 
 
 def _show_batch(console: Console, model: CertifiedModel, answers: Sequence[Answer], seconds: float) -> None:
@@ -142,9 +152,8 @@ def _show_batch(console: Console, model: CertifiedModel, answers: Sequence[Answe
     text += f", {refused} refused" * bool(refused) + f", {full} by the full model" * bool(full)
     console.print(text, soft_wrap=True)
     if outside:
-        show_warnings(
-            console, [f"{outside} parameters lie outside the box of the training; the bound holds all the same"]
-        )
+        lie = "1 parameter lies" if outside == 1 else f"{outside} parameters lie"
+        show_warnings(console, [f"{lie} outside the box of the training; the bound holds all the same"])
 
 
 def _write(model: CertifiedModel, answers: Sequence[Answer], many: bool, out: Path) -> None:

@@ -12,16 +12,25 @@ from softgrasp.reduction.bases.states import States
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_linear
-from softgrasp.study.reduce.result import COMPARED, LARGER, BoxErrors, BoxPoint, BoxTests, Sweep, TestedModel, nearest
+from softgrasp.study.reduce.result import (
+    COMPARED,
+    LARGER,
+    BoxErrors,
+    BoxPoint,
+    BoxTests,
+    MethodSweep,
+    TestedModel,
+    nearest,
+)
 from softgrasp.study.reduce.sweep import bases_of
 
 METHODS_TESTED = 4
 
 
-def best_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
+def best_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
     """The methods with the least deformation error of a stable model at the N that is compared."""
 
-    def error(s: Sweep, i: int) -> float:
+    def error(s: MethodSweep, i: int) -> float:
         value = s.points[i].error_deformation
         return value if np.isfinite(value) else np.inf
 
@@ -29,7 +38,7 @@ def best_methods(sweeps: Sequence[Sweep]) -> list[Sweep]:
     return [s for _, _, s in sorted(order)[:METHODS_TESTED]]
 
 
-def box_models(full: FullRun, sweeps: Sequence[Sweep], states: States | None) -> list[TestedModel]:
+def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
     scene, system, models = full.model.scene, full.model.system, []
     outputs = make_outputs(scene, system)
@@ -57,7 +66,9 @@ def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]
     return tuple(errors)
 
 
-def measure_box(full: FullRun, sweeps: Sequence[Sweep], progress: Callable[[int, int], None] | None = None) -> BoxTests:
+def measure_box(
+    full: FullRun, sweeps: Sequence[MethodSweep], progress: Callable[[int, int], None] | None = None
+) -> BoxTests:
     """Train, and test over the box. Collective.
 
     Raises:
@@ -89,13 +100,7 @@ def measure_box(full: FullRun, sweeps: Sequence[Sweep], progress: Callable[[int,
 def summary(
     models: Sequence[TestedModel], own: Sequence[float], points: Sequence[BoxPoint], runs: int
 ) -> tuple[BoxErrors, ...]:
-    """Error at the scene's own parameter, and median and largest over the parameters that trained no basis.
-
-    Args:
-        own: errors at the scene's own parameter.
-        points: errors over the box.
-        runs: that trained the models with ``several``.
-    """
+    """Error at the scene's own parameter, and median and largest over the parameters that trained no basis."""
     tests = [p for p in points if not p.trained] or points
     rows = []
     for i, m in enumerate(models if tests else ()):

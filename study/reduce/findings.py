@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 
 from softgrasp.reduction.bases.registry import PAPER_METHODS, PAPER_PLAIN
-from softgrasp.study.reduce.result import COMPARED, Point, Sweep
+from softgrasp.study.reduce.result import COMPARED, MethodSweep, Point
 
 MEASURES = (
     ("error_deformation", "the deformation"),
@@ -17,7 +17,7 @@ MEASURES = (
 )
 
 
-def leader(sweeps: Sequence[Sweep], N: int, key: str, stable: bool = True) -> tuple[Sweep, Point] | None:
+def leader(sweeps: Sequence[MethodSweep], N: int, key: str, stable: bool = True) -> tuple[MethodSweep, Point] | None:
     """Method with the least value at exactly N, among stable models or all; None without any."""
     models = [
         (getattr(p, key), k, s, p)
@@ -28,30 +28,25 @@ def leader(sweeps: Sequence[Sweep], N: int, key: str, stable: bool = True) -> tu
     return min(models)[2:] if models else None
 
 
-def sizes_of(sweeps: Sequence[Sweep]) -> list[int]:
+def sizes_of(sweeps: Sequence[MethodSweep]) -> list[int]:
     """All N of any method, ascending."""
     return sorted({p.N for s in sweeps for p in s.points})
 
 
-def compared_size(sweeps: Sequence[Sweep]) -> int | None:
-    """The N nearest to the one compared, the smaller of two."""
-    return min(sizes_of(sweeps), key=lambda N: (abs(N - COMPARED), N), default=None)
-
-
-def leaders(sweeps: Sequence[Sweep], key: str) -> list[tuple[Sweep, list[Point]]]:
+def leaders(sweeps: Sequence[MethodSweep], key: str) -> list[tuple[MethodSweep, list[Point]]]:
     """Best stable methods in the order of N, with their points in a row."""
     best = [b for N in sizes_of(sweeps) if (b := leader(sweeps, N, key)) is not None]
     groups = [list(group) for _, group in groupby(best, key=lambda b: b[0].method.key)]
     return [(group[0][0], [p for _, p in group]) for group in groups]
 
 
-def findings(sweeps: Sequence[Sweep]) -> tuple[str, ...]:
+def findings(sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:
     """Who is best at which N in which measure, what structure buys, and whether the paper's ranking holds."""
     shown = [s for s in sweeps if s.points]
     return (*_best(shown), *_stability(shown), *_structure(shown), *_paper(shown)) if shown else ()
 
 
-def _best(sweeps: Sequence[Sweep]) -> Iterator[str]:
+def _best(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
     seen: dict[tuple[tuple[str, int], ...], str] = {}
     for key, name in MEASURES:
         rows = leaders(sweeps, key)
@@ -62,15 +57,12 @@ def _best(sweeps: Sequence[Sweep]) -> Iterator[str]:
             yield f"In {name} the same methods lead as in {seen[order]}."
             continue
         seen[order] = name
+        spans = [" to ".join(str(N) for N in sorted({points[0].N, points[-1].N})) for _, points in rows]
         texts = [
-            f"{s.method.short_title} at N = {_span([p.N for p in points])} ({_value(points, key)})"
-            for s, points in rows
+            f"{s.method.short_title} at N = {span} ({_value(points, key)})"
+            for (s, points), span in zip(rows, spans, strict=True)
         ]
         yield f"Least error of {name} among stable models: {'; '.join(texts)}."
-
-
-def _span(sizes: list[int]) -> str:
-    return str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
 
 
 def _value(points: Sequence[Point], key: str) -> str:
@@ -80,7 +72,7 @@ def _value(points: Sequence[Point], key: str) -> str:
     return value if len(points) == 1 else f"{value} at N = {p.N}"
 
 
-def _stability(sweeps: Sequence[Sweep]) -> Iterator[str]:
+def _stability(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
     for keeps, label in ((True, "that keep the structure"), (False, "that do not")):
         group = [s for s in sweeps if s.method.preserving == keeps]
         total = sum(len(s.points) for s in group)
@@ -92,8 +84,8 @@ def _stability(sweeps: Sequence[Sweep]) -> Iterator[str]:
         yield f"Unstable models among the {total} {label}: " + (f"{count} ({where})." if count else "none.")
 
 
-def _structure(sweeps: Sequence[Sweep]) -> Iterator[str]:
-    N = compared_size(sweeps)
+def _structure(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
+    N = min(sizes_of(sweeps), key=lambda N: (abs(N - COMPARED), N), default=None)
     groups = {
         keeps: [(s, p) for s in sweeps if s.method.preserving == keeps for p in s.points if p.N == N and p.stable]
         for keeps in (True, False)
@@ -117,7 +109,7 @@ def _structure(sweeps: Sequence[Sweep]) -> Iterator[str]:
     )
 
 
-def _paper(sweeps: Sequence[Sweep]) -> Iterator[str]:
+def _paper(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
     """The paper's two statements on its six methods, in its own error, at every N where both sides have a model."""
     six = [s for s in sweeps if s.method.key in PAPER_METHODS]
     others = [s for s in six if s.method.key in PAPER_PLAIN]
@@ -130,7 +122,9 @@ def _paper(sweeps: Sequence[Sweep]) -> Iterator[str]:
     yield from _statement("PSD without fixed solid modes is the best", psd, others, "for it", "for the best other")
 
 
-def _statement(text: str, left: Sequence[Sweep], right: Sequence[Sweep], one: str, other: str) -> Iterator[str]:
+def _statement(
+    text: str, left: Sequence[MethodSweep], right: Sequence[MethodSweep], one: str, other: str
+) -> Iterator[str]:
     pairs = [
         (N, a, b)
         for N in sizes_of([*left, *right])

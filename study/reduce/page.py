@@ -5,19 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from softgrasp.study.reduce import tables
 from softgrasp.study.reduce.result import ReductionStudy
-from softgrasp.study.reduce.tables import (
-    N_NOTE,
-    box_note,
-    box_point_tables,
-    box_table,
-    error_note,
-    error_table,
-    inner_note,
-    refused_table,
-    time_table,
-)
-from softgrasp.study.report.page import Section
+from softgrasp.study.report.page import Section, captioned
 
 CAPTIONS = {
     "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
@@ -41,18 +31,18 @@ CAPTIONS = {
 
 def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
     """Parts of the page. Rank 0 only."""
-    energy, drawn = study.full.model.scene.reduction.energy, {file.name: file for file in files}
+    energy = study.full.model.scene.reduction.energy
     text = (
-        f"{N_NOTE}\n\n{error_note(energy)} Each method is built from the snapshots of one run and repeats it, driven "
-        f"by the same hand. {inner_note(study.sweeps)}"
+        f"{tables.N_NOTE}\n\n{tables.error_note(energy)} Each method is built from the snapshots of one run and "
+        f"repeats it, driven by the same hand. {tables.inner_note(study.sweeps)}"
     )
     parts = [
-        error_table(study.sweeps, energy).section(text),
+        tables.error_table(study.sweeps, energy).section(text),
         Section("What holds", text="\n\n".join(study.findings)),
-        Section("", figures=[(drawn[name], caption) for name, caption in CAPTIONS.items() if name in drawn]),
-        time_table(study.speeds).section("\n\n".join(study.speed_notes)),
+        Section("", figures=captioned(files, CAPTIONS)),
+        tables.time_table(study.speeds).section("\n\n".join(study.speed_notes)),
     ]
-    refused = refused_table(study.sweeps)
+    refused = tables.refused_table(study.sweeps)
     if refused.rows:
         parts.append(refused.section())
     return [*parts, *box_sections(study)]
@@ -63,7 +53,7 @@ def box_sections(study: ReductionStudy) -> list[Section]:
     box = study.box
     if box.none:
         return [Section("Other parameters", f"No tests at other parameters: {box.none}.")]
-    text = box_note(box)
+    text = tables.box_note(box)
     text += " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
-    points = [table.section(f"All parameters, N = {N}.") for N, table in box_point_tables(box)]
-    return [box_table(box).section(text), *points]
+    points = [table.section(f"All parameters, N = {N}.") for N, table in tables.box_point_tables(box)]
+    return [tables.box_table(box).section(text), *points]

@@ -18,15 +18,8 @@ from softgrasp.study.pictures.animation import Film, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow, speed_up
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save, segments
-from softgrasp.study.reduce.plots import (
-    figure_errors,
-    figure_further_errors,
-    figure_sigma,
-    figure_times,
-    further_methods,
-    of_paper,
-)
-from softgrasp.study.reduce.result import Sweep
+from softgrasp.study.reduce import plots
+from softgrasp.study.reduce.result import MethodSweep
 from softgrasp.study.reduce.views import View, Views
 
 INSTANTS = 3  # at most, in the still picture
@@ -35,18 +28,18 @@ STRETCH = 0.15  # largest displacement of a drawn mode over the size of the body
 FULL: dict[str, Any] = {"color": ORANGE, "linewidth": 1.1}
 
 
-def draw(out: Path, sweeps: Sequence[Sweep], full: float, views: Views | None) -> list[Path]:
+def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | None) -> list[Path]:
     """All figures; ``full`` are the seconds of the full model's steps. Rank 0 only."""
     files: list[Path] = []
     shown = [s for s in sweeps if s.points]
-    if of_paper(shown):
-        files += figure_errors(of_paper(shown), out / "errors.png")
-        files += figure_further_errors(of_paper(shown), out / "errors_state.png")
-    if any(s not in of_paper(shown) for s in shown):
-        files += figure_errors(further_methods(shown), out / "errors_beyond.png")
+    if plots.of_paper(shown):
+        files += plots.figure_errors(plots.of_paper(shown), out / "errors.png")
+        files += plots.figure_further_errors(plots.of_paper(shown), out / "errors_state.png")
+    if any(s not in plots.of_paper(shown) for s in shown):
+        files += plots.figure_errors(plots.further_methods(shown), out / "errors_beyond.png")
     if shown:
-        files += figure_times(shown, full, out / "times.png")
-        files += figure_sigma(shown, out / "sigma.png") or ()
+        files += plots.figure_times(shown, full, out / "times.png")
+        files += plots.figure_sigma(shown, out / "sigma.png") or ()
     if views is not None and views.modes:
         files += figure_modes(views, out / "modes.png")
     if views is not None and views.reduced:

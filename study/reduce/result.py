@@ -45,7 +45,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class MethodSweep:
     """One method at all its N."""
 
     method: Method  # which
@@ -128,18 +128,19 @@ class FullTimes:
 class Speed:
     """One method against the full model at the stable N nearest to the one compared."""
 
-    method: str  # method, title: which
-    title: str
-    N: int  # columns of V
-    N_tissue: int  # those without the hand's own
-    stable: bool  # no model is otherwise; False when the method has no stable one
-    time_offline: float  # time_offline, time_setup, time_online: [s]
-    time_setup: float
-    time_online: float
+    method: Method
+    point: Point  # its times; not stable where the method has no stable model
     speedup_same_model: float  # full steps over a reduced run of the same model again, both with everything prefactored
     speedup_new_parameter: float  # full factorisation and steps over reduced set-up and run
     # time_offline / (full run - reduced run) at new parameters; None when the reduced is not faster
     break_even_runs: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """One entry of "speed" in ``result.json``."""
+        keys = ("N", "N_tissue", "stable", "time_offline", "time_setup", "time_online")
+        pays = ("speedup_same_model", "speedup_new_parameter", "break_even_runs")
+        numbers = {key: getattr(self.point, key) for key in keys} | {key: getattr(self, key) for key in pays}
+        return {"method": self.method.key, "title": self.method.title, **numbers}
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ class ReductionStudy:
     """All that ``softgrasp reduce`` measures."""
 
     full: FullRun  # the full run
-    sweeps: tuple[Sweep, ...]  # every method
+    sweeps: tuple[MethodSweep, ...]  # every method
     times: FullTimes  # of the full model
     speeds: tuple[Speed, ...]  # every method with a model against the full model
     box: BoxTests  # errors at other parameters

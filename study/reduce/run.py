@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
@@ -17,29 +17,18 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
 from softgrasp.reduction.replay import FullRun
 from softgrasp.study.pictures.beside import beside
+from softgrasp.study.reduce import tables
 from softgrasp.study.reduce.box import measure_box
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.page import sections
-from softgrasp.study.reduce.result import BoxTests, FullTimes, ReductionStudy, Sweep, best, head_of
+from softgrasp.study.reduce.result import BoxTests, FullTimes, MethodSweep, ReductionStudy, best, head_of
 from softgrasp.study.reduce.sweep import chosen_methods, sweep
-from softgrasp.study.reduce.tables import (
-    N_NOTE,
-    box_note,
-    box_table,
-    error_note,
-    error_table,
-    inner_note,
-    point_table,
-    refused_table,
-    summary,
-    time_table,
-)
 from softgrasp.study.reduce.times import measured_run, speed_notes, speed_of
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.session import Page, Session, list_files
+from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
@@ -68,19 +57,16 @@ def run_reduce(
     overrides: list[str],
     console: Console,
     *,
-    quiet: bool = False,
-    pictures: bool = True,
-    empty: bool = False,
     tolerance: float | None = None,
+    **flags: Unpack[Flags],
 ) -> dict[str, Any]:
     """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
 
-    Raises:
-        SoftgraspError: with one sentence.
+    Raises SoftgraspError: with one sentence.
     """
     if tolerance is not None:
         overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
-    session = Session("reduce", path, overrides, out, console, quiet, pictures, empty)
+    session = Session("reduce", path, overrides, out, console, **flags)
     scene = session.scene()
     names = check_scene(scene)
     if scene.reduction.certify != "off" or scene.reduction.train == "greedy":
@@ -102,8 +88,8 @@ def run_reduce(
     def page() -> Page:
         files = drawn()
         parts = sections(study, files)
-        tables = {"points.csv": point_table(study)}
-        return Page(f"{scene.name}: reduced models", summary(study), parts, tables, [*files, *models])
+        points = {"points.csv": tables.point_table(study)}
+        return Page(f"{scene.name}: reduced models", tables.summary(study), parts, points, [*files, *models])
 
     show(console, study)
     list_files(console, session.write(scene, result, page))
@@ -115,12 +101,7 @@ def reduce_model(
 ) -> tuple[ReductionStudy, Callable[[], list[Path]]]:
     """Full run, every method, errors over the box, beside which pictures are drawn. Collective.
 
-    Args:
-        bar: shows what is done.
-        watch: takes the seconds of "full", "sweep" and "box".
-
-    Returns:
-        What came out, and what waits for the pictures on rank 0.
+    Returned with the study: what waits for the pictures on rank 0.
 
     Raises:
         SolverError: a solve failed or a factorisation did.
@@ -137,7 +118,7 @@ def reduce_model(
     bar.remove_task(task)
     size = len(scene.reduction.N)
     task = bar.add_task("bases", total=size * len(names))
-    sweeps: list[Sweep] = []
+    sweeps: list[MethodSweep] = []
     with watch.stage("sweep"):
         for name in names:
 
@@ -157,7 +138,9 @@ def reduce_model(
     return ReductionStudy(full, tuple(sweeps), times, speeds, box, findings(sweeps), notes), drawn
 
 
-def _drawn(session: Session, full: FullRun, sweeps: Sequence[Sweep], times: FullTimes) -> Callable[[], list[Path]]:
+def _drawn(
+    session: Session, full: FullRun, sweeps: Sequence[MethodSweep], times: FullTimes
+) -> Callable[[], list[Path]]:
     """Begin to draw on rank 0. Collective."""
     if not session.pictures:
         return list
@@ -173,7 +156,7 @@ def _drawn(session: Session, full: FullRun, sweeps: Sequence[Sweep], times: Full
     return beside(session.comm, session.out, draw_all)
 
 
-def save_models(out: Path, sweeps: Sequence[Sweep]) -> list[Path]:
+def save_models(out: Path, sweeps: Sequence[MethodSweep]) -> list[Path]:
     """Write the best stable model of every method into ``out/models``. Collective."""
     files = []
     for s in sweeps:
@@ -189,11 +172,11 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
     model = study.full.model
     head, seconds = head_of(model, study.full.trajectory)
     result = head | {
-        "N_means": N_NOTE,
+        "N_means": tables.N_NOTE,
         "methods": {s.method.key: [asdict(p) for p in s.points] for s in study.sweeps},
         "about": {s.method.key: _about(s) for s in study.sweeps},
         "findings": study.findings,
-        "speed": [asdict(speed) for speed in study.speeds],
+        "speed": [speed.to_json() for speed in study.speeds],
         "speed_notes": study.speed_notes,
         "box": _box_result(study.box),
         "time": {
@@ -207,7 +190,7 @@ def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
     return dict(to_json(result))
 
 
-def _about(s: Sweep) -> dict[str, Any]:
+def _about(s: MethodSweep) -> dict[str, Any]:
     return {
         "title": s.method.title,
         "paper": s.method.paper,
@@ -239,21 +222,23 @@ def _box_result(box: BoxTests) -> dict[str, Any]:
 def show(console: Console, study: ReductionStudy) -> None:
     """Print the tables."""
     energy, box = study.full.model.scene.reduction.energy, study.box
-    _print(console, error_table(study.sweeps, energy, narrow=True))
-    note = f"{error_note(energy)} fixed: with fixed solid modes. {N_NOTE} {inner_note(study.sweeps)}"
+    _print(console, tables.error_table(study.sweeps, energy, narrow=True))
+    note = (
+        f"{tables.error_note(energy)} fixed: with fixed solid modes. {tables.N_NOTE} {tables.inner_note(study.sweeps)}"
+    )
     console.print(note, style="dim", markup=False)
     for sentence in study.findings:
         console.print(sentence, markup=False)
-    for sizes, titles, reason in refused_table(study.sweeps, narrow=True).rows:
+    for sizes, titles, reason in tables.refused_table(study.sweeps, narrow=True).rows:
         console.print(f"N = {sizes} refused for {titles}: {reason}.", markup=False)
-    _print(console, time_table(study.speeds, narrow=True))
+    _print(console, tables.time_table(study.speeds, narrow=True))
     for note in study.speed_notes:
         console.print(note)
     if box.none:
         console.print(f"no errors at other parameters: {box.none}")
     else:
-        console.print(box_note(box), markup=False)
-        _print(console, box_table(box, narrow=True))
+        console.print(tables.box_note(box), markup=False)
+        _print(console, tables.box_table(box, narrow=True))
 
 
 def _print(console: Console, table: Table) -> None:

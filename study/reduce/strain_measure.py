@@ -19,7 +19,7 @@ from softgrasp.reduction.strain.compare import Reference, errors_of, reference_o
 from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.reduction.strain.training import Training, replay_strain, train
 from softgrasp.study.reduce.result import FullTimes
-from softgrasp.study.reduce.strain_result import Family, StrainPoint, StrainStudy, Test
+from softgrasp.study.reduce.strain_result import StrainFamily, StrainPoint, StrainStudy, Test
 from softgrasp.study.shell.timing import median_seconds
 
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
@@ -37,7 +37,7 @@ Say = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldOutRun:
     """A full run that trained no model."""
 
     kind: str
@@ -56,7 +56,7 @@ def measure_strain(model: Model, own: FullRun, times: FullTimes, say: Say) -> St
     first, near = model.system.materials[0], []
     for share in SHARES if _has_target(model) else ():
         target = [share * x for x in model.scene.motion.target or []]
-        near.append(Held("motion", _full(model, (first.lam, first.mu), target)))
+        near.append(HeldOutRun("motion", _full(model, (first.lam, first.mu), target)))
     families = []
     for key, runs, tests in (("own", [own], near), ("box", box_runs, held)):
         if len(runs) > 1 or key == "own":
@@ -95,7 +95,7 @@ def _full(model: Model, place: Place, target: list[float] | None) -> FullRun:
         ) from error
 
 
-def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list[Held], str]:
+def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list[HeldOutRun], str]:
     """Training runs over the box of materials and motions, held-out runs inside it, and why there are none."""
     reason, first = outside(model), model.system.materials[0]
     places = [] if reason else training_of(model)
@@ -108,10 +108,10 @@ def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list
         jobs += [("material", place, None) for place in tests if not np.allclose(place, here)]
     if targets:
         jobs += [("motion", here, target) for target in _inside(model)]
-    done: list[Held] = []
+    done: list[HeldOutRun] = []
     for i, (kind, place, target) in enumerate(jobs):
         say("full runs", i, len(jobs))
-        done.append(Held(kind, _full(model, place, target)))
+        done.append(HeldOutRun(kind, _full(model, place, target)))
     held = [h for h in done if h.kind != "train"]
     return [own, *(h.full for h in done if h.kind == "train")], held, reason
 
@@ -129,8 +129,8 @@ def _inside(model: Model) -> list[list[float]]:
 
 
 def _family(
-    key: str, model: Model, runs: Sequence[FullRun], held: Sequence[Held], sizes: Sequence[int], say: Say
-) -> Family:
+    key: str, model: Model, runs: Sequence[FullRun], held: Sequence[HeldOutRun], sizes: Sequence[int], say: Say
+) -> StrainFamily:
     refused: dict[int, str] = {}
     training = None
     for N in sorted(sizes, reverse=True):
@@ -160,18 +160,20 @@ def _family(
         raise ReductionError(f"no N of {list(sizes)} gives a model: {'; '.join(refused.values())}")
     curves += points
     tests = tuple(_test(h, reference, models.values()) for h, reference in zip(held, references, strict=True))
-    return Family(key, training.whole.box, len(runs), tuple(points), tuple(curves), tests, models, refused)
+    return StrainFamily(key, training.whole.box, len(runs), tuple(points), tuple(curves), tests, models, refused)
 
 
 def _measure(
-    training: Training, rom: StrainModel, held: Sequence[Held], references: Sequence[Reference]
+    training: Training, rom: StrainModel, held: Sequence[HeldOutRun], references: Sequence[Reference]
 ) -> StrainPoint:
     """Errors on training runs and on held-out ones, drift, times."""
     pairs = list(zip(training.references, training.runs, strict=True))
     done = [replay_strain(rom, run, outside=True) for _, run in pairs]
     trained = errors_of([r.missed(x.a, x.v) for (r, _), x in zip(pairs, done, strict=True)])
     own = training.references[0].errors(done[0].a, done[0].v)
-    worst = {kind: _worst(rom, kind, held, references) for kind in ("material", "motion")}
+    errors = [(h.kind, _error(rom, h, r)) for h, r in zip(held, references, strict=True)]
+    worst = {key: max((e for kind, e in errors if kind == key and e is not None), default=None)
+             for key in ("material", "motion")}  # fmt: skip
     full, comm = training.runs[0], training.model.system.layout.comm
     small = rom.at(full.dt, outside=True)  # few cells may overshoot
     start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
@@ -180,19 +182,15 @@ def _measure(
     return StrainPoint(
         N=rom.N, k=rom.k, tau=rom.tau, residual=rom.residual, cells=rom.cells.count,
         error_own=own.z, error_own_velocity=own.v, error_own_energy_norm=own.energy_norm,
-        error_training=trained.z, error_galerkin=rom.error_galerkin, floor=training.references[0].floor(rom.k),
+        error_training=trained.z, error_galerkin=rom.error_galerkin,
+        floor=training.references[0].projection_error(rom.k),
         error_materials=worst["material"], error_motions=worst["motion"],
         drift=max(run.energy_drift for run in done), evaluations=done[0].evaluations, engine=done[0].engine,
         time_offline=sum(rom.seconds.values()), time_setup=setup, time_online=online,
     )  # fmt: skip
 
 
-def _worst(rom: StrainModel, kind: str, held: Sequence[Held], references: Sequence[Reference]) -> float | None:
-    errors = [_error(rom, h, r) for h, r in zip(held, references, strict=True) if h.kind == kind]
-    return max((e for e in errors if e is not None), default=None)
-
-
-def _error(rom: StrainModel, held: Held, reference: Reference) -> float | None:
+def _error(rom: StrainModel, held: HeldOutRun, reference: Reference) -> float | None:
     """Error in z on a held-out run; None where the model refuses it or fails."""
     try:
         run = replay_strain(rom, held.full)
@@ -201,7 +199,7 @@ def _error(rom: StrainModel, held: Held, reference: Reference) -> float | None:
     return reference.errors(run.a, run.v).z
 
 
-def _test(held: Held, reference: Reference, models: Iterable[StrainModel]) -> Test:
+def _test(held: HeldOutRun, reference: Reference, models: Iterable[StrainModel]) -> Test:
     first = held.full.model.system.materials[0]
     target = tuple(held.full.trajectory.q_s[-1].tolist())
     return Test(held.kind, first.lam, first.mu, target, {m.N: _error(m, held, reference) for m in models})

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from softgrasp.study.reduce.strain_measure import CELLS_AT
-from softgrasp.study.reduce.strain_result import Family, StrainStudy
+from softgrasp.study.reduce.strain_result import StrainFamily, StrainStudy
 from softgrasp.study.reduce.tables import TIMES, time_cells
-from softgrasp.study.report.page import Section
+from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 
 TITLES = {"own": "trained on the scene's run", "box": "trained over the box"}
@@ -68,7 +68,7 @@ def time_table(study: StrainStudy) -> Table:
     return Table(("runs", "N", "cells", *TIMES), rows, "Times")
 
 
-def test_table(family: Family) -> Table:
+def test_table(family: StrainFamily) -> Table:
     """Every held-out run with a column for each N."""
     sizes = [p.N for p in family.points]
     rows = [
@@ -130,9 +130,7 @@ def summary(study: StrainStudy) -> list[str]:
 
 def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
     """Parts of the page."""
-    drawn = {file.name: file for file in files}
-    figures = [(drawn[name], caption) for name, caption in CAPTIONS.items() if name in drawn]
     parts = [error_table(study).section(NOTE), Section("What holds", text="\n\n".join(sentences(study)))]
-    parts += [Section("", figures=figures), time_table(study).section(), cell_table(study).section()]
+    parts += [Section("", figures=captioned(files, CAPTIONS)), time_table(study).section(), cell_table(study).section()]
     parts += [test_table(f).section(title=f"Held-out runs, models {TITLES[f.key]}") for f in study.families if f.tests]
     return parts

@@ -14,21 +14,9 @@ from matplotlib.colors import LogNorm
 
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.reduction.strain.model import StrainModel
+from softgrasp.study.pictures import style
 from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
-from softgrasp.study.pictures.style import (
-    BLUE,
-    COLUMN,
-    GREEN,
-    HAND,
-    ORANGE,
-    OUTLINE,
-    PURPLE,
-    WIDTH,
-    colour_map,
-    paper_style,
-    save,
-)  # fmt: skip
-from softgrasp.study.reduce.plots import FULL, log_axis
+from softgrasp.study.reduce.plots import FULL
 from softgrasp.study.reduce.strain_measure import CELLS_AT
 from softgrasp.study.reduce.strain_page import TITLES
 from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy
@@ -46,13 +34,13 @@ def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Pat
 
 def figure_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
     """Errors against N, and against the number of cells."""
-    colours = dict(zip((f.key for f in study.families), (BLUE, ORANGE), strict=False))
-    with paper_style():
-        figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 3.4), sharey=True, layout="constrained")
+    colours = dict(zip((f.key for f in study.families), (style.BLUE, style.ORANGE), strict=False))
+    with style.paper_style():
+        figure, (left, right) = plt.subplots(1, 2, figsize=(style.WIDTH, 3.4), sharey=True, layout="constrained")
         for f in study.families:
             _pair(left, [p.N for p in f.points], f.points, colours[f.key], TITLES[f.key])
             left.plot([p.N for p in f.points], [p.error_galerkin for p in f.points], ls=":", color=colours[f.key])
-            for N, colour in zip(CELLS_AT, (GREEN, PURPLE), strict=True):
+            for N, colour in zip(CELLS_AT, (style.GREEN, style.PURPLE), strict=True):
                 points = sorted((p for p in f.curves if p.N == N), key=lambda p: p.cells)
                 if f is study.families[-1] and points:
                     _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {TITLES[f.key]}")
@@ -60,12 +48,12 @@ def figure_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
         for ax, label in ((left, "$N$"), (right, "sampled cells")):
             ax.axhline(study.linear, **FULL)
             ax.set_xlabel(label)
-            log_axis(ax, None)
+            style.log_axis(ax, None)
             ax.legend(fontsize=6.5, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.2, labelspacing=0.25)
         at = {"xy": (0.99, study.linear), "xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
         right.annotate("linear elasticity", **at, fontsize=6.5)
         left.set_ylabel("error of the deformation $z$")
-        return tuple(save(figure, out_png))
+        return tuple(style.save(figure, out_png))
 
 
 def _pair(ax: Any, x: Sequence[int], points: Sequence[StrainPoint], colour: str, label: str) -> None:
@@ -80,42 +68,33 @@ def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: P
     """Sampled cells on the body at rest, coloured by their weight."""
     flat = seen(picture.points)
     size = np.ptp(flat, axis=0)
-    height = min(4.0, 1.1 + (WIDTH / 2 if len(models) > 1 else COLUMN) * float(size[1] / size[0]) * 0.8)
-    weights = [_weights(m) for m in models]
-    together = np.concatenate([x for _, x in weights])
-    norm = LogNorm(float(together.min()), float(together.max()))
-    with paper_style():
-        figure, axes = plt.subplots(
-            1, len(models), figsize=(WIDTH if len(models) > 1 else COLUMN, height), squeeze=False, layout="constrained"
-        )
-        for ax, model, (cells, xi) in zip(axes[0], models, weights, strict=True):
+    wide = style.WIDTH if len(models) > 1 else style.COLUMN
+    height = min(4.0, 1.1 + wide / min(len(models), 2) * float(size[1] / size[0]) * 0.8)
+    sampled = [np.unique(m.cells.cell, return_index=True) for m in models]
+    weights = [m.cells.xi[first] for m, (_, first) in zip(models, sampled, strict=True)]  # xi = weight / vol
+    together = np.concatenate(weights)
+    norm, edge = LogNorm(float(together.min()), float(together.max())), style.OUTLINE
+    with style.paper_style():
+        figure, axes = plt.subplots(1, len(models), figsize=(wide, height), squeeze=False, layout="constrained")
+        for ax, model, (cells, _), xi in zip(axes[0], models, sampled, weights, strict=True):
+            colours = style.colour_map()(norm(xi))
             if picture.dimension == 2:
-                ax.add_collection(
-                    PolyCollection(list(flat[picture.cells]), facecolors="#f4f4f4", edgecolors="#d0d0d0", lw=0.3)
-                )
-                colours = colour_map()(norm(xi))
-                ax.add_collection(
-                    PolyCollection(list(flat[picture.cells[cells]]), facecolors=colours, edgecolors=OUTLINE, lw=0.5)
-                )
-                polygons = hand_polygons(picture)[0]
-                ax.add_collection(PolyCollection(polygons, facecolors=HAND, edgecolors=HAND, lw=0.3, zorder=4))
+                looks: list[tuple[Any, dict[str, Any]]] = [
+                    (flat[picture.cells], {"facecolors": "#f4f4f4", "edgecolors": "#d0d0d0", "lw": 0.3}),
+                    (flat[picture.cells[cells]], {"facecolors": colours, "edgecolors": edge, "lw": 0.5}),
+                    (hand_polygons(picture)[0], {"facecolors": style.HAND, "edgecolors": style.HAND, "lw": 0.3}),
+                ]
+                for order, (polygons, look) in enumerate(looks, 1):
+                    ax.add_collection(PolyCollection(list(polygons), zorder=order, **look))
             else:
-                ax.add_collection(LineCollection(shadow(flat, picture.facets), colors=OUTLINE, linewidths=0.8))
+                ax.add_collection(LineCollection(shadow(flat, picture.facets), colors=edge, linewidths=0.8))
                 x = seen(picture.points[picture.cells[cells]].mean(axis=1))
-                ax.scatter(
-                    x[:, 0], x[:, 1], c=xi, norm=norm, cmap=colour_map(), s=14, edgecolors=OUTLINE, linewidths=0.3
-                )
+                ax.scatter(x[:, 0], x[:, 1], c=colours, s=14, edgecolors=edge, linewidths=0.3)
             ax.set_title(f"N = {model.N}: {len(cells)} of {model.cells_full} cells", pad=4)
             ax.autoscale_view()
             ax.set_aspect("equal")
             ax.axis("off")
         figure.colorbar(
-            ScalarMappable(norm, colour_map()), ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell"
+            ScalarMappable(norm, style.colour_map()), ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell"
         )
-        return tuple(save(figure, out_png))
-
-
-def _weights(model: StrainModel) -> tuple[np.ndarray, np.ndarray]:
-    """Cells with their weights xi = weight / vol."""
-    cells, first = np.unique(model.cells.cell, return_index=True)
-    return cells, model.cells.xi[first]
+        return tuple(style.save(figure, out_png))

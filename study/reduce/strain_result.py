@@ -49,7 +49,7 @@ class Test:
 
 
 @dataclass(frozen=True)
-class Family:
+class StrainFamily:
     """Models of all N from the same training runs."""
 
     key: str  # "own", the scene's run alone, or "box", runs at other materials and motions too
@@ -67,7 +67,7 @@ class StrainStudy:
     """All that is measured."""
 
     full: FullRun  # the scene's own full run
-    families: tuple[Family, ...]  # one or two
+    families: tuple[StrainFamily, ...]  # one or two
     times: FullTimes  # of the full run
     linear: float  # error in z of linear elasticity on the same scene
     none: str  # why there are no runs at other materials; empty when there are

@@ -24,11 +24,7 @@ from softgrasp.study.shell.session import Page, Session, list_files
 
 
 def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
-    """Reduce the scene and write the results. Collective.
-
-    Raises:
-        SoftgraspError: with one sentence.
-    """
+    """Reduce the scene and write the results. Collective. Raises SoftgraspError: with one sentence."""
     if scene.reduction.methods:
         raise SceneError(
             "reduction.methods names linear bases; leave it out with effects.finite_strain, whose models have one basis"

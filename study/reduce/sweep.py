@@ -11,15 +11,8 @@ from mpi4py import MPI
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.scene.control import Reduction
+from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.bases.registry import (
-    METHODS,
-    PAPER_METHODS,
-    find_method,
-    impossible_sizes,
-    make_bases,
-    possible_sizes,
-)
 from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.errors import Comparison
@@ -27,7 +20,7 @@ from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs
-from softgrasp.study.reduce.result import Point, Sweep, kept_points
+from softgrasp.study.reduce.result import MethodSweep, Point, kept_points
 from softgrasp.study.shell.timing import median_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
@@ -38,14 +31,10 @@ Progress = Callable[[str, int, int], None]
 
 
 def chosen_methods(options: Reduction) -> tuple[str, ...]:
-    """Methods of the scene, or the paper's six and further ones.
-
-    Raises:
-        BasisError: a name is unknown.
-    """
-    names = tuple(options.methods) or (*PAPER_METHODS, *FURTHER)
+    """Methods of the scene, or the paper's six and further ones. Raises BasisError: a name is unknown."""
+    names = tuple(options.methods) or (*registry.PAPER_METHODS, *FURTHER)
     for name in names:
-        find_method(name)
+        registry.find_method(name)
     return names
 
 
@@ -56,13 +45,13 @@ def bases_of(
 
     What does not fit is put into ``refused`` by its N, with the reason. Collective.
     """
-    method = METHODS[name]
+    method = registry.METHODS[name]
     inner = None if options.inner == "auto" or not method.snapshots else options.inner
     rule = [Truncation(energy=options.energy)] if method.snapshots else []
     sizes = list(sizes)
     while sizes or rule:
         try:
-            bases = make_bases(name, states, [*sizes, *rule], inner, options.engine)
+            bases = registry.make_bases(name, states, [*sizes, *rule], inner, options.engine)
         except BasisError as error:
             most = error.most
             larger = [N for N in sizes if most is not None and most < N]
@@ -81,11 +70,9 @@ def bases_of(
 def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = None) -> Point:
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
-    Args:
-        comparison: of the largest model of the family; None prepares one for this model alone.
+    ``comparison``: of the largest model of the family; None prepares one for this model alone.
 
-    Raises:
-        ModelError: E or A is singular, so that the model has no run or no equilibrium to start in.
+    Raises ModelError: E or A is singular, so that the model has no run or no equilibrium to start in.
     """
     layout = full.model.system.layout
     comparison = comparison or comparison_of(model, full)
@@ -100,8 +87,8 @@ def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = 
         N_tissue=model.N - (2 * layout.n_s if model.fixed_solid else 0),
         split=model.split,
         **asdict(errors),
-        projection_error_deformation=comparison.floor("deformation", model, small),
-        projection_error=comparison.floor("velocities", model, small),
+        projection_error_deformation=comparison.projection_error("deformation", model, small),
+        projection_error=comparison.projection_error("velocities", model, small),
         time_offline=float(layout.comm.allreduce(sum(model.seconds.values()), MPI.MAX)),
         time_setup=setup,
         time_online=online,
@@ -110,16 +97,14 @@ def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = 
     )
 
 
-def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | None = None) -> Sweep:
-    """One method at all its N. Collective.
-
-    Raises:
-        SolverError: a factorisation failed.
-    """
-    scene, system, method = full.model.scene, full.model.system, METHODS[name]
+def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | None = None) -> MethodSweep:
+    """One method at all its N. Collective. Raises SolverError: a factorisation failed."""
+    scene, system, method = full.model.scene, full.model.system, registry.METHODS[name]
     states = States(system, ((system, full.snapshots),))
-    refused = impossible_sizes(method, system.layout.n_s, options.N)
-    bases, kept = bases_of(name, states, possible_sizes(method, system.layout.n_s, options.N), options, refused)
+    refused = registry.impossible_sizes(method, system.layout.n_s, options.N)
+    bases, kept = bases_of(
+        name, states, registry.possible_sizes(method, system.layout.n_s, options.N), options, refused
+    )
     outputs, key = make_outputs(scene, system), scene_hash(scene)
     points: list[Point] = []
     models: dict[int, ReducedModel] = {}
@@ -136,7 +121,7 @@ def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | Non
             continue
         models[len(points) - 1] = model
         models = {j: models[j] for j in models if j in kept_points(points)}
-    return Sweep(
+    return MethodSweep(
         method=method,
         points=tuple(points),
         models=models,

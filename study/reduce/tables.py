@@ -8,8 +8,7 @@ from dataclasses import astuple, fields
 
 import numpy as np
 
-from softgrasp.reduction.bases.registry import METHODS
-from softgrasp.study.reduce.result import COMPARED, BoxTests, Point, ReductionStudy, Speed, Sweep, nearest
+from softgrasp.study.reduce.result import COMPARED, BoxTests, MethodSweep, Point, ReductionStudy, Speed, nearest
 from softgrasp.study.report.tables import Table
 
 LEVELS = (1e-1, 1e-2, 1e-3)  # of the error of the deformation, for which the least N is named
@@ -45,7 +44,7 @@ def stability(points: Sequence[Point]) -> str:
     return "not " + ", ".join(map(str, bad))
 
 
-def error_table(sweeps: Sequence[Sweep], energy: float, narrow: bool = False) -> Table:
+def error_table(sweeps: Sequence[MethodSweep], energy: float, narrow: bool = False) -> Table:
     """N by energy, errors at the N nearest to the one compared, least N for some errors, stability."""
     header = ("method", share(energy), "N", "V_e", "deform.", "state", "energy", *LEVEL_NAMES, "stable N")
     rows: list[tuple[str, ...]] = []
@@ -78,7 +77,7 @@ def error_note(energy: float) -> str:
     )
 
 
-def refused_table(sweeps: Sequence[Sweep], narrow: bool = False) -> Table:
+def refused_table(sweeps: Sequence[MethodSweep], narrow: bool = False) -> Table:
     """N that were refused, the methods, and the one reason: methods and N that share it stand together."""
     groups: dict[tuple[str, str], list[str]] = {}
     for s in sweeps:
@@ -102,7 +101,7 @@ def summary(study: ReductionStudy) -> list[str]:
         f"At N = {point.N} the most accurate stable model is {s.method.title}: its deformation is "
         f"{point.error_deformation:.2%} off the full run."
     ]
-    speed = next((v for v in study.speeds if v.method == s.method.key), None)
+    speed = next((v for v in study.speeds if v.method == s.method), None)
     if speed is not None:
         told.append(
             f"It runs {speed.speedup_same_model:.3g} times as fast as the full model, and "
@@ -125,9 +124,10 @@ def time_table(speeds: Sequence[Speed], narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
     rows = []
     for s in speeds:
-        title, size = METHODS[s.method].short_title if narrow else s.title, str(s.N) if s.stable else f"{s.N} !"
+        p, title = s.point, s.method.short_title if narrow else s.method.title
         pays = (s.speedup_same_model, s.speedup_new_parameter, s.break_even_runs)
-        rows.append((title, size, *time_cells(s.time_offline, s.time_setup, s.time_online, pays)))
+        cells = time_cells(p.time_offline, p.time_setup, p.time_online, pays)
+        rows.append((title, str(p.N) if p.stable else f"{p.N} !", *cells))
     return Table(("method", "N", *TIMES), rows, "Times")
 
 
@@ -170,7 +170,7 @@ def box_point_tables(box: BoxTests) -> list[tuple[int, Table]]:
     return tables
 
 
-def inner_note(sweeps: Sequence[Sweep]) -> str:
+def inner_note(sweeps: Sequence[MethodSweep]) -> str:
     """Which methods were built in which inner product."""
     groups: dict[str, list[str]] = {}
     for s in sweeps:

@@ -10,7 +10,7 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.study.reduce.result import FullTimes, Speed, Sweep, nearest
+from softgrasp.study.reduce.result import FullTimes, MethodSweep, Speed, nearest
 
 FULL_REPEATS = 3  # behind the median of the full run
 PATIENCE = 2.0  # seconds of a full run above which one is enough
@@ -35,27 +35,14 @@ def steps_seconds(run: Trajectory) -> float:
     return run.seconds["steps"] / max(n - 1, 1) * n
 
 
-def speed_of(sweep: Sweep, full: FullTimes) -> Speed | None:
+def speed_of(sweep: MethodSweep, full: FullTimes) -> Speed | None:
     """Compare times; None for a method without points."""
     i = nearest(sweep.points)
     i = nearest(sweep.points, stable=False) if i is None else i
     if i is None:
         return None
     p = sweep.points[i]
-    again, new, runs = full.against(p.time_offline, p.time_setup, p.time_online)
-    return Speed(
-        method=sweep.method.key,
-        title=sweep.method.title,
-        N=p.N,
-        N_tissue=p.N_tissue,
-        stable=p.stable,
-        time_offline=p.time_offline,
-        time_setup=p.time_setup,
-        time_online=p.time_online,
-        speedup_same_model=again,
-        speedup_new_parameter=new,
-        break_even_runs=runs,
-    )
+    return Speed(sweep.method, p, *full.against(p.time_offline, p.time_setup, p.time_online))
 
 
 def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) -> tuple[str, ...]:
@@ -67,12 +54,13 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
         "sides. x new: factorisation and steps over new. Break-even runs = offline / (full - new), at new parameters; "
         "the full run that gives the snapshots is one more."
     )
-    stable = [s for s in speeds if s.stable]
-    chosen = next((s for s in stable if s.method == "psd"), None) or next(iter(stable), None)
+    stable = [s for s in speeds if s.point.stable]
+    chosen = next((s for s in stable if s.method.key == "psd"), None) or next(iter(stable), None)
     if chosen is None:
         return (against,)
     # tissue unknowns at which a full run would take as long as a reduced one, at this mesh's time per unknown
-    mesh, model = n_e * chosen.time_online / full.steps, f"{chosen.title}, N = {chosen.N}"
+    p = chosen.point
+    mesh, model = n_e * p.time_online / full.steps, f"{chosen.method.title}, N = {p.N}"
     if mesh < LEAST_MESH:
         pays = f"the reduced run ({model}) is faster than a full run on every mesh"
     else:
@@ -83,6 +71,6 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
         "python -m softgrasp.study.bench meshes.",
         f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
         f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
-        f"{1e3 * (full.factor + full.steps):.1f} ms against {1e3 * (chosen.time_setup + chosen.time_online):.2f} ms, "
+        f"{1e3 * (full.factor + full.steps):.1f} ms against {1e3 * (p.time_setup + p.time_online):.2f} ms, "
         f"a speed-up of {chosen.speedup_new_parameter:.0f} for a new parameter ({model}).",
     )

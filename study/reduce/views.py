@@ -12,7 +12,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.reduction.replay import FullRun, replay_linear
-from softgrasp.study.reduce.result import Sweep, nearest
+from softgrasp.study.reduce.result import MethodSweep, nearest
 
 MODES = 4  # a method
 FRAMES = 30
@@ -43,7 +43,7 @@ class Views:
     modes: tuple[tuple[str, Array, bool], ...]
 
 
-def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
+def compared(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
     """First of the paper's methods and best of all at the N compared."""
     first = [s for s in sweeps if s.method.key in PAPER_METHODS and s.points][:1]
     chosen = [(s, i) for s in first if (i := nearest(s.points, stable=False)) is not None]
@@ -52,11 +52,11 @@ def compared(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     return chosen + [f for f in stable[:1] if f[0] not in first]
 
 
-def _error(chosen: tuple[Sweep, int]) -> float:
+def _error(chosen: tuple[MethodSweep, int]) -> float:
     return chosen[0].points[chosen[1]].error_deformation
 
 
-def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views | None:
+def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> Views | None:
     """Bring to rank 0 what the pictures need; None on other ranks and for very large bodies. Collective."""
     if model.space.mesh.mesh.geometry.index_map().size_global > MANY_VERTICES:
         return None
@@ -82,7 +82,7 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[Sweep]) -> Views |
     return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
 
 
-def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
+def modes_of(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
     """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
     fixed = sorted(((s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None), key=_error)
     old = [f for f in fixed if f[0].method.key in PAPER_METHODS][:1]
@@ -91,7 +91,7 @@ def modes_of(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, int]]:
     return old + new
 
 
-def _modes(model: Model, s: Sweep, i: int) -> Array | None:
+def _modes(model: Model, s: MethodSweep, i: int) -> Array | None:
     """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
     layout = model.system.layout
     lift = s.models[i].lift

@@ -55,6 +55,12 @@ class Section:
     best: Sequence[int] = ()  # rows of a long table that stand unfolded; the first ones if there are none
 
 
+def captioned(files: Sequence[Path], captions: Mapping[str, str]) -> list[tuple[Path, str]]:
+    """The pictures among some files with their captions, in the order of the captions."""
+    drawn = {file.name: file for file in files}
+    return [(drawn[name], text) for name, text in captions.items() if name in drawn]
+
+
 def equation_text(rows: Equation) -> str:
     """An equation as lines of text: in blocks, as it is stepped, and what the symbols are."""
     lines = ["in blocks:", *_lines(rows.blocks), "", "stepped as:", *_lines(rows.stepped), ""]

@@ -23,6 +23,8 @@ WORDS = {
     "online": "the steps of a reduced run",
     "deformation": "displacement of the tissue relative to the rigid motion of the hand",
     "snapshot": "the state of the full run at one instant, of which bases are built",
+    "box": "the range of lambda and mu that a model was trained for",
+    "proved": "not exceeded, up to rounding; what is estimated is about so large",
     "tick": "one period of the controller: it measures, computes and holds a force",
 }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import time
 import tomllib
 from collections.abc import Iterator
@@ -29,24 +28,18 @@ LONGEST = 6  # entries of a list that is compared entry by entry
 
 
 def runs_below(folder: Path) -> Table:
-    """One row a run: folder, command, scene, unknowns, seconds, warnings, and when it ended; newest last.
-
-    Raises:
-        SceneError: the folder does not exist.
-    """
+    """One row a run, the newest last. Raises SceneError: the folder does not exist."""
     if not folder.is_dir():
         raise SceneError(f"{folder}: there is no such folder; runs write into out/SCENE-COMMAND or where --out says")
-    found = []
-    for root, _, files in os.walk(folder):
-        if "result.json" in files and (result := read_result(Path(root))):
-            found.append(((Path(root) / "result.json").stat().st_mtime, Path(root), result))
+    files = sorted(folder.rglob("result.json"), key=lambda file: file.stat().st_mtime)
     header = ("folder", "command", "scene", "n_e", "total [s]", "warnings", "ended")
     rows = [
         (
-            str(path), r["command"], r.get("scene", ""), r.get("n_e"), r.get("time", {}).get("total"),
-            len(r.get("warnings", ())), time.strftime("%Y-%m-%d %H:%M", time.localtime(ended)),
+            str(file.parent), r["command"], r.get("scene", ""), r.get("n_e"), r.get("time", {}).get("total"),
+            len(r.get("warnings", ())), time.strftime("%Y-%m-%d %H:%M", time.localtime(file.stat().st_mtime)),
         )
-        for ended, path, r in sorted(found, key=lambda entry: entry[0])
+        for file in files
+        if (r := read_result(file.parent))
     ]  # fmt: skip
     return Table(header, rows)
 
@@ -74,11 +67,7 @@ class Comparison:
 
 
 def compare(a: Path, b: Path) -> Comparison:
-    """Which keys, numbers and trajectories of two runs differ.
-
-    Raises:
-        SceneError: a folder holds no run.
-    """
+    """Which keys, numbers and trajectories of two runs differ. Raises SceneError: a folder holds no run."""
     results = []
     for folder in (a, b):
         if not (result := read_result(folder)):
@@ -134,8 +123,7 @@ def apart(traces: tuple[list[str], np.ndarray, np.ndarray] | None) -> str:
 def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool = True, empty: bool = False) -> None:
     """Print how two runs differ, and write compare.csv, result.json and a picture. Not collective.
 
-    Raises:
-        SceneError: a folder holds no run, or the one to write into holds another.
+    Raises SceneError: a folder holds no run, or the one to write into holds another.
     """
     comparison = compare(a, b)
     claim(out, "compare", f"{a.name} {b.name}", empty=empty)
@@ -154,34 +142,26 @@ def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool
     if pictures and (comparison.traces is not None or numbers.rows):
         from softgrasp.study.runs.plots import figure_numbers, figure_two  # brings Matplotlib
 
-        names = (a.name, b.name)
-        file = out / "compare.png"
-        drawn = (
-            figure_numbers(numbers, names, file)
-            if comparison.traces is None
-            else figure_two(*comparison.traces, names, file)
-        )
+        names, file = (a.name, b.name), out / "compare.png"
+        traces = comparison.traces
+        drawn = figure_numbers(numbers, names, file) if traces is None else figure_two(*traces, names, file)
     files += drawn
     first = [f"{name} is {x} in A and {y} in B" for name, x, y in keys.rows[:3]]
-    files.append(
-        write_report(
-            out / "report.html",
-            title=f"{a.name} (A) and {b.name} (B)",
-            summary=[
-                f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows), 'number')} of the results differ.",
-                f"{'; '.join(first) or 'The scenes are the same'}.",
-                *([distance] if distance else []),
-            ],
-            sections=[
-                Section(
-                    "", figures=[(file, "A and B, and their difference.") for file in drawn if file.suffix == ".png"]
-                ),
-                *([keys.section(title="Keys of the scene")] if keys.rows else []),
-                numbers.section(title="Numbers of result.json"),
-            ],
-            reproduce=command_line("compare", a, [], 1, f" {b}"),
-            numbers="compare.csv and result.json",
-            files=files,
-        )
+    page = write_report(
+        out / "report.html",
+        title=f"{a.name} (A) and {b.name} (B)",
+        summary=[
+            f"{counted(len(keys.rows), 'key')} and {counted(len(numbers.rows), 'number')} of the results differ.",
+            f"{'; '.join(first) or 'The scenes are the same'}.",
+            *([distance] if distance else []),
+        ],
+        sections=[
+            Section("", figures=[(file, "A and B, and their difference.") for file in drawn[:1]]),
+            *([keys.section(title="Keys of the scene")] if keys.rows else []),
+            numbers.section(title="Numbers of result.json"),
+        ],
+        reproduce=command_line("compare", a, [], 1, f" {b}"),
+        numbers="compare.csv and result.json",
+        files=files,
     )
-    list_files(console, files)
+    list_files(console, [*files, page])

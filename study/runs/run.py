@@ -80,10 +80,7 @@ def run_sweep(
 ) -> dict[str, Any]:
     """Run a scene file at all combinations of values and write the results. Collective.
 
-    Points are kept in ``out``; the same command after an interruption goes on from there.
-
-    Raises:
-        SoftgraspError: with one sentence; also when no point could be run.
+    Points are kept in ``out``; the same command after an interruption goes on from there. Raises SoftgraspError.
     """
     session = Session("sweep", path, overrides, out, console, quiet, pictures, empty)
     scene, comm = session.scene(), session.comm
@@ -91,9 +88,7 @@ def run_sweep(
     out.mkdir(parents=True, exist_ok=True)
     with session.progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("points", total=len(sweep.points()))
-        rows = run_sweep_points(
-            sweep, out, comm, each, lambda done, total: bar.update(task, completed=done, total=total)
-        )
+        rows = run_sweep_points(sweep, out, comm, each, lambda n, total: bar.update(task, completed=n, total=total))
     failed = [row for row in rows if "reason" in row]
     if len(failed) == len(rows):
         raise SceneError(f"no point of the sweep could be run; the first: {failed[0]['reason']}")

@@ -10,8 +10,8 @@ import numpy as np
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.materials import LIBRARY
+from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.schema import full_schema
 
 SCHEMA = "scene.schema.json"
 SCENE = """\
@@ -30,7 +30,7 @@ material = "muscle" # `softgrasp materials`, or {{ young = 2.0e4, poisson = 0.45
 [hand]
 mass = 0.73 # [kg]
 
-[effects] # what is not named is off and costs nothing: gravity, damping, reaction, rotation
+[effects] # what is not named is off and costs nothing: gravity, damping, reaction, rotation, finite_strain
 gravity = {{ g = {g} }} # [m/s2]
 damping = {{ kind = "kelvin-voigt", beta = 0.01 }} # D = beta K, beta [s]
 
@@ -74,11 +74,11 @@ def new_scene(file: Path, *, solid: bool = False, mesh: Path | None = None) -> l
         lower, upper, tip = points.min(axis=0), points.max(axis=0), points[points[:, -1].argmin()]
         tissue = f"mesh = {json.dumps(str(mesh.resolve()))} # scale = 1.0e-3 for a file in millimetres"
         sides = ""
-    d = len(upper)
+    d, body = len(upper), f"The body of {mesh.name}" if mesh else f"A {'block' if solid else 'strip'} of muscle"
     top = np.append(lower[:-1], upper[-1] - (0.1 if mesh else 0.25) * (upper[-1] - lower[-1]))
     text = SCENE.format(
         schema=SCHEMA, file=file.name, name=file.stem, tissue=tissue,
-        description="A strip of muscle in a hand." if mesh is None else f"The body of {mesh.name} in a hand.",
+        description=f"{body} in a hand.",
         contact=f"{sides}box = [{_list(top)}, {_list(upper)}]",
         g=_list([0.0] * (d - 1) + [-9.81]), target=_list([0.1] + [0.0] * (d - 2) + [0.05]), point=_list(tip),
     )  # fmt: skip
@@ -90,7 +90,7 @@ def new_scene(file: Path, *, solid: bool = False, mesh: Path | None = None) -> l
     except SceneError:
         file.unlink()
         raise
-    schema.write_text(json.dumps(full_schema(), indent=1) + "\n")
+    schema.write_text(json.dumps(scene_schema(), indent=1) + "\n")
     return [file, schema]
 
 

@@ -39,11 +39,7 @@ class Axis:
 
 
 def parse_axis(text: str) -> Axis:
-    """``key=first:last:count[:log]`` or ``key=a,b,c``; whole numbers stay whole where all values are.
-
-    Raises:
-        SceneError: with the form that it must have.
-    """
+    """``key=first:last:count[:log]`` or ``key=a,b,c``; whole numbers stay whole where all values are."""
     key, _, right = text.partition("=")
     parts, log = right.split(":"), right.endswith(":log")
     try:
@@ -64,19 +60,12 @@ def parse_axis(text: str) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is asked for.
+    """What is asked for."""
 
-    Attributes:
-        path: scene file.
-        overrides: arguments of ``--set``.
-        axes: keys with their values; all combinations are run.
-        N: columns of the reduced model that runs instead of the full one; None for the full model.
-    """
-
-    path: Path
-    overrides: Sequence[str]
-    axes: tuple[Axis, ...]
-    N: int | None = None
+    path: Path  # scene file
+    overrides: Sequence[str]  # arguments of ``--set``
+    axes: tuple[Axis, ...]  # keys with their values; all combinations are run
+    N: int | None = None  # columns of the reduced model that runs instead of the full one; None for the full model
 
     def points(self) -> list[dict[str, float]]:
         """The values of every point, the last key fastest."""
@@ -84,11 +73,7 @@ class Sweep:
         return [dict(zip(keys, v, strict=True)) for v in itertools.product(*(axis.values for axis in self.axes))]
 
     def scene(self, values: dict[str, float]) -> Scene:
-        """The scene of a point.
-
-        Raises:
-            SceneError: a key or a value is wrong.
-        """
+        """The scene of a point. Raises SceneError: a key or a value is wrong."""
         kept = ["output.snapshots=none"] if self.N is None else []
         return load_scene(self.path, [*self.overrides, *kept, *(f"{key}={value!r}" for key, value in values.items())])
 
@@ -115,12 +100,8 @@ class Runner:
         m = scene.tissue.material
         return self.model.with_materials(m.lam, m.mu, m.rho) if only_material(self.model.scene, scene) else self.model
 
-    def row(self, values: dict[str, float], scene: Scene, judged: bool) -> Row:
-        """Largest distance of each output from the rigid motion, final outputs, energy drift, seconds. Collective.
-
-        Raises:
-            SoftgraspError: with one sentence.
-        """
+    def row(self, values: dict[str, float], scene: Scene, with_error: bool) -> Row:
+        """Largest distance of each output from the rigid motion, final outputs, energy drift, seconds. Collective."""
         N = self.sweep.N
         if N is None:
             model = self.at(scene)
@@ -137,17 +118,18 @@ class Runner:
         begin = MPI.Wtime()
         small = replay_linear(self.rom, model, self.base)
         seconds, off = MPI.Wtime() - begin, None
-        if judged:
+        if with_error:
             off = float(errors_linear(self.rom, small, full_run(model, simulate(model))).error_deformation)
         return {**values, **_outputs(self.base, small.outputs), "seconds": seconds, "error_deformation": off}
 
 
 def _outputs(run: Trajectory, outputs: np.ndarray) -> Row:
     """Numbers of the outputs, by the labels of their columns."""
-    lag = np.abs(outputs - run.outputs_rigid).max(axis=0)
-    names = [f"{c.label} {{}} [{c.unit}]" for c in run.columns]
-    return {name.format("lag"): float(x) for name, x in zip(names, lag, strict=True)} | {
-        name.format("end"): float(x) for name, x in zip(names, outputs[-1], strict=True)
+    numbers = {"lag": np.abs(outputs - run.outputs_rigid).max(axis=0), "end": outputs[-1]}
+    return {
+        f"{c.label} {what} [{c.unit}]": float(x)
+        for what, values in numbers.items()
+        for c, x in zip(run.columns, values, strict=True)
     }
 
 
@@ -156,14 +138,8 @@ def run_sweep_points(
 ) -> list[Row]:
     """All points, ``comm.size / each`` at a time; rows in the order of the points, on all ranks. Collective.
 
-    A point that fails has its reason instead of numbers and is tried again by the next call.
-
-    Args:
-        sweep: what is asked for.
-        out: the folder of the points' files, one a group of ranks.
-        comm: all ranks.
-        each: ranks of one point.
-        progress: called on rank 0 with the points done (of its own group, times the groups) and in all.
+    A point that fails has its reason instead of numbers and is tried again by the next call. ``out`` takes a file of
+    points a group of ranks; ``progress`` gets the points done (of the own group, times the groups) and in all.
 
     Raises:
         SceneError: a key or a value is wrong; on all ranks, before the first run.
@@ -181,7 +157,7 @@ def run_sweep_points(
     own: dict[str, Row] = {}
     for count, i in enumerate(missing[number::groups], start=1):
         try:
-            row = runner.row(points[i], scenes[i], judged=i in (0, len(points) - 1))
+            row = runner.row(points[i], scenes[i], with_error=i in (0, len(points) - 1))
         except Interrupted:
             raise
         except SoftgraspError as error:

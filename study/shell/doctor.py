@@ -18,6 +18,7 @@ from pathlib import Path
 
 import psutil
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from softgrasp.study.shell.processes import IN_MPI_JOB, find_mpiexec, run_limited
@@ -38,7 +39,7 @@ class Check:
 
     name: str  # what was looked at
     ok: bool  # whether it will work
-    value: str  # what was found
+    value: str  # version, path or number
     cure: str = ""  # one sentence on what to do; empty when ok
 
 
@@ -170,27 +171,17 @@ def check_memory() -> Check:
     return Check("memory", ok, value, "" if ok else "Free at least 1 GiB before a run.")
 
 
-CHECKS: tuple[tuple[str, Callable[[], Check]], ...] = (
-    ("Python", check_python),
-    ("DOLFINx", check_dolfinx),
-    ("PETSc", check_petsc),
-    ("SLEPc", check_slepc),
-    ("mpiexec", check_launcher),
-    ("two ranks", check_launch),
-    ("threads", check_threads),
-    ("C compiler", check_compiler),
-    ("JIT cache", check_cache),
-    ("memory", check_memory),
-)
+CHECKS: dict[str, Callable[[], Check]] = {
+    "Python": check_python, "DOLFINx": check_dolfinx, "PETSc": check_petsc, "SLEPc": check_slepc,
+    "mpiexec": check_launcher, "two ranks": check_launch, "threads": check_threads, "C compiler": check_compiler,
+    "JIT cache": check_cache, "memory": check_memory,
+}  # fmt: skip
 
 
 def checks() -> list[Check]:
-    """Run all checks; one that raises has failed.
-
-    Not collective: call on one rank.
-    """
+    """Run all checks; one that raises has failed. Not collective: call on one rank."""
     results = []
-    for name, look in CHECKS:
+    for name, look in CHECKS.items():
         try:
             results.append(look())
         except (ImportError, OSError, RuntimeError, AttributeError) as error:
@@ -201,12 +192,12 @@ def checks() -> list[Check]:
 
 def show(console: Console) -> bool:
     """Write the diagnosis as a table; True when nothing needs a cure. Not collective: call on one rank."""
-    table = Table(box=None, pad_edge=False)
-    for title in ("", "check", "found", "cure"):
-        table.add_column(title, overflow="fold")
+    table = Table("", "check", "value", "cure", box=None, pad_edge=False)
+    for column in table.columns:
+        column.overflow = "fold"
     results = checks()
     for check in results:
         mark = "[green]ok[/]" if check.ok else "[red]bad[/]"
-        table.add_row(mark, check.name, check.value.replace("[", r"\["), check.cure.replace("[", r"\["))
+        table.add_row(mark, check.name, escape(check.value), escape(check.cure))
     console.print(table)
     return all(check.ok for check in results)

@@ -15,6 +15,7 @@ from softgrasp.fem.errors import SceneError, SoftgraspError, one_line
 from softgrasp.study.shell.streams import outlive_readers, write_utf8
 
 RANK = ("PMI_RANK", "PMIX_RANK", "OMPI_COMM_WORLD_RANK")  # set by launchers, known before MPI is loaded
+PIPED = 120  # letters of a line that no terminal shows
 
 
 def rank() -> int:
@@ -27,8 +28,11 @@ def rank() -> int:
 
 
 def console() -> Console:
-    """A console that writes on rank 0 only."""
-    return Console(quiet=rank() != 0, highlight=False)
+    """A console that writes on rank 0 only; as wide as the terminal, or 120 letters into a file or pipe."""
+    shown = Console(quiet=rank() != 0, highlight=False)
+    if not shown.is_terminal and "COLUMNS" not in os.environ:
+        shown.width = PIPED
+    return shown
 
 
 def end_all() -> None:

@@ -36,12 +36,7 @@ def remove_files(folder: Path, names: Iterable[str]) -> None:
 def claim(out: Path, command: str, scene: str, *, path: Path = Path(), empty: bool = False) -> None:
     """Refuse a folder that holds the run of another scene or command, or empty it. Not collective: call on one rank.
 
-    Args:
-        out: folder of the results.
-        command: what is about to be run.
-        scene: name of the scene; empty for a command without one.
-        path: the scene file, which must not be removed.
-        empty: remove what a run has left in the folder.
+    ``path``, the scene file, must not be removed.
 
     Raises:
         SceneError: the folder belongs to another run, or holds more than one run and is to be emptied.

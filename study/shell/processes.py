@@ -29,12 +29,7 @@ def child_environment() -> dict[str, str]:
 def run_limited(command: list[str], limit: float, environment: dict[str, str] | None = None) -> tuple[int | None, str]:
     """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough."""
     with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-        env=environment,
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True, env=environment
     ) as process:
         try:
             output, _ = process.communicate(timeout=limit)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from mpi4py import MPI
 from rich.console import Console
@@ -29,50 +29,37 @@ from softgrasp.study.shell.folder import claim, read_result, remove_files
 
 @dataclass(frozen=True)
 class Page:
-    """What a command writes beside result.json.
-
-    Attributes:
-        title: first line of the page.
-        summary: three sentences that say what came out.
-        sections: parts of the page.
-        tables: CSV file name -> table.
-        files: what is written already, pictures and fields.
-        options: of the command line, for the page's last line: " --tolerance 1e-2".
-    """
+    """What a command writes beside result.json."""
 
     title: str
-    summary: Sequence[str]
+    summary: Sequence[str]  # three sentences that say what came out
     sections: Sequence[Section]
-    tables: Mapping[str, Table] = field(default_factory=dict)
-    files: Sequence[Path] = ()
-    options: str = ""
+    tables: Mapping[str, Table] = field(default_factory=dict)  # by the name of its CSV file
+    files: Sequence[Path] = ()  # written already: pictures and fields
+    options: str = ""  # of the command line, for the page's last line: " --tolerance 1e-2"
+
+
+class Flags(TypedDict, total=False):
+    """What every command may be told beside its own options, see :class:`Session`."""
+
+    quiet: bool
+    pictures: bool
+    empty: bool
 
 
 @dataclass(frozen=True)
 class Session:
-    """What a command was called with.
-
-    Attributes:
-        command: its name.
-        path: scene file.
-        overrides: arguments of ``--set``.
-        out: folder of the results.
-        console: writes on rank 0 only.
-        quiet: no progress bars.
-        pictures: draw figures.
-        empty: remove what an earlier run has left in the folder.
-        begin: clock at the start [s].
-    """
+    """What a command was called with."""
 
     command: str
-    path: Path
-    overrides: Sequence[str]
-    out: Path
-    console: Console
-    quiet: bool = False
+    path: Path  # scene file
+    overrides: Sequence[str]  # arguments of ``--set``
+    out: Path  # folder of the results
+    console: Console  # writes on rank 0 only
+    quiet: bool = False  # no progress bars
     pictures: bool = True
-    empty: bool = False
-    begin: float = field(default_factory=time.perf_counter)
+    empty: bool = False  # remove what an earlier run has left in the folder
+    begin: float = field(default_factory=time.perf_counter)  # [s]
 
     @property
     def comm(self) -> MPI.Intracomm:
@@ -80,13 +67,9 @@ class Session:
         return MPI.COMM_WORLD
 
     def scene(self, *, writes: bool = True) -> Scene:
-        """Load the scene file, claim the folder, and print name and description. Collective.
+        """Load the scene file, claim the folder if it ``writes`` there, and print name and description. Collective.
 
-        Args:
-            writes: the command will write into the folder.
-
-        Raises:
-            SceneError: the file or a key is wrong, or the folder holds another run.
+        Raises SceneError: the file or a key is wrong, or the folder holds another run.
         """
         scene = load_scene_collective(self.comm, self.path, self.overrides)
         with agree(self.comm):
@@ -99,12 +82,7 @@ class Session:
     def model(self, scene: Scene, steps: bool = True) -> Model:
         """Build a scene and print its size and what its mesh warns of. Collective.
 
-        Args:
-            scene: the scene.
-            steps: whether a tolerance of its mesh is refused that its time steps cannot carry.
-
-        Raises:
-            SoftgraspError: the scene cannot be built.
+        ``steps``: refuse a tolerance of its mesh that its time steps cannot carry. Raises SoftgraspError.
         """
         if scene.tissue.refine is None:
             model = build(scene, comm=self.comm)
@@ -113,8 +91,7 @@ class Session:
 
             model = build_to_tolerance(scene, self.comm, steps)
         layout = model.system.layout
-        sizes = f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)"
-        self.console.print(sizes)
+        self.console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
         show_warnings(self.console, model.space.mesh.notes)
         return model
 
@@ -127,20 +104,17 @@ class Session:
     ) -> list[Path]:
         """Write result.json and scene.toml, then pictures, tables and report.html on rank 0. Collective.
 
-        Files of the run before in this folder that are not written again are removed.
+        Files of the run before in this folder that are not written again are removed. On rank 0 ``result`` takes the
+        names of all files, and with ``clock`` the times ``total`` and ``pictures`` and the seconds of CPU.
 
         Args:
             scene: as it was run.
-            result: what result.json holds, equal on all ranks. On rank 0 it takes the names of all ``files``, and the
-                times ``total`` and ``pictures``, the wait for them, with the CPU seconds of all its processes.
+            result: what result.json holds, equal on all ranks; rank 0 adds the wait for pictures and the CPU times.
             page: draws and composes the rest; called on rank 0 only, so it must not communicate.
             clock: add the times.
 
         Returns:
-            The files, on rank 0.
-
-        Raises:
-            OSError: the folder cannot be written; on all ranks.
+            The files, on rank 0. Raises OSError on all ranks: the folder cannot be written.
         """
         files: list[Path] = []
         with agree(self.comm):
@@ -153,21 +127,12 @@ class Session:
                 now = time.perf_counter(), sum(os.times()[:4])
                 files += [table.write_csv(self.out / name) for name, table in content.tables.items()]
                 files += content.files
-                files.append(
-                    write_report(
-                        self.out / "report.html",
-                        title=content.title,
-                        subtitle=scene.description,
-                        sections=content.sections,
-                        summary=content.summary,
-                        files=files,
-                        scene=scene,
-                        result=result,
-                        reproduce=command_line(
-                            self.command, self.path, self.overrides, self.comm.size, content.options
-                        ),
-                    )
-                )
+                line = command_line(self.command, self.path, self.overrides, self.comm.size, content.options)
+                report = write_report(
+                    self.out / "report.html", title=content.title, subtitle=scene.description, result=result,
+                    sections=content.sections, summary=content.summary, files=files, scene=scene, reproduce=line,
+                )  # fmt: skip
+                files.append(report)
                 if clock:
                     result.setdefault("time", {}).update(
                         pictures=now[0] - drawing[0], total=time.perf_counter() - self.begin,
@@ -180,13 +145,7 @@ class Session:
 
 
 def progress_bar(console: Console, count: ProgressColumn, *, quiet: bool = False) -> Progress:
-    """Bars with the time left, in a terminal only.
-
-    Args:
-        console: where they go; a rank that prints nothing has none.
-        count: how far a task is, a share or m of n.
-        quiet: no bars.
-    """
+    """Bars with the time left, in a terminal only; ``count`` says how far a task is, a share or m of n."""
     columns = (TextColumn("{task.description}"), BarColumn(), count, TextColumn("left"), TimeRemainingColumn())
     return Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True)
 

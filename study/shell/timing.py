@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from mpi4py import MPI
@@ -38,13 +38,18 @@ def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict
 
     Noise of the machine then hits all methods alike, and none is always the first.
     """
-    names = list(methods)
-    samples: dict[str, list[float]] = {name: [] for name in names}
+    samples: dict[str, list[float]] = {name: [] for name in methods}
     for i in range(repeats):
-        shift = i % len(names)
-        for name in names[shift:] + names[:shift]:
+        for name in rotated(methods, i):
             samples[name].append(methods[name]())
     return samples
+
+
+def rotated(names: Iterable[str], i: int) -> list[str]:
+    """The order of round i: each name is once the first."""
+    order = list(names)
+    shift = i % len(order)
+    return order[shift:] + order[:shift]
 
 
 def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:

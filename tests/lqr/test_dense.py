@@ -15,7 +15,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.care import care, riccati_schur
-from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
+from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
@@ -23,8 +23,6 @@ from softgrasp.lqr.plant.coordinates import (
     costates_to_absolute,
     costates_to_relative,
     gain_to_absolute,
-    gain_to_relative,
-    states_to_absolute,
     states_to_relative,
 )
 from softgrasp.lqr.plant.gain import Gain
@@ -40,6 +38,7 @@ from tests.helpers.models import (
     make_scene,
     reference,
 )
+from tests.helpers.riccati import relative_space
 
 EPS = np.finfo(float).eps
 Example = tuple[Array, Array, Array, Array, Array, Array]  # A, B, C, Q, R, X
@@ -341,9 +340,9 @@ def test_coordinates_there_and_back(changes: list[dict]) -> None:
     solution = RiccatiSolution(X, Gain.of_block(X[:n_s]), 0, "dense")
     Z, K = costates_to_absolute(problem.system, solution.factor), gain_to_absolute(problem.system, solution.gain.block)
     for back, there in (
-        (states_to_relative(system, states_to_absolute(system, X)), X),
+        (states_to_relative(system, states_to_relative(system, X, -1)), X),
         (costates_to_relative(system, Z), X),
-        (gain_to_relative(system, K), solution.gain.block),
+        (gain_to_absolute(system, K, -1), solution.gain.block),
     ):
         assert close(back.hand, there.hand) < 1e-14  # one product with T and back
         assert n == 0 or close(back.tall, there.tall) < 1e-13  # as above

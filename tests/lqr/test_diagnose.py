@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
@@ -18,7 +17,7 @@ from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights
 from softgrasp.lqr.plant.identities import translation_defect
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
-from tests.helpers.models import close, gather_matrix, gather_rows, make_scene, same_everywhere
+from tests.helpers.models import close, make_scene, same_everywhere
 
 SMALL = {"tissue": {"cells": [3, 6]}}
 
@@ -77,31 +76,14 @@ def test_undamped_is_refused_with_a_way_out(reaction: bool) -> None:
     assert sentences(enough, "warning") == []
 
 
-def test_nearly_undamped_is_a_warning_and_the_rank_grows_as_the_damping_falls() -> None:
-    ranks = []
-    for beta in (0.2, 0.02, 0.002):
-        found = diagnose(make(damped(beta)), modes=20)
-        assert found.solvable
-        ranks.append(found.rank_estimate)
-    assert ranks == sorted(ranks)
-    assert ranks[0] < ranks[-1]
+def test_nearly_undamped_is_a_warning() -> None:
+    for beta in (0.2, 0.002):
+        enough = diagnose(make(damped(beta)), modes=20)
+        assert enough.solvable
+        assert sentences(enough, "warning") == []
     weak = diagnose(make(damped(1e-5)))
     assert weak.solvable
     assert sentences(weak, "warning")[0].startswith("nearly undamped: the first mode has the damping ratio 2")
-
-
-def test_rank_estimate_is_that_of_the_solution() -> None:
-    problem = make(damped(0.02))
-    solution = DenseRiccati().solve(problem)
-    # energy coordinates: singular values of [Z_s; L_K^-1 Z_z; L_M^-1 ...] = those of the modal X
-    layout, system = problem.layout, problem.system
-    K, M = (gather_matrix(layout, A).toarray() for A in (system.K_ee, system.M_ee))
-    omega, Phi = scipy.linalg.eigh(K, M)
-    z, v = (gather_rows(layout, part) for part in np.vsplit(solution.factor.tall, 2))
-    energy = np.vstack([solution.factor.hand, Phi.T @ z / np.sqrt(omega)[:, None], np.linalg.solve(Phi, v)])
-    sigma = np.linalg.svd(energy, compute_uv=False) ** 2
-    rank = int(np.sum(sigma > 1e-10 * sigma[0]))
-    assert abs(diagnose(problem).rank_estimate - rank) <= 2  # modes beyond the 60 lowest
 
 
 NODE = [{"kind": "node", "point": [0.5, 0.0]}]

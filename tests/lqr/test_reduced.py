@@ -20,7 +20,7 @@ from softgrasp.lqr.plant.coordinates import costates_to_absolute, gain_to_absolu
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, energy_scaled, make_family
-from softgrasp.lqr.reduced.retune import Retuner, over_box
+from softgrasp.lqr.reduced.retune import Retuner, retuned_gain
 from softgrasp.lqr.reduced.riccati import GainJudge, project_plant, reduce_riccati
 from softgrasp.lqr.spectrum.certificate import abscissa, certified_abscissa
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
@@ -371,7 +371,8 @@ def test_retuning_over_a_box() -> None:
     material = problem.system.materials[0]
     retuner = Retuner(problem, family("structured").at(12))
     settings = [(replace(material, lam=lam, mu=mu),) for lam, mu in ((50.0, 50.0), (200.0, 100.0))]
-    points = over_box(retuner, settings, DenseRiccati().solve, hand_start(problem, -TARGET))
+    start = hand_start(problem, -TARGET)
+    points = [retuned_gain(retuner, at, DenseRiccati().solve, start) for at in settings]
     assert all(p.stable for p in points)
     assert all(p.error_K < 1e-3 for p in points)  # measured 1e-5 and 3e-5: modes of the reference material
     assert points[0].error_K < points[1].error_K

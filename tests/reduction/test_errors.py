@@ -71,9 +71,10 @@ def test_errors_against_dense_matrices(comm: MPI.Intracomm, whole: bool) -> None
         shown = views(*(gather_rows(layout, part) for part in rom.reconstruct(small, eye)),
                       small.operators.S_q, small.operators.S_v)  # fmt: skip
         for view, mine, X, V in zip(("velocities", "momenta"), found, exact, shown, strict=False):
-            floor = norm(X - V @ scipy.linalg.lstsq(V, X)[0]) / norm(X)
-            assert comparison.floor(view, rom, small) == pytest.approx(floor, rel=1e-8)  # least squares, condition 1e4
-            assert mine > floor
+            least = norm(X - V @ scipy.linalg.lstsq(V, X)[0]) / norm(X)
+            projected = comparison.projection_error(view, rom, small)
+            assert projected == pytest.approx(least, rel=1e-8)  # least squares, condition 1e4
+            assert mine > least
 
 
 def test_a_model_outside_the_family_is_refused(comm: MPI.Intracomm) -> None:
@@ -83,7 +84,7 @@ def test_a_model_outside_the_family_is_refused(comm: MPI.Intracomm) -> None:
     rom, other = reduced(model, basis), reduced(model, replace(basis, V_q=basis.V_p, V_p=basis.V_q))
     comparison = Comparison(rom, rom.at(), model.system, snapshots, full_energy(model.system, snapshots.Z))
     with pytest.raises(ModelError, match="shows more"):
-        comparison.floor("deformation", other, other.at())
+        comparison.projection_error("deformation", other, other.at())
 
 
 def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
@@ -95,6 +96,6 @@ def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
     errors = comparison.errors(rom, small, run(small, step_of(model), force_of(model)))
     # rounding of 30 steps in other coordinates
     assert max(errors.error, errors.error_canonical, errors.error_deformation, errors.error_energy) < 1e-9
-    assert comparison.floor("velocities", rom, small) < 1e-13  # the whole space leaves rounding
+    assert comparison.projection_error("velocities", rom, small) < 1e-13  # the whole space leaves rounding
     with pytest.raises(ModelError, match="reach step 30"):
         comparison.errors(rom, small, run(small, 0.1, np.zeros((5, 2))))

@@ -7,6 +7,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -17,6 +18,7 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.archive import load, save
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
+from softgrasp.reduction.files import LINEAR, write_model
 from softgrasp.reduction.modal import rotation
 from softgrasp.reduction.model import ModelError, SmallModel
 from softgrasp.reduction.online import Stepper, run, run_batch
@@ -264,6 +266,17 @@ def test_file_keeps_everything(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
         # another number of ranks: every rank holds the whole mesh
         z_alone, _ = (lambda m: m.reconstruct(m.at(), x))(load(path, alone))
         assert close(gather_rows(alone, z_alone), gather_rows(layout, z)) < 1e-15  # the same numbers
+
+
+@pytest.mark.serial
+def test_a_file_that_cannot_be_written_whole_leaves_nothing(tmp_path: Path) -> None:
+    def fails(file: h5py.File) -> None:
+        file["part"] = np.ones(1000)
+        raise OSError("No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        write_model(tmp_path / "model.h5", LINEAR, {}, None, fails)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_that_do_not_fit_are_refused(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:

@@ -16,13 +16,13 @@ from rich.console import Console
 import softgrasp as sg
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.file import shipped_scenes
+from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.forward.run import run_simulate
 from softgrasp.study.runs import sweep as sweep_module
 from softgrasp.study.runs.listing import apart, compare, run_compare, runs_below
 from softgrasp.study.runs.run import run_sweep, short_table
 from softgrasp.study.runs.start import SCHEMA, materials_table, new_scene
 from softgrasp.study.runs.sweep import parse_axis
-from softgrasp.study.shell.schema import full_schema
 
 SMALL = ["tissue.cells=[3,6]", "time.steps=60"]
 SCENE = shipped_scenes()["paper_forward"]
@@ -167,5 +167,5 @@ def test_materials_have_sources() -> None:
 
 def test_the_schema_beside_the_shipped_scenes_is_current() -> None:
     shipped = json.loads((SCENE.parent / SCHEMA).read_text())
-    assert shipped == full_schema(), f"write it again: softgrasp schema > demos/scenes/{SCHEMA}"
+    assert shipped == scene_schema(), f"write it again: softgrasp schema > demos/scenes/{SCHEMA}"
     assert all(path.read_text().startswith(f"#:schema ./{SCHEMA}\n") for path in shipped_scenes().values())

@@ -15,10 +15,11 @@ import pytest
 import ufl
 from mpi4py import MPI
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.bisect import bisect, distribute
 from softgrasp.fem.mesh.make import make_mesh, structured_mesh
+from softgrasp.fem.mesh.spread import spread
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.assembly import cells_of_layers
 from softgrasp.fem.model.build import build
@@ -26,10 +27,11 @@ from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.model.refined import lattice, refined_mesh, unknowns
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from tests.helpers.models import CUBE, LAYERS, gather_mesh, make_scene
+from tests.helpers.models import CUBE, LAYERS, gather_mesh, make_scene, merged
 
 ROUND = 1e-12  # sums of some hundred terms of order one
 ROUGH = {"tolerance": 0.05}
+LAYERED = {"tissue": {"layers": LAYERS}, "effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
 
 
 def refined(*changes: dict[str, Any], **refine: Any) -> Scene:
@@ -96,8 +98,7 @@ def test_lines_keep_the_unknowns_of_the_box(comm: MPI.Intracomm) -> None:
 
 @pytest.mark.ranks
 def test_layers_are_inherited(comm: MPI.Intracomm) -> None:
-    damping = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}}
-    scene = refined({"tissue": {"layers": LAYERS}}, damping, **ROUGH)
+    scene = refined(LAYERED, **ROUGH)
     mesh = refined_mesh(comm, scene)
     cells = cells_of_layers(mesh, scene)
     sizes = {}
@@ -142,6 +143,20 @@ def test_tags_survive_four_bisections(comm: MPI.Intracomm, dimension: int) -> No
     assert comm.allreduce(dolfinx.fem.assemble_scalar(form)) == pytest.approx(1.0, rel=ROUND)
 
 
+@pytest.mark.serial
+def test_cells_that_cannot_be_bisected_are_named() -> None:
+    """A needle with a short side beside a cell that is split: half of it keeps its length and has half its area."""
+    points, cells = np.array([[0.0, 0.0], [1.0, 0.0], [0.99, 3e-12], [0.0, -1.0]]), np.array([[0, 1, 2], [0, 3, 1]])
+    mesh, _ = spread(MPI.COMM_SELF, 2, (points, cells), {})
+    mesh.topology.create_connectivity(1, 2)
+    whole = Whole(mesh, "needle.msh", {}, {})
+    beside = int(np.argmin(whole.points[whole.simplices].mean(axis=1)[:, 1]))
+    with pytest.raises(
+        MeshError, match=r"needle\.msh cannot be bisected further: \d cells? would be flat, the worst ar"
+    ):
+        bisect(whole, np.array([beside], dtype=np.int32))
+
+
 def l_shape(path: Path) -> Path:
     """An L of 12 squares with its foot as a named facet tag, written by meshio."""
     x = np.arange(5)
@@ -183,9 +198,16 @@ def test_mesh_file_is_bisected_at_its_corner(comm: MPI.Intracomm, mpi_tmp_path: 
         assert h[at].max() < 0.25 * h.max()
 
 
-@pytest.mark.parametrize("refine", [{"tolerance": 0.05}, {"method": "bisect"}, {}], ids=str)
-def test_energy_is_kept_on_graded_meshes(comm: MPI.Intracomm, refine: Any) -> None:
-    run = simulate(build(refined({"tissue": {"order": 2}}, **refine), comm=comm))
+@pytest.mark.parametrize(
+    ("change", "refine"),
+    [
+        ({}, {"tolerance": 0.05}), ({}, {"tolerance": 1e-3}), ({}, {"method": "bisect"}), ({}, {}),
+        (LAYERED, ROUGH), (merged(CUBE, {"tissue": {"order": 1}}), {"method": "bisect"}),
+    ],
+    ids=["tolerance", "fine", "given cells", "lines", "layers", "3D"],
+)  # fmt: skip
+def test_energy_is_kept_on_graded_meshes(comm: MPI.Intracomm, change: Any, refine: Any) -> None:
+    run = simulate(build(refined({"tissue": {"order": 2}}, change, **refine), comm=comm))
     assert run.energy_drift < ROUND  # sixty steps of rounding, as on even meshes
     assert max(run.residuals) < ROUND
 

@@ -51,12 +51,13 @@ def test_the_paper_has_these_sizes(comm: MPI.Intracomm, cells: list[int], states
 @pytest.mark.ranks
 @pytest.mark.parametrize("entries", [1, 10**6])
 @pytest.mark.parametrize("storage", ["C", "F"])
-@pytest.mark.parametrize("columns", [1, 3, 8, 21])
+@pytest.mark.parametrize("columns", [1, 2, 3, 7, 8, 21])
 def test_products_with_columns_equal_scipy(
     comm: MPI.Intracomm, columns: int, storage: Any, entries: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By vectors, in one block, in two, and by SciPy; also after the matrix changed."""
     monkeypatch.setattr(petsc, "BLOCK_ENTRIES", entries)
+    monkeypatch.setattr(petsc, "FEW_ENTRIES", entries)
     system = build(make_scene({}), comm=comm).system
     layout, start = system.layout, system.layout.start
     X = np.random.default_rng(1).standard_normal((layout.n_e, columns))

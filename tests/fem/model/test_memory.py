@@ -61,6 +61,15 @@ def test_what_the_sentence_advises_fits(comm: MPI.Intracomm) -> None:
         check_memory(some, comm, True, 2, simplices([round(1.25 * n) for n in cells]))
 
 
+def test_a_graded_mesh_that_does_not_fit_is_refused(comm: MPI.Intracomm) -> None:
+    """What says how many cells there are is the tolerance, not the cells of the box."""
+    scene = make_scene(tissue={"order": 2, "refine": {"tolerance": 1e-2}}, output={"memory": 1e-3})
+    with pytest.raises(
+        ResourceError, match=r"^tissue\.refine\.tolerance = 0\.01 needs .* take about \d+ of its \d+ cells"
+    ):
+        build(scene, comm=comm)
+
+
 def test_steps_count_only_for_a_run(comm: MPI.Intracomm) -> None:
     scene = make_scene(time={"steps": 10**12})
     assert build(scene, comm=comm, run=False).system.layout.n_e > 0

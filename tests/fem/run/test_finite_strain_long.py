@@ -92,7 +92,7 @@ def test_gate_holds_in_three_dimensions(lam: int, mu: int, size: float) -> None:
 def test_gate_holds_for_other_bodies_and_moves(
     size: list[float], cells: list[int], grip: float, move: list[float]
 ) -> None:
-    """The estimate is 0.41 to 2.3 times the error."""
+    """The estimate is 0.41 to 2.25 times the error."""
     stiff = 8e4 if size[2] > 0.1 else 2e4
     changes = (
         f"tissue.size={size}", f"tissue.cells={cells}", f"contact.box=[[0, 0, {grip}], {size}]",

@@ -18,6 +18,7 @@ from mpi4py import MPI
 from softgrasp.fem.disk import MARGIN, check_room
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError
 from softgrasp.fem.model.build import build
+from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.sealed import read_manifest, write_arrays, write_manifest
@@ -74,7 +75,7 @@ def test_a_checkpoint_removes_what_older_ones_left(comm: MPI.Intracomm, mpi_tmp_
     stopped(mpi_tmp_path, 6)
     stopped(mpi_tmp_path, 8, resume=True)
     files = {path.name for path in (mpi_tmp_path / "checkpoint").iterdir()}
-    name = read_manifest(mpi_tmp_path / "checkpoint" / "checkpoint.json", 4)["run"]
+    name = read_manifest(mpi_tmp_path / "checkpoint" / "checkpoint.json", FORMAT)["run"]
     assert files == {"checkpoint.json", *(f"{name}-step8-rank{rank}.npz" for rank in range(comm.size))}
 
 

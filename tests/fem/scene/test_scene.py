@@ -45,6 +45,7 @@ def write_tetrahedra(path: Path, top: float = 1.0, tag: int = 1, cells: int = 2)
 REFUSED: list[tuple[Path, list[str], str]] = [
     # unknown, missing, ill-typed
     (PAPER, ["tissue.cels=[1, 2]"], "tissue.cels is not a key; did you mean tissue.cells?"),
+    (PAPER, ["mu=1"], "mu is not a key; did you mean tissue.material.mu?"),
     (PAPER, ["tissu.order=1"], "tissu is not a key; did you mean tissue?"),
     (PAPER, ["time.zzz=1"], "time.zzz is not a key; keys of time are steps, end, start, solver, rtol"),
     (
@@ -192,6 +193,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["control.Q=[[1.0, 2.0], [0.0, 1.0]]"], "control.Q is not symmetric"),
     (PAPER, ["control.Q=[[1.0, 2.0], [2.0, 1.0]]"], "control.Q has the eigenvalue -1; all must be >= 0"),
     (PAPER, ["control.R=[[1.0, 1.0], [1.0, 1.0]]"], "all must be > 0"),
+    (PAPER, ["tissue.refine={tolerance=1e-10}"], "below 1e-09 rounding decides, take a larger one"),
     # --set itself
     (PAPER, ["hand.mass"], "--set hand.mass: it must read section.key=value"),
     (PAPER, ["hand..mass=1"], "it must read section.key=value"),

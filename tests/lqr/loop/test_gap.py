@@ -10,12 +10,14 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.design.bounds import with_bounds
+from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.loop.gap import DualityGap, duality_gaps
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import make_family
-from softgrasp.lqr.reduced.riccati import GainJudge, reduce_riccati
+from softgrasp.lqr.reduced.riccati import GainJudge, GainReport, reduce_riccati
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.loop import CASES, Setup, setup
 from tests.helpers.models import local_rows, make_scene, same_everywhere
@@ -124,6 +126,15 @@ def test_reduced_gains_stay_below_their_bound() -> None:
     bounds = np.array([gap.cost_excess_at_most for gap in longer])[:-1]
     assert (bounds >= excess * (1 - 1e-6)).all(), bounds / excess  # rounding of the Lyapunov equation
     assert (bounds[:2] <= [1.001 * excess[0], 2 * excess[1]]).all(), bounds / excess  # sharp, as little is to come
+
+
+def test_a_run_that_starts_at_its_target_costs_nothing_and_bounds_nothing() -> None:
+    """0 / 0 of the relative excess: the bound says infinite, and nothing is divided by zero."""
+    case = setup("one_way")
+    start, plan = hand_start(case.problem, [0.0, 0.0]), LoopPlan(DT, STEPS, settle=1.0)
+    report = GainReport("structured", 4, 0.0, error_K=0.0, cost_excess=0.0, abscissa_full=-1.0, gain=case.gain)
+    (judged,) = with_bounds(case.problem, case.solution, [report], start, plan)
+    assert judged.cost_excess_at_most == np.inf
 
 
 def test_a_gain_that_does_not_stabilise_has_no_bound() -> None:

@@ -77,7 +77,7 @@ def test_deficient_snapshots_have_the_right_rank(comm: MPI.Intracomm, engine: En
     }[kind]
     f = factor(comm, rows_of(comm, full), engine)
     u, s, _ = small_svd(comm, f.R)
-    rank = int(np.sum(s > f.floor * s[0]))
+    rank = int(np.sum(s > f.noise * s[0]))
     true = np.linalg.svd(full, compute_uv=False)
     assert rank == (1 if kind == "one column" else 3)
     assert close(s[:rank] * f.scale, true[:rank]) < 1e-13  # well conditioned

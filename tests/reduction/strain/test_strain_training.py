@@ -74,7 +74,7 @@ def test_models_of_one_run(trained: Training) -> None:
         run = replay_strain(rom, full)
         errors = errors_strain(rom, run, full)
         assert rom.residual <= rom.tau == pytest.approx(rom.error_galerkin / 2)
-        assert trained.references[0].floor(rom.k) < rom.error_galerkin < 1.1 * most
+        assert trained.references[0].projection_error(rom.k) < rom.error_galerkin < 1.1 * most
         assert errors.z < most
         assert errors.z < errors.energy_norm < 5e-2
         assert rom.cells.count < 144 * 0.6

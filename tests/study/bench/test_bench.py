@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,13 @@ from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.study.bench import driver
 from softgrasp.study.bench import forward as bench_forward
 from softgrasp.study.bench import forward_rows as bench_worker
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.driver import growth
+from softgrasp.study.bench.driver import growth, launch_worker
+from softgrasp.study.bench.forward_rows import ForwardPoint, WholeRun
 from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop
-from softgrasp.study.shell.jobs import launch_worker
 from softgrasp.study.shell.processes import IN_MPI_JOB
 
 TINY: dict[str, Any] = {"size": 150, "repeats": 3, "repeat_seconds": 0.005}
@@ -29,26 +31,26 @@ TINY: dict[str, Any] = {"size": 150, "repeats": 3, "repeat_seconds": 0.005}
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_worker_returns_every_number_of_its_row(comm: MPI.Intracomm, dimension: int) -> None:
-    row = bench_worker.measure(comm, dimension, **TINY)
+    point = bench_worker.measure(comm, dimension, **TINY)
     methods = {"ts", "solve", "own", "loop"} | ({"scipy", "pymor"} if comm.size == 1 else set())
-    assert set(row["step_us"]) == methods
-    assert all(len(samples) == 3 and min(samples) > 0 for samples in row["samples_us"].values())
-    assert row["step_us"] == {name: float(np.median(samples)) for name, samples in row["samples_us"].items()}
-    for name, value in (("solve", row["ratio"]), ("own", row["ratio_own"])):
-        assert value == np.median(np.divide(row["samples_us"]["ts"], row["samples_us"][name]))
-    assert set(row["seconds"]) == {"mesh", "assembly", "factor"}
-    assert min(row["seconds"].values()) > 0
-    assert row["ranks"] == comm.size
-    assert row["memory_mb"] >= row["memory_base_mb"] > 0
-    assert row["drift"] < 1e-12  # the goal of the issue for undamped runs
-    assert row["whole"] is None
+    assert set(point.step_us) == methods
+    assert all(len(samples) == 3 and min(samples) > 0 for samples in point.samples_us.values())
+    assert point.step_us == {name: float(np.median(samples)) for name, samples in point.samples_us.items()}
+    for name, value in (("solve", point.ratio), ("own", point.ratio_own)):
+        assert value == np.median(np.divide(point.samples_us["ts"], point.samples_us[name]))
+    assert set(point.seconds) == {"mesh", "assembly", "factor"}
+    assert min(point.seconds.values()) > 0
+    assert point.ranks == comm.size
+    assert point.memory_mb >= point.memory_base_mb > 0
+    assert point.drift < 1e-12  # the goal of the issue for undamped runs
+    assert point.whole is None
 
 
 def test_large_worker_runs_to_the_end(comm: MPI.Intracomm) -> None:
-    row = bench_worker.measure_large(comm, 2, 200, 5)
-    assert row["drift_steps"] == 5
-    assert row["residual"] < 1e-8  # what the solver itself accepts
-    assert bench_forward.goals([row | {"problem": "tiny", "large": True}])[0].ok
+    point = bench_worker.measure_large(comm, 2, 200, 5, "tiny")
+    assert point.drift_steps == 5
+    assert point.residual < 1e-8  # what the solver itself accepts
+    assert bench_forward.goals([point])[0].ok
 
 
 def test_size_1000_is_the_paper_and_others_come_near(comm: MPI.Intracomm) -> None:
@@ -114,43 +116,46 @@ def test_exponents_of_made_up_costs_come_back() -> None:
     assert powers == pytest.approx({"assembly": 1.0, "factor": 1.5, "step": 1.1, "memory": 1.0}, rel=1e-12)
 
 
-def made_up(n: int, **changes: Any) -> dict[str, Any]:
-    row = {
-        "problem": f"2D {n}",
-        "dimension": 2,
-        "n_e": n,
-        "states": 2 * n + 4,
-        "ranks": 1,
-        "large": False,
-        "solver": "cholesky",
-        "seconds": {"mesh": 1.0, "assembly": 1e-6 * n, "factor": 1e-8 * n**1.5},
-        "step_us": {"ts": 0.02 * n**1.1, "solve": 0.018 * n**1.1},
-        "ratio": 1.2,
-        "ratio_own": 1.4,
-        "drift": 1e-14,
-        "drift_steps": 600,
-        "memory_mb": 100 + 0.02 * n,
-        "memory_base_mb": 100.0,
-        "whole": None,
-    }
-    return row | changes
+def made_up(n: int, **changes: Any) -> ForwardPoint:
+    point = ForwardPoint(
+        problem=f"2D {n}",
+        dimension=2,
+        cells=[1, 2],
+        n_e=n,
+        states=2 * n + 4,
+        ranks=1,
+        large=False,
+        solver="cholesky",
+        seconds={"mesh": 1.0, "assembly": 1e-6 * n, "factor": 1e-8 * n**1.5},
+        step_us={"ts": 0.02 * n**1.1, "solve": 0.018 * n**1.1},
+        ratio=1.2,
+        ratio_own=1.4,
+        drift=1e-14,
+        drift_steps=600,
+        residual=1e-15,
+        memory_mb=100 + 0.02 * n,
+        memory_base_mb=100.0,
+        repeats=3,
+        steps_per_repeat=10,
+    )
+    return replace(point, **changes)
 
 
 def test_goals_are_told_apart_by_size() -> None:
-    whole = {"steps": 600, "drift": 1e-14, "seconds": {"ts_none": 0.02, "ts_memory": 0.03, "scipy": 0.06}}
-    found = bench_forward.goals([made_up(956, whole=whole), made_up(10_198)])
-    assert [(goal.limit, goal.ok) for goal in found] == [(1.5, True), (1.0, True), (1.15, False)]
-    assert found[1].value == pytest.approx(0.5)
+    whole = WholeRun(600, {"ts_none": 0.02, "ts_memory": 0.03, "scipy": 0.06}, {}, 1e-14)
+    goals = bench_forward.goals([made_up(956, whole=whole), made_up(10_198)])
+    assert [(goal.limit, goal.ok) for goal in goals] == [(1.5, True), (1.0, True), (1.15, False)]
+    assert goals[1].value == pytest.approx(0.5)
 
 
 @pytest.mark.serial
 def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def launch(name: str, spec: dict[str, Any], ranks: int) -> dict[str, Any]:
         if spec["size"] == 300:
-            return {"error": "exit status 1: broken", "ranks": ranks}
-        return made_up(spec["size"], ranks=ranks)
+            return {"points": [], "error": "exit status 1: broken"}
+        return {"points": [asdict(made_up(spec["size"], ranks=ranks, problem=spec["problem"]))]}
 
-    monkeypatch.setattr(bench_forward, "launch_worker", launch)
+    monkeypatch.setattr(driver, "launch_worker", launch)
     for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     arguments = ["forward", "--sizes", "2d:2000,40000,3d:300", "--out", str(tmp_path)]
@@ -159,7 +164,7 @@ def test_command_prints_one_table_and_writes_its_files(tmp_path: Path, monkeypat
     assert "3D 3e2, 1 rank(s) failed: exit status 1: broken" in done.output
     assert "goal missed: 2D" in done.output
     report = json.loads((tmp_path / "bench.json").read_text())
-    assert len(report["rows"]) == 6
+    assert (len(report["rows"]), len(report["failed"])) == (4, 2)
     assert set(report["exponents"]) == {"1", "2"}
     with (tmp_path / "bench.csv").open() as file:
         lines = list(csv.DictReader(file))
@@ -175,9 +180,10 @@ def test_driver_gets_numbers_from_two_ranks(monkeypatch: pytest.MonkeyPatch) -> 
     for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     spec = {"dimension": 2, "large": False} | TINY
-    row = launch_worker("forward", spec, 2)
-    assert row.get("ranks") == 2, row
-    assert "ts" in row["step_us"]
+    result = launch_worker("forward", spec, 2)
+    assert "error" not in result, result
+    assert result["points"][0]["ranks"] == 2
+    assert "ts" in result["points"][0]["step_us"]
     for ranks in (1, 2):
         assert "ZeroDivisionError" in launch_worker("forward", spec | {"dimension": 0}, ranks)["error"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, small_svd
 from softgrasp.study.bench import bases as bench_bases
+from softgrasp.study.bench import driver
 from softgrasp.study.bench.__main__ import app
 from softgrasp.study.bench.bases import known_matrix, parse_shapes, right_down_to, spectrum_of
 from softgrasp.study.shell.processes import IN_MPI_JOB
@@ -47,28 +49,29 @@ def test_shapes_of_the_benchmark() -> None:
 
 @pytest.mark.ranks(2)
 def test_benchmark_measures_every_engine(comm: MPI.Intracomm) -> None:
-    row = bench_bases.measure(900, 200, 1, comm)
+    points = bench_bases.measure(900, 200, 1, comm)
     names = {"tsqr", "svd", "svd_all", "gram", "psd_tsqr", "psd_gram"}
-    assert set(row["engines"]) == (names | {"numpy", "psd_numpy"} if comm.size == 1 else names)
-    for name, found in row["engines"].items():
-        assert found["off"] < 1e-12, name  # rounding
-        assert found["seconds"] > 0
+    assert {p.engine for p in points} == (names | {"numpy", "psd_numpy"} if comm.size == 1 else names)
+    for p in points:
+        assert p.orthonormality < 1e-12, p.engine  # rounding
+        assert p.seconds > 0
         # Gram has half the digits; svd stops at 60 of 200 values, the last of them 1.8e-5
-        assert found["rough"] <= found["right"] < (1e-6 if name != "svd" else 2e-5), name
-    assert bench_bases.missed([row]) == []
-    row["engines"]["tsqr"]["right"] = 2e-10
-    assert "goal 1e-10" in bench_bases.missed([row])[0]
+        assert p.rough <= p.right < (1e-6 if p.engine != "svd" else 2e-5), p.engine
+    assert all(goal.ok for goal in bench_bases.goals(points))
+    first = replace(points[0], right=2e-10)
+    assert first.engine == "tsqr"
+    assert not bench_bases.goals([first])[0].ok  # its goal is 1e-10
 
 
 def test_benchmark_prints_one_table_and_fails_with_its_workers(
     mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench_bases, "launch_worker", lambda name, spec, ranks: {"error": "no"})
+    monkeypatch.setattr(driver, "launch_worker", lambda name, spec, ranks: {"points": [], "error": "no"})
     for variable in IN_MPI_JOB:
         monkeypatch.delenv(variable, raising=False)
     folder = mpi_tmp_path / str(MPI.COMM_WORLD.rank)
     done = CliRunner().invoke(app, ["bases", "--sizes", "40x8", "--ranks", "1", "--out", str(folder)])
     assert done.exit_code == 1
-    assert "40 x 8, 1 rank(s): no" in done.stdout
+    assert "40 x 8, 1 rank(s) failed: no" in done.stdout
     assert (folder / "bench_bases.json").is_file()
     assert (folder / "bench_bases.csv").read_text().startswith("engine,rows,columns,ranks,seconds")

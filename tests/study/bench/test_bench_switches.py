@@ -11,16 +11,17 @@ from typer.testing import CliRunner
 
 import softgrasp.lqr.lowrank.modal_start
 import softgrasp.reduction.online
+from softgrasp.study.bench import driver
 from softgrasp.study.bench import switches as bench_switches
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.switches import Row, product, start, table_of
+from softgrasp.study.bench.switches import Setup, SwitchPoint, product, start, table_of
 from softgrasp.study.shell.processes import IN_MPI_JOB
 
 
 @pytest.mark.serial
 def test_rows_compare_two_methods_and_leave_the_constants_alone(comm: MPI.Intracomm) -> None:
     before = softgrasp.lqr.lowrank.modal_start.FEW_MODES, softgrasp.reduction.online.TOGETHER
-    rows = list(start(comm, 1, False))
+    rows = list(start(Setup(comm, 1, False)))
     assert [row.setting for row in rows] == [f"2D, {k} modes" for k in (15, 16, 30, 60)]
     assert all(row.first > 0 and row.second > 0 and row.ranks == 1 for row in rows)
     assert rows[0].limit == f"FEW_MODES = {before[0]}"
@@ -34,7 +35,7 @@ def test_products_are_measured_beside_scipy_and_petsc_by_rows_and_by_columns(
 ) -> None:
     sizes = iter(([2, 4], [3, 6]))
     monkeypatch.setattr(bench_switches, "cells_for", lambda d, size: next(sizes))
-    rows = list(product(comm, 1, False))
+    rows = list(product(Setup(comm, 1, False)))
     assert len(rows) == 2 * 3 * 2 * 2
     assert {row.switch for row in rows} == {"product, SciPy", "product, PETSc"}
     assert all(row.first > 0 and row.second > 0 for row in rows)
@@ -44,20 +45,20 @@ def test_products_are_measured_beside_scipy_and_petsc_by_rows_and_by_columns(
 def test_command_writes_what_the_workers_measured(
     comm: MPI.Intracomm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = Row("batch", "TOGETHER = 1 MB", "3 models", 1, 2.0, 3.0)
-    found = {1: {"rows": [vars(made)]}, 2: {"error": "exit status 1: no more"}}
-    monkeypatch.setattr(bench_switches, "launch_worker", lambda name, spec, ranks: found[ranks])
+    point = SwitchPoint("batch", "TOGETHER = 1 MB", "3 models", 1, 2.0, 3.0)
+    answers = {1: {"points": [vars(point)]}, 2: {"points": [], "error": "exit status 1: no more"}}
+    monkeypatch.setattr(driver, "launch_worker", lambda name, spec, ranks: answers[ranks])
     for name in IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
     runner = CliRunner()
     good = runner.invoke(app, ["switches", "--switches", "batch", "--ranks", "1", "--out", str(tmp_path)])
     assert good.exit_code == 0, good.output
     assert "1.50" in good.output
-    assert json.loads((tmp_path / "bench_switches.json").read_text())["rows"] == [vars(made)]
+    assert json.loads((tmp_path / "bench_switches.json").read_text())["rows"] == [vars(point)]
     assert (tmp_path / "bench_switches.csv").read_text().splitlines()[1].endswith("3 models,1,2.0,3.0")
     bad = runner.invoke(app, ["switches", "--switches", "batch,shift", "--out", str(tmp_path)])
     assert bad.exit_code == 1
-    assert "shift, 2 rank(s): exit status 1: no more" in bad.output
+    assert "shift, 2 rank(s) failed: exit status 1: no more" in bad.output
     assert "batch, 2 rank(s)" not in bad.output  # on one rank only
     wrong = runner.invoke(app, ["switches", "--switches", "btach", "--out", str(tmp_path)])
     assert wrong.exit_code == 2

@@ -370,7 +370,9 @@ def test_a_scene_without_control_watches_tip_and_turning_hand() -> None:
 
 
 def points(name: str, *values: tuple[int, float, float]) -> BasisGains:
-    return BasisGains(name, None, tuple(GainReport(name, N, e, e, e, a, 1e-3) for N, e, a in values))
+    return BasisGains(
+        name, None, tuple(GainReport(name, N, e, 1e-3, error_K=e, cost_excess=e, abscissa_full=a) for N, e, a in values)
+    )
 
 
 def test_large_errors_break_the_line_and_unstable_gains_are_marked() -> None:

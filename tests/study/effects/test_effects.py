@@ -23,16 +23,17 @@ from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.effects import measure as effects_measure
 from softgrasp.study.effects.change import Experiments, Names, Shown, compare, judge_together, shown
-from softgrasp.study.effects.judge import judge, prove_off
+from softgrasp.study.effects.judge import difference, judge, prove_off
 from softgrasp.study.effects.measure import (
     Case,
     Stepper,
     bare_output,
+    counting,
     fingerprint,
     holdings,
     objects_of,
+    read_table,
 )
-from softgrasp.study.effects.objects import counting, difference, read_table
 from softgrasp.study.effects.result import Change, EffectsStudy, Finding
 from softgrasp.study.effects.run import _beside, run_effects, show, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches

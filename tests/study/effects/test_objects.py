@@ -8,7 +8,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.effects.objects import counting, difference
+from softgrasp.study.effects.judge import difference
+from softgrasp.study.effects.measure import counting
 from tests.helpers.models import (
     LAYERS,
     make_scene,

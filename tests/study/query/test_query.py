@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,6 +26,7 @@ from softgrasp.reduction.certified.training import certified_model
 from softgrasp.study.cli import app
 from softgrasp.study.query.asked import drive_of, materials_of, parse_settings, read_batch
 from softgrasp.study.query.run import run_query
+from softgrasp.study.shell.folder import claim
 
 KV = ["tissue.cells=[4, 8]", "time.steps=100", "effects.damping={kind='kelvin-voigt',beta=0.002}"]
 SCENES = Path(__file__).parents[3] / "demos" / "scenes"
@@ -292,3 +294,39 @@ def test_the_command_line(file: Path) -> None:
     text = runner.invoke(app, ["query", "--help"]).output
     for word in ("--set", "--motion", "--dt", "--allow", "--fallback", "--batch", "--csv", "exit status 3"):
         assert word in text
+
+
+@pytest.mark.parametrize("kind", ["answer", "refused", "full", "batch"])
+def test_a_page_says_what_came_out_and_how_far_it_is_off(file: Path, tmp_path: Path, kind: str) -> None:
+    keys: dict[str, object] = {"folder": tmp_path / "page"}
+    if kind != "answer":
+        keys["tolerance"] = 0.2 if kind == "batch" else 1e-6
+    if kind == "full":
+        keys["fallback"] = "full"
+    if kind == "batch":
+        (tmp_path / "many.csv").write_text("lambda, mu\n300,200\n77,60\n600,600\n30,20\n")
+        keys["batch"] = tmp_path / "many.csv"
+    status, _ = ask(file, *(() if kind == "batch" else ("lambda=77", "mu=60")), **keys)
+    assert status == (3 if kind in ("refused", "batch") else 0)
+    result = json.loads((tmp_path / "page" / "result.json").read_text())
+    page = (tmp_path / "page" / "report.html").read_text()
+    certified = made()[1]
+    for row in result["answers"]:
+        run = certified.run(certified.materials(row["lambda [Pa]"], row["mu [Pa]"]), allow=True)
+        assert row["error at most"] == pytest.approx(run.certificate.reduction, rel=1e-9)
+    assert ("<h2>Warnings</h2>" in page) == bool(result["warnings"])
+    for name in ("result.json", "data:image/png", f"softgrasp query {file}"):
+        assert name in page, name
+    if kind == "batch":
+        assert "The reduced model answers 2 of 4 materials" in page
+        assert len(columns(tmp_path / "page" / "answers.csv")["mesh"]) == 4
+    else:
+        said = {
+            "answer": "the reduced model ends with",
+            "refused": "refuses to answer",
+            "full": "the full model ends with",
+        }
+        assert said[kind] in page
+        assert (tmp_path / "page" / "answer.csv").exists() == (kind != "refused")
+    with pytest.raises(SceneError, match="it holds the results of query"):
+        claim(tmp_path / "page", "simulate", "certified")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
 from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.result import Point, Sweep, best, kept_points, nearest
+from softgrasp.study.reduce.result import MethodSweep, Point, best, kept_points, nearest
 from softgrasp.study.reduce.sweep import FURTHER, chosen_methods
 from softgrasp.study.reduce.tables import error_table, least_size, stability
 from tests.helpers.models import make_scene
@@ -36,8 +36,8 @@ def test_choice_of_points() -> None:
     assert nearest([]) is None
 
 
-def swept_of(key: str, *points: Point) -> Sweep:
-    return Sweep(METHODS[key], points, {}, ())
+def swept_of(key: str, *points: Point) -> MethodSweep:
+    return MethodSweep(METHODS[key], points, {}, ())
 
 
 def test_findings_name_the_best_of_every_measure_and_the_unstable() -> None:

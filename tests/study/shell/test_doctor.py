@@ -26,7 +26,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_this_environment_passes_every_look_but_memory() -> None:
-    for name, look in doctor.CHECKS:
+    for name, look in doctor.CHECKS.items():
         if name not in ("memory", "two ranks"):
             check = look()
             assert check.ok, check
@@ -131,7 +131,7 @@ def test_complex_petsc_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_missing_stack_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "dolfinx", None)  # import raises ModuleNotFoundError
-    monkeypatch.setattr(doctor, "CHECKS", (("DOLFINx", doctor.check_dolfinx),))
+    monkeypatch.setattr(doctor, "CHECKS", {"DOLFINx": doctor.check_dolfinx})
     (check,) = doctor.checks()
     assert not check.ok
     assert "softgrasp[solver]" in check.cure
@@ -140,7 +140,7 @@ def test_missing_stack_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("ok", [True, False])
 def test_show_tells_the_cure_and_whether_all_is_well(monkeypatch: pytest.MonkeyPatch, ok: bool) -> None:
     check = doctor.Check("thing", ok, "value [1]", "" if ok else "Do 'softgrasp[solver]'.")
-    monkeypatch.setattr(doctor, "CHECKS", (("thing", lambda: check),))
+    monkeypatch.setattr(doctor, "CHECKS", {"thing": lambda: check})
     out = io.StringIO()
     assert doctor.show(Console(file=out, width=100)) is ok
     assert "value [1]" in out.getvalue()
