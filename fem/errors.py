@@ -24,6 +24,11 @@ def one_line(text: str) -> str:
     return shown if len(shown) <= LONGEST else one_line(shown)
 
 
+def shortened(value: str) -> str:
+    """A value as it stands in a sentence, at most 60 letters."""
+    return value if len(value) <= 60 else value[:57] + "..."
+
+
 class SoftgraspError(Exception):
     """Base of all errors that end a command with one sentence and a non-zero status."""
 

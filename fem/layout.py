@@ -12,31 +12,18 @@ from softgrasp.fem.petsc import Array
 
 @dataclass(frozen=True)
 class BlockLayout:
-    """Sizes and ownership of q = [q_s; q_e].
+    """Sizes and ownership of q = [q_s; q_e]."""
 
-    Attributes:
-        comm: communicator of the tissue blocks.
-        dimension: space dimension d.
-        n_s: hand degrees of freedom (replicated on every rank).
-        n_e: tissue degrees of freedom, global.
-        n_local: tissue degrees of freedom owned by this rank.
-        start: global number of the first one.
-        nodes: coordinates [m] of the owned free nodes, shape (n_local / d, d).
-        reference: the hand's reference point [m], shape (d,).
-        held: coordinates [m] of the owned nodes that follow the hand, shape (k, d).
-        extent: longest side of the bounding box of the free nodes [m], the same on every rank.
-    """
-
-    comm: MPI.Intracomm
-    dimension: int
-    n_s: int
-    n_e: int
-    n_local: int
-    start: int
-    nodes: Array
-    reference: Array
-    extent: float = 1.0
-    held: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    comm: MPI.Intracomm  # of the tissue blocks
+    dimension: int  # space dimension d
+    n_s: int  # hand degrees of freedom, on every rank
+    n_e: int  # tissue degrees of freedom, global
+    n_local: int  # tissue degrees of freedom owned by this rank
+    start: int  # global number of the first one
+    nodes: Array  # coordinates [m] of the owned free nodes, (n_local / d, d)
+    reference: Array  # the hand's reference point [m], (d,)
+    extent: float = 1.0  # longest side of the bounding box of the free nodes [m], the same on every rank
+    held: Array = field(default_factory=lambda: np.zeros((0, 0)))  # owned nodes that follow the hand [m], (k, d)
 
     @property
     def states(self) -> int:
@@ -63,12 +50,8 @@ class BlockLayout:
             key = self.rounded(distance)
             candidates = np.flatnonzero(key == key.min())
             first = min(candidates, key=lambda i: tuple(self.rounded(self.nodes[i])))
-            best = (
-                float(key[first]),
-                tuple(self.rounded(self.nodes[first]).tolist()),
-                self.comm.rank,
-                int(first) * self.dimension,
-            )
+            where = tuple(self.rounded(self.nodes[first]).tolist())
+            best = float(key[first]), where, self.comm.rank, int(first) * self.dimension
         nearest = min(b for b in self.comm.allgather(best) if b is not None)
         return nearest[2], nearest[3], np.array(nearest[1])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -101,8 +101,7 @@ def times_columns(A: PETSc.Mat, X: Array) -> Array:
     On one rank X stored by rows, or of eight columns and more with few entries, goes by SciPy's product, for which the
     matrix keeps a copy, and other X by PETSc's in blocks; on more ranks all columns go at once, since every block costs
     messages. One or two columns, and a rank without rows, on which PETSc's product crashes, go by the product with
-    vectors.
-    ``python -m softgrasp.study.bench switches --switches product`` measures the ways.
+    vectors. ``python -m softgrasp.study.bench switches --switches product`` measures the ways.
     """
     k, serial, entries = X.shape[1], A.comm.size == 1, A.getType() != PETSc.Mat.Type.PYTHON
     few = k >= BLOCK_COLUMNS and X.size <= FEW_ENTRIES
@@ -154,23 +153,19 @@ def led(
     """What ``method(call)`` returns: it decides on rank 0 alone, and every rank takes part in its calls. Collective.
 
     Raises:
-        ArithmeticError: ``call`` raised it, as it must on all ranks alike.
+        Exception: of the method, or of ``call``, which must raise it on all ranks alike.
     """
-    if comm.rank == 0:
+
+    def lead() -> Array:
         try:
-            answer = method(lambda x: call(np.array(comm.bcast(x))))  # a copy: the method may write into its own later
+            return method(lambda x: call(np.array(comm.bcast(x))))  # a copy: the method may write into its own later
         finally:
             comm.bcast(None)
-        return np.asarray(comm.bcast(answer))
-    failed = False
-    while (x := comm.bcast(None)) is not None:
-        try:
+
+    while comm.rank > 0 and (x := comm.bcast(None)) is not None:
+        with suppress(Exception):  # rank 0 tells it to all
             call(x)
-        except ArithmeticError:
-            failed = True
-    if failed:
-        raise ArithmeticError
-    return np.asarray(comm.bcast(None))
+    return on_root(comm, lead)
 
 
 def on_root[R](comm: MPI.Intracomm, call: Callable[[], R]) -> R:

@@ -10,7 +10,7 @@ K_ee T + K_es = 0, and the only coupling is the inertia G = M_es + M_ee T:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -74,39 +74,23 @@ class BlockSystem:
 
     K_ee = sum over layers of mu K_mu + lambda K_lambda, M_ee = sum of rho M_1; the equations stand at the top of this
     module. Matrices are distributed over ``layout.comm``, small arrays are the same on every rank.
-
-    Attributes:
-        layout: sizes and ownership.
-        layers: affine components and the materials they carry.
-        materials: one per layer.
-        M_ee, K_ee: tissue mass [kg] and stiffness [N/m], (n_e, n_e), symmetric positive definite.
-        T: rigid modes of the hand at the free nodes, local rows (n_local, n_s) [1, m].
-        G: M_es + M_ee T, local rows (n_local, n_s) [kg, kg m].
-        M_hand: hand mass matrix, (n_s, n_s) [kg, kg m^2].
-        M_rigid: inertia of the tissue moved rigidly with the hand, (n_s, n_s) [kg, kg m, kg m^2].
-        damping: tissue damping.
-        gravity: acceleration of free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None.
-        hand_weight: gravity acts on the hand's own mass too.
-        two_way: the hand feels the tissue.
-        graded: nodes crowd where cells shrink, so that Euclidean norms of node values mean little.
-        points: where finite strain evaluates its law; None while the effect is off, and K_ee z is the whole force.
     """
 
-    layout: BlockLayout
-    layers: tuple[LayerBlocks, ...]
-    materials: tuple[LayerMaterial, ...]
-    M_ee: PETSc.Mat
-    K_ee: PETSc.Mat
-    T: Array
-    G: Array
-    M_hand: Array
-    M_rigid: Array
-    damping: Damping
-    gravity: Array | None = None
-    hand_weight: bool = False
-    two_way: bool = False
-    graded: bool = False
-    points: Points | None = None
+    layout: BlockLayout  # sizes and ownership
+    layers: tuple[LayerBlocks, ...]  # affine components
+    materials: tuple[LayerMaterial, ...]  # one per layer
+    M_ee: PETSc.Mat  # tissue mass [kg], (n_e, n_e), symmetric positive definite
+    K_ee: PETSc.Mat  # tissue stiffness [N/m], alike
+    T: Array  # rigid modes of the hand at the free nodes, local rows (n_local, n_s) [1, m]
+    G: Array  # M_es + M_ee T, local rows (n_local, n_s) [kg, kg m]
+    M_hand: Array  # hand mass matrix, (n_s, n_s) [kg, kg m^2]
+    M_rigid: Array  # inertia of the tissue moved rigidly with the hand, (n_s, n_s) [kg, kg m, kg m^2]
+    damping: Damping  # of the tissue
+    gravity: Array | None = None  # free fall in the hand's degrees of freedom, (n_s,) [m/s^2], or None
+    hand_weight: bool = False  # gravity acts on the hand's own mass too
+    two_way: bool = False  # the tissue acts on the hand
+    graded: bool = False  # nodes crowd where cells shrink, so that Euclidean norms of node values mean little
+    points: Points | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
 
     @property
     def M_es(self) -> Array:
@@ -116,13 +100,7 @@ class BlockSystem:
     @property
     def K_es(self) -> Array:
         """The paper's K_es, local rows (n_local, n_s)."""
-        return sum_dense(
-            [
-                term
-                for layer, m in zip(self.layers, self.materials, strict=True)
-                for term in ((m.mu, layer.K_mu.es), (m.lam, layer.K_lambda.es))
-            ]
-        )
+        return sum_dense(_stiffness(self.layers, self.materials, "es"))
 
     def with_materials(self, materials: tuple[LayerMaterial, ...]) -> BlockSystem:
         """The same scene with other lambda, mu, rho, beta: a few axpy, no assembly. Collective."""
@@ -141,13 +119,21 @@ def sum_dense(terms: list[tuple[float, Array]]) -> Array:
     return result
 
 
+def _stiffness(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...], block: str) -> list[Any]:
+    """Factors and terms of K = sum over the layers of mu K_mu + lambda K_lambda, in one block."""
+    return [
+        (factor, getattr(component, block))
+        for layer, m in zip(layers, materials, strict=True)
+        for factor, component in ((m.mu, layer.K_mu), (m.lam, layer.K_lambda))
+    ]
+
+
 def tissue_matrices(
     layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]
 ) -> tuple[PETSc.Mat, PETSc.Mat]:
     """M_ee = sum rho M_1 and K_ee = sum mu K_mu + lambda K_lambda over the layers. Collective."""
-    pairs = list(zip(layers, materials, strict=True))
-    M = combine([(m.rho, layer.M_1.ee) for layer, m in pairs])
-    K = combine([t for layer, m in pairs for t in ((m.mu, layer.K_mu.ee), (m.lam, layer.K_lambda.ee))])
+    M = combine([(m.rho, layer.M_1.ee) for layer, m in zip(layers, materials, strict=True)])
+    K = combine(_stiffness(layers, materials, "ee"))
     for A in (M, K):
         A.setOption(PETSc.Mat.Option.SPD, True)
     return M, K
@@ -157,13 +143,8 @@ def layered_viscosity(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMat
     """D_ee = sum beta_k K_k when the layers differ in beta; None when one number says it. Collective."""
     if len({m.beta for m in materials}) == 1:
         return None
-    return combine(
-        [
-            term
-            for layer, m in zip(layers, materials, strict=True)
-            for term in ((m.beta * m.mu, layer.K_mu.ee), (m.beta * m.lam, layer.K_lambda.ee))
-        ]
-    )
+    viscous = tuple(replace(m, lam=m.beta * m.lam, mu=m.beta * m.mu) for m in materials)
+    return combine(_stiffness(layers, viscous, "ee"))
 
 
 def coupling(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...], T: Array) -> tuple[Array, Array]:

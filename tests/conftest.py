@@ -7,9 +7,10 @@ from softgrasp.fem import _stack as _stack  # threads and MPI, before numpy and 
 # isort: split
 import gc
 import os
+import resource
 import sys
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -101,3 +102,11 @@ def comm() -> MPI.Intracomm:
 def mpi_tmp_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One empty directory for all ranks."""
     return Path(OWN.bcast(str(tmp_path_factory.mktemp("mpi")) if OWN.rank == 0 else None))
+
+
+@pytest.fixture
+def small_files() -> Iterator[Callable[[int], None]]:
+    """Limit the size of the files of this process."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)

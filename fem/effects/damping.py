@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.effects.gate import Gate, Problem
+from softgrasp.fem.effects.gate import Effect, Gate, Problem
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import Damping as DampingOperator
@@ -17,12 +17,7 @@ def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[Lay
     if law is None:
         return DampingOperator()
     matrix = layered_viscosity(layers, materials)
-    return DampingOperator(
-        alpha=law.alpha,
-        beta=materials[0].beta if matrix is None else 0.0,
-        in_space=law.drag == "space",
-        matrix=matrix,
-    )
+    return DampingOperator(law.alpha, 0.0 if matrix is not None else materials[0].beta, law.drag == "space", matrix)
 
 
 def ratios(alpha: float, beta: float, omega: Array) -> Array:
@@ -38,7 +33,7 @@ def layered(scene: Scene) -> bool:
     )
 
 
-class Damping:
+class Damping(Effect):
     """D = alpha M + beta K on the motion against the hand, or with drag = "space" against space."""
 
     name = "damping"
@@ -47,10 +42,6 @@ class Damping:
         "Equal damping in all layers takes no matrix and a few vector operations a step; layers that differ take D_ee "
         "and two products."
     )
-
-    def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on."""
-        return scene.effects.damping is not None
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
         """D_ee when the layers differ in beta, else none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softgrasp.fem.effects.gate import Gate, Problem
+from softgrasp.fem.effects.gate import Effect, Gate, Problem
 from softgrasp.fem.scene.scene import Scene
 
 # Error of linear elasticity over rms|grad z|, measured: on the paper's scene 0.29 to 0.37 over seven materials and six
@@ -18,16 +18,12 @@ def linear_error(rms: float, dimension: int) -> float:
     return SLOPE[dimension] * rms
 
 
-class FiniteStrain:
+class FiniteStrain(Effect):
     """f(z) = dW/dz of a law W(F), F = I + grad z, instead of K_ee z."""
 
     name = "finite_strain"
     term = "f(z) = dW/dz instead of K_ee z, with W(F) of effects.finite_strain.law and F = I + grad z"
     cost = "The gradient B and the law in every point: two to five iterations a step and now and then a new factor."
-
-    def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on."""
-        return scene.effects.finite_strain is not None
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
         """The gradient in the quadrature points."""

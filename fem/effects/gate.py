@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 from softgrasp.fem.effects.sag import Gradient, Sag
 from softgrasp.fem.scene.scene import Scene
@@ -51,7 +51,7 @@ class Problem:
     response: Gradient
 
 
-class Effect(Protocol):
+class Effect(ABC):
     """One unit of physics that a scene switches on."""
 
     name: str  # its key
@@ -60,10 +60,13 @@ class Effect(Protocol):
 
     def active(self, scene: Scene) -> bool:
         """Whether the scene has it on."""
+        return bool(getattr(scene.effects, self.name))
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the operators it allocates in this scene; empty when it is off."""
+        """Names of the operators it allocates in this scene; empty when it is off, or where it needs none."""
+        return ()
 
+    @abstractmethod
     def gate(self, problem: Problem) -> Gate:
         """The dimensionless number that says whether it matters."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.effects.gate import Gate, Problem
+from softgrasp.fem.effects.gate import Effect, Gate, Problem
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 
@@ -19,20 +19,12 @@ def acceleration(scene: Scene, n_s: int) -> Array | None:
     return np.pad(np.asarray(gravity.g, dtype=float), (0, n_s - len(gravity.g)))
 
 
-class Gravity:
+class Gravity(Effect):
     """Body force rho g: f_e = G g, for K_ee T + K_es = 0 makes falling the same as accelerating the hand."""
 
     name = "gravity"
     term = "f_e = G g, as the load -G (q_s'' - g)"
     cost = "Gravity takes no operator and no work in a step: G multiplies q_s'' - g instead of q_s''."
-
-    def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on."""
-        return scene.effects.gravity is not None
-
-    def operators(self, scene: Scene) -> tuple[str, ...]:
-        """None: n_s numbers."""
-        return ()
 
     def gate(self, problem: Problem) -> Gate:
         """Gradient of the static displacement under the weight, bending included; `fem.fields.sag` solves for it."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from softgrasp.fem.effects.gate import Gate, Problem
+from softgrasp.fem.effects.gate import Effect, Gate, Problem
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
 
 THRESHOLD = 1.05  # stiffness within 5 % is one material for any purpose here
 
 
-class Layers:
+class Layers(Effect):
     """K = sum_k mu_k K_mu,k + lambda_k K_lambda,k and M = sum_k rho_k M_1,k over the layers k."""
 
     name = "layers"

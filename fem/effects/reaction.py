@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from softgrasp.fem.effects.gate import Gate, Problem, force_drives
+from softgrasp.fem.effects.gate import Effect, Gate, Problem, force_drives
 from softgrasp.fem.scene.scene import Scene
 
 THRESHOLD = 0.05  # the hand's acceleration under a given force changes by about this much
 
 
-class Reaction:
+class Reaction(Effect):
     """The inertia of the tissue in the hand's equation; makes M and K symmetric."""
 
     name = "reaction"
@@ -16,10 +16,6 @@ class Reaction:
     cost = (
         "n_s extra solves before the run when a force drives the hand; n_s columns Y and two small reductions a step."
     )
-
-    def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on."""
-        return scene.effects.reaction
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
         """Y = S^-1 G, n_s columns, and its small product with G, when a force moves the hand."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.effects import reaction as reaction_gate
-from softgrasp.fem.effects.gate import Gate, Problem, force_drives
+from softgrasp.fem.effects.gate import Effect, Gate, Problem, force_drives
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 
@@ -29,16 +29,12 @@ def hand_mass(scene: Scene, d: int) -> Array:
     return np.diag(diagonal)
 
 
-class Rotation:
+class Rotation(Effect):
     """d (d - 1) / 2 linearised rotations in q_s."""
 
     name = "rotation"
     term = "d (d-1)/2 small angles in q_s: as many columns more in R, T and G, the hand's inertia in M_ss"
     cost = "R, T and G have 1 column more in 2D and 3 more in 3D; a step multiplies with those columns of G too."
-
-    def active(self, scene: Scene) -> bool:
-        """Whether the scene has it on."""
-        return scene.effects.rotation
 
     def operators(self, scene: Scene) -> tuple[str, ...]:
         """Columns in operators that are there anyway."""
@@ -67,7 +63,7 @@ class Rotation:
                 else "Off; with the reaction, which this scene calls for too, the tissue would turn the hand."
                 if matters
                 else "Off; nothing in this scene turns the hand."
-                if not scene.effects.reaction
+                if not reaction
                 else "Off; the tissue hardly turns the hand, or the motion is prescribed."
             )
             condition = ""

@@ -44,29 +44,24 @@ def make_probe(space: Discretisation, places: Sequence[Array], rotation: bool) -
     position = np.full(index_map.size_local, -1)
     position[space.free] = np.arange(len(space.free))
     C_s = np.zeros((len(places) * d, n_s))
-    rows: list[dict[int, float]] = []
+    entries = []  # of each output: free nodes and their weights
     for i, points in enumerate(places):
-        entries: dict[int, float] = {}
         if not len(points):
             C_s[i * d : (i + 1) * d, :d] = np.eye(d)
-            rows.append(entries)
             continue
         nodes, values, where = locate(space, points)
         for row in rigid_modes(where, d, rotation, layout.reference).reshape(len(points), d, n_s):
             C_s[i * d : (i + 1) * d] += row / len(points)
         own = nodes - index_map.local_range[0]
-        for node, value in zip(own.ravel().tolist(), values.ravel().tolist(), strict=True):
-            if 0 <= node < len(position) and position[node] >= 0:
-                column = int(position[node])
-                entries[column] = entries.get(column, 0.0) + value / len(points)
-        rows.append(entries)
-    free = sorted({node for entries in rows for node in entries})
-    weights = np.zeros((len(rows) * d, len(free) * d))
-    for i, entries in enumerate(rows):
-        for node, value in entries.items():
-            weights[np.arange(i * d, (i + 1) * d), free.index(node) * d + np.arange(d)] = value
-    dofs = (np.array(free, dtype=int)[:, None] * d + np.arange(d)).ravel()
-    return Probe(dofs, weights, C_s, d)
+        here = (own >= 0) & (own < len(position))
+        columns, shares = position[own[here]], values[here] / len(points)
+        entries.append((i, columns[columns >= 0], shares[columns >= 0]))
+    free = np.unique(np.concatenate([np.zeros(0, dtype=int), *[columns for _, columns, _ in entries]]))
+    weights = np.zeros((len(places), len(free)))
+    for i, columns, shares in entries:
+        np.add.at(weights[i], np.searchsorted(free, columns), shares)
+    dofs = (free[:, None] * d + np.arange(d)).ravel()
+    return Probe(dofs, np.asarray(np.kron(weights, np.eye(d))), C_s, d)
 
 
 def locate(space: Discretisation, points: Array) -> tuple[np.ndarray, Array, Array]:

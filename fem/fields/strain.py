@@ -12,6 +12,8 @@ from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import BlockSystem
 
 SMALL_STRAIN = 0.1  # linear elasticity neglects terms of this relative size
+EPS = float(np.finfo(float).eps)
+SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to count: far above rounding
 
 
 def gradient(model: Model, z: Array) -> Gradient:
@@ -42,12 +44,6 @@ def _top(rows: Array, limit: float) -> Array:
     """The steepest rows [size, volume], down to the one with which their volume exceeds the limit."""
     ordered = rows[np.argsort(-rows[:, 0], kind="stable")]
     return ordered[: int(np.searchsorted(np.cumsum(ordered[:, 1]), limit, side="right")) + 1]
-
-
-EPS = float(np.finfo(float).eps)
-
-
-SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to count: far above rounding
 
 
 def magnified(system: BlockSystem, z: Array) -> float:

@@ -52,7 +52,11 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     if contact.sides:
         keys.append(f"contact.sides = {list(contact.sides)}")
         on_side = np.zeros(len(facets), dtype=np.bool_)
-        for axis, end in _planes(contact, tissue.dimension):
+        try:
+            planes = contact.axes(tissue.dimension)
+        except ValueError as error:
+            raise SceneError(f"{error}") from error
+        for axis, end in planes:
             on_side |= np.abs(midpoints[:, axis] - (high if end > 0 else low)[axis]) <= tolerance
         chosen &= on_side
     if contact.box is not None:
@@ -217,7 +221,8 @@ def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
     Raises:
         SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
     """
-    midpoints = cell_midpoints(tissue)
+    owned = np.arange(tissue.mesh.topology.index_map(tissue.dimension).size_local, dtype=np.int32)
+    midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, owned)[:, : tissue.dimension]
     if layer.tag is not None:
         if tissue.cell_tags is None:
             raise SceneError(f"A layer has tag = {layer.tag}, but the {tissue.source} mesh has no cell tags: use box.")
@@ -227,20 +232,12 @@ def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
                 f"its cell tags are {_present(tissue.cell_sets)}."
             )
         cells = tissue.cell_tags.indices[np.isin(tissue.cell_tags.values, tissue.cell_sets[layer.tag])]
-        return np.asarray(np.sort(cells[cells < len(midpoints)]), dtype=np.int32)
+        return np.asarray(np.sort(cells[cells < len(owned)]), dtype=np.int32)
     if layer.box is None:
         raise SceneError("A layer has neither tag nor box: give one of them.")
     # The tolerance must not depend on the rank: lengths of the layer's own box, not of the local mesh.
     tolerance = BOX_TOLERANCE * float(np.max(np.ptp(np.asarray(layer.box, dtype=np.float64), axis=0)))
     return np.flatnonzero(_inside(midpoints, layer.box, tolerance, "box of a layer")).astype(np.int32)
-
-
-def cell_midpoints(tissue: TissueMesh) -> Floats:
-    """Midpoints of the owned cells, shape (n_owned, dimension) [m]."""
-    owned = tissue.mesh.topology.index_map(tissue.dimension).size_local
-    cells = np.arange(owned, dtype=np.int32)
-    midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, cells)
-    return np.asarray(midpoints[:, : tissue.dimension], dtype=np.float64)
 
 
 def _tagged_facets(tissue: TissueMesh, tag: int | str) -> Ints:
@@ -257,13 +254,6 @@ def _tagged_facets(tissue: TissueMesh, tag: int | str) -> Ints:
 
 def _present(sets: dict[int | str, tuple[int, ...]]) -> list[int | str]:
     return [*sorted(k for k in sets if isinstance(k, int)), *sorted(k for k in sets if isinstance(k, str))]
-
-
-def _planes(contact: Contact, dimension: int) -> list[tuple[int, int]]:
-    try:
-        return contact.axes(dimension)
-    except ValueError as error:
-        raise SceneError(f"{error}") from error
 
 
 def _inside(points: Floats, box: Any, tolerance: float, key: str) -> npt.NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import psutil
 from mpi4py import MPI
 
-from softgrasp.fem.errors import ResourceError
+from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import choose_solver, factor_on_every_rank
@@ -23,16 +24,6 @@ LAYER_BYTES = {(2, 1): 600.0, (2, 2): 3900.0, (2, 3): 10800.0, (3, 1): 900.0, (3
                (2, 4): 24000.0, (3, 4): 180000.0}  # fmt: skip
 # Gradients, tangent and law of finite strain on each rank that holds the whole tissue; cubic ones by points and nodes.
 STRAIN_BYTES = {(2, 1): 1650.0, (2, 2): 12000.0, (2, 3): 40000.0, (3, 1): 5200.0, (3, 2): 97000.0, (3, 3): 420000.0}
-NODES = {
-    (2, 1): 1 / 2,
-    (2, 2): 2.0,
-    (2, 3): 9 / 2,
-    (2, 4): 8.0,
-    (3, 1): 1 / 6,
-    (3, 2): 4 / 3,
-    (3, 3): 9 / 2,
-    (3, 4): 32 / 3,
-}  # a cell, for large regular meshes
 GIB = 2.0**30
 CONTAINER = Path("/sys/fs/cgroup")
 
@@ -65,10 +56,7 @@ def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
 
 def simplices(cells: list[int]) -> int:
     """Triangles or tetrahedra of a structured box."""
-    count = 2 if len(cells) == 2 else 6
-    for n in cells:
-        count *= n
-    return count
+    return math.factorial(len(cells)) * math.prod(cells)
 
 
 def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: bool) -> Need:
@@ -79,7 +67,7 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
         run: the steps are taken.
     """
     kind, d = (dimension, scene.tissue.order), dimension
-    n_e = max(int(NODES[kind] * cells * d), 1)
+    n_e = max(int(kind[1] ** d / math.factorial(d) * cells * d), 1)  # p^d / d! nodes a cell in large regular meshes
     n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
     layout = BlockLayout(comm, d, n_s, n_e, 0, 0, np.zeros((0, d)), np.zeros(d))
     name, _ = choose_solver(layout, scene.time.solver)
@@ -146,7 +134,7 @@ def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, c
     where = f"{ranks} rank{'s' if ranks > 1 else ''} of {comm.size} on one node"
     needs = size_text(estimate.of(share, ranks))
     raise ResourceError(
-        f"{key} = {_short(given)} needs about {needs} ({parts}) for {where}, where {size_text(free)} may be taken; "
+        f"{key} = {shortened(given)} needs about {needs} ({parts}) for {where}, where {size_text(free)} may be taken; "
         f"take about {fits} or less, more nodes, or allow more with --set output.memory=GIB"
     )
 
@@ -191,7 +179,3 @@ def size_text(size: float) -> str:
             return f"{size:.3g} {unit}"
         size /= 1024
     return f"{size:.3g} TiB"
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= 60 else text[:57] + "..."

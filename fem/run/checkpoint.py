@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.errors import CheckpointError, agree
+from softgrasp.fem.errors import CheckpointError, agree, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
@@ -24,43 +24,25 @@ OLD = ("*step*-rank*", "*frame*.npz")  # patterns of the files that a new manife
 
 @dataclass(frozen=True)
 class RestartState:
-    """What a run needs to go on bit by bit: this rank's share of its arrays, and a few numbers.
+    """What a run needs to go on bit by bit: this rank's share of its arrays, and a few numbers."""
 
-    Attributes:
-        run: name of the run.
-        step: last step taken, n.
-        legs: steps at which it was started and resumed.
-        beside: names and SHA-256 of further files in the checkpoint's folder; rank 0's count.
-        state: local [z; v_z].
-        r: local rows of the right-hand side of the next step.
-        pending: load that it still lacks.
-        hand_q, hand_v: hand so far, shape (n + 1, n_s).
-        outputs: this rank's share of the outputs so far, shape (n + 1, components).
-        snapshots: stored columns.
-        loads, pulls: what the work of the loads needs, shapes (n, n_s) and (n + 1, n_s or 2 n_s).
-        energies: dissipated, at the start, largest [J].
-        residual_first: relative residual of the first solve.
-        forces: on the hand so far, shape (n, n_s); None where the motion is prescribed.
-        newton_rows, newton_numbers: what the iterations of finite strain remember; None where the steps are linear.
-    """
-
-    run: str
-    step: int
-    legs: list[int]
-    beside: dict[str, str]
-    state: Array
-    r: Array
-    pending: Array
-    hand_q: Array
+    run: str  # name of the run
+    step: int  # last step taken, n
+    legs: list[int]  # steps at which it was started and resumed
+    beside: dict[str, str]  # names and SHA-256 of further files in the checkpoint's folder; rank 0's count
+    state: Array  # local [z; v_z]
+    r: Array  # local rows of the right-hand side of the next step
+    pending: Array  # load that it still lacks
+    hand_q: Array  # hand so far, (n + 1, n_s)
     hand_v: Array
-    outputs: Array
-    snapshots: Array
-    loads: Array
-    pulls: Array
-    energies: Array
-    residual_first: float
-    forces: Array | None = None
-    newton_rows: Array | None = None
+    outputs: Array  # this rank's share of the outputs so far, (n + 1, components)
+    snapshots: Array  # stored columns
+    loads: Array  # with ``pulls`` what the work of the loads needs, (n, n_s)
+    pulls: Array  # (n + 1, n_s or 2 n_s)
+    energies: Array  # dissipated, at the start, largest [J]
+    residual_first: float  # relative, of the first solve
+    forces: Array | None = None  # on the hand so far, (n, n_s); None where the motion is prescribed
+    newton_rows: Array | None = None  # with ``newton_numbers`` what the iterations of finite strain remember, or None
     newton_numbers: Array | None = None
 
     def arrays(self) -> dict[str, Any]:
@@ -193,5 +175,4 @@ def _flat(value: dict[str, Any], path: str = "") -> dict[str, Any]:
 
 
 def _short(value: Any) -> str:
-    text = "nothing" if value is None else json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return "nothing" if value is None else shortened(json.dumps(value))

@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.errors import SceneError, SolverError
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState
+from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState
 from softgrasp.fem.run.motion import HandTable
 from softgrasp.fem.system import BlockSystem
 
@@ -165,8 +165,8 @@ class ForceDrive:
         c0 = self.alpha * v - self.g
         pull = -midpoint.s * total(layout.comm, self.system.G.T @ state.array[layout.n_local :])
         a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
-        feel = Feel(self.kappa * self.theta * self.inverse, midpoint.G, np.array(midpoint.s**2 / self.theta))
-        midpoint.solve_midpoint(-(self.kappa * a + c0), feel)
+        feedback = Feedback(self.kappa * self.theta * self.inverse, midpoint.G, np.array(midpoint.s**2 / self.theta))
+        midpoint.solve_midpoint(-(self.kappa * a + c0), feedback)
         self.c[n] = midpoint.c
         self._move(n, -(midpoint.c + c0) / self.kappa)
 

@@ -7,8 +7,8 @@ With w = z_mid - z_n, s = 2/dt, pi = M v and the force f_alg of `softgrasp.fem.s
 
 the linear step with one more load, -(f_alg - K z_mid). The energy W + v'pi/2 changes by the work 2 c'G'w of the load,
 less what D dissipates, and by 2 w'R; so a step ends with a bit of a correction that makes w'R = 0 to first order.
-A step that does not converge is taken in 2, 4, .. 16 parts under the same load, that of the whole step where the hand
-or feedback feels it.
+A step that does not converge is taken in 2, 4, .. 16 parts under the same load, that of the whole step where hand
+or controller answer to the tissue.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, led, total
-from softgrasp.fem.run.midpoint import Feel, TissueMidpoint, TissueState, viscosity
+from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
 from softgrasp.fem.strain.body import Body
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
 from softgrasp.fem.strain.points import whole_points
@@ -70,7 +70,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.past: deque[Array] = deque(maxlen=KEPT)
         self.tangent_at: Array | None = None
         self.counts, self.price = Counts(), self._price()
-        self.parts, self.jump, self.feel = 1, None, None
+        self.parts, self.jump, self.feedback = 1, None, None
         self.load = self.right = np.zeros_like(self.r_array)
         self.last = 0.0
         self._propagate = self._carry_on
@@ -78,8 +78,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
     parts: int  # into which the step in work is divided
     jump: Array | None  # of the velocity over a divided step
     rate: Array  # (v_0 + v_1) / 2s of a divided step, on the rows held
-    feel: Feel | None
-    felt: Array  # p of feel
+    feedback: Feedback | None
+    sensed: Array  # p of feedback
     now: TissueState  # where the step in work begins
 
     def _price(self) -> float:
@@ -99,12 +99,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
 
     def start(self, state: TissueState) -> None:
         """Set s pi_n = s M v and the law at z; the tangent there unless z = 0. Collective."""
-        self.join(state)
-        y = state.z.duplicate()
-        self.system.M_ee.mult(state.v, y)
-        self.r.array_w[:] = self.s * self.held.gather(y.array_r)
-        y.destroy()
-        self.c = self.pending = np.zeros_like(self.c)
+        self._set_momentum(state)
         self.past.clear()
         z = self.at.array_r.copy()
         if self.dot(z, z) > 0 or self.tangent_at is not None:
@@ -117,9 +112,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def join(self, state: TissueState) -> None:
         """Take a state over whose r is set. Collective."""
         self.now = state
-        if self.held.whole:
-            self.z.array_w[:] = self.held.gather(state.z.array_r)
-        self._arrive(self._held_z(state), check=True)
+        self._arrive(self._gathered_z(state), check=True)
 
     def _arrive(self, z: PETSc.Vec, check: bool = False) -> None:
         """Evaluate the law at z, where the next step starts, and refuse what it does not describe. Collective."""
@@ -174,29 +167,30 @@ class FiniteStrainMidpoint(TissueMidpoint):
         """Columns on the owned rows, (n_local, m), as they are held. Collective."""
         return np.asfortranarray(self.held.gather(N))
 
-    def solve_midpoint(self, c: Array, feel: Feel | None = None) -> None:
-        """Solve R(w) = 0 under the load G (c + C p); ``self.c`` is c + C p then, ``felt`` is p. Collective.
+    def solve_midpoint(self, c: Array, feedback: Feedback | None = None) -> None:
+        """Solve R(w) = 0 under the load G (c + C p); ``self.c`` is c + C p then, ``sensed`` is p. Collective.
 
         Args:
             c: load, (n_s,).
-            feel: what hand and feedback add as the tissue moves; None where they do not feel it.
+            feedback: what hand and controller add as the tissue moves; None where they do not depend on it.
 
         Raises:
             SolverError: no convergence, not even in parts of the step; the message names the cell with the smallest J.
         """
-        self.feel, self.jump, counts = feel, None, self.counts
+        self.feedback, self.jump, counts = feedback, None, self.counts
         self.load = self.G @ c
         self.right = self.r_array + self.load
         counts.scale = max(counts.scale, math.sqrt(self.dot(self.right, self.right)))
-        guess = self._guess()
+        past = self.past
+        guess = 2 * past[0] - past[1] if len(past) == KEPT else past[0] if past else np.zeros_like(self.w_array)
         if counts.first >= 0 and counts.spent >= self.price:
-            self._renew(self.at.array_r + guess) or self._renew(self.at.array_r)
+            self._renew_about(guess)
         root = self._find(guess)
         if root.spent < 0:
             root = self._divided(c)
-        elif feel is not None:
-            self.felt = self._dots(feel.N.T, root.x)
-            c = c + feel.C @ self.felt
+        elif feedback is not None:
+            self.sensed = self._dots(feedback.N.T, root.x)
+            c = c + feedback.C @ self.sensed
         if self.jump is None:
             self.c = c
         self.w.array_w[:] = root.x
@@ -204,10 +198,6 @@ class FiniteStrainMidpoint(TissueMidpoint):
         counts.spent += max(root.spent - counts.first, 0)
         counts.iterations, counts.steps = counts.iterations + root.spent, counts.steps + 1
         counts.most = max(counts.most, root.spent)
-
-    def _guess(self) -> Array:
-        past = self.past
-        return 2 * past[0] - past[1] if len(past) == KEPT else past[0] if past else np.zeros_like(self.w_array)
 
     def _find(self, guess: Array) -> Root:
         """The root, moved to w'R = 0 by a small part of a correction made before. Collective."""
@@ -244,8 +234,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if self.drag is not None:
             self.drag.mult(self.trial, self.y)
             R += n * self.y_array
-        if self.feel is not None:
-            R -= self.G @ (self.feel.C @ self._dots(self.feel.N.T, w))
+        if self.feedback is not None:
+            R -= self.G @ (self.feedback.C @ self._dots(self.feedback.N.T, w))
         return R, math.sqrt(self.dot(R, R))
 
     def _apply(self, q: Array) -> Array:
@@ -254,8 +244,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
         self.trial.stateIncrease()
         self._solve(self.trial, self.solved)
         x: Array = np.array(self.solved_array)
-        if self.feel is not None:
-            C, N, _ = self.feel
+        if self.feedback is not None:
+            C, N, _ = self.feedback
             seen = C @ self._dots(N.T, self.Y)
             x += self.Y @ np.linalg.solve(np.eye(len(seen)) - seen, C @ self._dots(N.T, x))
         return x
@@ -276,29 +266,34 @@ class FiniteStrainMidpoint(TissueMidpoint):
         if not self.solver.renew(S):
             return False
         if hasattr(self, "Y"):
-            feel, self.feel = self.feel, None
+            feedback, self.feedback = self.feedback, None
             self.Y = np.column_stack([self._apply(g) for g in self.G.T])
-            self.feel = feel
+            self.feedback = feedback
         return True
+
+    def _renew_about(self, w: Array) -> None:
+        """Factor the tangent at z + w, or at z where that fails. Collective."""
+        if not self._renew(self.at.array_r + w):
+            self._renew(self.at.array_r)
 
     # ---- parts of a step
 
     def _divided(self, c: Array) -> Root:
-        """The step in 2 to 16 parts under one load, ``self.c``; sets ``jump``, ``rate`` and ``felt``. Collective.
+        """The step in 2 to 16 parts under one load, ``self.c``; sets ``jump``, ``rate`` and ``sensed``. Collective.
 
         Raises:
             SolverError: no number of parts converges.
         """
-        feel, self.feel, at = self.feel, None, self.at
+        feedback, self.feedback, at = self.feedback, None, self.at
         begin = at, self.r_array.copy(), self.held.gather(self.now.v.array_r) / self.s, self.dissipated
         while self.parts < PARTS:
             self.parts *= 2
-            root = self._taken(c, begin) if feel is None else self._balanced(c, feel, begin)
+            root = self._taken(c, begin) if feedback is None else self._balanced(c, feedback, begin)
             if root is None:
                 continue
             self.parts, self.past = 1, deque(maxlen=KEPT)
             self.counts.divided += 1
-            self._renew(at.array_r + root.x) or self._renew(at.array_r)
+            self._renew_about(root.x)
             return root
         self.parts = 1
         J, place = self.body.lowest(self.body.J, None if self.held.whole else self.comm)
@@ -307,8 +302,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
             f"{place} the last trial has det F = {J:.3g}: take more time.steps, a finer mesh or a gentler motion"
         )
 
-    def _balanced(self, c: Array, feel: Feel, begin: Begin) -> Root | None:
-        """The parts under the load that they make hand and feedback take, Powell's hybrid method. Collective."""
+    def _balanced(self, c: Array, feedback: Feedback, begin: Begin) -> Root | None:
+        """The parts under the load that they make hand and controller take, Powell's hybrid method. Collective."""
         root: Root | None = None
 
         def miss(load: Array) -> Array:
@@ -316,9 +311,9 @@ class FiniteStrainMidpoint(TissueMidpoint):
             root = self._taken(load, begin)
             if root is None:
                 raise ArithmeticError
-            w = self._dots(feel.N.T, root.x)
-            self.felt = w + feel.speed * (self._dots(feel.N.T, self.rate) - w)
-            return np.asarray(load - c - feel.C @ self.felt)
+            w = self._dots(feedback.N.T, root.x)
+            self.sensed = w + feedback.speed * (self._dots(feedback.N.T, self.rate) - w)
+            return np.asarray(load - c - feedback.C @ self.sensed)
 
         from scipy.optimize import root as solve  # few runs need it
 
@@ -387,7 +382,8 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
         self.body.destroy()
-        mine = (*self.held.parts, self.trial, self.f, self.y, self.solved)
-        for item in (*mine, *([self.body.points.B] if self.held.whole else [])):
+        for item in (*self.held.parts, self.trial, self.f, self.y, self.solved):
             item.destroy()
+        if self.held.whole:  # else the points are the system's
+            self.body.points.B.destroy()
         super().destroy()

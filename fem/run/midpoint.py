@@ -88,8 +88,8 @@ def state_on(array: Array, system: BlockSystem) -> TissueState:
     )
 
 
-class Feel(NamedTuple):
-    """What a hand that feels the tissue, or feedback, adds to the load G c of a step: G C p with p = N'w.
+class Feedback(NamedTuple):
+    """What a two-way coupled hand, or a controller, adds to the load G c of a step: G C p with p = N'w.
 
     Where a step is divided, w is (z_1 - z_0) / 2 in the share 1 - speed of each column, (v_0 + v_1) / 2s in the rest.
     """
@@ -212,30 +212,37 @@ class TissueMidpoint:
 
     def start(self, state: TissueState) -> None:
         """Set the carried vectors k = -2 K z and r = h = s M v - K z. Collective."""
+        self._set_momentum(state)
+        self.r.axpy(0.5, self.k)
+
+    def _set_momentum(self, state: TissueState) -> None:
+        """R = s M v, no load pending. Collective."""
         self.join(state)
         y = state.z.duplicate()
         self.system.M_ee.mult(state.v, y)
-        self.r.array_w[:] = self.held.gather(y.array_r)
+        self.r.array_w[:] = self.s * self.held.gather(y.array_r)
         y.destroy()
-        self.r.scale(self.s)
-        self.r.axpy(0.5, self.k)
         self.c = self.pending = np.zeros_like(self.c)
 
     def join(self, state: TissueState) -> None:
         """Take a state over whose r is set. Collective."""
+        self.K2.mult(self._gathered_z(state), self.k)
+
+    def _gathered_z(self, state: TissueState) -> PETSc.Vec:
+        """The rows held of a new state. Collective."""
         if self.held.whole:
             self.z.array_w[:] = self.held.gather(state.z.array_r)
-        self.K2.mult(self._held_z(state), self.k)
+        return self._held_z(state)
 
     def _held_z(self, state: TissueState) -> PETSc.Vec:
         return self.z if self.held.whole else state.z
 
-    def solve_midpoint(self, c: Array, feel: Feel | None = None) -> None:
+    def solve_midpoint(self, c: Array, feedback: Feedback | None = None) -> None:
         """Solve S w = h + G c, once a step. Collective.
 
         Args:
             c: load, (n_s,); kept, not copied: leave it as it is until the next solve.
-            feel: of finite strain only.
+            feedback: of finite strain only.
         """
         np.add(self.pending, c, out=self.added_array)
         self.coupling.multAdd(self.added, self.r_here, self.r_here)
@@ -359,20 +366,6 @@ class TissueMidpoint:
         """Free all PETSc objects. Collective."""
         self.solver.destroy()
         self.held.destroy()
-        for name in (
-            "r",
-            "k",
-            "x",
-            "w",
-            "r_here",
-            "w_here",
-            "added",
-            "moved",
-            "coupling",
-            "k_old",
-            "y",
-            "z",
-            "D",
-        ):
+        for name in ("r", "k", "x", "w", "r_here", "w_here", "added", "moved", "coupling", "k_old", "y", "z", "D"):
             if hasattr(self, name):
                 getattr(self, name).destroy()

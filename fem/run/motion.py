@@ -68,6 +68,11 @@ def read_csv(path: Path, columns: int, end: float | None = None, key: str = "mot
     return table[:, 0], table[:, 1:]
 
 
+def _target(scene: Scene, n_s: int) -> Array:
+    target = scene.motion.target or []
+    return np.pad(np.array(target, dtype=float), (0, n_s - len(target)))
+
+
 def motion_table(scene: Scene, n_s: int) -> HandTable:
     """Positions of the prescribed motion (drive = "motion") on the time grid.
 
@@ -85,10 +90,8 @@ def motion_table(scene: Scene, n_s: int) -> HandTable:
                 f"time.steps = {steps} gives steps of {end / steps:g} s, too long for a move of {motion.duration:g} s; "
                 f"take at least {int(np.ceil(2 * end / motion.duration))}"
             )
-        target = np.zeros(n_s)
-        target[: len(motion.target or [])] = motion.target or []
         s, ds, _ = quintic(t, motion.duration)
-        q, v = np.outer(s, target), np.outer(ds, target)
+        q, v = (np.outer(x, _target(scene, n_s)) for x in (s, ds))
     elif motion.profile == "csv":
         times, values = read_csv(scene.directory / (motion.csv or ""), n_s, end)
         spline = CubicSpline(times, values, bc_type="clamped")
@@ -112,10 +115,8 @@ def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
     t = end * (np.arange(steps) + 0.5) / steps
     motion = scene.motion
     if motion.profile == "quintic":
-        target = np.zeros(n_s)
-        target[: len(motion.target or [])] = motion.target or []
-        acceleration = np.outer(np.where(t < motion.duration, quintic(t, motion.duration)[2], 0.0), target)
-        return acceleration @ M_hand.T
+        rate = np.where(t < motion.duration, quintic(t, motion.duration)[2], 0.0)
+        return np.outer(rate, _target(scene, n_s)) @ M_hand.T
     if motion.profile == "csv":
         times, values = read_csv(scene.directory / (motion.csv or ""), n_s, end)
         return np.stack([np.interp(t, times, column) for column in values.T], axis=1)
@@ -129,9 +130,7 @@ def largest_acceleration(scene: Scene, n_s: int, M_hand: Array) -> Array:
         SceneError: a CSV file does not fit.
     """
     if scene.motion.profile == "quintic":
-        target = np.zeros(n_s)
-        target[: len(scene.motion.target or [])] = scene.motion.target or []
-        return np.asarray(10 / np.sqrt(3) / scene.motion.duration**2 * target)
+        return np.asarray(10 / np.sqrt(3) / scene.motion.duration**2 * _target(scene, n_s))
     if scene.motion.drive == "motion":
         a = motion_table(scene, n_s).a
     else:

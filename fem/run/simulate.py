@@ -35,25 +35,15 @@ Observer = Callable[["Run"], None]
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How to run, apart from what the scene says.
+    """How to run, apart from what the scene says."""
 
-    Attributes:
-        directory: where checkpoints and streamed snapshots go.
-        resume: continue from the checkpoint in ``directory``.
-        until: stop after this step and leave a checkpoint; None runs to the end.
-        progress: called with the :class:`Run` about five times a second.
-        frame: called with it at the start, at the end and at ``output.frames`` steps between.
-        begin: called with it once before the first step, when a checkpoint has been read.
-        keep: called with it before every checkpoint is written, to add files to :attr:`Run.beside`.
-    """
-
-    directory: Path = Path("out")
-    resume: bool = False
-    until: int | None = None
-    progress: Observer | None = None
-    frame: Observer | None = None
-    begin: Observer | None = None
-    keep: Observer | None = None
+    directory: Path = Path("out")  # where checkpoints and streamed snapshots go
+    resume: bool = False  # continue from the checkpoint in ``directory``
+    until: int | None = None  # stop after this step and leave a checkpoint; None runs to the end
+    progress: Observer | None = None  # called with the :class:`Run` about five times a second
+    frame: Observer | None = None  # called with it at the start, at the end and at ``output.frames`` steps between
+    begin: Observer | None = None  # called with it once before the first step, when a checkpoint has been read
+    keep: Observer | None = None  # called with it before every checkpoint, to add files to :attr:`Run.beside`
 
 
 class Run(Stepped):

@@ -23,22 +23,14 @@ BUFFER_BYTES = 64 * 2**20  # per rank; large enough that HDF5 writes whole chunk
 
 @dataclass(frozen=True)
 class Snapshots:
-    """Hand and relative tissue states at some steps.
+    """Hand and relative tissue states at some steps."""
 
-    Attributes:
-        layout: sizes and ownership.
-        steps: step numbers of the columns, shape (m,).
-        times: their times [s], shape (m,).
-        q_s, v_s: hand, shape (n_s, m), on every rank.
-        Z: local rows of [z; v_z] relative to the hand, shape (2 n_local, m), Fortran order.
-    """
-
-    layout: BlockLayout
-    steps: np.ndarray
-    times: Array
-    q_s: Array
-    v_s: Array
-    Z: Array
+    layout: BlockLayout  # sizes and ownership
+    steps: np.ndarray  # step numbers of the columns, (m,)
+    times: Array  # their times [s], (m,)
+    q_s: Array  # hand, (n_s, m), on every rank
+    v_s: Array  # its velocity, alike
+    Z: Array  # local rows of [z; v_z] relative to the hand, (2 n_local, m), Fortran order
 
     def displacement(self, T: Array) -> Array:
         """Absolute displacement q_e = z + T q_s, local rows (n_local, m)."""
@@ -134,7 +126,7 @@ class Hdf5Store(NoStore):
     def __init__(self, system: BlockSystem, steps: int, every: int, directory: Path, run: str | None) -> None:
         super().__init__(system)
         layout = system.layout
-        self.directory = directory
+        self.directory, self.path = directory, directory / f"snapshots-rank{layout.comm.rank}.h5"  # of this rank
         count = steps // every + 1
         self.needed = 16 * layout.n_e * count
         with agree(layout.comm):
@@ -158,7 +150,7 @@ class Hdf5Store(NoStore):
             self._open(rows, run)
 
     def _open(self, rows: int, run: str | None) -> None:
-        path, shape = self._file(self.system.layout.comm.rank), (len(self.steps), rows)
+        path, shape = self.path, (len(self.steps), rows)
         if run is not None:
             try:
                 with h5py.File(path, "w") as file:
@@ -178,9 +170,6 @@ class Hdf5Store(NoStore):
                 "run again without --resume"
             )
 
-    def _file(self, rank: int) -> Path:
-        return self.directory / f"snapshots-rank{rank}.h5"
-
     def target(self, step: int) -> TissueState:
         """The buffer slot of the step if it is stored, else the working state."""
         j = self.index.get(step)
@@ -193,18 +182,17 @@ class Hdf5Store(NoStore):
 
     def flush(self, step: int) -> None:
         """Append the filled slots to this rank's file. Collective."""
-        end = int(np.searchsorted(self.steps, step, side="right"))
-        path = self._file(self.system.layout.comm.rank)
+        end, comm = int(np.searchsorted(self.steps, step, side="right")), self.system.layout.comm
         if end > self.written:
-            check_room(self.system.layout.comm, [path], 8 * len(self.buffer) * (end - self.written))
-            with agree(self.system.layout.comm):
+            check_room(comm, [self.path], 8 * len(self.buffer) * (end - self.written))
+            with agree(comm):
                 try:
-                    with h5py.File(path, "r+") as file:
+                    with h5py.File(self.path, "r+") as file:
                         for j in range(self.written, end):
                             file["Z"][j] = self.buffer[:, j % self.width]
                         file.attrs["written"] = end
                 except OSError as error:
-                    raise ResourceError(f"{path} cannot be written ({error}); free the disk") from error
+                    raise ResourceError(f"{self.path} cannot be written ({error}); free the disk") from error
             self.written = end
 
     def restore(self, columns: Array, step: int, run: str) -> None:
@@ -213,8 +201,7 @@ class Hdf5Store(NoStore):
         Raises:
             CheckpointError: the file is of another run, is damaged or holds less.
         """
-        self.written = int(np.searchsorted(self.steps, step, side="right"))
-        path = self._file(self.system.layout.comm.rank)
+        self.written, path = int(np.searchsorted(self.steps, step, side="right")), self.path
         if self.owner != run:
             raise CheckpointError(
                 f"{path} belongs to another run, which was started in this folder later; run again without --resume"
@@ -241,7 +228,7 @@ class Hdf5Store(NoStore):
                     joined = h5py.VirtualLayout((len(s), layout.n_e), dtype="f8")
                     at = 0
                     for rank, n in enumerate(sizes):
-                        source = h5py.VirtualSource(self._file(rank).name, "Z", (len(s), 2 * n))
+                        source = h5py.VirtualSource(f"snapshots-rank{rank}.h5", "Z", (len(s), 2 * n))
                         joined[:, at : at + n] = source[:, part * n : (part + 1) * n]
                         at += n
                     file.create_virtual_dataset(key, joined)

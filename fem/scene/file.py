@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from softgrasp import PACKAGE
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import SceneError, shortened
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.text import check_values, parse_toml, read_text
 
@@ -82,28 +82,20 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
         _apply(data, override)
     try:
         check_values(data)
-    except ValueError as error:
-        raise SceneError(f"{path}: {error}") from None
-    try:
         scene = Scene.model_validate(data)
     except ValidationError as error:
         raise SceneError(f"{path}: {_explain(error, data)}") from None
+    except ValueError as error:
+        raise SceneError(f"{path}: {error}") from None
     scene._directory = file.resolve().parent
     return scene
 
 
 def load_scene_collective(comm: MPI.Intracomm, path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     """`load_scene` on rank 0, broadcast to all. Collective. Raises SceneError: on every rank, as rank 0 met it."""
-    result: Scene | Exception | None = None
-    if comm.rank == 0:
-        try:
-            result = load_scene(path, overrides)
-        except Exception as error:
-            result = error
-    result = comm.bcast(result, root=0)
-    if isinstance(result, Scene):
-        return result
-    raise result if isinstance(result, Exception) else SceneError(f"{path}: rank 0 sent no scene")
+    from softgrasp.fem.petsc import on_root  # loads MPI, which scenes do without
+
+    return on_root(comm, lambda: load_scene(path, overrides))
 
 
 def resolved_toml(scene: Scene) -> str:
@@ -211,8 +203,7 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
 
 
 def _show(value: Any) -> str:
-    text = _value(value) if isinstance(value, dict | list | str | bool | int | float) else str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return shortened(_value(value) if isinstance(value, dict | list | str | bool | int | float) else str(value))
 
 
 def _locate(loc: tuple[int | str, ...], data: Any) -> tuple[list[str], Any]:

@@ -44,10 +44,7 @@ LIBRARY: dict[str, LibraryMaterial] = {
         *young_poisson(50.0, 50.0), 1.0, "lambda = mu = 50, rho = 1: the dimensionless values of the paper"
     ),
     "muscle": LibraryMaterial(
-        20e3,
-        0.45,
-        1060.0,
-        _TISSUE.format("passive muscle is 1e4 to 1e5 Pa; density of MendezKeys1960"),
+        20e3, 0.45, 1060.0, _TISSUE.format("passive muscle is 1e4 to 1e5 Pa; density of MendezKeys1960")
     ),
     "fat": LibraryMaterial(
         3e3, 0.45, 920.0, _TISSUE.format("adipose tissue is 1e3 to 1e4 Pa (Samani2007); density rounded")

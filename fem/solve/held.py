@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, rows_on_all, whole_copy
-from softgrasp.fem.solve.order import Dissection, NodeOrder, dissect
+from softgrasp.fem.solve.order import NodeOrder, dissect
 from softgrasp.fem.system import BlockSystem
 
 
@@ -71,33 +71,28 @@ def held_operators(
         parts: further matrices, consumed.
     """
     layout, D = system.layout, system.damping.matrix
-    M = None if D is None else system.M_ee
+    beside = () if D is None else (D, system.M_ee)
     first, last = layout.start, layout.start + layout.n_local
     if not (whole or ordered):
         K = system.K_ee.copy()
         if K.comm.size == 1:  # the conversion of a parallel matrix takes its source apart
             K.convert("baij")
-        return Held(layout, False, None, slice(0, layout.n_local), K, np.asfortranarray(system.G), S, D, M, parts)
-    K, step = whole_copy(system.K_ee), whole_copy(S)
-    D, M = (None if A is None else whole_copy(A) for A in (D, M))
-    whole_parts = tuple(whole_copy(A) for A in parts)
+        G, M = np.asfortranarray(system.G), None if D is None else system.M_ee
+        return Held(layout, False, None, slice(0, layout.n_local), K, G, S, D, M, parts)
+    every = [whole_copy(A) for A in (system.K_ee, S, *beside, *parts)]
     for A in (S, *parts):
         A.destroy()
-    G = rows_on_all(layout.comm, system.G)
-    if not ordered:
-        K.convert("baij")
-        return Held(layout, True, None, slice(first, last), K, np.asfortranarray(G), step, D, M, whole_parts)
-    dissection = dissect(K, layout.dimension)
-    K, step = _moved(dissection, K), _moved(dissection, step)
-    D, M = (None if A is None else _moved(dissection, A) for A in (D, M))
-    order = dissection.order
-    whole_parts = tuple(_moved(dissection, A) for A in whole_parts)
-    G = np.asfortranarray(order.enter(G))
-    return Held(layout, True, order, order.rows_of(first, last), K, G, step, D, M, whole_parts)
-
-
-def _moved(dissection: Dissection, A: PETSc.Mat) -> PETSc.Mat:
-    """A in the order found; consumes A."""
-    result = dissection.matrix(A)
-    A.destroy()
-    return result
+    G, order = rows_on_all(layout.comm, system.G), None
+    rows: slice | NDArray[np.intp] = slice(first, last)
+    if ordered:
+        dissection = dissect(every[0], layout.dimension)
+        for i, A in enumerate(every):
+            every[i] = dissection.matrix(A)
+            A.destroy()
+        order = dissection.order
+        G, rows = order.enter(G), order.rows_of(first, last)
+    else:
+        every[0].convert("baij")
+    K, S, *rest = every
+    D, M = rest[: len(beside)] or (None, None)
+    return Held(layout, True, order, rows, K, np.asfortranarray(G), S, D, M, tuple(rest[len(beside) :]))

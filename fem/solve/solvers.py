@@ -248,7 +248,10 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
     try:
         ksp.setUp()
         if ksp.comm.size > 1 and name == "mumps":
-            _first_solve(ksp, S)
+            w, r = S.createVecs()  # PETSc makes a redundant factor in the first solve, which belongs to the set-up
+            ksp.solve(r, w)
+            r.destroy()
+            w.destroy()
     except PETSc.Error as error:
         raise SolverError(
             f"{name}: the factorisation of the tissue matrix (n_e = {S.getSize()[0]}) failed (PETSc error "
@@ -257,14 +260,6 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
     reason = ksp.getPC().getFailedReason()
     if reason:
         raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
-
-
-def _first_solve(ksp: PETSc.KSP, S: PETSc.Mat) -> None:
-    """Solve for zero: PETSc makes a redundant factor in the first solve, which belongs to the set-up. Collective."""
-    w, r = S.createVecs()
-    ksp.solve(r, w)
-    r.destroy()
-    w.destroy()
 
 
 def _set_up_mumps(ksp: PETSc.KSP, prefix: str, repeated: bool) -> None:

@@ -42,7 +42,9 @@ class Body:
         self.kernel = None if code is None else Kernel(points, self.lam, self.mu, code)
 
     def _rounding(self) -> float:
-        size, force = abs_copy(self.points.B), self.points.B.createVecRight()
+        B, force = self.points.B, self.points.B.createVecRight()
+        indptr, columns, values = B.getValuesCSR()
+        size = PETSc.Mat().createAIJ(B.getSizes(), csr=(indptr, columns, np.abs(values)), comm=B.comm)
         self.H[:] = self.points.vol * self.mu
         self.h.stateIncrease()
         size.multTranspose(self.h, force)
@@ -160,9 +162,3 @@ class Body:
         for item in (self.h, self.A, self.product, self.K):
             if item is not None:
                 item.destroy()
-
-
-def abs_copy(B: PETSc.Mat) -> PETSc.Mat:
-    """|B| entry by entry. Collective."""
-    indptr, columns, values = B.getValuesCSR()
-    return PETSc.Mat().createAIJ(B.getSizes(), csr=(indptr, columns, np.abs(values)), comm=B.comm)

@@ -33,31 +33,19 @@ LEAST_STRETCH = 0.65  # of St. Venant-Kirchhoff, whose stress in compression fal
 
 @dataclass(frozen=True)
 class Start:
-    """A law at the start of a step.
+    """A law at the start of a step."""
 
-    Attributes:
-        H: H_0, (d, d, Q).
-        j: J_0 - 1, (Q,).
-        log: ln J_0, (Q,); of no use to St. Venant-Kirchhoff.
-    """
-
-    H: Array
-    j: Array
-    log: Array
+    H: Array  # H_0, (d, d, Q)
+    j: Array  # J_0 - 1, (Q,)
+    log: Array  # ln J_0, (Q,); of no use to St. Venant-Kirchhoff
 
 
 class Law(ABC):
-    """A law of the material; lam, mu [Pa] are numbers or (Q,).
+    """A law of the material; lam, mu [Pa] are numbers or (Q,)."""
 
-    Attributes:
-        name: as scenes write it.
-        barrier: W has no value where J <= 0.
-        least_stretch: principal stretch below which the law is no model of a solid; 0 where there is none.
-    """
-
-    name: LawName
-    barrier = True
-    least_stretch = 0.0
+    name: LawName  # as scenes write it
+    barrier = True  # W has no value where J <= 0
+    least_stretch = 0.0  # principal stretch below which the law is no model of a solid; 0 where there is none
 
     @abstractmethod
     def energy(self, H: Array, lam: Array, mu: Array) -> Array:

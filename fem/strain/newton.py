@@ -18,18 +18,12 @@ GROWTH = 4.0  # of |R|, beyond which a correction is halved
 
 
 class Root(NamedTuple):
-    """Where R is small.
-
-    Attributes:
-        x, R: the point and what is left there.
-        norm: |R|, infinite where there is no R.
-        spent: iterations, or -1 where R did not become small.
-    """
+    """Where R is small."""
 
     x: Array
-    R: Array
-    norm: float
-    spent: int
+    R: Array  # what is left there
+    norm: float  # |R|, infinite where there is no R
+    spent: int  # iterations, or -1 where R did not become small
 
 
 @dataclass
@@ -49,20 +43,13 @@ class Counts:
 
 @dataclass(frozen=True)
 class NewtonFigures:
-    """How the steps of a run converged.
+    """How the steps of a run converged."""
 
-    Attributes:
-        mean, max: iterations of a step [1].
-        factors: tangents factored after the linear one.
-        min_det: smallest det F at the end of any step.
-        divided: steps taken in parts.
-    """
-
-    mean: float
-    max: int
-    factors: int
-    min_det: float
-    divided: int
+    mean: float  # iterations of a step [1]
+    max: int  # their largest number [1]
+    factors: int  # tangents factored after the linear one
+    min_det: float  # smallest det F at the end of any step
+    divided: int  # steps taken in parts
 
 
 class Pairs:

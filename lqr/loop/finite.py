@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import Feel, TissueState
+from softgrasp.fem.run.midpoint import Feedback, TissueState
 from softgrasp.lqr.loop.drive import LoopDrive, PlantStep
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
@@ -70,7 +70,7 @@ class FiniteDrive(LoopDrive):
             right += plant.s * total(plant.comm, system.G.T @ state.array[system.layout.n_local :])
             C[:, 2 * n_s :] = -plant.theta * np.eye(n_s)
         inverse = np.linalg.inv(self.inertia - free[:, None] * self.F)
-        feel = Feel(-plant.kappa * inverse @ C, self.N, self.speed)
-        self.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feel)
+        feedback = Feedback(-plant.kappa * inverse @ C, self.N, self.speed)
+        self.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feedback)
         a = -(self.midpoint.c + c_0) / plant.kappa
-        return a, known + self.F @ a + self.midpoint.felt[:n_s] + self.midpoint.felt[n_s : 2 * n_s]
+        return a, known + self.F @ a + self.midpoint.sensed[:n_s] + self.midpoint.sensed[n_s : 2 * n_s]

@@ -1,19 +1,25 @@
-"""Cost, verdict, proof and advice for one effect, from the cases that `study.effects.measure` measured."""
+"""Cost, verdict, proof and advice for one effect from the measured cases; whether linear elements are enough."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.model.build import build
+from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.simulate import Run, RunOptions
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.trajectory import Trajectory
+from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.change import Changes, Together
+from softgrasp.study.effects.change import Changes, Together, compare, shown
 from softgrasp.study.effects.measure import AGAIN, SCENE, Case, fingerprint, objects_of
-from softgrasp.study.effects.result import Change, Company, Cost, Finding, OffProof
-from softgrasp.study.effects.switch import Switch, neutral
+from softgrasp.study.effects.result import Change, Company, Cost, Elements, Finding, OffProof
+from softgrasp.study.effects.switch import Switch, changed, neutral
 from softgrasp.study.forward.accuracy import percent
+from softgrasp.study.forward.cautions import LOCKING
 from softgrasp.study.forward.explain import EffectReport, Explanation
 from softgrasp.study.report.tables import listed
 
@@ -169,3 +175,39 @@ def _cost_in_words(cost: Cost) -> str:
     if cost.memory_relative > 0:
         parts.append(f"{percent(cost.memory_relative)} to the memory")
     return " and ".join(parts)
+
+
+# --- whether linear elements are enough
+
+
+def judge_elements(model: Model, trajectory: Trajectory, tolerance: float) -> Elements | None:
+    """Run the scene with P2 when it has P1 and a ratio of Poisson at which P1 locks, else None. Collective."""
+    nu = max(young_poisson(m.lam, m.mu)[1] for m in model.system.materials)
+    if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
+        return None
+    other = build(quadratic(model), comm=model.system.layout.comm)
+    change = compare(shown(model, trajectory), shown(other, simulate(other, RunOptions())))
+    needed = change.outputs > tolerance
+    text = (
+        f"Measured at nu = {nu:.4g}: on the same mesh tissue.order = 2 changes the outputs by {change.outputs:.2g} and "
+        f"their deformation by {change.deformation:.2g}, tolerance {tolerance:g}: "
+    )
+    text += "P2 is needed." if needed else "this run does not show the locking."
+    ratio = other.system.layout.n_e / model.system.layout.n_e
+    return Elements(nu, change, ratio, needed, text)
+
+
+def quadratic(model: Model) -> Scene:
+    """The scene with P2 and its outputs at the very nodes that they have with P1. Collective."""
+    outputs = make_outputs(model.scene, model.system)
+
+    def edit(table: dict[str, Any]) -> None:
+        table["tissue"]["order"] = 2
+        control = table.setdefault("control", {})
+        if not control.get("outputs"):
+            control["outputs"] = [{"kind": "node", "name": o.name, "point": list(o.point)} for o in outputs]
+        for entry, output in zip(control["outputs"], outputs, strict=True):
+            if entry["kind"] == "node":
+                entry["point"] = list(output.point)
+
+    return changed(model.scene, edit)

@@ -19,8 +19,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.change import Changes, Experiments, judge_together
-from softgrasp.study.effects.elements import judge_elements
-from softgrasp.study.effects.judge import ends, find, shows
+from softgrasp.study.effects.judge import ends, find, judge_elements, shows
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, measure_builds, measure_steps, objects_of
 from softgrasp.study.effects.page import compose, show
 from softgrasp.study.effects.result import Change, Company, EffectsStudy

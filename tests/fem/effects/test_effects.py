@@ -12,6 +12,7 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
+from tests.helpers.effects import GRAVITY, NEUTRAL, OFF, RAYLEIGH, VISCOUS, WEIGHT
 from tests.helpers.models import (
     LAYERS,
     absolute,
@@ -28,19 +29,8 @@ from tests.helpers.models import (
 
 BARE_FORMS = ["K_mu", "K_lambda", "M_1"]
 BARE_OPERATORS = ["K_mu[tissue]", "K_lambda[tissue]", "M_1[tissue]", "M_ee", "K_ee", "T", "G"]
-GRAVITY = {"gravity": {"g": [1.0, -9.0]}}
-WEIGHT = {"gravity": {"g": [1.0, -9.0], "hand_weight": True}}
-VISCOUS = {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}
-RAYLEIGH = {"damping": {"kind": "rayleigh", "alpha": 0.4, "beta": 0.01}}
 DRAGGED = {"damping": {"kind": "rayleigh", "alpha": 0.4, "beta": 0.01, "drag": "space"}}
 HOLD: dict[str, Any] = {"profile": "hold", "target": None}
-OFF: dict[str, Any] = {"gravity": False, "damping": False, "reaction": False, "rotation": False}
-NEUTRAL: list[dict[str, Any]] = [
-    OFF,
-    {"gravity": {"g": [0.0, 0.0]}},
-    {"damping": {"kind": "rayleigh", "alpha": 0.0, "beta": 0.0}},
-    {"damping": {"kind": "rayleigh", "alpha": 0.0, "beta": 0.0, "drag": "space"}},
-]
 
 
 class Forms:

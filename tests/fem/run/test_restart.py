@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -156,14 +155,6 @@ def test_snapshots_stream_through_the_smallest_buffer(
         assert np.array_equal(file["z"][:, start : start + n], memory.Z[:n].T)
         assert np.array_equal(file["v"][:, start : start + n], memory.Z[n:].T)
         assert np.array_equal(file["steps"], memory.steps)
-
-
-@pytest.fixture
-def small_files() -> Iterator[Callable[[int], None]]:
-    """Limit the size of the files of this process."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_room_counts_all_ranks_and_the_size_so_far(

@@ -18,6 +18,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.midpoint import TissueMidpoint
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
@@ -207,7 +208,7 @@ def test_restart_file_of_another_format(comm: MPI.Intracomm, mpi_tmp_path: Path)
     if comm.rank == 0:
         manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 1}))
     comm.Barrier()
-    with pytest.raises(CheckpointError, match=r"another version of softgrasp .format 1, this one reads 4.; run"):
+    with pytest.raises(CheckpointError, match=f"another version of softgrasp .format 1, this one reads {FORMAT}.; run"):
         simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
 
 

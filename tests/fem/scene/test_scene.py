@@ -48,25 +48,13 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["mu=1"], "mu is not a key; did you mean tissue.material.mu?"),
     (PAPER, ["tissu.order=1"], "tissu is not a key; did you mean tissue?"),
     (PAPER, ["time.zzz=1"], "time.zzz is not a key; keys of time are steps, end, start, solver, rtol"),
-    (
-        PAPER,
-        ["tissue.material.yung=1"],
-        "tissue.material.yung is not a key; did you mean tissue.material.young?",
-    ),
-    (
-        PAPER,
-        ["effects.damping={kind='rayleigh', bta=1.0, beta=1.0}"],
-        "effects.damping.bta is not a key; did you mean",
-    ),
+    (PAPER, ["tissue.material.yung=1"], "tissue.material.yung is not a key; did you mean tissue.material.young?"),
+    (PAPER, ["effects.damping={kind='rayleigh', bta=1.0, beta=1.0}"], "effects.damping.bta is not a key; did you mean"),
     (PAPER, ["control.outputs.0.pont=[0.0, 0.0]"], "control.outputs.0.pont is not a key; did you mean"),
     (SCENES["layers_2d"], ["tissue.layers.fat.bx=1"], "tissue.layers.fat.bx is not a key; did you mean"),
     (PAPER, ["time={}"], "time.steps is missing; give number of equal time steps"),
     (PAPER, ["effects.damping={beta=1.0}"], "damping.kind is missing; give damping law: 'kelvin-voigt', 'rayleigh'"),
-    (
-        PAPER,
-        ["tissue.material={mu=1.0, rho=1.0}"],
-        "tissue.material.lambda is missing; give first Lame constant",
-    ),
+    (PAPER, ["tissue.material={mu=1.0, rho=1.0}"], "tissue.material.lambda is missing; give first Lame constant"),
     (PAPER, ["tissue.order=4"], "tissue.order is 4; it must be 1, 2 or 3"),
     (PAPER, ["tissue.repair=1"], "tissue.repair is 1; it must be true or false"),
     (PAPER, ["hand.mass='heavy'"], 'hand.mass is "heavy"; it must be a number'),
@@ -88,31 +76,11 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["tissue.material.rho=-1"], "tissue.material.rho is -1; it must be > 0"),
     (PAPER, ["tissue.material.lambda=-40"], "tissue.material.lambda is -40.0; it must be > -2 mu / 3"),
     (PAPER, ["tissue.material.lambda=1e30"], "it gives nu = 0.5"),
-    (
-        PAPER,
-        ["tissue.material={young=1.0, poisson=0.5, rho=1.0}"],
-        "tissue.material.poisson is 0.5; it must lie",
-    ),
-    (
-        PAPER,
-        ["tissue.material={young=1.0, poisson=-1.0, rho=1.0}"],
-        "tissue.material.poisson is -1.0; it must lie",
-    ),
-    (
-        PAPER,
-        ["tissue.material={young=0.0, poisson=0.3, rho=1.0}"],
-        "tissue.material.young is 0.0; it must be > 0",
-    ),
-    (
-        PAPER,
-        ["tissue.material={young=nan, poisson=0.3, rho=1.0}"],
-        "tissue.material.young is nan; it must be finite",
-    ),
-    (
-        PAPER,
-        ["tissue.material={young='a', poisson=0.3, rho=1.0}"],
-        "tissue.material.young is 'a'; it must be a number",
-    ),
+    (PAPER, ["tissue.material={young=1.0, poisson=0.5, rho=1.0}"], "tissue.material.poisson is 0.5; it must lie"),
+    (PAPER, ["tissue.material={young=1.0, poisson=-1.0, rho=1.0}"], "tissue.material.poisson is -1.0; it must lie"),
+    (PAPER, ["tissue.material={young=0.0, poisson=0.3, rho=1.0}"], "tissue.material.young is 0.0; it must be > 0"),
+    (PAPER, ["tissue.material={young=nan, poisson=0.3, rho=1.0}"], "tissue.material.young is nan; it must be finite"),
+    (PAPER, ["tissue.material={young='a', poisson=0.3, rho=1.0}"], "tissue.material.young is 'a'; it must be a number"),
     (PAPER, ["tissue.material={young=1.0, rho=1.0}"], "tissue.material.poisson is missing"),
     (PAPER, ["tissue.material.young=1.0"], "young and poisson exclude lambda and mu"),
     # numbers
@@ -123,29 +91,17 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["time.steps=0"], "time.steps is 0; it must be >= 1"),
     (PAPER, ["time.rtol=1"], "time.rtol is 1; it must be < 1"),
     (PAPER, ["output.every=0"], "output.every is 0; it must be >= 1"),
-    (
-        PAPER,
-        ["effects.damping={kind='rayleigh', beta=-1.0}"],
-        "effects.damping.beta is -1.0; it must be >= 0",
-    ),
+    (PAPER, ["effects.damping={kind='rayleigh', beta=-1.0}"], "effects.damping.beta is -1.0; it must be >= 0"),
     # geometry
     (PAPER, ["tissue.mesh=a.msh"], "tissue.size and cells cannot go with tissue.mesh; drop them, or mesh (--set"),
     (PILLOW, ["tissue.cells=[1, 1, 1]"], "tissue.cells cannot go with tissue.mesh"),
     (PAPER, ["tissue.size=[1.0]"], "tissue.size is [1.0]; it must have at least 2 items"),
     (PAPER, ["tissue.cells=[1, 2, 3]"], "tissue.cells is [1, 2, 3]; it must have 2 entries as size does"),
-    (
-        PAPER,
-        ["tissue={material='fat', size=[1.0, 1.0]}"],
-        "tissue.cells is missing; give size and cells, or mesh",
-    ),
+    (PAPER, ["tissue={material='fat', size=[1.0, 1.0]}"], "tissue.cells is missing; give size and cells, or mesh"),
     (PAPER, ["tissue.scale=0.001"], "tissue.scale needs tissue.mesh"),
     (PAPER, ["tissue.layers.a={material='fat'}"], "tissue.layers.a.box or tag must be given"),
     (PAPER, ["tissue.layers.a={material='fat', tag=1}"], "tissue.layers.a.tag needs tissue.mesh"),
-    (
-        PAPER,
-        ["tissue.layers.a={material='fat', box=[[0.0, 0.0], [1.0, 1.0]], beta=1.0}"],
-        "layers.a.beta needs",
-    ),
+    (PAPER, ["tissue.layers.a={material='fat', box=[[0.0, 0.0], [1.0, 1.0]], beta=1.0}"], "layers.a.beta needs"),
     (PAPER, ["contact={}"], "contact.sides, box or facet_tag must be given"),
     (PAPER, ["tissue.cells=4,8"], "'4,8' is not a TOML value; write [4,8]"),
     (PAPER, ["contact.sides='left'"], 'write sides = ["left", "right"]'),
@@ -169,11 +125,7 @@ REFUSED: list[tuple[Path, list[str], str]] = [
     (PAPER, ["control.R=[[1.0]]"], "control.R has 1 rows; it must have 2"),
     (PAPER, ["hand.inertia=[1, 1, 1]"], "hand.inertia is a list; in 2D it must be one number"),
     # effects, motion, control
-    (
-        PAPER,
-        ["effects.rotation=true", "motion.target=[1, 2, 0]"],
-        "hand.inertia is missing; effects.rotation needs it",
-    ),
+    (PAPER, ["effects.rotation=true", "motion.target=[1, 2, 0]"], "hand.inertia is missing; effects.rotation needs it"),
     (
         PAPER,
         ["effects.damping={kind='kelvin-voigt', beta=1.0, alpha=1.0}"],
@@ -233,15 +185,7 @@ def test_shipped_scene_loads_and_survives_its_resolved_text(name: str, tmp_path:
 
 
 def test_scenes_that_checks_name_are_shipped() -> None:
-    wanted = {
-        "paper_forward",
-        "paper_lqr",
-        "paper_lqr_undamped",
-        "franka_muscle",
-        "block_3d",
-        "pillow_3d",
-        "layers_2d",
-    }
+    wanted = {"paper_forward", "paper_lqr", "paper_lqr_undamped", "franka_muscle", "block_3d", "pillow_3d", "layers_2d"}
     assert wanted <= SCENES.keys()
     assert PILLOW.parent.joinpath("meshes", "pillow_small.LICENSE").is_file()
 
@@ -252,19 +196,9 @@ def test_paper_scene_values_and_defaults() -> None:
     material = scene.tissue.material
     assert (material.lam, material.mu, material.rho, material.nu) == (50.0, 50.0, 1.0, 0.25)
     assert material.young == 125.0  # mu (3 lambda + 2 mu) / (lambda + mu), exact in binary
-    assert (scene.hand.mass, scene.motion.target, scene.time.steps, scene.time_end) == (
-        20.0,
-        [5.0, 3.0],
-        600,
-        3.0,
-    )
+    assert (scene.hand.mass, scene.motion.target, scene.time.steps, scene.time_end) == (20.0, [5.0, 3.0], 600, 3.0)
     effects = scene.effects
-    assert (effects.gravity, effects.damping, effects.reaction, effects.rotation) == (
-        None,
-        None,
-        False,
-        False,
-    )
+    assert (effects.gravity, effects.damping, effects.reaction, effects.rotation) == (None, None, False, False)
     assert load_scene(SCENES["paper_lqr"]).time_end == 300.0
     assert load_scene(SCENES["paper_lqr_undamped"]).effects.damping is None
 
@@ -278,12 +212,7 @@ def test_no_motion_table_means_hold(tmp_path: Path) -> None:
 
 
 def test_set_takes_toml_values_bare_words_indices_and_false() -> None:
-    overrides = [
-        "tissue.cells=[4, 8]",
-        "tissue.material=fat",
-        "control.outputs.0.name='a b'",
-        "output.fields=none",
-    ]
+    overrides = ["tissue.cells=[4, 8]", "tissue.material=fat", "control.outputs.0.name='a b'", "output.fields=none"]
     scene = load_scene(PAPER, [*overrides, "effects.damping={kind='rayleigh', beta=0, alpha=2}"])
     assert scene.tissue.cells == [4, 8]
     assert scene.tissue.material.name == "fat"

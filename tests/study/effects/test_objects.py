@@ -10,32 +10,8 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.effects.judge import difference
 from softgrasp.study.effects.measure import counting
-from tests.helpers.models import (
-    LAYERS,
-    make_scene,
-)
-
-GRAVITY = {"gravity": {"g": [1.0, -9.0]}}
-
-
-WEIGHT = {"gravity": {"g": [1.0, -9.0], "hand_weight": True}}
-
-
-VISCOUS = {"damping": {"kind": "kelvin-voigt", "beta": 0.01}}
-
-
-RAYLEIGH = {"damping": {"kind": "rayleigh", "alpha": 0.4, "beta": 0.01}}
-
-
-OFF: dict[str, Any] = {"gravity": False, "damping": False, "reaction": False, "rotation": False}
-
-
-NEUTRAL: list[dict[str, Any]] = [
-    OFF,
-    {"gravity": {"g": [0.0, 0.0]}},
-    {"damping": {"kind": "rayleigh", "alpha": 0.0, "beta": 0.0}},
-    {"damping": {"kind": "rayleigh", "alpha": 0.0, "beta": 0.0, "drag": "space"}},
-]
+from tests.helpers.effects import GRAVITY, NEUTRAL, RAYLEIGH, VISCOUS, WEIGHT
+from tests.helpers.models import LAYERS, make_scene
 
 
 def objects_of_a_run(comm: MPI.Intracomm, **tables: Any) -> dict[str, int]:

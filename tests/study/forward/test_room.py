@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,14 +18,6 @@ from softgrasp.study.pictures.frames import Frames
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.ranks
-
-
-@pytest.fixture
-def small_files() -> Iterator[Callable[[int], None]]:
-    """Limit the size of the files of this process."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_fields_without_room_leave_a_restart_file(
