@@ -16,18 +16,19 @@ from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.linearise import finite_problem
-from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains
+from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains, fast_order
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.target import rest
-from softgrasp.study.control.result import FiniteLoop, LoopRuns, ReducedLoopRun
+from softgrasp.study.control.result import ControlStudy, FiniteLoop, LoopRuns, ReducedLoopRun, a_priori
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import move_steps
 from softgrasp.study.shell.timing import repeated
 
 NEAR = 0.01  # of the way, which a loop that settles comes to
+SHOWN_MODES = 20  # whose poles are drawn
 TICKS = 1000  # behind the time of one tick of the controller
 
 
@@ -115,3 +116,17 @@ def run_loops(
         loop.destroy()
     to_come = predicted_cost(problem, design.solution, full.final - design.target.state)
     return LoopRuns(plan, full, to_come, tuple(reduced), law.bound(problem.layout.n_s))
+
+
+def pole_sets(study: ControlStudy) -> dict[str, np.ndarray]:
+    """Poles with the optimal and the a-priori gain and without any, on the lowest modes. Collective."""
+    design, loop, basis = study.design, study.design.judge.loop, a_priori(study.bases)
+    K = design.gain.block
+    sets = {
+        "without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))),
+        ("modal gain" if design.modal else "optimal gain"): loop.poles(K),
+    }
+    best = None if basis is None else basis.best(fast_order(design.problem.layout.n_s))
+    if best is not None and best.gain is not None:
+        sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(best.gain.block)
+    return {name: p[np.argsort(np.abs(p))][: 2 * SHOWN_MODES] for name, p in sets.items()}

@@ -13,10 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.design.orders import BasisGains, fast_order
+from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.bode import figure_bode
-from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned, a_priori
+from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories, figure_loop_move
@@ -36,7 +36,6 @@ QUANTITIES = (
 )
 TOP = 1.0  # errors above 100 % are not drawn
 LOWEST = 1e-12  # smaller excess cost is rounding
-SHOWN_MODES = 20
 CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.2, "color": style.UNSTABLE}
 
 
@@ -137,22 +136,8 @@ def _few_ticks(ax: Any, lam: Sequence[float], mu: Sequence[float]) -> None:
         axis.set_ticks([], minor=True)
 
 
-def pole_sets(study: ControlStudy) -> dict[str, Poles]:
-    """Poles with the optimal and the a-priori gain and without any, on the lowest modes. Collective."""
-    design, loop, basis = study.design, study.design.judge.loop, a_priori(study.bases)
-    K = design.gain.block
-    sets = {
-        "without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))),
-        ("modal gain" if design.modal else "optimal gain"): loop.poles(K),
-    }
-    best = None if basis is None else basis.best(fast_order(design.problem.layout.n_s))
-    if best is not None and best.gain is not None:
-        sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(best.gain.block)
-    return {name: p[np.argsort(np.abs(p))][: 2 * SHOWN_MODES] for name, p in sets.items()}
-
-
 def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Frames) -> list[Path]:
-    """All figures and the animation. Rank 0 only."""
+    """All figures but that of the re-tuning, and the animation. Rank 0 only."""
     design, loops, full = study.design, study.loops, study.loops.full
     files = _move(out, study, frames) if frames.picture is not None and frames.states else []
     files += figure_histories(
@@ -162,8 +147,6 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
     )  # fmt: skip
     if any(b.reports for b in study.bases):
         files += figure_reduced(study.bases, out / "errors.png")
-    if study.retuned:
-        files += figure_retune(study.retuned, out / "retune.png")
     if study.margins is not None:
         files += figure_bode(study.margins, out / "bode.png")
     # rounding of the eigenvalues of the lowest modes

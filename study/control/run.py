@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -21,11 +22,12 @@ from softgrasp.lqr.design.linearise import linearised
 from softgrasp.lqr.design.orders import BasisGains, orders
 from softgrasp.lqr.design.scene import with_control
 from softgrasp.study.control.gain import run_gain, small_controller
-from softgrasp.study.control.loop import run_finite, run_loops, save_controllers
+from softgrasp.study.control.loop import pole_sets, run_finite, run_loops, save_controllers
 from softgrasp.study.control.page import sections
 from softgrasp.study.control.result import ControlStudy, Note, Retuned, a_priori, control_result
 from softgrasp.study.control.sweep import retune, sweep
 from softgrasp.study.control.tables import best_table, summary, summary_rows, tables
+from softgrasp.study.pictures.beside import beside
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
@@ -56,26 +58,21 @@ def run_control(
         notes = [Note("table", sentence)] if sentence else []
         if gain_only:
             return run_gain(session, model, watch, solver_bar(bar, model), notes, restart)
-        study, frames = control_model(session, model, watch, bar, notes, restart)
-    fields = frames.close()
+        study, fields, others = control_model(session, model, watch, bar, notes, restart)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         target = study.design.target if study.finite is None else study.finite.target
         saved = save_controllers(study.design, study.controller, out, target.state)
-    poles = {}
-    if session.pictures:
-        from softgrasp.study.control.plots import pole_sets  # brings Matplotlib
-
-        poles = pole_sets(study)
     seconds = {**model.watch.seconds, **watch.seconds}
     result = control_result(study, seconds)
 
     def page() -> Page:
         drawn: list[Path] = []
-        if session.pictures:
-            from softgrasp.study.control.plots import draw_all
+        if session.pictures and study.retuned:
+            from softgrasp.study.control.plots import figure_retune  # brings Matplotlib
 
-            drawn = draw_all(out, study, poles, frames)
+            drawn += figure_retune(study.retuned, out / "retune.png")
+        drawn += others()
         title = f"{model.scene.name}: optimal feedback"
         parts, files = sections(study, seconds, drawn), [*drawn, *fields, *saved]
         return Page(title, summary(study), parts, tables(study), files)
@@ -99,17 +96,17 @@ def restart_folder(model: Model, out: Path) -> Path | None:
 
 def control_model(
     session: Session, model: Model, watch: Stopwatch, bar: Progress, notes: list[Note], restart: Path | None = None
-) -> tuple[ControlStudy, Frames]:
-    """Solve, reduce, re-tune and close the loop of a scene with a control table. Collective.
+) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
+    """Solve, reduce, close the loop of a scene with a control table, and re-tune while that is drawn. Collective.
 
     ``watch`` takes the seconds of the stages; more is added to ``notes``; ``restart`` is the folder of restart files.
+    Returned are also the field files, and what waits for the pictures on rank 0.
     """
     own_end = not notes  # a scene made for control says how long its loop runs
     finite_strain = model.system.points is not None
     linear = linearised(model)
     feedback = design(linear, watch, solver_bar(bar, model), restart)
     bases: tuple[BasisGains, ...] = ()
-    retuned: tuple[Retuned, ...] = ()
     notes, duration = list(notes), plan(feedback, own_end)
     if feedback.modal:
         sentence = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
@@ -120,13 +117,7 @@ def control_model(
             bases = sweep(feedback, sizes, counted(bar, "reduced equations"))
         with watch.stage("bounds"):
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
-        with watch.stage("retune"):
-            if finite_strain and model.system.gravity is not None:
-                retuned, why = (), "the stiffness is that of the equilibrium, which moves with the material"
-            else:
-                retuned, why = retune(feedback, bases, duration, counted(bar, "re-tuning"))
         notes += [Note("orders", few)] if few else []
-        notes += [Note("retune", f"no re-tuning: {why}")] if why else []
     controller, tick, refused = small_controller(feedback, a_priori(bases))
     notes += refused
     sampled = feedback.quality.sampled
@@ -141,7 +132,34 @@ def control_model(
     if finite_strain:
         with watch.stage("finite strain"):
             finite = run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
-    return ControlStudy(feedback, bases, retuned, controller, tick, loops, tuple(notes), finite), frames
+    study = ControlStudy(feedback, bases, (), controller, tick, loops, tuple(notes), finite)
+    fields, drawn = frames.close(), _drawn(session, study, frames)
+    if feedback.modal:
+        return study, fields, drawn
+    retuned: tuple[Retuned, ...] = ()
+    with watch.stage("retune"):
+        if finite_strain and model.system.gravity is not None:
+            why = "the stiffness is that of the equilibrium, which moves with the material"
+        else:
+            retuned, why = retune(feedback, bases, duration, counted(bar, "re-tuning"))
+    notes += [Note("retune", f"no re-tuning: {why}")] if why else []
+    return replace(study, retuned=retuned, notes=tuple(notes)), fields, drawn
+
+
+def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[], list[Path]]:
+    """Begin to draw on rank 0. Collective."""
+    if not session.pictures:
+        return list
+    poles = pole_sets(study)
+    if session.comm.rank != 0:
+        return list
+
+    def draw(out: Path) -> list[Path]:
+        from softgrasp.study.control.plots import draw_all  # brings Matplotlib
+
+        return draw_all(out, study, poles, frames)
+
+    return beside(session.comm, session.out, draw)
 
 
 def unused_rate(model: Model) -> list[Note]:

@@ -165,16 +165,22 @@ class Frames:
         if self.picture is None or not self.states:
             return []
         from softgrasp.study.pictures.animation import gif_move  # these bring Matplotlib
+        from softgrasp.study.pictures.beside import beside
         from softgrasp.study.pictures.body import figure_move
         from softgrasp.study.pictures.traces import figure_traces
 
-        scene = self.model.scene
+        scene, picture = self.model.scene, self.picture
         table = np.column_stack([run.times, run.q_s])
         target = scene.motion.target
         states = np.stack(self.states)
         times = np.array(self.times)
-        chosen = list(range(len(times))) if self.few else pick_instants(self.picture, states, times, table)
-        files = [*figure_move(self.picture, states[chosen], times[chosen], table, target, directory / "move.png")]
+
+        def moving(out: Path) -> list[Path]:
+            return [] if self.few else [gif_move(picture, states, times, table, target, out / "move.gif")]
+
+        moved = beside(self.model.system.layout.comm, directory, moving)
+        chosen = list(range(len(times))) if self.few else pick_instants(picture, states, times, table)
+        files = [*figure_move(picture, states[chosen], times[chosen], table, target, directory / "move.png")]
         files += figure_traces(
             run.times,
             run.outputs,
@@ -182,11 +188,9 @@ class Frames:
             run.q_s,
             directory / "traces.png",
             rigid=run.outputs_rigid,
-            dimension=self.picture.dimension,
+            dimension=picture.dimension,
         )
-        if not self.few:
-            files.append(gif_move(self.picture, states, times, table, target, directory / "move.gif"))
-        return files
+        return files + moved()
 
 
 def _series(begun: int) -> str:

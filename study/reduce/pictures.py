@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,62 +12,33 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_displacement
-from softgrasp.fem.model.build import Model
+from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.bases.registry import PAPER_METHODS
-from softgrasp.reduction.replay import FullRun, replay_linear
 from softgrasp.study.pictures.animation import Film, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import seen, shadow, speed_up
 from softgrasp.study.pictures.style import COLUMN, HAND, ORANGE, WIDTH, paper_style, save, segments
 from softgrasp.study.reduce import plots
-from softgrasp.study.reduce.result import MethodSweep, ReductionStudy, nearest
+from softgrasp.study.reduce.result import MethodSweep
+from softgrasp.study.reduce.views import View, Views
 
-MODES = 4  # a method
-FRAMES = 30
 INSTANTS = 3  # at most, in the still picture
 ROOM = 0.25  # between two bodies there, over the size of the body
 STRETCH = 0.15  # largest displacement of a drawn mode over the size of the body
 FULL: dict[str, Any] = {"color": ORANGE, "linewidth": 1.1}
-MANY_VERTICES = 200_000  # above, no pictures of the body
 
 
-@dataclass(frozen=True)
-class View:
-    """One reduced model for the eye."""
-
-    title: str  # method and N
-    stable: bool  # of the model
-    error: float  # of its deformation
-    states: Array  # vertex displacements of its run at the frames, (k, n, d) [m]
-
-
-@dataclass(frozen=True)
-class Views:
-    """What the pictures need, on rank 0."""
-
-    picture: PictureMesh  # the body
-    times: Array  # of the frames, (k,) [s]
-    table: Array  # the hand, columns time and q_s, (steps + 1, 1 + n_s) [s, m, rad]
-    full: Array  # vertex displacements of the full run at the frames, (k, n, d) [m]
-    reduced: tuple[View, ...]  # models to compare
-    # title and vertex displacements (k, n, d) of the first modes of some methods, largest entry 1; whether they are
-    # absolute displacements, that take the hand along
-    modes: tuple[tuple[str, Array, bool], ...]
-
-
-def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
-    """All figures. Rank 0 only."""
+def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | None) -> list[Path]:
+    """All figures; ``full`` are the seconds of the full model's steps. Rank 0 only."""
     files: list[Path] = []
-    shown = [s for s in study.sweeps if s.points]
+    shown = [s for s in sweeps if s.points]
     if plots.of_paper(shown):
         files += plots.figure_errors(plots.of_paper(shown), out / "errors.png")
         files += plots.figure_further_errors(plots.of_paper(shown), out / "errors_state.png")
     if any(s not in plots.of_paper(shown) for s in shown):
         files += plots.figure_errors(plots.further_methods(shown), out / "errors_beyond.png")
     if shown:
-        files += plots.figure_times(shown, study.times.steps, out / "times.png")
+        files += plots.figure_times(shown, full, out / "times.png")
         files += plots.figure_sigma(shown, out / "sigma.png") or ()
     if views is not None and views.modes:
         files += figure_modes(views, out / "modes.png")
@@ -75,67 +46,6 @@ def draw(out: Path, study: ReductionStudy, views: Views | None) -> list[Path]:
         files += figure_compare(views, out / "compare.png")
         files.append(gif_compare(views, out / "compare.gif"))
     return files
-
-
-def compared(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
-    """First of the paper's methods and best of all at the N compared."""
-    first = [s for s in sweeps if s.method.key in PAPER_METHODS and s.points][:1]
-    chosen = [(s, i) for s in first if (i := nearest(s.points, stable=False)) is not None]
-    stable = [(s, i) for s in sweeps if (i := nearest(s.points)) is not None]
-    stable.sort(key=_error)
-    return chosen + [f for f in stable[:1] if f[0] not in first]
-
-
-def _error(chosen: tuple[MethodSweep, int]) -> float:
-    return chosen[0].points[chosen[1]].error_deformation
-
-
-def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> Views | None:
-    """Bring to rank 0 what the pictures need; None on other ranks and for very large bodies. Collective."""
-    if model.space.mesh.mesh.geometry.index_map().size_global > MANY_VERTICES:
-        return None
-    picture = gather_picture(model)
-    snapshots, n = run.snapshots, model.system.layout.n_local
-    chosen = np.unique(np.linspace(0, len(snapshots.steps) - 1, FRAMES + 1).round().astype(int))
-    steps = snapshots.steps[chosen]
-    full = vertex_displacement(model, snapshots.Z[:n, chosen], snapshots.q_s[:, chosen])
-    views = []
-    for s, i in compared(sweeps):
-        point, reduced = s.points[i], s.models[i]
-        with np.errstate(all="ignore"):  # an unstable model may overflow
-            motion = replay_linear(reduced, model, run, allow_unstable=True)
-            z, _ = reduced.reconstruct(reduced.at(), motion.x[steps].T, motion.v_s[steps].T)
-        states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
-        if states is not None:
-            views.append(View(f"{s.method.title}, $N$ = {point.N}", point.stable, point.error_deformation, states))
-    modes = [(s.method.title, _modes(model, s, i), s.method.frame == "absolute") for s, i in modes_of(sweeps)]
-    if picture is None or full is None:
-        return None
-    table = np.column_stack([run.trajectory.times, run.trajectory.q_s])
-    shown = tuple((title, shapes, free) for title, shapes, free in modes if shapes is not None and len(shapes))
-    return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
-
-
-def modes_of(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
-    """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
-    fixed = sorted(((s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None), key=_error)
-    old = [f for f in fixed if f[0].method.key in PAPER_METHODS][:1]
-    new = [f for f in fixed if f[0].method.key not in PAPER_METHODS]
-    new = ([f for f in new if not f[0].method.snapshots] or new)[:1]
-    return old + new
-
-
-def _modes(model: Model, s: MethodSweep, i: int) -> Array | None:
-    """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
-    layout = model.system.layout
-    lift = s.models[i].lift
-    if lift is None:
-        return None
-    Q = lift.L_q[:, 2 * layout.n_s :]
-    largest = layout.comm.allreduce(np.abs(Q).max(axis=0, initial=0.0), np.maximum)
-    kept = np.flatnonzero(largest > 1e-12 * largest.max(initial=0.0))[:MODES]
-    shapes = vertex_displacement(model, Q[:, kept] / largest[kept], np.zeros((layout.n_s, len(kept))))
-    return None if shapes is None else np.asarray(shapes)
 
 
 def figure_modes(views: Views, out_png: Path) -> tuple[Path, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Unpack
@@ -15,13 +15,16 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
+from softgrasp.reduction.replay import FullRun
+from softgrasp.study.pictures.beside import beside
 from softgrasp.study.reduce import tables
 from softgrasp.study.reduce.box import measure_box
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.page import sections
-from softgrasp.study.reduce.result import BoxTests, MethodSweep, ReductionStudy, best, head_of
+from softgrasp.study.reduce.result import BoxTests, FullTimes, MethodSweep, ReductionStudy, best, head_of
 from softgrasp.study.reduce.sweep import chosen_methods, sweep
 from softgrasp.study.reduce.times import measured_run, speed_notes, speed_of
+from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
@@ -77,18 +80,13 @@ def run_reduce(
     model = session.model(scene)
     watch = Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
-        study = reduce_model(model, names, bar, watch)
+        study, drawn = reduce_model(session, model, names, bar, watch)
     with watch.stage("models"):
         models = save_models(out, study.sweeps)
-    views = None
-    if session.pictures:
-        from softgrasp.study.reduce.pictures import draw, gather_views  # brings Matplotlib
-
-        views = gather_views(model, study.full, study.sweeps)
     result = reduce_result(study, watch)
 
     def page() -> Page:
-        files = draw(out, study, views) if session.pictures else []
+        files = drawn()
         parts = sections(study, files)
         points = {"points.csv": tables.point_table(study)}
         return Page(f"{scene.name}: reduced models", tables.summary(study), parts, points, [*files, *models])
@@ -98,8 +96,12 @@ def run_reduce(
     return result
 
 
-def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopwatch) -> ReductionStudy:
-    """Full run, every method, errors over the box. Collective.
+def reduce_model(
+    session: Session, model: Model, names: Sequence[str], bar: Progress, watch: Stopwatch
+) -> tuple[ReductionStudy, Callable[[], list[Path]]]:
+    """Full run, every method, errors over the box, beside which pictures are drawn. Collective.
+
+    Returned with the study: what waits for the pictures on rank 0.
 
     Raises:
         SolverError: a solve failed or a factorisation did.
@@ -126,13 +128,32 @@ def reduce_model(model: Model, names: Sequence[str], bar: Progress, watch: Stopw
             sweeps.append(sweep(name, full, scene.reduction, reduced))
             bar.update(task, completed=size * len(sweeps))
     bar.remove_task(task)
+    drawn = _drawn(session, full, sweeps, times)
     task = bar.add_task("other parameters", total=None)
     with watch.stage("box"):
         box = measure_box(full, sweeps, lambda done, of: bar.update(task, completed=done, total=of))
     bar.remove_task(task)
     speeds = tuple(speed for s in sweeps if (speed := speed_of(s, times)) is not None)
     notes = speed_notes(model.system.layout.n_e, scene.time.steps, times, speeds)
-    return ReductionStudy(full, tuple(sweeps), times, speeds, box, findings(sweeps), notes)
+    return ReductionStudy(full, tuple(sweeps), times, speeds, box, findings(sweeps), notes), drawn
+
+
+def _drawn(
+    session: Session, full: FullRun, sweeps: Sequence[MethodSweep], times: FullTimes
+) -> Callable[[], list[Path]]:
+    """Begin to draw on rank 0. Collective."""
+    if not session.pictures:
+        return list
+    views = gather_views(full.model, full, sweeps)
+    if session.comm.rank != 0:
+        return list
+
+    def draw_all(out: Path) -> list[Path]:
+        from softgrasp.study.reduce.pictures import draw  # brings Matplotlib
+
+        return draw(out, sweeps, times.steps, views)
+
+    return beside(session.comm, session.out, draw_all)
 
 
 def save_models(out: Path, sweeps: Sequence[MethodSweep]) -> list[Path]:

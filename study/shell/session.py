@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -108,7 +109,7 @@ class Session:
 
         Args:
             scene: as it was run.
-            result: what result.json holds, equal on all ranks.
+            result: what result.json holds, equal on all ranks; rank 0 adds the wait for pictures and the CPU times.
             page: draws and composes the rest; called on rank 0 only, so it must not communicate.
             clock: add the times.
 
@@ -121,9 +122,9 @@ class Session:
                 self.out.mkdir(parents=True, exist_ok=True)
                 before = read_result(self.out).get("files", [])
                 files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
-                drawing = time.perf_counter(), time.process_time()
+                drawing = time.perf_counter(), sum(os.times()[:4])
                 content = page()
-                now = time.perf_counter(), time.process_time()
+                now = time.perf_counter(), sum(os.times()[:4])
                 files += [table.write_csv(self.out / name) for name, table in content.tables.items()]
                 files += content.files
                 line = command_line(self.command, self.path, self.overrides, self.comm.size, content.options)
@@ -135,7 +136,7 @@ class Session:
                 if clock:
                     result.setdefault("time", {}).update(
                         pictures=now[0] - drawing[0], total=time.perf_counter() - self.begin,
-                        pictures_cpu=now[1] - drawing[1], total_cpu=time.process_time(),
+                        pictures_cpu=now[1] - drawing[1], total_cpu=sum(os.times()[:4]),
                     )  # fmt: skip
                 result["files"] = [f.relative_to(self.out).as_posix() for f in files if f.is_relative_to(self.out)]
                 write_json(self.out / "result.json", result)

@@ -25,11 +25,12 @@ from softgrasp.reduction.parameters import grid_of, outside, training_of, traini
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
 from softgrasp.study.reduce.box import box_models, measure_box
-from softgrasp.study.reduce.pictures import gather_views, instants
+from softgrasp.study.reduce.pictures import instants
 from softgrasp.study.reduce.result import FullTimes
 from softgrasp.study.reduce.run import run_reduce
 from softgrasp.study.reduce.sweep import FURTHER, sweep
 from softgrasp.study.reduce.times import speed_of
+from softgrasp.study.reduce.views import gather_views
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, make_scene
 
