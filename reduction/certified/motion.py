@@ -21,7 +21,7 @@ from softgrasp.reduction.online import ReducedTrajectory, consistent
 from softgrasp.reduction.propagator import propagator
 
 Materials = tuple[LayerMaterial, ...]
-SLOW = 0.3  # angle of a mode in a step below which smoothing its residual gains less than 1 % of the bound
+SLOW = 1.0  # angle of a mode in a step below which smoothing its residual gains a few per cent of the bound
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def modal_residual(
     """Residual of a run in modes: what the modes are not modes of, (K - omega^2 M) Phi X y + (G - M Phi X g) c.
 
     It uses b' + alpha b = -omega^2 y - g c of the reduced equations, y = eta + beta eta', so that it has k + n_s
-    coefficients a step instead of 2 k + n_s; the triangles are brought to that size once a parameter.
+    coefficients a step instead of 2 k + n_s, and Phi' r = 0; the triangles are brought to that size once a parameter.
 
     Args:
         y: (k, steps + 1).
@@ -186,18 +186,21 @@ def modal_residual(
         c_0: at a start in equilibrium, (n_s,); else None.
         dt: step [s]; modes that turn by less than :data:`SLOW` in it are not smoothed and leave nothing at the middles.
     """
-    slow = int(np.searchsorted(m.omega * dt, SLOW))
-    middles = np.vstack([c, 0.5 * (y[slow:, 1:] + y[slow:, :-1])])
-    nodes, left = nodal(middles, None if c_0 is None else np.concatenate([c_0, y[slow:, 0]]))
-    G, M, K, _ = norms.columns("static", materials)
-    static = _triangle([G - M @ (m.X @ m.g), K @ m.X - (M @ m.X) * m.omega**2])
-    static *= norms.static_factor(materials)
-    X = m.X[:, slow:]
-    G, M, K, _ = norms.columns("mass", materials)
-    mass = _triangle([G - M @ (m.X @ m.g), K @ X - (M @ X) * m.omega[slow:] ** 2])
-    n_s = len(c)
-    at_steps = static @ np.vstack([nodes[:n_s], y[:slow], nodes[n_s:]])
-    return Residual(at_steps, norms.mass_factor(materials) * lengths(mass @ left))
+    slow, n_s, norms = int(np.searchsorted(m.omega * dt, SLOW)), len(c), norms.galerkin
+
+    def columns(which: Literal["static", "mass"], first: int) -> Array:
+        G, M, K, _ = norms.columns(which, materials)
+        X = m.X[:, first:]
+        A = K @ X - M @ (X * m.omega[first:] ** 2)
+        return _triangle([A[:, : slow - first], G - M @ (m.X @ m.g), A[:, slow - first :]])
+
+    middles, steps = np.empty((n_s + len(y) - slow, c.shape[1])), np.empty((n_s + len(y), y.shape[1]))
+    middles[:n_s], steps[:slow] = c, y[:slow]
+    np.add(y[slow:, 1:], y[slow:, :-1], out=middles[n_s:])
+    middles[n_s:] *= 0.5
+    _, left = nodal(middles, None if c_0 is None else np.concatenate([c_0, y[slow:, 0]]), steps[slow:])
+    rest = norms.mass_factor(materials) * lengths(columns("mass", slow) @ left)
+    return Residual((norms.static_factor(materials) * columns("static", 0)) @ steps, rest)
 
 
 def _triangle(columns: list[Array]) -> Array:

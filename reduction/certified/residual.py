@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import scipy.linalg
 from mpi4py import MPI
 from slepc4py import SLEPc
 
@@ -26,6 +27,7 @@ from softgrasp.fem.solve.solvers import choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem, LayerMaterial
 from softgrasp.reduction.galerkin import unit_coupling
 
+DEPENDENT = 1e-8  # of the longest mode: shorter rests are not sure to be orthogonal to a residual
 DROPPED = 1e-14  # of a column's own length: what is left of it is rounding
 PREFIX = "softgrasp_certified_"
 MARGIN = 1.01  # of the largest frequency, which the iteration meets from below
@@ -55,6 +57,13 @@ class ResidualNorms:
         """Of the first k modes: leading blocks."""
         width = len(self.reference) * (self.n_s + 3 * k)
         return replace(self, static=_leading(self.static, width), mass=_leading(self.mass, width))
+
+    @cached_property
+    def galerkin(self) -> ResidualNorms:
+        """The same for residuals with Phi' r = 0: these have no part in the rows of K_r Phi, nor of M_r Phi."""
+        static = _beyond(self.static, self.columns("static", self.reference)[2])
+        mass = _beyond(self.mass, self.columns("mass", self.reference)[1])
+        return replace(self, static=static, mass=mass)
 
     @cached_property
     def _parts(self) -> dict[str, tuple[Array, Array]]:
@@ -111,6 +120,13 @@ def _leading(T: Array, width: int) -> Array:
     columns = T[:, :width]
     used = np.flatnonzero(columns.any(axis=1))
     return np.ascontiguousarray(columns[: int(used[-1]) + 1 if len(used) else 1])
+
+
+def _beyond(T: Array, B: Array) -> Array:
+    """Rows of T turned such that those in the range of B come first, without these; all where nothing else is left."""
+    Q, R, _ = scipy.linalg.qr(B, pivoting=True)
+    rank = int(np.count_nonzero(abs(np.diag(R)) > DEPENDENT * abs(R[0, 0])))
+    return T if rank == len(T) else np.asarray(Q[:, rank:].T @ T)
 
 
 class Orthonormal:

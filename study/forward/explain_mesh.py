@@ -12,6 +12,7 @@ from softgrasp.study.forward.accuracy import judge, percent
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import Model
 
+WORTH, MOST = 4.0, 25_000  # [s] predicted, and unknowns: a dearer estimate is left to simulate --certify
 LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
 
 
@@ -32,7 +33,7 @@ class MeshReport:
     order: float  # expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1]
     graded: bool  # whether cells shrink towards the ends
     first: bool  # whether a run may refine this mesh further
-    # estimate, bound: relative error of the deformation [1]; None where the estimate costs more than a second
+    # estimate, bound: relative error of the deformation [1]; None where the estimate takes long
     estimate: float | None
     bound: float | None
     time_error: float | None  # that of the time steps [1]
@@ -53,7 +54,7 @@ def mesh_report(model: Model) -> MeshReport:
     graded = refine is not None and refine.grading != "off"
     edges = graded and tissue.dimension == 3 and not by_lines(scene)
     order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
-    error = judge(model, 0.0, False)[0]
+    error = judge(model, WORTH if model.system.layout.n_e <= MOST else 0.0, False)[0]
     values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
     first = refine is not None and refine.tolerance is not None and refine.passes > 0
     return MeshReport(kinds, order, graded, first, *values)
@@ -61,9 +62,10 @@ def mesh_report(model: Model) -> MeshReport:
 
 def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
     """The report in sentences."""
-    place = "points" if dimension == 2 else "edges"
+    place = "point" if dimension == 2 else "edge"
     lines = [
-        f"At {e.count} {place} of kind '{e.kind}' the displacement grows like r^{e.alpha:.3g}." for e in report.ends[:6]
+        f"At {e.count} {place}{'s' * (e.count > 1)} of kind '{e.kind}' the displacement grows like r^{e.alpha:.3g}."
+        for e in report.ends[:6]
     ]
     if len(report.ends) > len(lines):
         lines.append(f"{len(report.ends) - len(lines)} more kinds of ends have larger exponents.")
@@ -82,6 +84,6 @@ def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
         )
     else:
         lines.append(
-            "The error of the mesh is not estimated here, as it takes more than a second; simulate --certify does it."
+            "The error of the mesh is not estimated here, as that takes some time; simulate --certify does it."
         )
     return lines

@@ -82,14 +82,7 @@ def advice(shares: dict[str, float]) -> str:
 
 
 class Answers:
-    """Answers for one study; ``measured`` are the points that were made for them. Its methods are collective.
-
-    Args:
-        scene: the study's scene.
-        runs: of the full model.
-        truth: reference solution.
-        forward, reduced: points of the diagrams.
-    """
+    """Answers for one study; ``measured`` are the points that were made for them. Its methods are collective."""
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ from softgrasp.study.precision.settings import (
 
 SHARES = (2.0, 1.0, 0.5, 0.25, 0.125)  # of the scene's steps
 CG_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)
-SLOW_SECONDS = 30.0  # of a run by CG, after which no tighter tolerance is tried
+SLOW_SECONDS = 30.0  # of a run by CG, beyond which neither it nor a tighter tolerance is tried
 FINEST = 3  # even meshes, or numbers of steps, behind a slope: coarser ones may not resolve ends or motion
 CLEAR = 2.0  # times the error of the reference, from which on an error has an order
 
@@ -56,14 +56,7 @@ def solver_settings(scene: Scene, steps: int | None = None) -> list[Setting]:
 
 
 def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | None = None) -> ForwardPoint:
-    """A run as a point of the diagram; its error may be anything in ``error_range``.
-
-    Args:
-        setting: of the run.
-        run: measured.
-        truth: what its outputs are compared with.
-        finest: the run with the most steps on the same mesh, when this is not it.
-    """
+    """A run as a point of the diagram; ``finest`` is the run with the most steps on its mesh, when this is not it."""
     error, displacement = errors_of(run.series, truth.series)
     change = None if finest is None else errors_of(run.series, finest.series)[0]
     names = ("n_e", "states", "dt", "mesh", "assembly", "factor", "per_step", "p50", "p99", "max")
@@ -75,13 +68,7 @@ def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | N
 
 
 def ask_forward(runs: FullRuns, truth: Truth, ends: Ends) -> Question:
-    """Run all settings of the diagram. Collective.
-
-    Args:
-        runs: of the full model.
-        truth: reference solution.
-        ends: singular ends of the body.
-    """
+    """Run all settings of the diagram. Collective."""
     points = list(_points(runs, truth))
     slopes = forward_slopes(points, truth, orders(runs.scene, ends, runs.dimension))
     return Question(tuple(points), tuple(slopes), truth)
@@ -118,11 +105,24 @@ def _points(runs: FullRuns, truth: Truth) -> Iterator[ForwardPoint]:
     n_e = runs.run(own).n_e
     steps = next((n for n in counts if n <= own.steps and n_e * n <= POINT_WORK[d]), counts[-1])
     usual = runs.run(replace(own, steps=steps)).series
+    tried: list[ForwardPoint] = []
     for setting in solver_settings(scene, steps):
-        run = runs.run(setting)
-        yield replace(to_point(setting, run, truth), error_solver=errors_of(run.series, usual)[0])
-        if setting.solver == "cg" and run.seconds > SLOW_SECONDS:
+        if setting.solver == "cg" and (seconds := runs.expected(setting)) > SLOW_SECONDS:
+            tried.append(too_slow(tried[-1], setting, seconds))
             break
+        run = runs.run(setting)
+        tried.append(replace(to_point(setting, run, truth), error_solver=errors_of(run.series, usual)[0]))
+    yield from tried
+
+
+def too_slow(other: ForwardPoint, setting: Setting, seconds: float) -> ForwardPoint:
+    """A setting that was not run, with its expected seconds; ``other`` is on the same mesh."""
+    lost, step = float("inf"), seconds / setting.steps
+    return replace(
+        other, label=setting.label, solver=setting.solver, rtol=setting.rtol, ok=False, seconds=seconds, error=lost,
+        error_displacement=lost, error_range=(0.0, lost), error_solver=None, factor=lost, per_step=step, p50=step,
+        p99=step, max=step,
+    )  # fmt: skip
 
 
 def on_meshes(points: Sequence[ForwardPoint]) -> dict[str, list[ForwardPoint]]:
@@ -145,11 +145,6 @@ def forward_slopes(
     """Orders: of the error in n_e^(1/d), of the change in the steps, of time in the unknowns.
 
     Errors nearer than :data:`CLEAR` times that of the reference tell no order.
-
-    Args:
-        points: of the diagram.
-        truth: what they were compared with.
-        expected: see :func:`orders`.
     """
     slopes: list[Slope] = []
     d = truth.series.dimension

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import statistics
 import time
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,16 +24,15 @@ LONG_SECONDS = 5.0  # a run that takes longer is its own average, and is not rep
 BUILD_SECONDS = 2.0  # builds are repeated about this long
 
 
-class FullRuns:
-    """Runs of one scene under many settings, cached; the model of the last mesh is kept. Collective.
+@dataclass(frozen=True)
+class Pace:
+    """Of a run."""
 
-    Args:
-        scene: the study's scene.
-        places: of its outputs.
-        reference: point that the hand turns about.
-        cache: of measured runs.
-        guard: asked before each run.
-    """
+    seconds: float  # of its second step
+
+
+class FullRuns:
+    """Runs of one scene under many settings, cached; the model of the last mesh is kept. Collective."""
 
     def __init__(self, scene: Scene, places: Places, reference: Array, cache: Cache, guard: Guard) -> None:
         self.scene, self.places, self.cache, self.guard = scene, places, cache, guard
@@ -51,6 +51,16 @@ class FullRuns:
         key = {"setting": setting.parameters | {"rtol": setting.rtol}, "repeats": count}
         self.guard.next(setting.label)
         return self.cache.get("run", key, TimedRun, lambda: [self._measure(setting, count)])[0]
+
+    def expected(self, setting: Setting) -> float:
+        """Seconds of the steps of a setting, from its second one; the first sets up the solver."""
+
+        def second_step() -> list[Pace]:
+            _, probe, _ = self._built(setting, 1)
+            return [Pace(float(run_probed(self.model(setting), probe, 2).stamps[1]))]
+
+        key = {"setting": setting.parameters | {"rtol": setting.rtol}}
+        return setting.steps * self.cache.get("pace", key, Pace, second_step)[0].seconds
 
     def _built(self, setting: Setting, repeats: int) -> tuple[Model, Probe, dict[str, float]]:
         """Model and probe of a mesh, with the median seconds of its builds; the first build also compiles."""

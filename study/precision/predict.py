@@ -37,11 +37,6 @@ class Predictor:
 
     The change between s and S steps of order 2 is (1 - (s / S)^2) of the error with s, and the error with S is a
     quarter of that with S / 2. Graded meshes between and beyond those run follow them in their tolerance.
-
-    Args:
-        scene: the study's scene.
-        points: of the forward diagram.
-        d: 2 or 3.
     """
 
     def __init__(self, scene: Scene, points: Sequence[ForwardPoint], d: int) -> None:

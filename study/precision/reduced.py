@@ -56,14 +56,7 @@ class TimedModel(Point):
 
 
 class ReducedRuns:
-    """Reduced models of one mesh and step; the full run is made when the first point is not in the cache. Collective.
-
-    Args:
-        scene: the study's scene.
-        setting: of the full run behind the bases.
-        runs: of the full model.
-        truth: reference solution.
-    """
+    """Reduced models of one mesh and step; the full run is made when the cache lacks a point. Collective."""
 
     def __init__(self, scene: Scene, setting: Setting, runs: FullRuns, truth: Truth) -> None:
         self.scene, self.setting, self.runs, self.truth = scene, setting, runs, truth

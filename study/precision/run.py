@@ -97,13 +97,6 @@ def study_scene(
 ) -> WorkStudy:
     """Reference, points of every question, slopes and answers. Collective.
 
-    Args:
-        scene: the scene.
-        comm: ranks.
-        cache: folder of the cached points.
-        request: questions, tolerance and budget; None stands for all questions and no answer.
-        progress: called before each point with its name and the share of points done.
-
     Raises:
         SoftgraspError: a scene that cannot be built, a failed solve, or an interruption.
     """

@@ -200,8 +200,12 @@ def few_steps(scene: Scene) -> int:
     return n // 2 if n >= 2 * max(FEW_STEPS, least_steps(scene)) else n
 
 
-def contraction(changes: list[float]) -> float:
-    """By what errors fall from mesh to mesh, from the last changes of the solution: the larger ones are cautious."""
-    if len(changes) < 2 or not changes[-2] > 0:
-        return SLOWEST
-    return float(np.clip(changes[-1] / changes[-2], FASTEST, SLOWEST))
+def contraction(changes: list[float], growth: float) -> float:
+    """By what errors fall from mesh to mesh: as the last changes of the solution do, one alone like 1 / n_e.
+
+    Args:
+        changes: of the solution from mesh to mesh.
+        growth: of the unknowns in the last of them.
+    """
+    ratio = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else 1 / growth
+    return float(np.clip(ratio, FASTEST, SLOWEST))

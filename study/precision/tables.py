@@ -114,6 +114,8 @@ def _error(point: RunPoint) -> float | str:
 def _why(p: WorkPoint) -> str:
     """What is wrong with a point, in a word or two."""
     match p:
+        case ForwardPoint():
+            return "too slow"
         case RiccatiPoint():
             return "not reached"
         case ReducedRiccatiPoint():

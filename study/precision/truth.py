@@ -6,7 +6,7 @@ with the scene's steps S, few steps s, a-priori graded meshes of falling toleran
 which time is refined by the order 2 of the midpoint rule: both at once would cost the product. With changes d1, d2 of
 the solution to the last two meshes and q = d2 / d1 the error estimate adds up
 
-    space: d2 q / (1 - q), what is left of errors that fall like q^k
+    space: d2 q / (1 - q), what is left of errors that fall like q^k; q = 1 / growth of n_e where d1 is not there
     time:  the second term of y* itself
     mixed: the change of y through the steps on m, times that through the mesh, both relative.
 """
@@ -26,12 +26,12 @@ from softgrasp.study.precision.probe import Series, TimedRun, largest
 from softgrasp.study.precision.result import Truth
 from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits
 
-ORDER = {2: 3, 3: 2}  # of the elements, by dimension
+ORDER = 3  # of the elements
 LADDER = tuple(round(a * 10.0**-k, 12) for k in range(1, 7) for a in (3.0, 1.0))  # tolerances of the meshes
 FINEST = {2: 1e-4, 3: 3e-3}  # of them, without a tolerance to answer for
 ROOM = 0.1  # of that tolerance
-WORK = {2: 1e7, 3: 4e6}  # unknowns times steps of the finest run: some seconds on a quiet core
-LARGEST = {2: 60_000, 3: 40_000}  # unknowns
+WORK = {2: 1e7, 3: 6e6}  # unknowns times steps of the finest run: some seconds on a quiet core
+LARGEST = {2: 60_000, 3: 60_000}  # unknowns
 TIME_WORK = {2: 8e6, 3: 2e6}  # unknowns times steps of the run behind the time part
 GROWTH = 1.6  # of unknowns from mesh to mesh, expected at least
 LEAST = 1.4  # and below this a mesh tells no more than the one before
@@ -50,15 +50,15 @@ def make_truth(scene: Scene, runs: FullRuns, tolerance: float | None = None) -> 
     aim = FINEST[d] if tolerance is None else min(FINEST[d], ROOM * tolerance)
     meshes: dict[Setting, TimedRun] = {}
     for goal in LADDER:
-        setting = Setting(None, ORDER[d], few, refine=goal)
+        setting = Setting(None, ORDER, few, refine=goal)
         sizes = [r.n_e for r in meshes.values()]
-        growth = max(GROWTH, sizes[-1] / sizes[-2]) if len(sizes) > 1 else GROWTH
+        growth = max(GROWTH, sizes[-1] / sizes[-2]) if d == 2 and len(sizes) > 1 else GROWTH  # in 3D some change little
         if sizes and (growth * sizes[-1] > LARGEST[d] or growth * sizes[-1] * few > WORK[d]):
             break
         run = runs.run(setting, 1)
         if not sizes or run.n_e > LEAST * sizes[-1]:
             meshes[setting] = run
-        if goal <= aim:
+        if goal <= aim and setting in meshes:
             break
     fit = [s for s, r in meshes.items() if r.n_e * 4 * base <= TIME_WORK[d]]
     middle = (fit or list(meshes))[-1 if fit else 0]
@@ -94,7 +94,8 @@ def combine(scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half
         return tuple(g / s if s > 0 else 0.0 for g, s in zip(largest(values, d), scale, strict=True))  # type: ignore[return-value]
 
     changes = [relative(b - a) for a, b in pairwise(values)] or [(1.0, 1.0)]
-    q = contraction([change[0] for change in changes])
+    sizes = [r.n_e for r in meshes.values()]
+    q = contraction([change[0] for change in changes], sizes[-1] / sizes[-2] if len(sizes) > 1 else 1.0)
     steps, mesh = relative(fine.series.at(few) - coarse), relative(last - coarse)
     truth = Truth(
         Series(t, total, d),

@@ -71,7 +71,10 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
     with paper_style():
         figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH, 2.7), layout="constrained")
         known = np.isfinite(bound)
-        left.semilogy(np.array(k)[known], bound[known], "o-", color=BLUE, ms=3.5, label="largest bound on the grid")
+        shown = np.maximum([*bound[known], tolerance], LEAST)  # a bound of 0, where nothing moves, has no logarithm
+        # limits first: there may be nothing to scale by
+        left.set(yscale="log", ylim=(shown.min() / 2, max(1.3, 1.3 * float(shown.max()))))
+        left.plot(np.array(k)[known], bound[known], "o-", color=BLUE, ms=3.5, label="largest bound on the grid")
         if not known.all():
             top = {"transform": left.get_xaxis_transform(), "clip_on": False}
             label = "larger than the deformation"
@@ -79,8 +82,6 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
         left.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
         left.set(xlabel="modes $k$", ylabel="relative bound")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
-        low = min([*bound[known], tolerance])
-        left.set_ylim(low / 2, max(1.3, 1.3 * float(max(bound[known], default=0.0))))
         few_ticks(left.yaxis)
         left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
         places: dict[tuple[float, float], list[int]] = {}

@@ -97,6 +97,16 @@ def test_triangles_against_dense_solves(comm: MPI.Intracomm) -> None:
         assert np.linalg.norm(X[0] @ c + X[1] @ b + X[2] @ a) == pytest.approx(
             np.sqrt(r @ np.linalg.solve(W, r)), rel=1e-9
         )
+    # without the part along K_r phi and M_r phi nothing is lost of a residual that is orthogonal to the modes
+    a = rng.standard_normal(6)
+    b = -np.linalg.solve(Phi.T @ M @ Phi, Phi.T @ (G @ c + K_at @ Phi @ a / 2))
+    r = 2 * G @ c + 2 * M @ Phi @ b + K_at @ Phi @ a
+    for which, W in (("static", K), ("mass", M)):
+        X = norms.galerkin.columns(which, other)
+        assert len(X[0]) == len(norms.columns(which, other)[0]) - 6
+        assert np.linalg.norm(X[0] @ c + X[1] @ b + X[2] @ a) == pytest.approx(
+            np.sqrt(r @ np.linalg.solve(W, r)), rel=1e-9
+        )
     # the constants of the reference norms, over random residuals and in the worst direction
     worst = scipy.linalg.eigvalsh(K, K_at)[-1] ** 0.5
     assert worst <= norms.static_factor(other) * (1 + 1e-12)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +32,24 @@ from softgrasp.study.precision import reduced as wp_reduced
 from softgrasp.study.precision import settings as wp_meshes
 from softgrasp.study.precision import truth as wp_truth
 from softgrasp.study.precision.answer import advice, parse_budget, parse_tolerance
-from softgrasp.study.precision.fit import interpolate, pareto, power_law
-from softgrasp.study.precision.forward import step_counts
-from softgrasp.study.precision.points import Request, WorkPoint
+from softgrasp.study.precision.fit import interpolate, pareto, power_law, usable
+from softgrasp.study.precision.forward import step_counts, too_slow
+from softgrasp.study.precision.points import ForwardPoint, Request, WorkPoint
 from softgrasp.study.precision.predict import balanced
 from softgrasp.study.precision.probe import find_places, largest, run_probed
 from softgrasp.study.precision.result import Part, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
-from softgrasp.study.precision.settings import Setting, even_meshes, fitted, least_steps, variant
+from softgrasp.study.precision.settings import (
+    FASTEST,
+    SLOWEST,
+    Setting,
+    contraction,
+    even_meshes,
+    fitted,
+    least_steps,
+    variant,
+)
+from softgrasp.study.precision.tables import question_table
 from softgrasp.study.reduce.run import run_reduce
 from tests.helpers.browser import look
 from tests.helpers.models import Array, graded_model, make_scene, rough_save, write_scene
@@ -459,6 +470,24 @@ def test_reference_counts_what_its_finest_mesh_leaves(fall: float) -> None:
     left = 1e-2 * fall**2 * largest(shape, 2)[0] / largest(truth.series.values, 2)[0]
     assert truth.space[0] == pytest.approx(left, rel=1e-9)
     assert truth.time[0] == 0.0
+
+
+def test_one_change_alone_falls_like_the_unknowns_grow() -> None:
+    """And never faster or slower than graded meshes were seen to."""
+    assert contraction([1e-2], 2.5) == pytest.approx(0.4)
+    assert (contraction([1e-2], 100.0), contraction([1e-2], 1.0)) == (FASTEST, SLOWEST)
+    assert contraction([1.0, 0.3], 100.0) == pytest.approx(0.3)
+
+
+def test_a_solver_that_would_take_too_long_is_a_row_without_a_run(result: dict[str, Any]) -> None:
+    row = {k: v for k, v in result["points"]["forward"][0].items() if k not in ("question", "pareto")}
+    cells = row["cells"] and tuple(row["cells"])
+    other = ForwardPoint(**row | {"cells": cells, "error_range": tuple(row["error_range"])})
+    point = too_slow(other, replace(other.setting, solver="cg", rtol=1e-4), 99.0)
+    (cells_of_row,) = question_table("forward", [point]).rows
+    assert (cells_of_row[-1], cells_of_row[-2], cells_of_row[2]) == ("too slow", 99.0, "-")
+    assert not usable([point])
+    assert point.per_step * point.steps == pytest.approx(99.0)
 
 
 def test_pareto_and_power_law() -> None:
