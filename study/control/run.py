@@ -151,8 +151,6 @@ def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[]
     if not session.pictures:
         return list
     poles = pole_sets(study)
-    if session.comm.rank != 0:
-        return list
 
     def draw(out: Path) -> list[Path]:
         from softgrasp.study.control.plots import draw_all  # brings Matplotlib

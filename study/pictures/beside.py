@@ -20,7 +20,7 @@ Draw = Callable[[Path], list[Path]]
 
 
 def beside(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path]]:
-    """Begin to draw into ``out``; the function returned waits for the files and names them. Not collective.
+    """Begin to draw into ``out``; the function returned waits for the files and names them on rank 0. Not collective.
 
     What is drawn must be on this rank already: the process has all of it by fork, nothing is copied or packed, and only
     the names come back. Several ranks have the cores taken, and their network may not bear a fork: with them, on one
@@ -29,6 +29,8 @@ def beside(comm: MPI.Intracomm, out: Path, draw: Draw) -> Callable[[], list[Path
     Raises (when they are asked for):
         Exception: what ``draw`` raised.
     """
+    if comm.rank != 0:
+        return list
     if comm.size > 1 or len(os.sched_getaffinity(0)) < 2:
         return partial(draw, out)
     context = multiprocessing.get_context("fork")

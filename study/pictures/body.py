@@ -61,30 +61,19 @@ DASHES: Any = (0, (5, 3))
 
 @dataclass(frozen=True)
 class Shot:
-    """What every view of one move shares.
+    """What every view of one move shares."""
 
-    Attributes:
-        picture: the body.
-        hands: hand coordinates at the instants, shape (k, n_s).
-        path: where the grip of the hand passes, shape (steps, d) [m].
-        norm: scale of the colours [unit]; from 0 to 0 when nothing deforms.
-        unit: factor and name of the unit of the colours.
-        low, high: corners of the scene in the plane of the picture, shape (2,) [m].
-        hand: polygons of the hand where it starts, each (corners, d); empty in 3D.
-        edges: outline and interfaces of layers in 2D, shape (m, 2); empty in 3D.
-        aim: closed lines around the body at the target in the plane of the picture, each (k, 2) [m].
-    """
-
-    picture: PictureMesh
-    hands: Array
-    path: Array
-    norm: Any
-    unit: tuple[float, str]
+    picture: PictureMesh  # the body
+    hands: Array  # hand coordinates at the instants, shape (k, n_s)
+    path: Array  # where the grip of the hand passes, shape (steps, d) [m]
+    norm: Any  # scale of the colours [unit]; from 0 to 0 when nothing deforms
+    unit: tuple[float, str]  # factor and name of the unit of the colours
+    # low, high: corners of the scene in the plane of the picture, shape (2,) [m]
     low: Array
     high: Array
-    hand: list[Array]
-    edges: Any
-    aim: list[Array]
+    hand: list[Array]  # polygons of the hand where it starts, each (corners, d); empty in 3D
+    edges: Any  # outline and interfaces of layers in 2D, shape (m, 2); empty in 3D
+    aim: list[Array]  # closed lines around the body at the target in the plane of the picture, each (k, 2) [m]
 
     def values(self, displacement: Array, q_s: Array) -> Array:
         """|u - R q_s| at the vertices in the unit of the colour bar, shape (n,)."""

@@ -182,14 +182,9 @@ class Frames:
         chosen = list(range(len(times))) if self.few else pick_instants(picture, states, times, table)
         files = [*figure_move(picture, states[chosen], times[chosen], table, target, directory / "move.png")]
         files += figure_traces(
-            run.times,
-            run.outputs,
-            run.columns,
-            run.q_s,
-            directory / "traces.png",
-            rigid=run.outputs_rigid,
+            run.times, run.outputs, run.columns, run.q_s, directory / "traces.png", rigid=run.outputs_rigid,
             dimension=picture.dimension,
-        )
+        )  # fmt: skip
         return files + moved()
 
 

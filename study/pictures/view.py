@@ -107,7 +107,7 @@ def view(folder: Path, field: str, save: Path | None) -> None:
     look = {"scalars": "value", "clim": move.range, "cmap": "viridis", "ambient": 0.4, "show_edges": True}
     look |= {
         "edge_opacity": 0.2,
-        "scalar_bar_args": {"title": move.title, "color": "black", "n_labels": 3, "fmt": "%.3g"},
+        "scalar_bar_args": {"title": f"{move.title}\n", "color": "black", "n_labels": 3, "fmt": "%.3g"},
     }
     shown = [0] if save is None else move.shown
     plotter = pyvista.Plotter(off_screen=save is not None, shape=(1, len(shown)), window_size=(1280, 640), border=False)

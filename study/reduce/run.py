@@ -145,8 +145,6 @@ def _drawn(
     if not session.pictures:
         return list
     views = gather_views(full.model, full, sweeps)
-    if session.comm.rank != 0:
-        return list
 
     def draw_all(out: Path) -> list[Path]:
         from softgrasp.study.reduce.pictures import draw  # brings Matplotlib
