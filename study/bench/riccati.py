@@ -74,7 +74,8 @@ class Record:
         try:
             old = json.loads(self.file.read_text()) if self.file.is_file() else {}
             if old.get("beta") == self.beta:
-                self.rows, self.peers = ([*adapter.validate_python(old[key])] for key in ("rows", "peers"))
+                rows, peers = (adapter.validate_python(old[key]) for key in ("rows", "peers"))
+                self.rows, self.peers = [*rows], [*peers]
         except (ValueError, KeyError, AttributeError) as error:
             raise CheckpointError(f"{self.file} holds no rows of this version; run once without --resume") from error
 
