@@ -32,8 +32,7 @@ def nodal(rows: Array, first: Array | None = None, nodes: Array | None = None) -
         first: (w,); None takes the first middle.
         nodes: where the means go; None makes room for them.
     """
-    if nodes is None:
-        nodes = np.empty((len(rows), rows.shape[1] + 1))
+    nodes = np.empty((len(rows), rows.shape[1] + 1)) if nodes is None else nodes
     nodes[:, 0] = rows[:, 0] if first is None else first
     nodes[:, -1] = rows[:, -1]
     inner = np.add(rows[:, 1:], rows[:, :-1], out=nodes[:, 1:-1])

@@ -115,6 +115,12 @@ class Certificate:
         """Relative error of the reduction in the norm asked for."""
         return (self.outputs if self.norm == "output" else self.energy).relative
 
+    def claim(self, number: str) -> str:
+        """What is known of the error, whose :attr:`reduction` is ``number`` in words."""
+        if self.reduction == np.inf:
+            return f"has a bound larger than the deformation itself (nothing is {self.how})"
+        return f"is {self.how} to be at most {number} of the {self.what}"
+
     @property
     def passed(self) -> bool:
         """Whether the error is at most the tolerance."""

@@ -161,10 +161,9 @@ class CertifiedModel:
         )  # fmt: skip
         certificate = run.certificate
         if not (allow or certificate.passed):
-            first = (materials or self.fine.materials)[0]
+            first, claim = (materials or self.fine.materials)[0], certificate.claim(f"{certificate.reduction:.2g}")
             raise ToleranceError(
-                f"the error at lambda = {first.lam:g}, mu = {first.mu:g} Pa is {certificate.how} at most "
-                f"{certificate.reduction:.2g} of the {certificate.what}, above the tolerance "
+                f"the error at lambda = {first.lam:g}, mu = {first.mu:g} Pa {claim}, above the tolerance "
                 f"{certificate.tolerance:g}; run the full model, or allow it",
                 run,
             )
@@ -231,9 +230,8 @@ class CertifiedModel:
         return result
 
     def _certificate(self, materials: Materials, answer: Motion, fine: Motion, drive: Drive) -> Certificate:
-        rigid = answer.q_s @ self.fine.outputs.C_s.T
-        size = answer.size
-        deformation = float(np.linalg.norm(answer.outputs - rigid, axis=1).max(initial=0.0))
+        size, rigid = answer.size, answer.q_s @ self.fine.outputs.C_s.T
+        deformation = float(bounds.lengths((answer.outputs - rigid).T).max())
         estimate = wide = None
         if fine is not answer:
             estimate = Bound(self._difference(materials, answer, fine, drive), size, "estimate")
@@ -285,8 +283,7 @@ class CertifiedModel:
             low, high = self.norms.frequencies(materials)
             kernel = bounds.decay(low, high, self.fine.alpha, betas.pop(), drive.dt, drive.steps)
         drift, gap, start = r.inexact or (None, None, 0.0)
-        balanced = drive.start == "equilibrium"
-        return bounds.static_bound(r.nodes, r.rest, drive.dt, balanced, kernel, drift, gap, start)
+        return bounds.static_bound(r.nodes, r.rest, drive.dt, drive.start == "equilibrium", kernel, drift, gap, start)
 
     def _reach(self, bound: Array, materials: Materials, drive: Drive) -> Array:
         """Bound of every output component from one of the energy, (steps + 1, p)."""

@@ -21,7 +21,7 @@ from softgrasp.reduction.online import ReducedTrajectory, consistent
 from softgrasp.reduction.propagator import propagator
 
 Materials = tuple[LayerMaterial, ...]
-SLOW = 1.0  # angle of a mode in a step below which smoothing its residual gains a few per cent of the bound
+SLOW = 0.25  # angle of a mode in a step below which smoothing its residual gains about 1 % of the bound
 
 
 @dataclass(frozen=True)
@@ -186,27 +186,28 @@ def modal_residual(
         c_0: at a start in equilibrium, (n_s,); else None.
         dt: step [s]; modes that turn by less than :data:`SLOW` in it are not smoothed and leave nothing at the middles.
     """
-    slow, n_s, norms = int(np.searchsorted(m.omega * dt, SLOW)), len(c), norms.galerkin
+    slow, n_s, k = int(np.searchsorted(m.omega * dt, SLOW)), len(c), len(y)
+    rows, norms = len(norms.mass), norms.galerkin
+    inertial = len(materials) > 1 or rows - len(norms.mass) < k  # else M Phi is M_r Phi but for rho, and left out
 
-    def columns(which: Literal["static", "mass"], first: int) -> Array:
-        G, M, K, _ = norms.columns(which, materials)
-        X = m.X[:, first:]
-        A = K @ X - M @ (X * m.omega[first:] ** 2)
-        return _triangle([A[:, : slow - first], G - M @ (m.X @ m.g), A[:, slow - first :]])
+    def triangle(which: Literal["static", "mass"], first: int) -> Array:
+        """R of a QR decomposition of the columns of the modes from ``first`` on, at most as many rows as columns."""
+        G, M, K = norms.columns(which, materials, 3)
+        A, at, X = np.empty((len(G), n_s + k - first), order="F"), slow - first, m.X[:, first:]
+        own = K @ X
+        if which == "static" or inertial:
+            own -= M @ (X * m.omega[first:] ** 2)
+            G = G - M @ (m.X @ m.g)
+        A[:, :at], A[:, at : at + n_s], A[:, at + n_s :] = own[:, :at], G, own[:, at:]
+        return np.triu(scipy.linalg.lapack.dgeqrf(A, overwrite_a=True)[0][: A.shape[1]])
 
-    middles, steps = np.empty((n_s + len(y) - slow, c.shape[1])), np.empty((n_s + len(y), y.shape[1]))
+    middles, steps = np.empty((n_s + k - slow, c.shape[1])), np.empty((n_s + k, y.shape[1]))
     middles[:n_s], steps[:slow] = c, y[:slow]
     np.add(y[slow:, 1:], y[slow:, :-1], out=middles[n_s:])
     middles[n_s:] *= 0.5
     _, left = nodal(middles, None if c_0 is None else np.concatenate([c_0, y[slow:, 0]]), steps[slow:])
-    rest = norms.mass_factor(materials) * lengths(columns("mass", slow) @ left)
-    return Residual((norms.static_factor(materials) * columns("static", 0)) @ steps, rest)
-
-
-def _triangle(columns: list[Array]) -> Array:
-    """R of a QR decomposition, at most as many rows as columns."""
-    A = np.concatenate(columns, axis=1)
-    return np.triu(scipy.linalg.lapack.dgeqrf(A)[0][: A.shape[1]])
+    rest = norms.mass_factor(materials) * lengths(triangle("mass", slow) @ left)
+    return Residual((norms.static_factor(materials) * triangle("static", 0)) @ steps, rest)
 
 
 def stepped_motion(

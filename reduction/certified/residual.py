@@ -78,16 +78,16 @@ class ResidualNorms:
         }
 
     def columns(
-        self, which: Literal["static", "mass"], materials: tuple[LayerMaterial, ...]
-    ) -> tuple[Array, Array, Array, Array]:
-        """A triangle at a parameter: what multiplies c, (rows, n_s), b' + alpha b, a, and b by viscosity, (rows, k)."""
+        self, which: Literal["static", "mass"], materials: tuple[LayerMaterial, ...], count: int = 4
+    ) -> tuple[Array, ...]:
+        """Blocks of a triangle at a parameter: of c, (rows, n_s), and of b' + alpha b, a, viscous b, (rows, k)."""
         (hand, tissue), rows = self._parts[which], len(self.static if which == "static" else self.mass)
         rho, mu, lam, beta = np.array([(m.rho, m.mu, m.lam, m.beta) for m in materials]).T
         weights = np.zeros((3, len(materials), 3))  # of M_1, K_mu, K_lambda
         weights[0, :, 0], weights[1, :, 1], weights[1, :, 2] = rho, mu, lam
         weights[2] = beta[:, None] * weights[1]
-        M, K, D = (weights.reshape(3, -1) @ tissue).reshape(3, rows, -1)
-        return (rho @ hand).reshape(rows, -1), M, K, D
+        own = weights[: count - 1].reshape(count - 1, -1) @ tissue
+        return (rho @ hand).reshape(rows, -1), *own.reshape(count - 1, rows, -1)
 
     def static_factor(self, materials: tuple[LayerMaterial, ...]) -> float:
         """Factor c with |r|_{K^-1} <= c |r|_{K_r^-1}: 0 <= K_lambda <= (d / 2) K_mu, since (tr e)^2 <= d e:e."""

@@ -46,10 +46,8 @@ class Answer:
             "--fallback full runs the full model, --allow shows the answer all the same" if self.run is None
             else "the full model ran instead" if self.full else "it is shown because --allow was given"
         )  # fmt: skip
-        return (
-            f"The error is {c.how} to be at most {c.reduction:.2g} of the {c.what}, which is above the tolerance "
-            f"{c.tolerance:g}; {ending}."
-        )
+        claim = c.claim(f"{c.reduction:.2g}")
+        return f"The error {claim}, which is above the tolerance {c.tolerance:g}; {ending}."
 
     @property
     def warnings(self) -> list[str]:

@@ -109,7 +109,7 @@ def _summary(answer: Answer, names: Sequence[str], seconds: float) -> list[str]:
     c, at = answer.certificate, f"At {parameters(answer.materials)}"
     off = [] if c.time_step is None else [f"that of the time step is about {percent(c.time_step)}"]
     off += [f"that of the mesh about {percent(c.mesh.largest)} of the deformation"] if c.mesh is not None else []
-    error = f"The error of the reduction is {c.how} to be at most {percent(c.reduction)} of the {c.what}"
+    error = f"The error of the reduction {c.claim(percent(c.reduction))}"
     error += f"; {listed(off)}, by estimates." if off else "; those of time step and mesh are not known."
     if answer.run is None:
         return [f"{at} the certified model refuses to answer.", error, answer.refusal]
@@ -127,8 +127,7 @@ def _summary_batch(answers: Sequence[Answer], seconds: float) -> list[str]:
     return [
         f"The reduced model answers {len(answers) - refused - full} of {len(answers)} materials, in "
         f"{1e3 * seconds:.3g} ms; the full model answers {full}, {refused} are refused.",
-        f"The largest error of the reduction is {c.how} to be at most {percent(c.reduction)} of the {c.what}, at "
-        f"{parameters(worst.materials)}.",
+        f"The largest error of the reduction {c.claim(percent(c.reduction))}, at {parameters(worst.materials)}.",
         f"Outside the box of the training: {outside}; the bound holds there too.",
     ]  # fmt: skip
 

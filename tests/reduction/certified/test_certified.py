@@ -350,8 +350,10 @@ def test_a_batch_is_the_runs_one_by_one(comm: MPI.Intracomm) -> None:
 
 def test_refusals(comm: MPI.Intracomm) -> None:
     certified = ritz(build(make_scene(), comm=comm), 4, 9, box=Box((30.0, 60.0), (20.0, 60.0)), tolerance=1e-3)
-    with pytest.raises(ToleranceError, match=r"proved at most .* above the tolerance 0\.001"):
+    with pytest.raises(ToleranceError, match=r"proved to be at most .* above the tolerance 0\.001"):
         certified.run()
+    with pytest.raises(ToleranceError, match="larger than the deformation itself"):
+        certified.with_sizes(1, 1).run(certified.materials(50.0, 2.0))
     run = certified.run(certified.materials(500.0, 50.0), allow=True)
     assert not run.certificate.inside
     assert any("outside the box" in reason for reason in run.certificate.reasons)
