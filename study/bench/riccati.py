@@ -13,6 +13,7 @@ import typer
 from pydantic import TypeAdapter
 from rich.console import Console
 
+from softgrasp.fem.errors import CheckpointError
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, Goal, number
 from softgrasp.study.bench.riccati_rows import STAGES, RiccatiPoint
@@ -64,12 +65,19 @@ class Record:
         return driver.of(RiccatiPoint, self.rows)
 
     def resume(self) -> None:
-        """Take over what an earlier run with the same damping has measured."""
-        old = json.loads(self.file.read_text()) if self.file.is_file() else {}
-        if old.get("beta") == self.beta:
-            adapter = TypeAdapter(list[RiccatiPoint])
-            self.rows = [*adapter.validate_python(old["rows"])]
-            self.peers = [*adapter.validate_python(old["peers"])]
+        """Take over what an earlier run with the same damping has measured.
+
+        Raises:
+            CheckpointError: the file is not one of these.
+        """
+        adapter = TypeAdapter(list[RiccatiPoint])
+        try:
+            old = json.loads(self.file.read_text()) if self.file.is_file() else {}
+            if old.get("beta") == self.beta:
+                rows, peers = (adapter.validate_python(old[key]) for key in ("rows", "peers"))
+                self.rows, self.peers = [*rows], [*peers]
+        except (ValueError, KeyError, AttributeError) as error:
+            raise CheckpointError(f"{self.file} holds no rows of this version; run once without --resume") from error
 
     def kept(self, nx: int, ranks: int, methods: Sequence[str]) -> Rows:
         """The points of a row where all its methods are there."""

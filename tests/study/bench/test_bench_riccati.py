@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from softgrasp.fem.errors import CheckpointError
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, failures, of
 from softgrasp.study.bench.riccati import Record, collect, collect_peers, peer_line
@@ -57,6 +58,9 @@ def test_rows_are_written_as_they_come_and_resumed(tmp_path: Path, monkeypatch: 
     other = Record(file, 0.02)
     other.resume()
     assert not other.rows  # another damping is another table
+    file.write_text('{"beta": 0.02, "rows": [{"nx": 10}], "peers": []}')
+    with pytest.raises(CheckpointError, match="holds no rows of this version"):
+        other.resume()
 
 
 def test_peers_beyond_their_size_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
