@@ -4,7 +4,9 @@
 
 is the difference of two small models (:mod:`softgrasp.fem.accuracy.small`) under the scene's own motion, start,
 damping and coupling: one of the mesh itself, one of elements of the next order on the same cells, or of a graded mesh
-where the mesh has no grading of its own. Both share the time step, whose error cancels.
+where the mesh has no grading of its own. Both share the time step, whose error cancels. The graded mesh of a mesh file
+has its cells, some bisected, and the next order, or it would be no finer away from the ends; that of a box has cells of
+its own, and what it cannot tell from its tolerance is left to the next order.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.small import Small, reduced, run_small
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.contact import contact_facets
@@ -46,7 +49,7 @@ def estimate(model: Model, coarse: Small | None = None, finer: Small | None = No
 
     Raises:
         SolverError: a static solve fails.
-        SceneError, MeshError: the graded mesh to compare with cannot be made.
+        SceneError, MeshError: the graded mesh to compare with cannot be made, or is too large.
     """
     begin = time.perf_counter()
     small = coarse or reduced(model)
@@ -55,22 +58,16 @@ def estimate(model: Model, coarse: Small | None = None, finer: Small | None = No
         other = finer or reduced(next_order(model))
         by, bound, offer = "order", BOUNDS[min(model.scene.tissue.order, 3)], None
         relative, delta = difference(small, other)
+        bound *= relative
     else:
-        by, bound = "graded", GRADED_BOUND
-        for goal in COMPARED[model.system.layout.dimension]:
-            other = reduced(build(comparison(model.scene, goal), comm=model.system.layout.comm))
-            relative, delta = difference(small, other)
-            offer = (goal, other.model.system.layout.n_e)
-            if relative > goal / SHARE or relative == 0:
-                break
-        bound = bound if relative > goal / SHARE else bound + goal / max(relative, 1e-300)
+        other, relative, delta, bound, by, offer = _compared(model, small)
     halved = run_small(small, 2 * model.scene.time.steps).deformation[::2]
     late, _ = difference(small, small, halved)
     delta = delta + other.run.rigid - run.rigid
     omega = small.modes[0][:2] / other.modes[0][:2] - 1
     return MeshEstimate(
         estimate=relative,
-        bound=bound * relative,
+        bound=bound,
         delta=delta,
         omega=tuple(float(x) for x in omega),
         time_error=late * 4 / 3,
@@ -81,6 +78,33 @@ def estimate(model: Model, coarse: Small | None = None, finer: Small | None = No
         offer=offer,
         seconds=model.system.layout.comm.allreduce(time.perf_counter() - begin, MPI.MAX),
     )
+
+
+def _compared(model: Model, small: Small) -> tuple[Small, float, Array, float, str, tuple[float, int] | None]:
+    """Finer model, estimate, delta y, bound, by and offer of :class:`MeshEstimate` for an ungraded mesh. Collective."""
+    by, offer, box, order = "graded", None, model.scene.tissue.size is not None, model.scene.tissue.order
+    count = next_unknowns(model)
+    if not box and count > MOST_COMPARED:
+        raise SceneError(
+            f"elements of the next order to compare with would have about {count} unknowns, more than the "
+            f"{MOST_COMPARED} of an estimate; run the scene with another tissue.order and compare the outputs."
+        )
+    for goal in COMPARED[model.system.layout.dimension]:
+        other = reduced(build(comparison(model.scene, goal), comm=model.system.layout.comm))
+        relative, delta = difference(small, other)
+        if other.model.scene.tissue.order == 2:
+            offer = (goal, other.model.system.layout.n_e)
+        if relative > goal / SHARE or relative == 0:
+            return other, relative, delta, GRADED_BOUND * relative, by, offer
+    bound = GRADED_BOUND * relative + goal
+    if box and count > MOST_COMPARED:
+        return other, bound, delta, bound, "bound", offer
+    if box:
+        up = reduced(next_order(model))
+        more, change = difference(small, up)
+        if more > relative:
+            return up, more, change, max(bound, BOUNDS[min(order, 3)] * more), "order", offer
+    return other, relative, delta, bound, by, offer
 
 
 def difference(small: Small, other: Small, finer: Array | None = None) -> tuple[float, Array]:
@@ -110,11 +134,18 @@ def next_order(model: Model) -> Model:
     )
 
 
+def next_unknowns(model: Model) -> int:
+    """About how many unknowns the next order has."""
+    order, layout = model.scene.tissue.order, model.system.layout
+    return int(layout.n_e * ((order + 1) / order) ** layout.dimension)
+
+
 def comparison(scene: Scene, tolerance: float) -> Scene:
-    """The scene on a graded mesh of quadratic elements or better."""
+    """The scene on a graded mesh of quadratic elements or better, on that of a mesh file of the next order."""
     tissue = scene.tissue
     refine = Refine(tolerance=tolerance, most=MOST_COMPARED)
-    tissue = tissue.model_copy(update={"order": max(2, tissue.order), "refine": refine})
+    order = tissue.order + 1 if tissue.size is None else max(2, tissue.order)
+    tissue = tissue.model_copy(update={"order": order, "refine": refine})
     return scene.model_copy(update={"tissue": tissue})
 
 

@@ -113,6 +113,14 @@ def assemble_space(
     return StateSpace(E, A, B, C)
 
 
+def relative_space(problem: RiccatiProblem) -> StateSpace | None:
+    """E, A, B, C in hand-relative coordinates, dense on rank 0, None elsewhere. Collective."""
+    tissue = gather_tissue(problem)
+    if tissue is None:
+        return None
+    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
+
+
 def modal_plant(
     problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, ...]
 ) -> ModalPlant:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgrasp.fem.accuracy.adapt import judged
+from softgrasp.fem.accuracy.estimate import next_unknowns
 from softgrasp.fem.errors import SceneError, SoftgraspError
 
 if TYPE_CHECKING:
@@ -42,8 +43,9 @@ def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | N
     if model.accuracy is not None:
         return model.accuracy, []
     d, n_e = model.system.layout.dimension, model.system.layout.n_e
-    base = BASE if model.scene.tissue.size is not None else BASE_FILE
-    cost = base[d] + PER_UNKNOWN[d] * n_e + PER_STEP * model.scene.time.steps
+    box = model.scene.tissue.size is not None
+    base, n = (BASE, n_e) if box else (BASE_FILE, next_unknowns(model))
+    cost = base[d] + PER_UNKNOWN[d] * n + PER_STEP * model.scene.time.steps
     if not certify and cost > max(CHEAP, seconds):
         return None, []
     try:
@@ -69,7 +71,7 @@ def keys(result: MeshEstimate | None, run: Trajectory) -> dict[str, Any]:
             "compared_with": {"by": result.by, "n_e": result.finer},
             "zone_shift": result.shift,
             "tolerance": result.tolerance,
-            "reached": result.tolerance is None or not result.obstacle,
+            "reached": result.tolerance is None or (not result.obstacle and result.estimate <= result.tolerance),
             "seconds": result.seconds,
         },
         "time_error": result.time_error,
@@ -84,8 +86,11 @@ def rows(result: MeshEstimate | None) -> list[tuple[str, str]]:
     if result.offer is not None and result.estimate > result.offer[0]:
         goal, n_e = result.offer
         better = f"; {percent(goal)} at n_e = {n_e} with tissue.refine.tolerance = {goal:g}, tissue.order = 2"
+    off = f"about {percent(result.estimate)} off on this mesh (bound {percent(result.bound)})"
+    if result.by == "bound":
+        off = f"at most {percent(result.bound)} off on this mesh, too fine a one to say how far"
     return [
-        ("deformation", f"about {percent(result.estimate)} off on this mesh (bound {percent(result.bound)}){better}"),
+        ("deformation", off + better),
         ("", f"about {percent(result.time_error)} off by the time step"),
     ]
 
@@ -94,9 +99,10 @@ def summary(result: MeshEstimate | None) -> list[str]:
     """The same in one sentence."""
     if result is None:
         return []
+    about = "at most" if result.by == "bound" else "about"
     return [
-        f"The deformation is about {percent(result.estimate)} off by the mesh and {percent(result.time_error)} by the "
-        "time step."
+        f"The deformation is {about} {percent(result.estimate)} off by the mesh and {percent(result.time_error)} by "
+        "the time step."
     ]
 
 

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene
-from softgrasp.lqr.dense.modal import DenseRiccati, StateSpace, assemble_space, gather_tissue
+from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.dense.small_care import ReducedMatrices
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.block import Block
@@ -92,11 +92,3 @@ def closed_loop(m: ReducedMatrices, P_N: Array) -> Array:
     """Eigenvalues of the reduced closed loop."""
     K = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
     return np.asarray(scipy.linalg.eigvals(np.linalg.solve(m.E, m.A + m.B @ K)))
-
-
-def relative_space(problem: RiccatiProblem) -> StateSpace | None:
-    """E, A, B, C in hand-relative coordinates, dense on rank 0, None elsewhere. Collective."""
-    tissue = gather_tissue(problem)
-    if tissue is None:
-        return None
-    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)

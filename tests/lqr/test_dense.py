@@ -15,7 +15,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.care import care, riccati_schur
-from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
@@ -38,7 +38,6 @@ from tests.helpers.models import (
     make_scene,
     reference,
 )
-from tests.helpers.riccati import relative_space
 
 EPS = np.finfo(float).eps
 Example = tuple[Array, Array, Array, Array, Array, Array]  # A, B, C, Q, R, X

@@ -10,11 +10,10 @@ from mpi4py import MPI
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.system import BlockSystem, Damping, LayerMaterial
-from softgrasp.lqr.dense.modal import StateSpace
+from softgrasp.lqr.dense.modal import StateSpace, relative_space
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
-from tests.helpers.riccati import relative_space
 
 COMM = MPI.COMM_SELF
 KINDS = ["kelvin", "rayleigh", "space", "layers", "two-way", "two-way-alpha", "two-way-layers"]

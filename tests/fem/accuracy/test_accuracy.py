@@ -141,7 +141,10 @@ def test_passes_end_at_most_and_say_so(comm: MPI.Intracomm) -> None:
     model = build_to_tolerance(Scene.model_validate(data), comm)
     assert model.accuracy is None  # the a-priori mesh
     result = judged(model)
-    assert (result.tolerance, result.obstacle) == (1e-2, "tissue.refine.passes = 0 allow none")
+    assert (result.tolerance, result.obstacle) == (1e-2, "")  # about met, which is no failure
+    data["tissue"] |= {"refine": {"tolerance": 1e-2, "passes": 0, "most": 500}}
+    result = judged(build(Scene.model_validate(data), comm=comm))
+    assert result.obstacle == "tissue.refine.passes = 0 allow no better mesh"
 
 
 def test_tolerance_below_the_steps_is_refused(comm: MPI.Intracomm) -> None:
@@ -275,7 +278,11 @@ FINE = {"block_3d": ["tissue.cells=[10,6,14]"], "pillow_3d": ["tissue.refine={to
         ("layers_2d", EVEN, 0.05),
         ("block_3d", [], 6e-3),
         ("block_3d", [*EVEN, "tissue.cells=[8,8,16]"], 0.5),
+        ("block_3d", ["tissue.refine=false", "tissue.order=2"], 0.3),
         ("pillow_3d", [], 5e-3),
+        ("pillow_3d", EVEN, 0.2),
+        ("pillow_3d", ["tissue.refine=false", "tissue.order=2"], 0.04),
+        ("pillow_3d", ["tissue.refine=false"], 5e-3),
     ],
     ids=lambda value: "-".join(v.split("=")[0] for v in value) if isinstance(value, list) else str(value),
 )
@@ -291,6 +298,23 @@ def test_estimates_of_scenes(comm: MPI.Intracomm, name: str, changes: list[str],
     tissue = np.abs(small.C).max(axis=1) > 0
     y, exact = ((s.run.deformation + s.run.rigid)[:, tissue] for s in (small, other))
     assert error(y + result.delta[:, tissue], exact) <= 0.6 * error(y, exact)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_mesh_file_is_compared_with_what_is_finer_everywhere(comm: MPI.Intracomm, order: int) -> None:
+    """The bisected edges of the pillow leave its error, which is inside."""
+    changes = ["time.steps=100", "tissue.refine=false"]
+    fine = reduced(build(load_scene("pillow_3d", ["time.steps=100"]), comm=comm))
+    small = reduced(build(load_scene("pillow_3d", [*changes, f"tissue.order={order}"]), comm=comm))
+    true, result = difference(small, fine)[0], estimate(small.model, small)
+    assert 0.4 <= result.estimate / true <= 1.1
+    assert true <= result.bound
+
+
+def test_too_large_a_comparison_is_told(comm: MPI.Intracomm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softgrasp.fem.accuracy.estimate.MOST_COMPARED", 1500)
+    with pytest.raises(SceneError, match="would have about 5913 unknowns, more than the 1500 of an estimate"):
+        estimate(build(load_scene("pillow_3d", ["tissue.refine=false", "tissue.order=2"]), comm=comm))
 
 
 def test_body_at_rest_has_no_error(comm: MPI.Intracomm) -> None:

@@ -13,6 +13,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.system import BlockSystem
+from softgrasp.lqr.dense.modal import relative_space
 from softgrasp.lqr.lowrank.adjoint import closed_adjoint, make_right
 from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin, frequencies
@@ -27,7 +28,7 @@ from softgrasp.lqr.lowrank.shifts import ShiftRange, choose_shifts, energy_produ
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import gather_matrix, gather_rows, local_rows
-from tests.helpers.riccati import SCENE, problem_of, relative_space
+from tests.helpers.riccati import SCENE, problem_of
 
 
 @pytest.mark.parametrize("name", ["one_way", "two_way_drag_in_space", "layers"])

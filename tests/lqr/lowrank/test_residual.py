@@ -8,13 +8,12 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.modal import DenseRiccati, dense_residual
+from softgrasp.lqr.dense.modal import DenseRiccati, dense_residual, relative_space
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import LAYERS, make_scene
-from tests.helpers.riccati import relative_space
 
 CONTROL = {"control": {"outputs": [{"kind": "node", "point": [0.5, 0.0]}], "Q": 7.0, "R": [[2.0, 0.5], [0.5, 1.0]]}}
 KELVIN = {"effects": {"damping": {"kind": "kelvin-voigt", "beta": 0.003}}}

@@ -11,14 +11,13 @@ import pytest
 from flint import acb_mat, arb_mat, ctx
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.study.hardcases import riccati as hard_riccati
 from softgrasp.study.hardcases.cases import HardCase
 from softgrasp.study.hardcases.exact import exact_gain, worst_part_error
 from softgrasp.study.hardcases.riccati import problem_of
-from tests.helpers.riccati import relative_space
 
 pytestmark = pytest.mark.serial
 
