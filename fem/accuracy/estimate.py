@@ -97,9 +97,7 @@ def _compared(model: Model, small: Small) -> tuple[Small, float, Array, float, s
         if relative > goal / SHARE or relative == 0:
             return other, relative, delta, GRADED_BOUND * relative, by, offer
     bound = GRADED_BOUND * relative + goal
-    if box and count > MOST_COMPARED:
-        return other, bound, delta, bound, "bound", offer
-    if box:
+    if box and count <= MOST_COMPARED:
         up = reduced(next_order(model))
         more, change = difference(small, up)
         if more > relative:

@@ -23,9 +23,7 @@ class MeshEstimate:
     shift: float  # largest distance of the ends of the zone held from ``contact.box`` [m]
     n_e: int  # tissue unknowns of the mesh judged
     finer: int  # tissue unknowns of the mesh it was compared with
-    # "order" (elements of the next order on the same cells), "graded" (another mesh, which meets the zone), or "bound"
-    # (that mesh leaves as much, the next order is too large: ``estimate`` is the bound)
-    by: str
+    by: str  # "order" (elements of the next order on the same cells) or "graded" (another mesh, which meets the zone)
     tolerance: float | None = None  # of the scene, or None
     passes: int = 0  # refinements after the first estimate
     obstacle: str = ""  # why the tolerance was not reached, or ""
