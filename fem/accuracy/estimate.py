@@ -164,4 +164,5 @@ def zone_shift(model: Model) -> float:
     low, high = (np.asarray(corner) for corner in box)
     below = np.where(low > body[0] + slack, np.abs(held[0] - low), 0.0)
     above = np.where(high < body[1] - slack, np.abs(held[1] - high), 0.0)
-    return float(max(below.max(), above.max()))
+    ends = np.maximum(below, above)
+    return float(ends[ends > slack].max(initial=0.0))

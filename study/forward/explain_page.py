@@ -57,7 +57,7 @@ def render(result: Explanation, parts: Sequence[Section], console: Console) -> N
                 line(f"{name} adds {adds}; allocates {operators}.")
                 line(cost, 4)
         elif part.header:
-            table = Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header)))
+            table = Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header)), width=console.width)
             console.print(Padding.indent(table, 2))
         for text in (*part.text.split("\n\n"), *part.code.splitlines()):
             if text:

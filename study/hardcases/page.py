@@ -35,7 +35,7 @@ def show(console: Console, result: FamilyResult) -> None:
     console.print(f"[bold]{family.name}[/bold]: {family.title}; {bare_label(family.quantity)}", soft_wrap=True)
     rows = [("ok" if case.ok else "no", *cells_of(case)) for case in result.cases]
     table = Table(("", "case", "bound", "here", family.textbook, "verdict"), rows)
-    console.print(table.terminal(wrap=range(1, 6)))
+    console.print(table.terminal(wrap=range(1, 6), width=console.width))
     console.print(f"{result.seconds:.1f} s\n")
 
 

@@ -130,7 +130,8 @@ def run_compare(a: Path, b: Path, out: Path, console: Console, *, pictures: bool
     out.mkdir(parents=True, exist_ok=True)
     keys, numbers = comparison.keys, comparison.numbers
     for table, none in ((keys, "The scenes are the same."), (numbers, "The numbers are the same.")):
-        console.print(Table(table.header, table.rows[:SHOWN]).terminal(wrap=(0, 1, 2)) if table.rows else none)
+        shown = Table(table.header, table.rows[:SHOWN]).terminal(wrap=(0, 1, 2), width=console.width)
+        console.print(shown if table.rows else none)
     if len(numbers.rows) > SHOWN:
         console.print(f"{len(numbers.rows) - SHOWN} more numbers are in compare.csv")
     if distance := apart(comparison.traces):

@@ -77,7 +77,7 @@ def test_estimate_tells_the_error_of_an_even_mesh(comm: MPI.Intracomm, change: A
     assert result.bound >= true
     corrected = result.corrected(run.outputs) - fine.outputs_rigid
     assert error(corrected, deformation(fine)) < 0.6 * true
-    assert result.shift == pytest.approx(0.0)  # lines of 4 x 8 cells meet y = 1.5
+    assert result.shift == 0.0  # lines of 4 x 8 cells meet y = 1.5, but for rounding
 
 
 def test_shift_of_the_zone_is_part_of_the_error(comm: MPI.Intracomm) -> None:
