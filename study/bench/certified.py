@@ -27,6 +27,7 @@ from softgrasp.study.bench.driver import Goal
 from softgrasp.study.shell.timing import interleave, medians
 
 K, K2 = 16, 48  # modes of the answer, and of the basis that certifies it
+ALONE = (8, K, K2)  # modes of one basis
 BOX = ((30.0, 500.0), (20.0, 500.0))  # lambda and mu [Pa]
 SHARE = 0.3  # of a query, and of the steps of the model in state space, that the proof may cost
 OF_FULL = {15: 1 / 3, 60: 1 / 50}  # of a full run that a query may cost, by cells of the short side
@@ -97,7 +98,7 @@ def in_state_space(model: CertifiedModel, materials: Materials, drive: Drive) ->
 def measure(nx: int, repeats: int) -> Iterator[AnswerCost]:
     """All answers on one mesh."""
     model, two = trained(nx)
-    estimate, alone = replace(two, certify="estimate"), [two.with_sizes(k, k) for k in (K, K2)]
+    estimate, alone = replace(two, certify="estimate"), [two.with_sizes(k, k) for k in ALONE]
     assert two.drive is not None
     short = replace(two.drive, finer=None)
     calls: dict[str, Callable[[Materials], Any]] = {
