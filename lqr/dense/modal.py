@@ -15,9 +15,8 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
 from softgrasp.lqr.dense.care import care as care
 from softgrasp.lqr.dense.poles import closed_loop_rates, lost_sentence
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
-from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.plant.gain import Block, Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 DENSE_MODES = 600  # a tenth of a second; SLEPc on several ranks is slower there

@@ -11,12 +11,11 @@ import scipy.linalg
 from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.dense.care import care, lyapunov, riccati_residual
+from softgrasp.lqr.dense.care import FAST_RESIDUAL, ReducedMatrices, care, fast_solution, lyapunov, riccati_residual
 from softgrasp.lqr.dense.modal import StateSpace, assemble_space, in_energy
-from softgrasp.lqr.dense.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY, ControlError
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import damp
 
 MODES = 30

@@ -17,10 +17,9 @@ from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.dense.poles import closed_loop_rates
 from softgrasp.lqr.lowrank.compress import gram, triangular
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
-from softgrasp.lqr.plant.operators import modal_inputs
+from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.operators import costates_to_absolute, costates_to_relative, modal_inputs, states_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.bases.engines import EPS, factor, small_svd

@@ -8,13 +8,19 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
+from softgrasp.lqr.dense.care import ReducedMatrices, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import costates_to_absolute, gain_to_absolute
-from softgrasp.lqr.plant.gain import Gain
-from softgrasp.lqr.plant.operators import descriptor, descriptor_adjoint, dynamics, inputs_adjoint, outputs
+from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.operators import (
+    costates_to_absolute,
+    descriptor,
+    descriptor_adjoint,
+    dynamics,
+    gain_to_absolute,
+    inputs_adjoint,
+    outputs,
+)
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
@@ -46,7 +52,7 @@ class GainQuality:
     sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
     gain: Gain | None = None  # K_hat; None where there is none
     cost_excess_at_most: float = NAN  # bound on the excess; nan where not asked for
-    cost_excess_proved: float = NAN  # the part that is proved, see softgrasp.lqr.design.bounds.with_bounds
+    cost_excess_proved: float = NAN  # the part that is proved, see softgrasp.lqr.design.duration.with_bounds
 
     @property
     def stable(self) -> bool:

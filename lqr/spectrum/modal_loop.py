@@ -18,7 +18,7 @@ from softgrasp.lqr.dense.modal import (
     modal_plant,
     modes_of_plant,
 )
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import damp, modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
 

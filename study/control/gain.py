@@ -10,8 +10,8 @@ from typing import Any
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
 from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.linearise import finite_problem, linearised
 from softgrasp.lqr.design.orders import BasisGains, orders, reduce_gains
+from softgrasp.lqr.design.scene import finite_problem, linearised
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.loop import save_controllers, tick_seconds
 from softgrasp.study.control.result import Note, a_priori, gain_result

@@ -15,8 +15,8 @@ from softgrasp.fem.model.build import Model
 from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.duration import LoopPlan, largest_cost
 from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.design.linearise import finite_problem
 from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains, fast_order
+from softgrasp.lqr.design.scene import finite_problem
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory

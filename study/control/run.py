@@ -15,12 +15,10 @@ from rich.progress import Progress, TaskProgressColumn
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.scene.control import Loop
-from softgrasp.lqr.design.bounds import bases_with_bounds
-from softgrasp.lqr.design.duration import plan
+from softgrasp.lqr.design.duration import bases_with_bounds, plan
 from softgrasp.lqr.design.feedback import design
-from softgrasp.lqr.design.linearise import linearised
 from softgrasp.lqr.design.orders import BasisGains, orders
-from softgrasp.lqr.design.scene import with_control
+from softgrasp.lqr.design.scene import linearised, with_control
 from softgrasp.study.control.gain import run_gain, small_controller
 from softgrasp.study.control.loop import pole_sets, run_finite, run_loops, save_controllers
 from softgrasp.study.control.page import sections

@@ -10,9 +10,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import on_root
-from softgrasp.lqr.dense.small_care import solve_reduced
-from softgrasp.lqr.design.bounds import with_bounds
-from softgrasp.lqr.design.duration import LoopPlan
+from softgrasp.lqr.dense.care import solve_reduced
+from softgrasp.lqr.design.duration import LoopPlan, with_bounds
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains, Notify, fast_order, reduce_gains
 from softgrasp.lqr.plant.checks import ControlError

@@ -14,10 +14,10 @@ from mpi4py import MPI
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene
+from softgrasp.lqr.dense.care import ReducedMatrices
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.dense.small_care import ReducedMatrices
 from softgrasp.lqr.design.scene import problem as make_problem
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from tests.helpers.models import CUBE, LAYERS, gather_rows, make_scene
 
