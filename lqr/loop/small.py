@@ -11,7 +11,7 @@ import numpy as np
 from softgrasp.fem.columns import labels
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
-from softgrasp.lqr.dense.modal import assemble_space
+from softgrasp.lqr.dense.modal import TissueMatrices, assemble_space
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.cost import accumulated_cost
 from softgrasp.lqr.plant.checks import ControlError
@@ -115,7 +115,7 @@ def galerkin(problem: RiccatiProblem, V: Array) -> tuple[SmallPlant, Shapes]:
     values = np.linalg.eigvalsh(M / np.sqrt(np.outer(size, size))) if (size > 0).all() else np.zeros(1)
     if not values.min(initial=1.0) > 1e-12:  # rounding of the products is about 1e-15 k
         raise ControlError(f"the {k} shapes of the tissue are linearly dependent; orthonormalise them first")
-    space = assemble_space(problem, M, K, D, G, C_z)
+    space = assemble_space(problem, TissueMatrices(M, K, D, G, C_z))
     f = np.zeros(len(space.E))
     if system.gravity is not None:
         f[2 * n_s + k :] = G @ system.gravity

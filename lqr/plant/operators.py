@@ -84,11 +84,6 @@ def normalising(gram: Array, share: float, least: float = 0.0) -> Array:
     return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
 
 
-def modal_inputs(problem: RiccatiProblem, Phi: Array) -> Array:
-    """Coupling of the inputs to shapes of the tissue, (k, m): Phi'G through the hand, else Phi'B_z. Collective."""
-    return total(problem.layout.comm, Phi.T @ (problem.system.G if problem.B_z is None else problem.B_z))
-
-
 def outputs(problem: RiccatiProblem, X: Block) -> Array:
     """C X, (p, k), on every rank. Collective."""
     n_s, n = problem.layout.n_s, problem.layout.n_local

@@ -8,7 +8,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.dense.care import ReducedMatrices, solve_reduced
+from softgrasp.lqr.dense.care import StateSpace, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Block, Gain
@@ -35,7 +35,7 @@ class ReducedRiccati:
     """P_hat = V P_N V' and its gain."""
 
     basis: RiccatiBasis  # the basis, scaled to energy
-    matrices: ReducedMatrices  # E_N, A_N, B_N, C_N with the weights
+    matrices: StateSpace  # E_N, A_N, B_N, C_N with the weights
     P_N: Array  # (N, N)
     gain: Gain  # K_hat on the full plant
 
@@ -79,13 +79,13 @@ class GainReport(GainQuality):
     N: int  # order of the reduced equation
     error_P: float = NAN  # noqa: N815  ||P - P_hat||_F / ||P||_F in the paper's coordinates
     time_are: float = NAN  # seconds of one solution of the reduced equation, for who measures it
-    matrices: ReducedMatrices | None = None  # of the reduced equation; None where they are not kept
+    matrices: StateSpace | None = None  # of the reduced equation; None where they are not kept
 
 
-def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
+def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> StateSpace:
     """E_N = W'EU, A_N = W'AU, B_N = W'B, C_N = CU. Collective."""
     comm, W, U = problem.layout.comm, basis.W, basis.U
-    return ReducedMatrices(
+    return StateSpace(
         E=gram(comm, W, descriptor(problem, U)),
         A=gram(comm, W, dynamics(problem, U)),
         B=np.ascontiguousarray(inputs_adjoint(problem, W).T),
