@@ -10,7 +10,7 @@ import numpy as np
 from softgrasp.study.control.result import TITLES, ControlStudy
 from softgrasp.study.control.tables import BOX_HEADER, box_rows, loop_table, reduced_table, summary_rows
 from softgrasp.study.pictures.shapes import speed_up
-from softgrasp.study.report.equation_control import control_text
+from softgrasp.study.report.equation import controlled
 from softgrasp.study.report.page import Section, captioned
 
 CAPTIONS = {
@@ -48,7 +48,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
         Section("", figures=pick("move.png", "move.gif")),
         *([Section("Notes", text=notes)] if notes else []),
         Section("Result", rows=summary_rows(study, dict(seconds)), figures=pick("histories.png", "decay.png")),
-        Section("Equation", code=control_text(study.design.model.scene)),
+        Section("Equation", equation=controlled(study.design.model.scene)),
     ]
     if study.bases:
         parts += _reduced(study, pick("errors.png"))
