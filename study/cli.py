@@ -15,10 +15,9 @@ from typing import Annotated, Any
 import typer
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.study.query.command import query
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
-from softgrasp.study.shell.options import Empty, Out, Overrides, Pdf, Pictures, Quiet, SceneFile, check_folder
+from softgrasp.study.shell.options import takes
 
 LIST_WIDTH = 200  # [letters]
 app = typer.Typer(
@@ -108,20 +107,18 @@ def list_runs(folder: Annotated[Path, typer.Argument(help="folder that the runs 
 
 
 @app.command()
+@takes("a b out pictures empty pdf")
 def compare(
     a: Annotated[Path, typer.Argument(help="folder of a run")],
     b: Annotated[Path, typer.Argument(help="folder of another run")],
-    out: Out = None,
-    pictures: Pictures = True,
-    empty: Empty = False,
-    pdf: Pdf = False,
+    out: Path | None,
+    **shared: bool,
 ) -> None:
     """Show in which keys, numbers and trajectories two runs differ."""
     from softgrasp.study.runs.listing import run_compare
 
     if rank() == 0:
-        folder = out or default_folder("compare", Path(f"{a.name}-{b.name}"))
-        run_compare(a, b, folder, console(), pictures=pictures, empty=empty)
+        run_compare(a, b, out or default_folder("compare", Path(f"{a.name}-{b.name}")), console(), **shared)
 
 
 @app.command()
@@ -134,54 +131,39 @@ def schema() -> None:
 
 
 @app.command()
-def explain(
-    scene: SceneFile,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", help="also write result.json and report.html into this folder", callback=check_folder
-        ),
-    ] = None,
-    set_: Overrides = None,
-    empty: Empty = False,
-) -> None:
+@takes("scene out set_ empty", out="also write result.json and report.html into this folder")
+def explain(scene: Path, out: Path | None, set_: list[str] | None, empty: bool) -> None:
     """Say what a scene simulates: its equation, sizes, solver, and which effects matter."""
     from softgrasp.study.forward.explain_page import run_explain
 
     run_explain(scene, out, set_ or [], console(), empty=empty)
 
 
-def _run(command: Callable[..., Any], scene: Path, out: Path | None, set_: list[str] | None, **options: Any) -> Any:
+def _run(command: Callable[..., Any], *, scene: Path, out: Path | None, set_: list[str] | None, **options: Any) -> None:
     """Run a command on a scene in the folder given or its own; named ``run_NAME``, it is the command NAME."""
     name = command.__name__.removeprefix("run_")
-    return command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
+    command(scene, out or default_folder(name, scene), set_ or [], console(), **options)
 
 
 @app.command()
+@takes("scene out set_ quiet resume pictures until certify empty pdf")
 def simulate(
-    scene: SceneFile,
-    out: Out = None,
-    set_: Overrides = None,
-    quiet: Quiet = False,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in the output folder")] = False,
-    pictures: Pictures = True,
     until: Annotated[int | None, typer.Option(help="stop after this step and leave a checkpoint", min=1)] = None,
     certify: Annotated[
         bool, typer.Option("--certify", help="estimate the error of mesh and time step, whatever it costs")
     ] = False,
-    empty: Empty = False,
-    pdf: Pdf = False,
+    **shared: Any,
 ) -> None:
     """Run a scene with the full model; also under `mpiexec -n N`."""
     from softgrasp.study.forward.run import run_simulate
 
-    more = {"resume": resume, "until": until, "certify": certify}
-    _run(run_simulate, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, **more)
+    _run(run_simulate, resume=resume, until=until, certify=certify, **shared)
 
 
 @app.command()
+@takes("scene axes out set_ reduced ranks_each quiet pictures empty pdf")
 def sweep(
-    scene: SceneFile,
     axes: Annotated[
         list[str],
         typer.Argument(
@@ -189,22 +171,16 @@ def sweep(
             help="values of a key: 100:500:9, 1e2:1e4:5:log or 20,50,500; one or two keys",
         ),
     ],
-    out: Out = None,
-    set_: Overrides = None,
     reduced: Annotated[
         int | None, typer.Option(help="run a reduced model with this many columns instead of the full one", min=1)
     ] = None,
     ranks_each: Annotated[int, typer.Option(help="ranks of one point under `mpiexec -n N`", min=1)] = 1,
-    quiet: Quiet = False,
-    pictures: Pictures = True,
-    empty: Empty = False,
-    pdf: Pdf = False,
+    **shared: Any,
 ) -> None:
     """Simulate a scene at many values of its keys; resumes; `mpiexec -n N` runs N points at a time."""
     from softgrasp.study.runs.run import run_sweep
 
-    more = {"axes": axes, "reduced": reduced, "each": ranks_each}
-    _run(run_sweep, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, **more)
+    _run(run_sweep, axes=axes, reduced=reduced, each=ranks_each, **shared)
 
 
 @app.command()
@@ -225,54 +201,93 @@ def view(
 
 
 @app.command()
+@takes("scene out set_ quiet pictures empty pdf tolerance")
 def reduce(
-    scene: SceneFile,
-    out: Out = None,
-    set_: Overrides = None,
-    quiet: Quiet = False,
-    pictures: Pictures = True,
-    empty: Empty = False,
-    pdf: Pdf = False,
     tolerance: Annotated[
         str | None,
         typer.Option(help="build one model that proves its error over the scene's box, to this relative error: 1e-2"),
     ] = None,
+    **shared: Any,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
     from softgrasp.study.precision.answer import parse_tolerance
     from softgrasp.study.reduce.run import run_reduce
 
-    accuracy = None if tolerance is None else parse_tolerance(tolerance)
-    _run(run_reduce, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, tolerance=accuracy)
-
-
-app.command()(query)
+    _run(run_reduce, tolerance=None if tolerance is None else parse_tolerance(tolerance), **shared)
 
 
 @app.command()
+@takes(
+    "model set_ motion dt tolerance allow fallback scene batch csv out empty pdf",
+    out="also write a page, a picture and tables into this folder",
+)
+def query(
+    model: Annotated[Path, typer.Argument(help="certified model that `softgrasp reduce SCENE --tolerance` wrote")],
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", "-s", help="material of the first layer: lambda=77, mu=60 [Pa], rho=1; may be repeated"),
+    ] = None,
+    motion: Annotated[
+        Path | None,
+        typer.Option(help="CSV file of the hand: time, then a position (or force) a column; else as in the scene"),
+    ] = None,
+    dt: Annotated[float | None, typer.Option("--dt", help="time step in seconds; else as in the scene")] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="largest relative error of an answer; else as the model was built for")
+    ] = None,
+    allow: Annotated[bool, typer.Option("--allow", help="answer above the tolerance too, with a warning")] = False,
+    fallback: Annotated[
+        str | None, typer.Option(help="full: run the full model where the answer is refused, and say so")
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="scene of the full model; else the scene.toml beside the model")
+    ] = None,
+    batch: Annotated[
+        Path | None, typer.Option(help="CSV table of parameters; its first line names lambda, mu, rho or some")
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option(help="write the trajectory with its bounds, or the answers of a batch, to this file")
+    ] = None,
+    out: Path | None = None,
+    empty: bool = False,
+) -> None:
+    """Ask a certified reduced model for other materials, motions or steps, and how far the answer can be off.
+
+    An answer has three errors: of the reduction (proved), of the time step and of the mesh (both estimates).
+
+    Above the tolerance it is refused, with exit status 3: take --fallback full, or --allow to see it all the same.
+
+    Outside the box of the training there is a warning only: the bound holds everywhere.
+
+    Example: softgrasp reduce paper_forward --tolerance 1e-2, then
+    softgrasp query out/paper_forward-reduce/models/certified.h5 --set lambda=77 --set mu=60
+    """
+    from softgrasp.study.query.run import run_query
+
+    status = run_query(
+        model, console(), settings=set_ or [], motion=motion, dt=dt, tolerance=tolerance, allow=allow,
+        fallback=fallback, scene=scene, batch=batch, out=csv, folder=out, empty=empty,
+    )  # fmt: skip
+    raise typer.Exit(status)
+
+
+@app.command()
+@takes("scene out set_ quiet pictures gain_only empty pdf")
 def control(
-    scene: SceneFile,
-    out: Out = None,
-    set_: Overrides = None,
-    quiet: Quiet = False,
-    pictures: Pictures = True,
     gain_only: Annotated[
         bool, typer.Option("--gain-only", help="only the Riccati equation and the controllers: no loop, no pictures")
     ] = False,
-    empty: Empty = False,
-    pdf: Pdf = False,
+    **shared: Any,
 ) -> None:
     """Design the optimal feedback of a scene, reduce it and close the loop; also under `mpiexec -n N`."""
     from softgrasp.study.control.run import run_control
 
-    _run(run_control, scene, out, set_, quiet=quiet, pictures=pictures, empty=empty, gain_only=gain_only)
+    _run(run_control, gain_only=gain_only, **shared)
 
 
 @app.command()
+@takes("scene out set_ tolerance budget question quiet empty pdf")
 def study(
-    scene: SceneFile,
-    out: Out = None,
-    set_: Overrides = None,
     tolerance: Annotated[
         str | None,
         typer.Option(help="find the cheapest setting with at most this error of the deformation, e.g. 1e-2"),
@@ -286,9 +301,7 @@ def study(
             help="only this question: forward, reduced, bases, riccati, reduced_riccati or loop; several with commas"
         ),
     ] = None,
-    quiet: Quiet = False,
-    empty: Empty = False,
-    pdf: Pdf = False,
+    **shared: Any,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
     from softgrasp.study.precision.answer import parse_budget, parse_tolerance
@@ -296,39 +309,30 @@ def study(
 
     limit = None if budget is None else parse_budget(budget)
     accuracy = None if tolerance is None else parse_tolerance(tolerance)
-    more = {"tolerance": accuracy, "budget": limit, "questions": question}
-    _run(run_study, scene, out, set_, quiet=quiet, empty=empty, **more)
+    _run(run_study, tolerance=accuracy, budget=limit, questions=question, **shared)
 
 
 @app.command()
-def effects(
-    scene: SceneFile,
-    out: Out = None,
-    set_: Overrides = None,
-    quiet: Quiet = False,
-    empty: Empty = False,
-    pdf: Pdf = False,
-) -> None:
+@takes("scene out set_ quiet empty pdf")
+def effects(**shared: Any) -> None:
     """Switch every effect on and off: what it costs, what it changes, and whether the scene needs it."""
     from softgrasp.study.effects.run import run_effects
 
-    _run(run_effects, scene, out, set_, quiet=quiet, empty=empty)
+    _run(run_effects, **shared)
 
 
 @app.command()
+@takes("out quick family quiet empty pdf")
 def hardcases(
-    out: Out = None,
+    out: Path | None,
     quick: Annotated[bool, typer.Option("--quick", help="the quick half only")] = False,
     family: Annotated[str | None, typer.Option(help="one family of cases only")] = None,
-    quiet: Quiet = False,
-    empty: Empty = False,
-    pdf: Pdf = False,
+    **shared: bool,
 ) -> None:
     """Run the suite of hard cases: stay stable, or refuse with a reason."""
     from softgrasp.study.hardcases.run import run_hardcases
 
-    folder = out or default_folder("hardcases")
-    result = run_hardcases(folder, console(), quick=quick, family=family, quiet=quiet, empty=empty)
+    result = run_hardcases(out or default_folder("hardcases"), console(), quick=quick, family=family, **shared)
     raise typer.Exit(0 if result["ok"] else 1)
 
 

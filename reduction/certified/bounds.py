@@ -78,13 +78,15 @@ def static_bound(
     rate = lengths(np.diff(nodes)) / dt
     force = np.hypot(rate if drift is None else rate + drift, rest)
     begin = np.hypot(0.0 if balanced else node[0], start)
+    steps = len(force)
+    moved = np.zeros(steps + 1)
     if kernel is None:
-        moved = begin + np.concatenate([[0.0], dt * np.cumsum(force)])
+        np.cumsum(dt * force, out=moved[1:])
+        moved += begin
     else:
         free, forced = kernel
-        steps = len(force)
-        folded = scipy.signal.convolve(force, forced[:steps])[:steps]
-        moved = begin * free[: steps + 1] + np.concatenate([[0.0], dt * folded])
+        moved[1:] = dt * scipy.signal.convolve(force, forced[:steps])[:steps]
+        moved += begin * free[: steps + 1]
     return np.asarray(moved + (node if gap is None else np.hypot(node, gap)))
 
 

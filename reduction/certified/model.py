@@ -287,7 +287,7 @@ class CertifiedModel:
 
     def _reach(self, bound: Array, materials: Materials, drive: Drive) -> Array:
         """Bound of every output component from one of the energy, (steps + 1, p)."""
-        reach = np.outer(bound, self.norms.static_factor(materials) * self.compliance)
+        reach = bound[:, None] * (self.norms.static_factor(materials) * self.compliance)
         if self._coupled(drive):
             # the hand's velocity error is at most S^(-1/2) |e|, its displacement error the integral of that
             scale = max(1.0, self.norms.mass_factor(materials))

@@ -187,27 +187,22 @@ def modal_residual(
         dt: step [s]; modes that turn by less than :data:`SLOW` in it are not smoothed and leave nothing at the middles.
     """
     slow, n_s, k = int(np.searchsorted(m.omega * dt, SLOW)), len(c), len(y)
-    rows, norms = len(norms.mass), norms.galerkin
-    inertial = len(materials) > 1 or rows - len(norms.mass) < k  # else M Phi is M_r Phi but for rho, and left out
-
-    def triangle(which: Literal["static", "mass"], first: int) -> Array:
-        """R of a QR decomposition of the columns of the modes from ``first`` on, at most as many rows as columns."""
-        G, M, K = norms.columns(which, materials, 3)
-        A, at, X = np.empty((len(G), n_s + k - first), order="F"), slow - first, m.X[:, first:]
-        own = K @ X
-        if which == "static" or inertial:
-            own -= M @ (X * m.omega[first:] ** 2)
-            G = G - M @ (m.X @ m.g)
-        A[:, :at], A[:, at : at + n_s], A[:, at + n_s :] = own[:, :at], G, own[:, at:]
-        return np.triu(scipy.linalg.lapack.dgeqrf(A, overwrite_a=True)[0][: A.shape[1]])
-
+    norms = norms.galerkin
+    G, M, K = norms.columns("both", materials, 3)
+    own = K @ m.X
+    own -= M @ (m.X * m.omega**2)
+    columns = np.hstack([own[:, :slow], G - M @ (m.X @ m.g), own[:, slow:]])
+    static, mass = (
+        np.triu(scipy.linalg.lapack.dgeqrf(A)[0][: A.shape[1]])
+        for A in (columns[: len(norms.static)], columns[len(norms.static) :, slow:])
+    )
     middles, steps = np.empty((n_s + k - slow, c.shape[1])), np.empty((n_s + k, y.shape[1]))
     middles[:n_s], steps[:slow] = c, y[:slow]
     np.add(y[slow:, 1:], y[slow:, :-1], out=middles[n_s:])
     middles[n_s:] *= 0.5
     _, left = nodal(middles, None if c_0 is None else np.concatenate([c_0, y[slow:, 0]]), steps[slow:])
-    rest = norms.mass_factor(materials) * lengths(triangle("mass", slow) @ left)
-    return Residual((norms.static_factor(materials) * triangle("static", 0)) @ steps, rest)
+    rest = norms.mass_factor(materials) * lengths(mass @ left)
+    return Residual((norms.static_factor(materials) * static) @ steps, rest)
 
 
 def stepped_motion(

@@ -67,27 +67,32 @@ class ResidualNorms:
 
     @cached_property
     def _parts(self) -> dict[str, tuple[Array, Array]]:
-        """Of both triangles: columns of G_1, (layers, rows n_s), and of M_1, K_mu and K_lambda, (3 layers, rows k)."""
+        """Of the triangles: columns of G_1, (layers, rows n_s), and of M_1, K_mu and K_lambda, (3 layers, rows k)."""
         layers, width = len(self.reference), len(self.reference) * self.n_s
+        triangles = {"static": self.static, "mass": self.mass, "both": np.vstack([self.static, self.mass])}
         return {
             which: (
                 T[:, :width].reshape(len(T), layers, -1).transpose(1, 0, 2).reshape(layers, -1),
                 T[:, width:].reshape(len(T), -1, 3 * layers).transpose(2, 0, 1).reshape(3 * layers, -1),
             )
-            for which, T in (("static", self.static), ("mass", self.mass))
+            for which, T in triangles.items()
         }
 
     def columns(
-        self, which: Literal["static", "mass"], materials: tuple[LayerMaterial, ...], count: int = 4
+        self, which: Literal["static", "mass", "both"], materials: tuple[LayerMaterial, ...], count: int = 4
     ) -> tuple[Array, ...]:
         """Blocks of a triangle at a parameter: of c, (rows, n_s), and of b' + alpha b, a, viscous b, (rows, k)."""
-        (hand, tissue), rows = self._parts[which], len(self.static if which == "static" else self.mass)
-        rho, mu, lam, beta = np.array([(m.rho, m.mu, m.lam, m.beta) for m in materials]).T
-        weights = np.zeros((3, len(materials), 3))  # of M_1, K_mu, K_lambda
-        weights[0, :, 0], weights[1, :, 1], weights[1, :, 2] = rho, mu, lam
-        weights[2] = beta[:, None] * weights[1]
-        own = weights[: count - 1].reshape(count - 1, -1) @ tissue
-        return (rho @ hand).reshape(rows, -1), *own.reshape(count - 1, rows, -1)
+        hand, tissue = self._parts[which]
+        rows = hand.shape[1] // self.n_s
+        weights = np.array(  # of M_1, K_mu, K_lambda in every layer
+            [
+                [(m.rho, 0.0, 0.0) for m in materials],
+                [(0.0, m.mu, m.lam) for m in materials],
+                [(0.0, m.beta * m.mu, m.beta * m.lam) for m in materials],
+            ][: count - 1]
+        )
+        own = weights.reshape(count - 1, -1) @ tissue
+        return (weights[0, :, 0] @ hand).reshape(rows, -1), *own.reshape(count - 1, rows, -1)
 
     def static_factor(self, materials: tuple[LayerMaterial, ...]) -> float:
         """Factor c with |r|_{K^-1} <= c |r|_{K_r^-1}: 0 <= K_lambda <= (d / 2) K_mu, since (tr e)^2 <= d e:e."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,23 +20,17 @@ from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive, Materials, modal_motions
 from softgrasp.reduction.certified.oscillators import SecondOrder
 from softgrasp.reduction.certified.trainer import Trainer, build_certified
-from softgrasp.study.bench.driver import (
-    Goal,
-    Row,
-    goal_rows,
-    list_bench,
-    open_console,
-    parse_numbers,
-    show_goals,
-    table_of,
-    write_bench,
-)
+from softgrasp.reduction.online import run as stepped_run
+from softgrasp.reduction.propagator import propagator
+from softgrasp.study.bench import driver
+from softgrasp.study.bench.driver import Goal
 from softgrasp.study.shell.timing import interleave, medians
 
 K, K2 = 16, 48  # modes of the answer, and of the basis that certifies it
+ALONE = (8, K, K2)  # modes of one basis
 BOX = ((30.0, 500.0), (20.0, 500.0))  # lambda and mu [Pa]
-SHARE = 0.3  # of an answer that its proof may cost
-OF_FULL = {15: 1 / 3, 60: 1 / 50}  # of a full run that an answer may cost, by cells of the short side
+SHARE = 0.3  # of a query, and of the steps of the model in state space, that the proof may cost
+OF_FULL = {15: 1 / 3, 60: 1 / 50}  # of a full run that a query may cost, by cells of the short side
 FULL, STEP = "full run with its factor", ", with the time step's error"
 COLUMNS = {
     "cells": "cells",
@@ -43,14 +38,30 @@ COLUMNS = {
     "CPU ms": "ms 3",
     "without the proof": "plain 3",
     "share of the proof": "share .0%",
+    "proof / state space": "of_stepped .0%",
     "of a full run": "of_full 3",
 }
 HELP = f"""Certified answers of the paper's scene with Kelvin-Voigt damping, {K} modes certified by {K2}.
 
 Each repeat draws a new material, for which every answer and the full run are made from the start, in turn, each after
 a call of its own kind that is not timed; medians of CPU time on one rank. The proof's share is that of an answer less
-the same answer without it: with two bases the estimate alone, with one basis the reduced run alone. A fast look:
---cells 15."""
+the same answer without it: with two bases the estimate alone, with one basis the reduced run alone, mode by mode. A
+query has the time step's error in it. The proof of one basis stands also beside the same run in state space: operators
+at the material, propagator, steps. A fast look: --cells 15."""
+
+
+@dataclass(frozen=True)
+class AnswerCost:
+    """One way to an answer on one mesh; None where a number does not apply."""
+
+    cells: int  # of the short side
+    answer: str
+    ms: float  # CPU time
+    plain: float | None = None  # the same without the proof [ms]
+    share: float | None = None  # of the proof in it
+    stepped: float | None = None  # the reduced run in state space [ms]
+    of_stepped: float | None = None  # proof over that
+    of_full: float | None = None  # answer over the full run
 
 
 def trained(nx: int) -> tuple[Model, CertifiedModel]:
@@ -78,24 +89,32 @@ def plain(model: CertifiedModel, blocks: SecondOrder, materials: Materials, driv
                 motion.trajectory(drive.dt, model.fine.outputs.names)
 
 
-def measure(nx: int, repeats: int) -> Iterator[Row]:
+def in_state_space(model: CertifiedModel, materials: Materials, drive: Drive) -> None:
+    """The reduced run of one basis by operators at the material, propagator and steps."""
+    step = propagator(model.fine.at(materials), drive.dt, driven=True)
+    stepped_run(step, hand=drive.hand)
+
+
+def measure(nx: int, repeats: int) -> Iterator[AnswerCost]:
     """All answers on one mesh."""
     model, two = trained(nx)
-    estimate, alone = replace(two, certify="estimate"), [two.with_sizes(k, k) for k in (K, K2)]
-    blocks = [SecondOrder.of(one.fine) for one in alone]
+    estimate, alone = replace(two, certify="estimate"), [two.with_sizes(k, k) for k in ALONE]
     assert two.drive is not None
-    step, short = two.drive, replace(two.drive, finer=None)
-    answers: dict[str, tuple[Callable[[Materials], Any], Callable[[Materials], Any]]] = {}
-    for drive, what in ((step, STEP), (short, "")):
-        answers[f"{K} + {K2}{what}"] = (
-            lambda m, drive=drive: two.run(m, drive, allow=True),  # type: ignore[misc]
-            lambda m, drive=drive: estimate.run(m, drive, allow=True),  # type: ignore[misc]
-        )
-        for one, own in zip(alone, blocks, strict=True):
-            answers[f"{one.k} alone{what}"] = (
-                lambda m, drive=drive, one=one: one.run(m, drive, allow=True),  # type: ignore[misc]
-                lambda m, drive=drive, one=one, own=own: plain(one, own, m, drive),  # type: ignore[misc]
-            )
+    short = replace(two.drive, finer=None)
+    calls: dict[str, Callable[[Materials], Any]] = {
+        FULL: lambda m: simulate(replace(model, system=model.system.with_materials(m)))
+    }
+    answers = []
+    for drive, what in ((two.drive, STEP), (short, "")):
+        answers.append(f"{K} + {K2}{what}")
+        calls[answers[-1]] = partial(two.run, drive=drive, allow=True)
+        calls[f"{answers[-1]} plain"] = partial(estimate.run, drive=drive, allow=True)
+        for one in alone:
+            answers.append(f"{one.k} alone{what}")
+            calls[answers[-1]] = partial(one.run, drive=drive, allow=True)
+            calls[f"{answers[-1]} plain"] = partial(plain, one, SecondOrder.of(one.fine), drive=drive)
+            if drive is short:
+                calls[f"{answers[-1]} stepped"] = partial(in_state_space, one, drive=drive)
 
     def timed(call: Callable[[Materials], Any]) -> Callable[[], float]:
         rng = np.random.default_rng(0)  # the same materials for each
@@ -107,31 +126,28 @@ def measure(nx: int, repeats: int) -> Iterator[Row]:
             call(two.materials(float(lam), float(mu)))
             return time.process_time() - begin
 
+        cpu()
         return cpu
 
-    calls = {FULL: timed(lambda m: simulate(replace(model, system=model.system.with_materials(m))))}
-    for name, pair in answers.items():
-        calls |= {name: timed(pair[0]), f"{name} plain": timed(pair[1])}
-    for call in calls.values():
-        call()
-    found = medians(interleave(calls, repeats))
-    full = found[FULL]
-    yield {"cells": nx, "answer": FULL, "ms": 1e3 * full}
+    ms = {name: 1e3 * t for name, t in medians(interleave({n: timed(c) for n, c in calls.items()}, repeats)).items()}
+    yield AnswerCost(nx, FULL, ms[FULL])
     for name in answers:
-        proved, less = found[name], found[f"{name} plain"]
-        about = {"ms": 1e3 * proved, "plain": 1e3 * less, "share": 1 - less / proved, "of_full": proved / full}
-        yield {"cells": nx, "answer": name, **about}
+        cost, less, stepped = ms[name], ms[f"{name} plain"], ms.get(f"{name} stepped")
+        ratio = None if stepped is None else (cost - less) / stepped
+        yield AnswerCost(nx, name, cost, less, 1 - less / cost, stepped, ratio, cost / ms[FULL])
 
 
-def goals_of(rows: list[Row]) -> list[Goal]:
-    """What was asked for: of every answer, and of those with all three numbers."""
+def goals_of(rows: list[AnswerCost]) -> list[Goal]:
+    """What was asked for: of queries, which have all three numbers, and of the proof beside the steps of one basis."""
     goals = []
     for r in rows:
-        name = f"nx = {r['cells']}, {r['answer']}"
-        if "share" in r:
-            goals.append(Goal(f"{name}: share of the proof", r["share"], SHARE))
-        if r["answer"] == f"{K} + {K2}{STEP}" and r["cells"] in OF_FULL:
-            goals.append(Goal(f"{name}: of a full run", r["of_full"], OF_FULL[r["cells"]]))
+        name = f"nx = {r.cells}, {r.answer}"
+        if r.share is not None and r.answer.endswith(STEP):
+            goals.append(Goal(f"{name}: share of the proof", r.share, SHARE))
+        if r.of_stepped is not None:
+            goals.append(Goal(f"{name}: proof over the run in state space", r.of_stepped, SHARE))
+        if r.of_full is not None and r.answer == f"{K} + {K2}{STEP}" and r.cells in OF_FULL:
+            goals.append(Goal(f"{name}: of a full run", r.of_full, OF_FULL[r.cells]))
     return goals
 
 
@@ -141,15 +157,16 @@ def main(
     out: Annotated[Path, typer.Option(help="folder for bench_certified.json and bench_certified.csv")] = Path("out"),
 ) -> None:
     """See HELP."""
-    sizes = parse_numbers(cells, r"([1-9]\d*)", "number of cells; write 15,60")
-    console = open_console(130)
-    rows: list[Row] = []
+    sizes = driver.parse_numbers(cells, r"([1-9]\d*)", "number of cells; write 15,60")
+    console = driver.open_console(130)
+    rows: list[AnswerCost] = []
     for nx in sizes:
         with console.status(f"{nx} x {2 * nx} cells"):
             rows += measure(nx, repeats)
-    table = table_of(rows, COLUMNS, f"certified answers, median CPU time of {repeats} new materials")
+    table = driver.table_of(rows, COLUMNS, f"certified answers, median CPU time of {repeats} new materials")
     console.print(table.terminal())
     goals = goals_of(rows)
-    show_goals(console, goals)
-    content = {"command": "bench_certified", "repeats": repeats, "rows": rows, "goals": goal_rows(goals)}
-    list_bench(console, write_bench(out, "bench_certified", content, table))
+    driver.show_goals(console, goals)
+    content = {"command": "bench_certified", "repeats": repeats, "rows": driver.as_rows(rows)}
+    content["goals"] = driver.goal_rows(goals)
+    driver.list_bench(console, driver.write_bench(out, "bench_certified", content, table))

@@ -10,12 +10,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.orders import BasisGains
+from softgrasp.lqr.loop.margins import LoopMargins
 from softgrasp.lqr.reduced.bases import A_PRIORI
-from softgrasp.study.control.bode import figure_bode
 from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.frames import Frames
@@ -36,6 +36,8 @@ QUANTITIES = (
 )
 TOP = 1.0  # errors above 100 % are not drawn
 LOWEST = 1e-12  # smaller excess cost is rounding
+LEAST_GAIN = 1e-4  # of the loop: smaller ones are not drawn
+DASHES = ("-", "--", ":", "-.")  # of the inputs
 CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 6.0, "mew": 1.2, "color": style.UNSTABLE}
 
 
@@ -134,6 +136,33 @@ def _few_ticks(ax: Any, lam: Sequence[float], mu: Sequence[float]) -> None:
         axis.set_ticks(values, [f"{v:.3g}" for v in values])
         axis.set_minor_formatter(NullFormatter())
         axis.set_ticks([], minor=True)
+
+
+def figure_bode(margins: LoopMargins, out_png: Path) -> tuple[Path, ...]:
+    """Gain and phase of the loop at each input, with the crossover of its phase margin."""
+    with style.paper_style():
+        figure, (gain, phase) = plt.subplots(
+            2, 1, figsize=(style.WIDTH, 0.6 * style.WIDTH), sharex=True, layout="constrained"
+        )
+        for i, axis in enumerate(margins.axes):
+            loop = margins.response[:, i]
+            colour, dashes = style.CYCLE[i % len(style.CYCLE)], DASHES[i % len(DASHES)]
+            size, shown = np.abs(loop), np.abs(loop) > LEAST_GAIN
+            gain.loglog(margins.omega[shown], size[shown], color=colour, ls=dashes, label=axis.name)
+            angle = np.degrees(np.unwrap(np.angle(-loop))) - 180
+            angle -= 360 * np.round((angle[0] + 180) / 360)
+            phase.semilogx(margins.omega[shown], angle[shown], color=colour, ls=dashes)
+            if np.isfinite(axis.crossover):
+                gain.plot(axis.crossover, 1.0, "o", color=colour, ms=4)
+                at = float(np.interp(np.log(axis.crossover), np.log(margins.omega), angle))
+                phase.plot([axis.crossover] * 2, [-180, at], "o-", color=colour, ms=3, lw=0.8)
+        gain.axhline(1.0, color=style.OUTLINE, lw=0.7)
+        phase.axhline(-180.0, color=style.OUTLINE, lw=0.7)
+        phase.yaxis.set_major_locator(MultipleLocator(45))
+        gain.set_ylabel("gain of the loop [1]")
+        phase.set(xlabel="frequency [rad/s]", ylabel="phase [deg]")
+        gain.legend()
+        return style.save(figure, out_png)
 
 
 def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Frames) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -19,7 +18,6 @@ from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.identities import rigid_gains, translation_defect, velocity_defect
 from softgrasp.lqr.plant.target import Target
-from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.reduced.retune import RetunedGain
 from softgrasp.lqr.reduced.riccati import GainQuality, GainReport
 from softgrasp.study.forward.result import newton_keys
@@ -101,17 +99,14 @@ class FiniteLoop:
 
 
 @dataclass(frozen=True)
-class ControlStudy:
-    """All that ``softgrasp control`` finds."""
+class GainStudy:
+    """The optimal feedback and the small controller."""
 
     design: Design  # the optimal feedback
     bases: tuple[BasisGains, ...]  # gains of the reduced equations
-    retuned: tuple[Retuned, ...]  # gains over the box
     controller: CertifiedController | None  # the small controller; None when no small gain is certified
     tick: float  # seconds of one tick of it, median
-    loops: LoopRuns  # closed loops
     notes: tuple[Note, ...]  # what was chosen for the user, and why parts are missing
-    finite: FiniteLoop | None = None  # the loop on the plant of finite strain; None where the effect is off
 
     @cached_property
     def margins(self) -> LoopMargins | None:
@@ -123,57 +118,59 @@ class ControlStudy:
         """Sentences of the diagnosis."""
         return [finding.sentence for finding in self.design.diagnosis.findings]
 
+    def result(self, seconds: dict[str, float]) -> dict[str, Any]:
+        """The keys of ``result.json``. Collective."""
+        d, layout = self.design, self.design.problem.layout
+        problem, solution, quality, sampled = d.problem, d.solution, d.quality, d.quality.sampled
+        displaced, moving = rigid_gains(problem, solution)
+        return {
+            "command": "control",
+            **origin(d.model.scene, layout.comm.size),
+            **{key: getattr(layout, key) for key in ("n_s", "n_e", "states")},
+            "method": solution.summary,
+            "rank": solution.rank,
+            **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
+            "residual": solution.residual,
+            "optimal_cost": d.judge.optimal,
+            "gain_translation": displaced.tolist(),
+            "gain_rigid_velocity": moving.tolist(),
+            "identity_translation": translation_defect(problem, solution),
+            "identity_velocity": velocity_defect(problem, solution),
+            **{f"closed_loop_{key}": getattr(quality, key) for key in ("abscissa", "certified", "exact")},
+            "sampled_radius": None if sampled is None else sampled.value,
+            "sampled_certified": sampled is not None and sampled.certified,
+            "sampled_exact": sampled is not None and sampled.exact,
+            "stable": quality.stable,
+            "findings": self.findings,
+            "damping_enough": d.diagnosis.damping_enough,
+            "controller": _controller(self),
+            "notes": [note.text for note in self.notes],
+            "time": {**seconds, "solver": dict(solution.seconds)},
+            "memory_peak_mb": peak_memory_mb(layout.comm),
+        }
+
+
+@dataclass(frozen=True)
+class ControlStudy(GainStudy):
+    """All that ``softgrasp control`` finds."""
+
+    loops: LoopRuns  # closed loops
+    finite: FiniteLoop | None  # the loop on the plant of finite strain; None where the effect is off
+    retuned: tuple[Retuned, ...] = ()  # gains over the box
+
     def distance(self, run: LoopTrajectory) -> Array:
         """Distance of the farthest output to its target at every instant [m], (steps + 1,)."""
         return farthest(run.outputs, self.design.target.y, self.design.problem.columns)
 
-
-def control_result(study: ControlStudy, seconds: dict[str, float]) -> dict[str, Any]:
-    """The keys of ``result.json``. Collective."""
-    return gain_result(study.design, study.controller, study.tick, study.notes, seconds) | {
-        "reduced": {b.name: [report_dict(r) | bounds_dict(r) for r in b.reports] for b in study.bases},
-        "refused": {b.name: b.refused for b in study.bases if b.refused},
-        "retune": [_retuned(r) for r in study.retuned],
-        "loop": _loop(study),
-        **_finite(study.finite),
-    }
-
-
-def gain_result(
-    d: Design, controller: CertifiedController | None, tick: float, notes: Sequence[Note], seconds: dict[str, float]
-) -> dict[str, Any]:
-    """The keys of ``result.json`` that need no closed loop. Collective."""
-    problem, solution, quality, layout = d.problem, d.solution, d.quality, d.problem.layout
-    displaced, moving = rigid_gains(problem, solution)
-    return {
-        "command": "control",
-        **origin(d.model.scene, layout.comm.size),
-        "n_s": layout.n_s,
-        "n_e": layout.n_e,
-        "states": layout.states,
-        "method": solution.summary,
-        "rank": solution.rank,
-        **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
-        "residual": solution.residual,
-        "optimal_cost": d.judge.optimal,
-        "gain_translation": displaced.tolist(),
-        "gain_rigid_velocity": moving.tolist(),
-        "identity_translation": translation_defect(problem, solution),
-        "identity_velocity": velocity_defect(problem, solution),
-        "closed_loop_abscissa": quality.abscissa,
-        "closed_loop_certified": quality.certified,
-        "closed_loop_exact": quality.exact,
-        "sampled_radius": None if quality.sampled is None else quality.sampled.value,
-        "sampled_certified": quality.sampled is not None and quality.sampled.certified,
-        "sampled_exact": quality.sampled is not None and quality.sampled.exact,
-        "stable": quality.stable,
-        "findings": [finding.sentence for finding in d.diagnosis.findings],
-        "damping_enough": d.diagnosis.damping_enough,
-        "controller": _controller(controller, tick, int(d.actuation.delay)),
-        "notes": [note.text for note in notes],
-        "time": {**seconds, "solver": dict(solution.seconds)},
-        "memory_peak_mb": peak_memory_mb(layout.comm),
-    }
+    def result(self, seconds: dict[str, float]) -> dict[str, Any]:
+        """The keys of ``result.json``. Collective."""
+        return super().result(seconds) | {
+            "reduced": {b.name: [report_dict(r) | bounds_dict(r) for r in b.reports] for b in self.bases},
+            "refused": {b.name: b.refused for b in self.bases if b.refused},
+            "retune": [_retuned(r) for r in self.retuned],
+            "loop": _loop(self),
+            **({} if self.finite is None else {"finite_strain": _finite(self.finite)}),
+        }
 
 
 def report_dict(report: GainReport) -> dict[str, Any]:
@@ -203,12 +200,12 @@ def _retuned(r: Retuned) -> dict[str, Any]:
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}
 
 
-def _controller(controller: CertifiedController | None, tick: float, delay: int) -> dict[str, Any] | None:
-    if controller is None:
+def _controller(study: GainStudy) -> dict[str, Any] | None:
+    if study.controller is None or study.margins is None:
         return None
-    c, margins = controller.controller, loop_margins(controller.controller, delay)
-    return {"method": controller.method, "N": c.plant.N, "period": c.period, "time_tick": tick,
-            "sampled_radius": controller.radius.value,
+    c, margins = study.controller.controller, study.margins
+    return {"method": study.controller.method, "N": c.plant.N, "period": c.period, "time_tick": study.tick,
+            "sampled_radius": study.controller.radius.value,
             "margins": {"axes": [asdict(axis) for axis in margins.axes], "distance": margins.distance}}  # fmt: skip
 
 
@@ -235,21 +232,17 @@ def _loop(study: ControlStudy) -> dict[str, Any]:
     }
 
 
-def _finite(finite: FiniteLoop | None) -> dict[str, Any]:
-    if finite is None:
-        return {}
+def _finite(finite: FiniteLoop) -> dict[str, Any]:
     keys = ("law", "cost_excess", "overshoot", "overshoot_linear", "reason")
     result = {key: getattr(finite, key) for key in keys} | {"stable": not finite.reason}
     if finite.run is not None and finite.run.newton is not None:
         result |= {"cost": float(finite.run.cost[-1]), "newton": newton_keys(finite.run.newton)}
-    return {"finite_strain": result}
+    return result
 
 
 def _reduced_run(study: ControlStudy, r: ReducedLoopRun) -> dict[str, Any]:
-    if r.run is None:
-        return {"method": r.method, "N": r.N, "reason": r.reason}
-    end = float(study.distance(r.run)[-1])
-    return {"method": r.method, "N": r.N, "distance_final": end, "cost": float(r.run.cost[-1]), "reason": ""}
+    ran = {} if r.run is None else {"distance_final": float(study.distance(r.run)[-1]), "cost": float(r.run.cost[-1])}
+    return {"method": r.method, "N": r.N, **ran, "reason": r.reason}
 
 
 def settled(times: Array, distance: Array, share: float = 0.01) -> float | None:
@@ -258,8 +251,3 @@ def settled(times: Array, distance: Array, share: float = 0.01) -> float | None:
     if len(outside) == 0:
         return float(times[0])
     return None if outside[-1] + 1 >= len(times) else float(times[outside[-1] + 1])
-
-
-def a_priori(bases: Sequence[BasisGains]) -> BasisGains | None:
-    """The gains of the basis that needs no P; None where there are none."""
-    return next((b for b in bases if b.name == A_PRIORI), None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -16,17 +16,16 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.scene.control import Loop
 from softgrasp.lqr.design.duration import bases_with_bounds, plan
-from softgrasp.lqr.design.feedback import design
-from softgrasp.lqr.design.orders import BasisGains, orders
-from softgrasp.lqr.design.scene import linearised, with_control
-from softgrasp.study.control.gain import run_gain, small_controller
-from softgrasp.study.control.loop import pole_sets, run_finite, run_loops, save_controllers
-from softgrasp.study.control.page import sections
-from softgrasp.study.control.result import ControlStudy, Note, Retuned, a_priori, control_result
-from softgrasp.study.control.sweep import retune, sweep
-from softgrasp.study.control.tables import best_table, summary, summary_rows, tables
+from softgrasp.lqr.design.feedback import Design, design
+from softgrasp.lqr.design.orders import BasisGains, orders, reduce_gains
+from softgrasp.lqr.design.scene import finite_problem, linearised, with_control
+from softgrasp.lqr.plant.gain import PlantState
+from softgrasp.lqr.reduced.bases import A_PRIORI
+from softgrasp.study.control import measure, tables
+from softgrasp.study.control.result import ControlStudy, GainStudy, Note, Retuned
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.pictures.frames import Frames
+from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
@@ -45,38 +44,44 @@ def run_control(
     """
     session = Session("control", path, overrides, out, console, **flags)
     model, sentence = with_control(session.model(session.scene(), steps=False))
+    notes = [Note("table", sentence)] if sentence else []
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
     watch, restart = Stopwatch(session.comm), restart_folder(model, out)
+    fields: list[Path] = []
+    drawn: Callable[[], list[Path]] = list
     with session.progress(TaskProgressColumn()) as bar:
         if restart is not None:
             exists = session.comm.bcast(restart.exists())
             word = "going on from" if exists else "interrupted, the same command goes on from"
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
-        notes = [Note("table", sentence)] if sentence else []
+        feedback = design(linearised(model), watch, solver_bar(bar, model), restart)
         if gain_only:
-            return run_gain(session, model, watch, solver_bar(bar, model), notes, restart)
-        study, fields, others = control_model(session, model, watch, bar, notes, restart)
+            study = small_study(feedback, watch, notes)
+        else:
+            study, fields, drawn = loop_study(session, model, feedback, watch, bar, notes)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
-        target = study.design.target if study.finite is None else study.finite.target
-        saved = save_controllers(study.design, study.controller, out, target.state)
+        saved = measure.save_controllers(study, out, end_state(model, study))
     seconds = {**model.watch.seconds, **watch.seconds}
-    result = control_result(study, seconds)
+    result = study.result(seconds)
+    if session.comm.rank == 0:
+        show(console, study, seconds)
 
     def page() -> Page:
-        drawn: list[Path] = []
+        name = model.scene.name
+        if not isinstance(study, ControlStudy):
+            parts = [Section("Result", rows=tables.gain_rows(study))]
+            return Page(f"{name}: optimal gain", tables.gain_summary(study), parts, {}, saved, " --gain-only")
+        pictures: list[Path] = []
         if session.pictures and study.retuned:
             from softgrasp.study.control.plots import figure_retune  # brings Matplotlib
 
-            drawn += figure_retune(study.retuned, out / "retune.png")
-        drawn += others()
-        title = f"{model.scene.name}: optimal feedback"
-        parts, files = sections(study, seconds, drawn), [*drawn, *fields, *saved]
-        return Page(title, summary(study), parts, tables(study), files)
+            pictures += figure_retune(study.retuned, out / "retune.png")
+        pictures += drawn()
+        parts, files = tables.sections(study, seconds, pictures), [*pictures, *fields, *saved]
+        return Page(f"{name}: optimal feedback", tables.summary(study), parts, tables.csv_tables(study), files)
 
-    if session.comm.rank == 0:
-        show(console, study, seconds)
     list_files(console, session.write(model.scene, result, page))
     if session.comm.rank == 0 and restart is not None:
         shutil.rmtree(restart, ignore_errors=True)
@@ -92,45 +97,58 @@ def restart_folder(model: Model, out: Path) -> Path | None:
     return out / f"restart-{scene_hash(model.scene)[:12]}-{layout.comm.size}"
 
 
-def control_model(
-    session: Session, model: Model, watch: Stopwatch, bar: Progress, notes: list[Note], restart: Path | None = None
-) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
-    """Solve, reduce, close the loop of a scene with a control table, and re-tune while that is drawn. Collective.
+def small_study(feedback: Design, watch: Stopwatch, notes: Sequence[Note]) -> GainStudy:
+    """The a-priori gains and the small controller, without closed loop. Collective."""
+    bases: tuple[BasisGains, ...] = ()
+    if not feedback.modal:
+        with watch.stage("reduced"):
+            bases = reduce_gains(feedback, orders(feedback)[0], names=(A_PRIORI,))
+    return measure.gain_study(feedback, bases, notes)
 
-    ``watch`` takes the seconds of the stages; more is added to ``notes``; ``restart`` is the folder of restart files.
+
+def end_state(model: Model, study: GainStudy) -> PlantState:
+    """Where the controllers go, at finite strain the equilibrium there. Collective."""
+    if isinstance(study, ControlStudy) and study.finite is not None:
+        return study.finite.target.state
+    if model.system.points is None:
+        return study.design.target.state
+    return finite_problem(study.design.problem, model.system, study.design.target)[1].state
+
+
+def loop_study(
+    session: Session, model: Model, feedback: Design, watch: Stopwatch, bar: Progress, notes: Sequence[Note]
+) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
+    """All reduced gains, the closed loops, and gains re-tuned while those are drawn. Collective.
+
     Returned are also the field files, and what waits for the pictures on rank 0.
     """
-    own_end = not notes  # a scene made for control says how long its loop runs
-    finite_strain = model.system.points is not None
-    linear = linearised(model)
-    feedback = design(linear, watch, solver_bar(bar, model), restart)
+    duration = plan(feedback, own_end=not notes)  # a scene made for control says how long its loop runs
+    finite_strain, sampled = model.system.points is not None, feedback.quality.sampled
     bases: tuple[BasisGains, ...] = ()
-    notes, duration = list(notes), plan(feedback, own_end)
     if feedback.modal:
-        sentence = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
-        notes.append(Note("modal", sentence))
+        text = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
+        notes = [*notes, Note("modal", text)]
     else:
         sizes, few = orders(feedback)
         with watch.stage("reduced"):
-            bases = sweep(feedback, sizes, counted(bar, "reduced equations"))
+            bases = measure.timed_gains(feedback, sizes, counted(bar, "reduced equations"))
         with watch.stage("bounds"):
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
-        notes += [Note("orders", few)] if few else []
-    controller, tick, refused = small_controller(feedback, a_priori(bases))
-    notes += refused
-    sampled = feedback.quality.sampled
-    if sampled is not None and sampled.reason:
-        notes.append(Note("sampling", f"the loop from tick to tick is not certified: {sampled.reason}"))
-    notes += unused_rate(model)
-    notes += [Note("end", duration.note)] if duration.note else []
+        notes = [*notes, Note("orders", few)]
+    small = measure.gain_study(feedback, bases, notes)
+    reason = "" if sampled is None else sampled.reason
+    sampling = Note("sampling", reason and f"the loop from tick to tick is not certified: {reason}")
+    all_notes = [*small.notes, sampling, *unused_rate(model), Note("end", duration.note)]
     frames = Frames(model, session.out, session.pictures)
     with watch.stage("loop"):
-        loops = run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
+        loops = measure.run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
     finite = None
     if finite_strain:
         with watch.stage("finite strain"):
-            finite = run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
-    study = ControlStudy(feedback, bases, (), controller, tick, loops, tuple(notes), finite)
+            finite = measure.run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
+    study = ControlStudy(
+        feedback, bases, small.controller, small.tick, tuple(n for n in all_notes if n.text), loops, finite
+    )
     fields, drawn = frames.close(), _drawn(session, study, frames)
     if feedback.modal:
         return study, fields, drawn
@@ -139,16 +157,16 @@ def control_model(
         if finite_strain and model.system.gravity is not None:
             why = "the stiffness is that of the equilibrium, which moves with the material"
         else:
-            retuned, why = retune(feedback, bases, duration, counted(bar, "re-tuning"))
-    notes += [Note("retune", f"no re-tuning: {why}")] if why else []
-    return replace(study, retuned=retuned, notes=tuple(notes)), fields, drawn
+            retuned, why = measure.retune(feedback, bases, duration, counted(bar, "re-tuning"))
+    told = (*study.notes, *([Note("retune", f"no re-tuning: {why}")] if why else []))
+    return replace(study, retuned=retuned, notes=told), fields, drawn
 
 
 def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[], list[Path]]:
     """Begin to draw on rank 0. Collective."""
     if not session.pictures:
         return list
-    poles = pole_sets(study)
+    poles = measure.pole_sets(study)
 
     def draw(out: Path) -> list[Path]:
         from softgrasp.study.control.plots import draw_all  # brings Matplotlib
@@ -193,10 +211,13 @@ def counted(bar: Progress, text: str) -> Callable[[int, int], None]:
     return note
 
 
-def show(console: Console, study: ControlStudy, seconds: dict[str, float]) -> None:
+def show(console: Console, study: GainStudy, seconds: dict[str, float]) -> None:
     """Summary, then the reduced gains."""
+    if not isinstance(study, ControlStudy):
+        console.print(pairs(tables.gain_rows(study)))
+        return
     for sentence in (*study.findings, *(note.text for note in study.notes if note.topic != "table")):
         console.print(f"note: {sentence}", soft_wrap=True, markup=False)
-    console.print(pairs(summary_rows(study, seconds)))
+    console.print(pairs(tables.summary_rows(study, seconds)))
     if study.bases:
-        console.print(best_table(study.bases).terminal(wrap=[0], width=console.width))
+        console.print(tables.best_table(study.bases).terminal(wrap=[0], width=console.width))

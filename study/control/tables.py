@@ -1,40 +1,58 @@
-"""Tables of ``softgrasp control``: the summary, reduced gains, re-tuning, closed loops, the trajectory."""
+"""Tables, sentences and page of ``softgrasp control``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from softgrasp.fem.columns import hand_columns
-from softgrasp.fem.petsc import Array
-from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
+from softgrasp.lqr.loop.margins import LoopMargins
 from softgrasp.lqr.plant.identities import rigid_gains
 from softgrasp.lqr.reduced.riccati import GainQuality
-from softgrasp.study.control.result import TITLES, ControlStudy, Retuned, radius_of, settled
+from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header
+from softgrasp.study.pictures.shapes import speed_up
+from softgrasp.study.report.equation import controlled
+from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 
 Row = tuple[Any, ...]
-SPECTRUM = ("abscissa [1/s]", "radius a tick")
 EXCESS = ("excess cost", "proved to the end", "at most")
+SPECTRUM = ("abscissa [1/s]", "radius a tick")
 REDUCED_HEADER = ("basis", "N", "error of P", "error of K", *EXCESS, *SPECTRUM, "reduced ARE [ms]", "gain")
 BOX_HEADER = ("lambda [Pa]", "mu [Pa]", "error of K", *EXCESS, *SPECTRUM, "re-tuned in [ms]", "gain")
 LOOP_HEADER = ("gain", "N", "distance at the end [m]", "cost", "over the optimal")
 BEST_HEADER = (
     "best stable gain", "N", "error P", "error K", "excess", "at most", "abscissa", "ARE, ms", "unstable N",
 )  # fmt: skip
+MARGIN_HEADER = ("input", "gain may change by a factor", "phase margin", "at", "delay it bears")
+CAPTIONS = {
+    "move.png": "The move to the target at some instants, full plant under the optimal gain.",
+    "move.gif": "The move in motion{speed}.",
+    "histories.png": "Outputs, force on the hand, and the distance of the farthest output to the target, on the "
+    "full plant; dashed and dash-dotted under the a-priori gain and the paper's reduced gain of largest cost.",
+    "errors.png": "Reduced Riccati equations: relative error of P, relative error of the gain and excess cost against "
+    "N. Errors above 100 % are not drawn, excess cost below 1e-12 at 1e-12. Red crosses: gains that leave the full "
+    "plant unstable or without certificate; on the upper edge those with an error above 100 %.",
+    "retune.png": "Excess cost over the box when the basis stays that of the scene's parameter. Red crosses: no stable "
+    "gain.",
+    "bode.png": "The loop at each input, all others closed, on the controller's own plant, sampled and held; marked: "
+    "the crossover and its phase margin.",
+    "decay.png": "Decay rates of the lowest modes without feedback and with the gains.",
+}
 
 
-def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[str, str]]:
+def summary_rows(study: ControlStudy, seconds: Mapping[str, float]) -> list[tuple[str, str]]:
     """The short table as label and text."""
     full, loops, away = study.loops.full, study.loops, study.distance(study.loops.full)
     arrived = settled(full.times, away)
     rows = [
-        *gain_rows(study.design),
+        *solution_rows(study.design),
         ("distance to the target", f"{away[0]:.3g} m at first, {away[-1]:.3g} m at the end"),
         ("stays within 1 % of the way from", "not within the run" if arrived is None else f"{arrived:.4g} s on"),
         ("cost of the run + still to come", f"{full.cost[-1]:.6g} + {loops.to_come:.3g}"),
@@ -43,18 +61,43 @@ def summary_rows(study: ControlStudy, seconds: dict[str, float]) -> list[tuple[s
         rows.append((f"on the plant of finite strain ({study.finite.law})", study.finite.text))
     if full.saturated:
         rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
-    rows += controller_rows(study.controller, study.tick)
+    rows += controller_rows(study)
     if study.margins is not None:
         low, high, phase = study.margins.together
-        text = (
-            f"gain x {low:.3g} to {high:.3g}, phase {phase:.3g} deg"
-            if high < 1e3
-            else f"gain x {low:.3g} or more, phase {phase:.3g} deg"
-        )
-        rows.append(("its margins, all inputs at once", text))
+        up = f"to {high:.3g}" if high < 1e3 else "or more"
+        rows.append(("its margins, all inputs at once", f"gain x {low:.3g} {up}, phase {phase:.3g} deg"))
     rows += [("re-tuned", _fast(r)) for r in study.retuned]
     stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
     return [*rows, ("time: ARE, reduced, loop", stages)]
+
+
+def gain_rows(study: GainStudy) -> list[tuple[str, str]]:
+    """Riccati equation and small controller as label and text."""
+    return [*solution_rows(study.design), *controller_rows(study)]
+
+
+def solution_rows(design: Design) -> list[tuple[str, str]]:
+    """The solution of the Riccati equation and its closed loop as label and text."""
+    solution, gains = design.solution, rigid_gains(design.problem, design.solution)
+    counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
+    displaced, moving = ("; ".join(" ".join(f"{v:.5g}" for v in row) for row in gain) for gain in gains)
+    return [
+        ("method", solution.summary),
+        ("rank, Newton steps, solves", ", ".join(counts)),
+        ("true relative residual", f"{solution.residual:.1e}"),
+        ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
+        *_spectrum(design),
+        ("gain, body displaced", displaced),
+        ("gain, body moving", moving),
+    ]
+
+
+def controller_rows(study: GainStudy) -> list[tuple[str, str]]:
+    """The small controller as label and text, if there is one."""
+    if study.controller is None:
+        return []
+    c = study.controller.controller
+    return [("small controller", f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms")]
 
 
 def summary(study: ControlStudy) -> list[str]:
@@ -64,55 +107,32 @@ def summary(study: ControlStudy) -> list[str]:
     reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
         f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
     )  # fmt: skip
-    excess, told = (full.cost[-1] + loops.to_come) / optimal - 1, [f"The optimal gain {reaches}."]
     if full.saturated:
-        told.append(f"With the limits of the loads the move costs {excess:.2%} more than without them.")
+        excess = (full.cost[-1] + loops.to_come) / optimal - 1
+        cost = f"With the limits of the loads the move costs {excess:.2%} more than without them."
     else:
-        told.append(f"The move costs {full.cost[-1]:.4g}; the Riccati equation predicts {optimal:.4g}.")
-    return [*told, _controller(study.controller, study.tick)]
+        cost = f"The move costs {full.cost[-1]:.4g}; the Riccati equation predicts {optimal:.4g}."
+    return [f"The optimal gain {reaches}.", cost, _controller(study)]
 
 
-def gain_summary(design: Design, controller: CertifiedController | None, tick: float) -> list[str]:
+def gain_summary(study: GainStudy) -> list[str]:
     """What came out of the Riccati equation alone, in three sentences."""
-    solution, quality = design.solution, design.quality
+    d = study.design
     return [
-        f"The Riccati equation is solved to the relative residual {solution.residual:.1e}.",
-        f"The move costs {design.judge.optimal:.4g} at least; the abscissa of its loop is {quality.abscissa:.3g} 1/s.",
-        _controller(controller, tick),
+        f"The Riccati equation is solved to the relative residual {d.solution.residual:.1e}.",
+        f"The move costs {d.judge.optimal:.4g} at least; the abscissa of its loop is {d.quality.abscissa:.3g} 1/s.",
+        _controller(study),
     ]
 
 
-def _controller(controller: CertifiedController | None, tick: float) -> str:
-    if controller is None:
+def _controller(study: GainStudy) -> str:
+    if study.controller is None:
         return "No small controller is certified, see the notes."
-    c = controller.controller
+    c = study.controller.controller
     return (
-        f"The small controller has N = {c.plant.N} columns and takes {1e6 * tick:.2g} us of each tick of "
+        f"The small controller has N = {c.plant.N} columns and takes {1e6 * study.tick:.2g} us of each tick of "
         f"{1e3 * c.period:g} ms."
     )
-
-
-def gain_rows(design: Design) -> list[tuple[str, str]]:
-    """The solution of the Riccati equation and its closed loop as label and text."""
-    solution, (displaced, moving) = design.solution, rigid_gains(design.problem, design.solution)
-    counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
-    return [
-        ("method", solution.summary),
-        ("rank, Newton steps, solves", ", ".join(counts)),
-        ("true relative residual", f"{solution.residual:.1e}"),
-        ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
-        *_spectrum(design),
-        ("gain, body displaced", _matrix(displaced)),
-        ("gain, body moving", _matrix(moving)),
-    ]
-
-
-def controller_rows(controller: CertifiedController | None, tick: float) -> list[tuple[str, str]]:
-    """The small controller as label and text, if there is one."""
-    if controller is None:
-        return []
-    c = controller.controller
-    return [("small controller", f"N = {c.plant.N}, {1e6 * tick:.2g} us a tick of {1e3 * c.period:g} ms")]
 
 
 def _spectrum(design: Design) -> list[tuple[str, str]]:
@@ -132,10 +152,6 @@ def _spectrum(design: Design) -> list[tuple[str, str]]:
         remark += "" if quality.sampled.certified else left_out
         rows.append(("spectral radius from tick to tick", f"{quality.sampled.value:.6g}{remark}"))
     return rows
-
-
-def _matrix(values: Array) -> str:
-    return "; ".join(" ".join(f"{v:.5g}" for v in row) for row in values)
 
 
 def _fast(r: Retuned) -> str:
@@ -159,31 +175,17 @@ def _mark(gain: GainQuality) -> str:
     return "unstable as sampled" if gain.sampled.value >= 1 else "not certified as sampled"
 
 
-def _cells(gain: GainQuality, *values: float) -> list[float | None]:
-    """Nothing where there is no gain, or no finite number."""
-    return [None if gain.reason or not np.isfinite(x) else float(x) for x in values]
-
-
-def _excess(gain: GainQuality) -> tuple[float, float, float]:
-    return gain.cost_excess, gain.cost_excess_proved, gain.cost_excess_at_most
+def _cells(gain: GainQuality, *first: float, seconds: float) -> Row:
+    """``first``, excess cost, spectrum, milliseconds and mark; nothing where there is no gain, or no finite number."""
+    excess = (gain.cost_excess, gain.cost_excess_proved, gain.cost_excess_at_most)
+    values = (*first, *excess, gain.abscissa_full, radius_of(gain), 1e3 * seconds)
+    return (*(None if gain.reason or not np.isfinite(x) else float(x) for x in values), _mark(gain))
 
 
 def reduced_table(bases: Sequence[BasisGains]) -> Table:
     """One row a gain; errors of an unusable gain are shown, its cost is not."""
-    rows = [
-        (
-            TITLES[b.name],
-            r.N,
-            *_cells(r, r.error_P, r.error_K, *_excess(r)),
-            None if r.reason else r.abscissa_full,
-            None if r.sampled is None else radius_of(r),
-            None if r.reason else 1e3 * r.time_are,
-            _mark(r),
-        )
-        for b in bases
-        for r in b.reports
-    ]
     reports = [(b, r) for b in bases for r in b.reports]
+    rows = [(TITLES[b.name], r.N, *_cells(r, r.error_P, r.error_K, seconds=r.time_are)) for b, r in reports]
     best = [i for i, (b, r) in enumerate(reports) if r is b.best()]
     return Table(REDUCED_HEADER, rows, "Reduced Riccati equations", best)
 
@@ -204,15 +206,26 @@ def best_table(bases: Sequence[BasisGains]) -> Table:
 
 def box_rows(r: Retuned) -> list[Row]:
     """One row a setting."""
-    return [
-        (
-            p.materials[0].lam,
-            p.materials[0].mu,
-            *_cells(p, p.error_K, *_excess(p), p.abscissa_full, radius_of(p), 1e3 * p.seconds),
-            _mark(p),
-        )
-        for p in r.points
-    ]
+    return [(p.materials[0].lam, p.materials[0].mu, *_cells(p, p.error_K, seconds=p.seconds)) for p in r.points]
+
+
+def margin_section(margins: LoopMargins, figures: Sequence[tuple[Path, str]]) -> Section:
+    """One row an input: gain factors, phase margin, crossover, delay; above them what all bear at once."""
+    rows = [
+        (a.name, f"{a.gain_down:.3g} to {_number(a.gain_up)}", f"{_number(a.phase)} deg",
+         f"{_number(a.crossover)} rad/s", f"{_number(a.delay)} s")
+        for a in margins.axes
+    ]  # fmt: skip
+    low, high, phase = margins.together
+    text = (
+        f"All inputs together bear any gain factors from {low:.3g} to {_number(high)}, or phase shifts up to "
+        f"{phase:.3g} deg; the smallest singular value of I + L is {margins.distance:.3g}."
+    )
+    return Table(MARGIN_HEADER, rows, "Margins of the small controller").section(text, figures=figures)
+
+
+def _number(x: float) -> str:
+    return "any" if np.isinf(x) or x > 1e3 else "none" if np.isnan(x) else f"{x:.3g}"
 
 
 def loop_table(study: ControlStudy) -> Table:
@@ -239,7 +252,7 @@ def trajectory_table(study: ControlStudy) -> Table:
     return Table(tuple(names), data.tolist())
 
 
-def tables(study: ControlStudy) -> dict[str, Table]:
+def csv_tables(study: ControlStudy) -> dict[str, Table]:
     """CSV file name -> table."""
     files = {"trajectory.csv": trajectory_table(study)}
     if study.bases:
@@ -248,3 +261,47 @@ def tables(study: ControlStudy) -> dict[str, Table]:
         rows = [(TITLES[r.name], r.N, *row) for r in study.retuned for row in box_rows(r)]
         files["retune.csv"] = Table(("basis", "N", *BOX_HEADER), rows)
     return files
+
+
+def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[Path]) -> list[Section]:
+    """Parts of the page."""
+    faster = speed_up(np.array([0.0, study.loops.plan.settle]))
+    speed = "" if faster == 1 else f" at {faster:g} times its speed"
+    figures = {file.name: (file, text.format(speed=speed)) for file, text in captioned(drawn, CAPTIONS)}
+
+    def pick(*names: str) -> list[tuple[Path, str]]:
+        return [figures[name] for name in names if name in figures]
+
+    notes = "\n\n".join((*study.findings, *(note.text for note in study.notes)))
+    parts = [
+        Section("", figures=pick("move.png", "move.gif")),
+        *([Section("Notes", text=notes)] if notes else []),
+        Section("Result", rows=summary_rows(study, seconds), figures=pick("histories.png", "decay.png")),
+        Section("Equation", equation=controlled(study.design.model.scene)),
+    ]
+    if study.bases:
+        parts += _reduced(study, pick("errors.png"))
+    if study.margins is not None:
+        parts.append(margin_section(study.margins, pick("bode.png")))
+    for i, r in enumerate(study.retuned):
+        text = f"{TITLES[r.name]}, N = {r.N}: basis of the scene's parameter, gain re-tuned at others."
+        own = [] if i else pick("retune.png")
+        parts.append(Section("" if i else "Re-tuning", text, header=BOX_HEADER, rows=box_rows(r), figures=own))
+    return parts
+
+
+def _reduced(study: ControlStudy, figures: list[tuple[Path, str]]) -> list[Section]:
+    plan = study.loops.plan
+    text = (
+        "Each equation is projected on N basis vectors and solved; its gain is tested on the full plant. The bases "
+        "of the paper need P first, the a-priori modes do not. Only stable gains are offered as controllers. "
+        "The excess cost is J/J* - 1 on the modes kept. The first bound beside it is proved for the whole plant, by "
+        f"the duality gap, for the run to t = {plan.dt * plan.steps:.4g} s and the optimal feedback after it; the "
+        "second makes room for what the gain's own way costs after that time, which is an allowance, not a proof."
+    )
+    none = [(f"{TITLES[b.name]}, N = {r.N}", r.unbounded) for b in study.bases for r in b.reports if r.unbounded]
+    parts = [reduced_table(study.bases).section(text, figures=figures)]
+    refused = [(TITLES[b.name], b.refused) for b in study.bases if b.refused]
+    parts += [Section("Refused", header=("basis", "reason"), rows=refused)] if refused else []
+    parts += [Section("Without a bound of the cost", header=("gain", "reason"), rows=none)] if none else []
+    return [*parts, loop_table(study).section("Full plant, same start, time step and actuation.")]

@@ -26,9 +26,9 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import ReducedRiccati, gain_error, reduce_riccati
 from softgrasp.lqr.riccati import Method, solve
+from softgrasp.study.control.measure import with_time
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.control.result import report_dict
-from softgrasp.study.control.sweep import with_time
 from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import CONTROL, ReducedRiccatiPoint, RiccatiPoint

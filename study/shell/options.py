@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+from collections.abc import Callable
+from copy import copy
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_origin
 
 import typer
 
 from softgrasp.fem.errors import SceneError
-
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", "-s", help="override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"),
-]
 
 
 def check_folder(out: Path | None) -> Path | None:
@@ -26,30 +25,11 @@ def check_folder(out: Path | None) -> Path | None:
     return out
 
 
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        "--out",
-        "-o",
-        help="folder for result.json, tables, pictures and report.html; out/SCENE-COMMAND if it is not given",
-        callback=check_folder,
-    ),
-]
-Empty = Annotated[
-    bool, typer.Option("--empty", help="first remove the results that an earlier run has left in the folder")
-]
-
-
 def _pdf(pdf: bool) -> bool:
     from softgrasp.study.pictures import PDF
 
     PDF.set(pdf)
     return pdf
-
-
-Pdf = Annotated[bool, typer.Option("--pdf", help="write figures as PDF too", callback=_pdf)]
-Quiet = Annotated[bool, typer.Option("--quiet", help="no progress bar")]
-Pictures = Annotated[bool, typer.Option(" /--no-pictures", show_default=False, help="numbers and fields only")]
 
 
 def _scenes(start: str) -> list[str]:
@@ -61,7 +41,49 @@ def _scenes(start: str) -> list[str]:
     return [name for name in (*shipped_scenes(), *near) if name.startswith(start)]
 
 
-SceneFile = Annotated[
-    Path,
-    typer.Argument(help="scene file (TOML); `softgrasp scenes` lists those that ship", autocompletion=_scenes),
-]
+OVERRIDE = "override a scene key, e.g. --set tissue.cells=[40,80]; may be repeated"
+EMPTY = "first remove the results that an earlier run has left in the folder"
+FOLDER = "folder for result.json, tables, pictures and report.html; out/SCENE-COMMAND if it is not given"
+SHARED: dict[str, tuple[Any, Any]] = {  # type, and what typer shows
+    "scene": (
+        Path,
+        typer.Argument(..., help="scene file (TOML); `softgrasp scenes` lists those that ship", autocompletion=_scenes),
+    ),
+    "out": (Path | None, typer.Option(None, "--out", "-o", help=FOLDER, callback=check_folder)),
+    "set_": (list[str] | None, typer.Option(None, "--set", "-s", help=OVERRIDE)),
+    "quiet": (bool, typer.Option(False, "--quiet", help="no progress bar")),
+    "pictures": (bool, typer.Option(True, " /--no-pictures", show_default=False, help="numbers and fields only")),
+    "empty": (bool, typer.Option(False, "--empty", help=EMPTY)),
+    "pdf": (bool, typer.Option(False, "--pdf", help="write figures as PDF too", callback=_pdf)),
+}
+
+
+def takes(order: str, out: str = "") -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command options of `SHARED` beside its own, which are `Annotated`; it gets all but ``pdf`` by keyword.
+
+    Args:
+        order: names of all its arguments and options as ``--help`` lists them.
+        out: what ``--out`` is for, if not for the folder of a run.
+    """
+
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True).parameters
+
+        def parameter(name: str) -> inspect.Parameter:
+            if name in own and get_origin(own[name].annotation) is Annotated:
+                return own[name].replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            kind, info = SHARED[name]
+            if name == "out" and out:
+                info = copy(info)
+                info.help = out
+            return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=info, annotation=kind)
+
+        @wraps(command)
+        def call(**given: Any) -> None:
+            given.pop("pdf", None)  # its callback has seen it
+            command(**given)
+
+        call.__signature__ = inspect.Signature(list(map(parameter, order.split())))  # type: ignore[attr-defined]
+        return call
+
+    return decorated

@@ -17,7 +17,7 @@ from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.lqr.loop.margins import loop_margins
 from softgrasp.reduction.lti import LTI
-from softgrasp.study.control.bode import figure_bode
+from softgrasp.study.control.plots import figure_bode
 from softgrasp.study.control.run import run_control
 from softgrasp.study.reduce.run import run_reduce
 

@@ -1,0 +1,234 @@
+"""What ``softgrasp control`` runs and times: closed loops, ticks, reduced equations, gains re-tuned over a box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from softgrasp.fem.errors import SolverError
+from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Model
+from softgrasp.fem.petsc import on_root
+from softgrasp.lqr.dense.care import solve_reduced
+from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
+from softgrasp.lqr.design.duration import LoopPlan, largest_cost, with_bounds
+from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains, fast_order, reduce_gains
+from softgrasp.lqr.design.scene import finite_problem
+from softgrasp.lqr.loop.controller import Controller, save_gain
+from softgrasp.lqr.loop.cost import overshoot, predicted_cost
+from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
+from softgrasp.lqr.plant.checks import ControlError
+from softgrasp.lqr.plant.gain import PlantState
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.plant.target import rest
+from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
+from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
+from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.lqr.riccati import solve
+from softgrasp.lqr.spectrum.modal_loop import SOME_MODES
+from softgrasp.reduction.parameters import grid_of, materials_at, outside
+from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, Note, ReducedLoopRun, Retuned
+from softgrasp.study.pictures.frames import Frames
+from softgrasp.study.pictures.shapes import move_steps
+from softgrasp.study.shell.timing import repeated
+
+NEAR = 0.01  # of the way, which a loop that settles comes to
+SHOWN_MODES = 20  # whose poles are drawn
+TICKS = 1000  # behind the time of one tick of the controller
+SOLUTIONS = 3  # of a reduced equation, the fastest counts
+REPEATS = 5  # of a re-tuning, the best counts
+BOX_STATES = 30_000  # above, nine more full solutions would take minutes
+
+
+def gain_study(design: Design, bases: Sequence[BasisGains], notes: Sequence[Note]) -> GainStudy:
+    """With the small controller and the time of its tick, or with a note why there is none. Collective."""
+    controller: CertifiedController | None = None
+    tick = float("nan")
+    try:
+        controller = certified_controller(design, a_priori(bases))
+        tick = design.problem.layout.comm.bcast(tick_seconds(controller.controller))
+    except NoController as error:
+        notes = [*notes, Note("controller", f"There is no small controller: {error}")]
+    return GainStudy(design, tuple(bases), controller, tick, tuple(notes))
+
+
+def a_priori(bases: Sequence[BasisGains]) -> BasisGains | None:
+    """The gains of the basis that needs no P; None where there are none."""
+    return next((b for b in bases if b.name == A_PRIORI), None)
+
+
+def tick_seconds(controller: Controller) -> float:
+    """Median seconds of a tick of ten."""
+    at_rest = np.zeros(controller.n_s)
+    ten = repeated(MPI.COMM_SELF, lambda: [controller.step(at_rest, at_rest) for _ in range(10)], TICKS // 10, np.inf)
+    controller.reset()
+    return float(np.median(ten)) / 10
+
+
+def save_controllers(study: GainStudy, out: Path, target: PlantState) -> list[Path]:
+    """controller.npz for the robot, gain.npz of full order with x_bar. Collective."""
+    design, layout = study.design, study.design.problem.layout
+    files = []
+    if study.controller is not None and layout.comm.rank == 0:
+        files.append(study.controller.controller.save(out / "controller.npz"))
+    return [*files, save_gain(out / "gain.npz", design.gain, target, layout, scene_hash(design.model.scene))]
+
+
+def run_finite(design: Design, model: Model, linear: LoopTrajectory, plan: LoopPlan, notify: Notify) -> FiniteLoop:
+    """The optimal gain of the linear plant on that of finite strain, from the same start. Collective.
+
+    ``linear`` is the run of the linear plant. Raises SolverError: there is no equilibrium under gravity.
+    """
+    scene, points = model.scene, model.system.points
+    assert points is not None
+    problem, target = finite_problem(design.problem, model.system, design.target)
+    start = rest(model.system, deformed=scene.time.start == "equilibrium")
+    options = LoopOptions(progress=lambda run: notify(run.reached, plan.steps), most=largest_cost(design, plan))
+    loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible)
+    try:
+        run = loop.run(design.gain, target, plan.steps, design.actuation, start, options)
+    except SolverError as error:  # it diverges, or leaves what the law describes
+        return FiniteLoop(points.law, None, target, str(error))
+    finally:
+        loop.destroy()
+    away, expected = (np.linalg.norm(r.outputs - t.y, axis=1) for r, t in ((run, target), (linear, design.target)))
+    reason = ""
+    if away[-1] > max(NEAR * away[0], 2 * expected[-1]):
+        reason = f"the outputs end {away[-1]:.3g} m from their target, on the linear plant {expected[-1]:.3g} m"
+    excess = float(run.cost[-1] / linear.cost[-1] - 1) if linear.cost[-1] > 0 else 0.0
+    past = overshoot(run.outputs, target.y), overshoot(linear.outputs, design.target.y)
+    return FiniteLoop(points.law, run, target, reason, excess, *past)
+
+
+def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frames: Frames, notify: Notify) -> LoopRuns:
+    """Full plant under the optimal gain with frames, then under the best stable gain of each basis. Collective.
+
+    Raises SolverError: the loop under the optimal gain diverges.
+    """
+    problem, scene, law = design.problem, design.model.scene, design.actuation
+    others = [] if design.modal else best_gains(bases, problem.layout)
+    total, done = (len(others) + 1) * plan.steps, 0
+
+    def progress(run: Any) -> None:
+        notify(done + run.reached, total)
+
+    shown = move_steps(plan.steps, plan.dt, plan.settle, 3 if frames.few else scene.output.frames)
+    frames.chosen = set(shown)
+    loop = ClosedLoop(problem, plan.dt, scene.time.solver, scene.time.rtol, scene.time.reproducible)
+    options = LoopOptions(progress=progress, most=largest_cost(design, plan))
+    reduced = []
+    try:
+        filmed = replace(options, frames=shown, frame=frames)
+        full = loop.run(design.gain, design.target, plan.steps, law, design.start, filmed)
+        for report in others:
+            done += plan.steps
+            if report.gain is None:
+                continue
+            try:
+                run = loop.run(report.gain, design.target, plan.steps, law, design.start, options)
+                reduced.append(ReducedLoopRun(report.method, report.N, run))
+            except SolverError as error:  # limits or sampling may upset what the continuous law stabilises
+                reduced.append(ReducedLoopRun(report.method, report.N, None, str(error)))
+    finally:
+        loop.destroy()
+    to_come = predicted_cost(problem, design.solution, full.final - design.target.state)
+    return LoopRuns(plan, full, to_come, tuple(reduced), law.bound(problem.layout.n_s))
+
+
+def pole_sets(study: ControlStudy) -> dict[str, np.ndarray]:
+    """Poles with the optimal and the a-priori gain and without any, on the lowest modes. Collective."""
+    design, loop, basis = study.design, study.design.judge.loop, a_priori(study.bases)
+    K = design.gain.block
+    sets = {
+        "without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))),
+        ("modal gain" if design.modal else "optimal gain"): loop.poles(K),
+    }
+    best = None if basis is None else basis.best(fast_order(design.problem.layout.n_s))
+    if best is not None and best.gain is not None:
+        sets[f"a-priori gain, $N = {best.N}$"] = loop.poles(best.gain.block)
+    return {name: p[np.argsort(np.abs(p))][: 2 * SHOWN_MODES] for name, p in sets.items()}
+
+
+def timed_gains(design: Design, orders: Sequence[int], notify: Notify) -> tuple[BasisGains, ...]:
+    """All bases over their orders, see :func:`softgrasp.lqr.design.orders.reduce_gains`, with times. Collective."""
+    bases = reduce_gains(design, orders, notify)
+    return tuple(replace(b, reports=tuple(with_time(design.problem, r) for r in b.reports)) for b in bases)
+
+
+def with_time(problem: RiccatiProblem, report: GainReport) -> GainReport:
+    """With the seconds of one solution of its reduced equation. Collective."""
+    matrices = report.matrices
+    if matrices is None:
+        return report
+    seconds = on_root(
+        problem.layout.comm, lambda: repeated(MPI.COMM_SELF, lambda: solve_reduced(matrices), SOLUTIONS, np.inf)
+    )
+    return replace(report, time_are=min(seconds))
+
+
+def retune(
+    design: Design, bases: Sequence[BasisGains], plan: LoopPlan, notify: Notify
+) -> tuple[tuple[Retuned, ...], str]:
+    """The a-priori basis and the paper's best at a small order, re-tuned over the box; or why not. Collective.
+
+    The duality gaps of all gains of one setting come from the same few runs of ``plan``.
+    """
+    layout = design.problem.layout
+    reason, chosen = outside(design.model), re_tunable(bases, layout.n_s)
+    if not reason and layout.states > BOX_STATES:
+        reason = (
+            f"{layout.states} states are more than {BOX_STATES}: the full solutions to compare with would take long"
+        )
+    if not reason and not chosen:
+        reason = f"no basis has a stable gain of order N <= {fast_order(layout.n_s)}"
+    if reason:
+        return (), reason
+    tuners = [Retuner(design.problem, family.at(N)) for family, N in chosen]
+    solutions: dict[Materials, RiccatiSolution] = {}
+    columns: list[list[RetunedGain]] = []
+    settings = [materials_at(design.model, *place) for place in grid_of(design.model)]
+    for done, materials in enumerate(settings, 1):
+        points = [_at(tuner, materials, solutions, design) for tuner in tuners]
+        if materials in solutions:
+            problem = replace(design.problem, system=design.problem.system.with_materials(materials))
+            points = with_bounds(problem, solutions[materials], points, design.error, plan)
+        columns.append([replace(point, gain=None) for point in points])
+        notify(done, len(settings))
+    rows = zip(*columns, strict=True)
+    return tuple(Retuned(family.name, N, tuple(row)) for (family, N), row in zip(chosen, rows, strict=True)), ""
+
+
+def _at(
+    tuner: Retuner, materials: Materials, solutions: dict[Materials, RiccatiSolution], design: Design
+) -> RetunedGain:
+    """The gain at one setting; the full solution there is kept for the other bases. Collective."""
+    comm, modes = tuner.problem.layout.comm, min(SOME_MODES, tuner.problem.layout.n_e)
+
+    def full(problem: RiccatiProblem) -> RiccatiSolution:
+        key = problem.system.materials
+        if key not in solutions:
+            solutions[key] = solve(problem)
+        return solutions[key]
+
+    try:
+        point = retuned_gain(tuner, materials, full, design.error, modes, design.judge.law)
+    except (ControlError, SolverError) as failed:  # the full solution, not the re-tuned one
+        return RetunedGain(materials, reason=f"no reference: {failed}")
+    if point.reason:
+        return point
+    # the first solution of a size pays for memory and caches, which a running controller does not
+    return replace(point, seconds=on_root(comm, lambda: min(tuner.solve(materials).seconds for _ in range(REPEATS))))
+
+
+def re_tunable(bases: Sequence[BasisGains], n_s: int) -> list[tuple[BasisFamily, int]]:
+    """The a-priori basis and the best of the others, each at its best small order."""
+    best = [(b.family, r) for b in bases if b.family is not None and (r := b.best(fast_order(n_s))) is not None]
+    best.sort(key=lambda x: (x[1].cost_excess, x[0].name))
+    own, others = ([x for x in best if (x[0].name == A_PRIORI) == same] for same in (True, False))
+    return [(family, r.N) for family, r in (*own, *others[:1])]
