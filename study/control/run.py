@@ -47,7 +47,9 @@ def run_control(
     notes = [Note("table", sentence)] if sentence else []
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
-    watch, restart = Stopwatch(session.comm), restart_folder(model, out)
+    watch, layout = Stopwatch(session.comm), model.system.layout
+    folder = out / f"restart-{scene_hash(model.scene)[:12]}-{layout.comm.size}"  # of one scene and rank count
+    restart = folder if layout.states >= RESTART_STATES else None
     fields: list[Path] = []
     drawn: Callable[[], list[Path]] = list
     with session.progress(TaskProgressColumn()) as bar:
@@ -69,10 +71,9 @@ def run_control(
         show(console, study, seconds)
 
     def page() -> Page:
-        name = model.scene.name
         if not isinstance(study, ControlStudy):
-            parts = [Section("Result", rows=tables.gain_rows(study))]
-            return Page(f"{name}: optimal gain", tables.gain_summary(study), parts, {}, saved, " --gain-only")
+            parts = [Section("Result", rows=tables.result_rows(study, seconds))]
+            return Page(f"{model.scene.name}: optimal gain", tables.summary(study), parts, {}, saved, " --gain-only")
         pictures: list[Path] = []
         if session.pictures and study.retuned:
             from softgrasp.study.control.plots import figure_retune  # brings Matplotlib
@@ -80,21 +81,14 @@ def run_control(
             pictures += figure_retune(study.retuned, out / "retune.png")
         pictures += drawn()
         parts, files = tables.sections(study, seconds, pictures), [*pictures, *fields, *saved]
-        return Page(f"{name}: optimal feedback", tables.summary(study), parts, tables.csv_tables(study), files)
+        title = f"{model.scene.name}: optimal feedback"
+        return Page(title, tables.summary(study), parts, tables.csv_tables(study), files)
 
     list_files(console, session.write(model.scene, result, page))
     if session.comm.rank == 0 and restart is not None:
         shutil.rmtree(restart, ignore_errors=True)
     session.comm.Barrier()
     return result
-
-
-def restart_folder(model: Model, out: Path) -> Path | None:
-    """Where the solver keeps restart files: one folder a scene and rank count; None for small plants."""
-    layout = model.system.layout
-    if layout.states < RESTART_STATES:
-        return None
-    return out / f"restart-{scene_hash(model.scene)[:12]}-{layout.comm.size}"
 
 
 def small_study(feedback: Design, watch: Stopwatch, notes: Sequence[Note]) -> GainStudy:
@@ -212,12 +206,10 @@ def counted(bar: Progress, text: str) -> Callable[[int, int], None]:
 
 
 def show(console: Console, study: GainStudy, seconds: dict[str, float]) -> None:
-    """Summary, then the reduced gains."""
-    if not isinstance(study, ControlStudy):
-        console.print(pairs(tables.gain_rows(study)))
-        return
-    for sentence in (*study.findings, *(note.text for note in study.notes if note.topic != "table")):
-        console.print(f"note: {sentence}", soft_wrap=True, markup=False)
-    console.print(pairs(tables.summary_rows(study, seconds)))
-    if study.bases:
+    """Notes, summary, and the reduced gains."""
+    if isinstance(study, ControlStudy):
+        for sentence in (*study.findings, *(note.text for note in study.notes if note.topic != "table")):
+            console.print(f"note: {sentence}", soft_wrap=True, markup=False)
+    console.print(pairs(tables.result_rows(study, seconds)))
+    if isinstance(study, ControlStudy) and study.bases:
         console.print(tables.best_table(study.bases).terminal(wrap=[0], width=console.width))

@@ -17,7 +17,7 @@ from softgrasp.reduction.archive import save
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.reduce import tables
 from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.result import N_NOTE, MethodSweep, ReductionStudy, best
+from softgrasp.study.reduce.result import N_NOTE, ReductionStudy, best
 from softgrasp.study.reduce.sweep import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.tables import Table
@@ -68,8 +68,11 @@ def run_reduce(
     model, watch = session.model(scene), Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
         study, drawn = reduce_model(session, model, names, bar, watch)
+    chosen = [(s, p) for s in study.sweeps if (p := best(s.points)) is not None]
+    models = [out / "models" / f"{s.method.key}.h5" for s, _ in chosen]
     with watch.stage("models"):
-        models = save_models(out, study.sweeps)
+        for file, (s, p) in zip(models, chosen, strict=True):
+            save(s.models[p.N], file)
     result = study.result(watch.seconds)
 
     def page() -> Page:
@@ -118,17 +121,6 @@ def reduce_model(
     speeds = tuple(speed for s in sweeps if (speed := speed_of(s, times)) is not None)
     notes = speed_notes(model.system.layout.n_e, model.scene.time.steps, times, speeds)
     return ReductionStudy(full, sweeps, times, speeds, box, findings(sweeps), notes), drawn
-
-
-def save_models(out: Path, sweeps: Sequence[MethodSweep]) -> list[Path]:
-    """Write the best stable model of every method into ``out/models``. Collective."""
-    files = []
-    for s in sweeps:
-        i = best(s.points)
-        if i is not None:
-            files.append(out / "models" / f"{s.method.key}.h5")
-            save(s.models[i], files[-1])
-    return files
 
 
 def show(console: Console, study: ReductionStudy) -> None:

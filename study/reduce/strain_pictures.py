@@ -70,20 +70,19 @@ def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: P
     height = min(4.0, 1.1 + wide / min(len(models), 2) * float(size[1] / size[0]) * 0.8)
     sampled = [np.unique(m.cells.cell, return_index=True) for m in models]
     weights = [m.cells.xi[first] for m, (_, first) in zip(models, sampled, strict=True)]  # xi = weight / vol
-    together = np.concatenate(weights)
-    norm, edge = LogNorm(float(together.min()), float(together.max())), style.OUTLINE
+    norm, edge = LogNorm(float(min(map(np.min, weights))), float(max(map(np.max, weights)))), style.OUTLINE
     with style.paper_style():
         figure, axes = plt.subplots(1, len(models), figsize=(wide, height), squeeze=False, layout="constrained")
         for ax, model, (cells, _), xi in zip(axes[0], models, sampled, weights, strict=True):
             colours = style.colour_map()(norm(xi))
             if picture.dimension == 2:
-                looks: list[tuple[Any, dict[str, Any]]] = [
-                    (flat[picture.cells], {"facecolors": "#f4f4f4", "edgecolors": "#d0d0d0", "lw": 0.3}),
-                    (flat[picture.cells[cells]], {"facecolors": colours, "edgecolors": edge, "lw": 0.5}),
-                    (hand_polygons(picture)[0], {"facecolors": style.HAND, "edgecolors": style.HAND, "lw": 0.3}),
+                looks: list[tuple[Any, Any, str, float]] = [
+                    (flat[picture.cells], "#f4f4f4", "#d0d0d0", 0.3),
+                    (flat[picture.cells[cells]], colours, edge, 0.5),
+                    (hand_polygons(picture)[0], style.HAND, style.HAND, 0.3),
                 ]
-                for order, (polygons, look) in enumerate(looks, 1):
-                    ax.add_collection(PolyCollection(list(polygons), zorder=order, **look))
+                for i, (polygons, inside, line, lw) in enumerate(looks, 1):
+                    ax.add_collection(PolyCollection(list(polygons), zorder=i, fc=inside, ec=line, lw=lw))
             else:
                 ax.add_collection(LineCollection(shadow(flat, picture.facets), colors=edge, linewidths=0.8))
                 x = seen(picture.points[picture.cells[cells]].mean(axis=1))
@@ -92,7 +91,6 @@ def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: P
             ax.autoscale_view()
             ax.set_aspect("equal")
             ax.axis("off")
-        figure.colorbar(
-            ScalarMappable(norm, style.colour_map()), ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell"
-        )
+        scale = ScalarMappable(norm, style.colour_map())
+        figure.colorbar(scale, ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell")
         return tuple(style.save(figure, out_png))
