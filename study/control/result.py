@@ -38,14 +38,6 @@ BOUNDS = ("cost_excess_proved", "cost_excess_at_most", "unbounded")
 
 
 @dataclass(frozen=True)
-class Note:
-    """What was chosen for the user, or why a part is missing."""
-
-    topic: str  # table, modal, orders, retune, controller, sampling, end
-    text: str  # one sentence
-
-
-@dataclass(frozen=True)
 class Retuned:
     """One basis of one parameter over the box of lambda and mu."""
 
@@ -110,7 +102,7 @@ class GainStudy:
     bases: tuple[BasisGains, ...]  # gains of the reduced equations
     controller: CertifiedController | None  # the small controller; None when no small gain is certified
     tick: float  # seconds of one tick of it, median
-    notes: tuple[Note, ...]  # what was chosen for the user, and why parts are missing
+    notes: tuple[str, ...]  # what was chosen for the user, and why parts are missing
 
     @cached_property
     def margins(self) -> LoopMargins | None:
@@ -159,7 +151,7 @@ class GainStudy:
             "findings": self.findings,
             "damping_enough": d.diagnosis.damping_enough,
             "controller": controller,
-            "notes": [note.text for note in self.notes],
+            "notes": self.notes,
             "time": {**seconds, "solver": dict(solution.seconds)},
             "memory_peak_mb": peak_memory_mb(layout.comm),
         }

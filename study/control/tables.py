@@ -246,7 +246,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     def pick(*names: str) -> list[tuple[Path, str]]:
         return [figures[name] for name in names if name in figures]
 
-    notes = "\n\n".join((*study.findings, *(note.text for note in study.notes)))
+    notes = "\n\n".join((*study.findings, *study.notes))
     parts = [
         Section("", figures=pick("move.png", "move.gif")),
         *([Section("Notes", text=notes)] if notes else []),

@@ -40,7 +40,7 @@ from softgrasp.study.shell.session import Page, Session, list_files
 from softgrasp.study.shell.timing import median_seconds, timed
 
 FILE = "certified.h5"
-REPEATS, CHECK_REPEATS = 7, 5  # behind the median time of a query, of the model and of each size
+REPEATS = 7  # behind the median time of a query
 TESTS, FEWER, LARGE = 5, 3, 20_000  # tests of each constant, and from so many unknowns on
 SHARES = (1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 3, 1 / 2)  # of the modes: sizes that are shown
 SECOND = 3  # times as many modes in the basis that certifies, as far as there are
@@ -130,7 +130,7 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
             tests[k, k2].append(Tested(*place, error / size, float(c.energy.largest) / size, estimate))
     sizes = {}
     for (k, k2), part in models.items():
-        query = median_seconds(comm, lambda part=part: part.run(allow=True), CHECK_REPEATS)  # type: ignore[misc]
+        query = median_seconds(comm, lambda part=part: part.run(allow=True), REPEATS)  # type: ignore[misc]
         sizes[k, k2] = Size(k, k2, part.coarse.N, query, tuple(tests[k, k2]))
     return BoxCheck(sizes[certified.k, certified.k2], tuple(sizes.values()), float(median(seconds)))
 
@@ -144,10 +144,7 @@ def sizes_of(certified: CertifiedModel) -> list[tuple[int, int]]:
 
 
 def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
-    """Build, save and show the certified model of a scene; an interrupted run goes on from its last round. Collective.
-
-    Raises SoftgraspError: with one sentence.
-    """
+    """Build, save and show a certified model of a scene; an interrupted run goes on from its last round. Collective."""
     model, file, console = session.model(scene), session.out / "models" / FILE, session.console
     watch, tolerance, options = Stopwatch(session.comm), scene.reduction.tolerance, scene.reduction
     earlier = _earlier(model, file)
@@ -190,7 +187,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     with watch.stage("tests"):
         check = check_box(model, certified)
     result = certify_result(model, certified, check, watch)
-    told = sentences(certified, result)
+    told = sentences(certified, check, result)
 
     def page() -> Page:
         drawn: list[Path] = []
@@ -285,7 +282,7 @@ def greedy_table(certified: CertifiedModel) -> Table:
     return Table(header, rows, "The greedy")
 
 
-def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
+def sentences(certified: CertifiedModel, check: BoxCheck | None, result: dict[str, Any]) -> list[str]:
     """What was built and how good it is."""
     about, time, share = result["certified"], result["time"], certified.training["proved"]
     lines = [f"The certified model has N = {about['N']} columns"]
@@ -316,12 +313,11 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
         *about["own"]["reasons"],
         f"A query takes {query * 1e3:.3g} ms, a full run {full * 1e3:.3g} ms with its factor.",
     ]
-    if result["tests"] is not None:
-        tested = result["tests"]["own"]["tested"]
-        ratios = [t["bound"] / t["truth"] for t in tested if t["truth"]]
+    if check is not None:
+        ratios = [t.effectivity for t in check.own.tested if t.truth]
         lines.append(
-            f"Against {len(tested)} full runs between the corners of the box: true error at most "
-            f"{max(t['truth'] for t in tested):.1e}, bound {np.median(ratios):.3g} times as large in the median, "
+            f"Against {len(check.own.tested)} full runs between the corners of the box: true error at most "
+            f"{check.own.largest('truth'):.1e}, bound {np.median(ratios):.3g} times as large in the median, "
             f"{max(ratios):.3g} at most."
         )
     if query > full:

@@ -252,8 +252,7 @@ def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
     shot = make_shot(views.picture, views.full, views.times, views.table, None)
     figure, axes = make_axes(shot, len(views.reduced), captions=True, width=width, tallest=3.6)
     for ax, view in zip(axes, views.reduced, strict=True):
-        state = "" if view.stable else ", unstable"
-        ax.set_title(f"{view.title}{state}\ndeformation error {view.error:.1e}{note}", pad=3, fontsize=7)
+        ax.set_title(view.title + note, pad=3, fontsize=7)
     entries: list[Any] = [
         Patch(color=style.HAND, label="hand"),
         Line2D([], [], label="outline of the full model", **OUTLINE),

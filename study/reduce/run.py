@@ -48,10 +48,7 @@ def run_reduce(
     tolerance: float | None = None,
     **flags: Unpack[Flags],
 ) -> dict[str, Any]:
-    """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
-
-    Raises SoftgraspError: with one sentence.
-    """
+    """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective."""
     if tolerance is not None:
         overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
     session = Session("reduce", path, overrides, out, console, **flags)
@@ -133,7 +130,7 @@ def show(console: Console, study: ReductionStudy) -> None:
         console.print(sentence, markup=False)
     for sizes, titles, reason in tables.refused_table(study.sweeps, narrow=True).rows:
         console.print(f"N = {sizes} refused for {titles}: {reason}.", markup=False)
-    _print(console, tables.time_table(study.speeds, narrow=True))
+    _print(console, tables.time_table(study, narrow=True))
     for note in study.speed_notes:
         console.print(note)
     if box.none:

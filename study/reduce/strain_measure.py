@@ -21,7 +21,6 @@ from softgrasp.reduction.strain.training import Training, replay_strain, train
 from softgrasp.study.reduce.result import FullTimes
 from softgrasp.study.shell.timing import median_seconds
 
-TITLES = {"own": "trained on the scene's run", "box": "trained over the box"}
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
 CELLS_AT = (14, 24)  # N at which tau is varied
 TAUS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
@@ -91,6 +90,11 @@ class StrainFamily:
     models: dict[int, StrainModel]  # those of ``points`` by N
     refused: dict[int, str]  # reason by N
 
+    @property
+    def title(self) -> str:
+        """How its models were trained."""
+        return "trained on the scene's run" if self.key == "own" else "trained over the box"
+
 
 @dataclass(frozen=True)
 class StrainStudy:
@@ -108,10 +112,7 @@ class StrainStudy:
 
 
 def measure_strain(model: Model, own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
-    """Train, test and time. Collective.
-
-    Raises SolverError: a run did not converge. ReductionError: the snapshots carry no model.
-    """
+    """Train, test and time. Collective. Raises SolverError: a run failed. ReductionError: there is no model."""
     options, hand = model.scene.reduction, 2 * model.system.layout.n_s
     chosen = options.N if "N" in options.model_fields_set else SIZES
     sizes = sorted({N for N in chosen if hand < N and N % 2 == 0})  # those that a model can have

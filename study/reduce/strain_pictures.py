@@ -17,7 +17,7 @@ from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
 from softgrasp.study.reduce.plots import FULL
-from softgrasp.study.reduce.strain_measure import CELLS_AT, TITLES, StrainPoint, StrainStudy
+from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainPoint, StrainStudy
 
 
 def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Path]:
@@ -36,12 +36,12 @@ def figure_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
     with style.paper_style():
         figure, (left, right) = plt.subplots(1, 2, figsize=(style.WIDTH, 3.4), sharey=True, layout="constrained")
         for f in study.families:
-            _pair(left, [p.N for p in f.points], f.points, colours[f.key], TITLES[f.key])
+            _pair(left, [p.N for p in f.points], f.points, colours[f.key], f.title)
             left.plot([p.N for p in f.points], [p.error_galerkin for p in f.points], ls=":", color=colours[f.key])
             for N, colour in zip(CELLS_AT, (style.GREEN, style.PURPLE), strict=True):
                 points = sorted((p for p in f.curves if p.N == N), key=lambda p: p.cells)
                 if f is study.families[-1] and points:
-                    _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {TITLES[f.key]}")
+                    _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {f.title}")
                     right.axhline(points[0].error_galerkin, ls=":", color=colour)
         for ax, label in ((left, "$N$"), (right, "sampled cells")):
             ax.axhline(study.linear, **FULL)

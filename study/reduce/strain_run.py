@@ -14,14 +14,7 @@ from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
 from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.reduce.strain_measure import (
-    CELLS_AT,
-    TITLES,
-    StrainFamily,
-    StrainPoint,
-    StrainStudy,
-    measure_strain,
-)
+from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainFamily, StrainPoint, StrainStudy, measure_strain
 from softgrasp.study.reduce.sweep import measured_run
 from softgrasp.study.reduce.tables import TIMES, time_cells
 from softgrasp.study.report.page import Section, captioned
@@ -85,9 +78,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
     def page() -> Page:
         files = draw(session.out, study, picture) if session.pictures else []
         errors, seconds, cells = tables
-        held = [
-            test_table(f).section(title=f"Held-out runs, models {TITLES[f.key]}") for f in study.families if f.tests
-        ]
+        held = [test_table(f).section(title=f"Held-out runs, models {f.title}") for f in study.families if f.tests]
         parts = [
             errors.section(NOTE),
             Section("What holds", text="\n\n".join(told)),
@@ -188,7 +179,7 @@ def sentences(study: StrainStudy) -> list[str]:
         if f.key == "own" and lam[0] == lam[1] and mu[0] == mu[1]:
             inside = f"lambda = {lam[0]:.4g}, mu = {mu[0]:.4g} Pa only"
         lines.append(
-            f"Models {TITLES[f.key]} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
+            f"Models {f.title} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
             f"accelerations of the hand up to {', '.join(f'{x:.3g}' for x in load)} by degree of freedom; they refuse "
             "what lies outside."
         )
@@ -210,7 +201,7 @@ def summary(study: StrainStudy) -> list[str]:
     again, new, _ = study.speed_up(p)
     return [
         f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
-        f"The most accurate reduced model, {TITLES[f.key]}, is {p.error_own:.2%} off with N = {p.N} columns and "
+        f"The most accurate reduced model, {f.title}, is {p.error_own:.2%} off with N = {p.N} columns and "
         f"{p.cells} sampled cells.",
         f"It runs {again:.3g} times as fast as the full model, and {new:.3g} times at a new parameter.",
     ]

@@ -94,9 +94,8 @@ def bases_of(
 def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = None) -> Point:
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
-    ``comparison``: of the largest model of the family; None prepares one for this model alone.
-
-    Raises ModelError: E or A is singular, so that the model has no run or no equilibrium to start in.
+    ``comparison``: of the largest model of the family; None prepares one for this model alone. Raises ModelError: E or
+    A is singular, so that the model has no run or no equilibrium to start in.
     """
     layout = full.model.system.layout
     comparison = comparison or comparison_of(model, full)
@@ -176,12 +175,7 @@ def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]
 
 
 def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress = lambda done, of: None) -> BoxTests:
-    """Train, and test over the box. Collective.
-
-    Raises:
-        SolverError: a full run failed, or a factorisation did.
-        ResourceError: the snapshots do not fit.
-    """
+    """Train, and test over the box. Collective. Raises SolverError: a run failed. ResourceError: no memory."""
     scene = full.model
     reason = outside(scene) or ("" if by_error(sweeps) else "no method has a stable model")
     if reason:

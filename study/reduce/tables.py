@@ -17,7 +17,6 @@ from softgrasp.study.reduce.result import (
     MethodSweep,
     Point,
     ReductionStudy,
-    Speed,
     by_error,
     nearest,
 )
@@ -141,10 +140,10 @@ def time_cells(
     return *seconds, short(again, 3), short(new, 3), "never" if runs is None else str(math.ceil(runs))
 
 
-def time_table(speeds: Sequence[Speed], narrow: bool = False) -> Table:
+def time_table(study: ReductionStudy, narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
     rows = []
-    for s in speeds:
+    for s in study.speeds:
         p, pays = s.point, (s.speedup_same_model, s.speedup_new_parameter, s.break_even_runs)
         cells = time_cells(p.time_offline, p.time_setup, p.time_online, pays)
         rows.append((title_of(s.method, narrow), _size(p), *cells))
@@ -206,7 +205,7 @@ def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
         error_table(study.sweeps, energy).section(text),
         Section("What holds", text="\n\n".join(study.findings)),
         Section("", figures=captioned(files, CAPTIONS)),
-        time_table(study.speeds).section("\n\n".join(study.speed_notes)),
+        time_table(study).section("\n\n".join(study.speed_notes)),
     ]
     refused = refused_table(study.sweeps)
     parts += [refused.section()] if refused.rows else []

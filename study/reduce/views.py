@@ -24,9 +24,7 @@ MANY_VERTICES = 200_000  # above, no pictures of the body
 class View:
     """One reduced model for the eye."""
 
-    title: str  # method and N
-    stable: bool  # of the model
-    error: float  # of its deformation
+    title: str  # method, N and error of the deformation
     states: Array  # vertex displacements of its run at the frames, (k, n, d) [m]
 
 
@@ -75,7 +73,9 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
             z, _ = reduced.reconstruct(reduced.at(), motion.x[steps].T, motion.v_s[steps].T)
         states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
         if states is not None:
-            views.append(View(f"{s.method.title}, $N$ = {point.N}", point.stable, point.error_deformation, states))
+            state = "" if point.stable else ", unstable"
+            title = f"{s.method.title}, $N$ = {point.N}{state}\ndeformation error {point.error_deformation:.1e}"
+            views.append(View(title, states))
     modes = [(s.method.title, _modes(model, s.models[p.N]), s.method.frame == "absolute") for s, p in modes_of(sweeps)]
     if picture is None or full is None:
         return None
