@@ -15,8 +15,7 @@ from softgrasp.fem.accuracy.small import Small, reduced
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.bisect import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.mesh_estimate import MeshEstimate
+from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
 

@@ -21,9 +21,8 @@ from mpi4py import MPI
 from softgrasp.fem.accuracy.small import Small, reduced, run_small
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.contact import contact_facets
-from softgrasp.fem.model.mesh_estimate import MeshEstimate
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.tissue import Refine
 

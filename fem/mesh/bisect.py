@@ -15,11 +15,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError
-from softgrasp.fem.mesh.check import FLAT, counted, longest_edges, place_text, signed_volumes
-from softgrasp.fem.mesh.parts import find_parts
-from softgrasp.fem.mesh.seams import sort_facets
-from softgrasp.fem.mesh.spread import Marks, spread
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
+from softgrasp.fem.mesh.check import FLAT, counted, find_parts, longest_edges, place_text, signed_volumes, sort_facets
+from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]

@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from softgrasp.fem.errors import MeshError, SceneError, agree
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.check import counted, place_text
-from softgrasp.fem.mesh.parts import Parts
+from softgrasp.fem.mesh.check import Parts, counted, place_text
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.scene.scene import Contact
 

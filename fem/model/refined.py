@@ -17,11 +17,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.bisect import bisect_to, distribute
-from softgrasp.fem.mesh.check import longest_edges
-from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField
-from softgrasp.fem.mesh.lines import box_axes, box_of_lines, even_cells
+from softgrasp.fem.mesh.check import longest_edges, sort_facets
+from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField, box_axes, box_of_lines, even_cells
 from softgrasp.fem.mesh.make import make_mesh
-from softgrasp.fem.mesh.seams import sort_facets
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.assembly import cells_of_layers

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from softgrasp.fem.effects.damping import layered
+from softgrasp.fem.effects.catalog import layered
 from softgrasp.fem.scene.scene import Scene
 
 Rows = tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
