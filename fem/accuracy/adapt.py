@@ -37,8 +37,6 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
     With ``passes = 0`` the mesh is the a-priori one, which nothing estimates here.
 
     Args:
-        scene: the scene.
-        comm: communicator.
         steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:

@@ -142,10 +142,6 @@ class SmallRun:
 def run_small(small: Small, steps: int | None = None) -> SmallRun:
     """Run the scene's motion or force with the midpoint rule, as the full model does.
 
-    Args:
-        small: the model.
-        steps: instead of the scene's.
-
     Raises:
         SceneError: a CSV file of the motion does not fit.
     """

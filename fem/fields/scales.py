@@ -22,11 +22,7 @@ SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to cou
 
 
 def gradient(model: Model, z: Array) -> Gradient:
-    """Gradient of a displacement against the hand. Collective.
-
-    Args:
-        z: displacement against the hand, local rows (n_local,) [m].
-    """
+    """Gradient of a displacement z against the hand, local rows (n_local,) [m]. Collective."""
     space, d = model.space, model.space.mesh.dimension
     mesh, comm = space.mesh.mesh, space.layout.comm
     cells = mesh.topology.index_map(d).size_local
@@ -52,13 +48,10 @@ def _top(rows: Array, limit: float) -> Array:
 
 
 def magnified(system: BlockSystem, z: Array) -> float:
-    """Share by which one rounding of K_ee may change the deformation z: eps sum K_ii z_i^2 / z'Kz [1]. Collective.
+    """Share by which one rounding of K_ee may change the deformation z: eps sum K_ii z_i^2 / z'Kz [1].
 
     Neither residual nor drift knows of it, since both take the rounded matrix for the true one; close to nu = 1/2 they
-    are ten to a hundred times smaller than the error.
-
-    Args:
-        z: local rows of a displacement against the hand, (n_local,).
+    are ten to a hundred times smaller than the error. Collective; z are local rows (n_local,).
     """
     diagonal = system.K_ee.getDiagonal()
     parts = np.array([np.dot(diagonal.array_r, z * z), np.dot(z, times_columns(system.K_ee, z[:, None])[:, 0])])
@@ -73,9 +66,7 @@ def slowest(system: BlockSystem, Z: Array) -> float:
     """Lowest frequency [1/s] of the clamped tissue in the span of Z - mean(Z), 0 when nothing moves. Collective.
 
     A Ritz value, omega^2 = min_z z'K z / z'M z: at least the lowest frequency, near it if the run excites its mode.
-
-    Args:
-        Z: displacements against the hand, local rows (n_local, k) [m].
+    Z are displacements against the hand, local rows (n_local, k) [m].
     """
     comm, centre = system.layout.comm, np.eye(Z.shape[1]) - 1 / Z.shape[1]
     M, K = (total(comm, Z.T @ times_columns(A, Z)) for A in (system.M_ee, system.K_ee))

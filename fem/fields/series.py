@@ -92,12 +92,7 @@ class FullField:
         self.free = (space.free[:, None] * d + np.arange(d)).ravel()
 
     def fill(self, z: Array, q_s: Array) -> Any:
-        """Set the function and return it. Collective; ghosts are updated.
-
-        Args:
-            z: relative displacement on the owned free dofs, shape (n_local,) [m].
-            q_s: hand, shape (n_s,) [m, rad].
-        """
+        """Set and return the function from z (n_local,) [m] and q_s (n_s,) [m, rad]. Collective; ghosts are updated."""
         values = self.u.x.array
         values[: len(self.R)] = self.R @ q_s
         values[self.free] = z + self.T @ q_s
@@ -111,10 +106,6 @@ class SeriesWriter:
     Each holds at the nodes ``displacement`` [m], ``velocity`` [m/s] and ``held`` (1 where the hand holds the tissue);
     in the cells ``strain`` [1], ``stress`` and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's
     displacement. Cells keep the order of the elements.
-
-    Args:
-        directory: made if missing.
-        name: stem of the files.
 
     Collective.
 

@@ -1,4 +1,8 @@
-"""What may be wrong with a simplex mesh in arrays: flat or inverted cells, open seams, loose parts (not collective)."""
+"""What may be wrong with a simplex mesh in arrays: flat or inverted cells, open seams, loose parts (not collective).
+
+``points`` are coordinates (n_points, d) [m], d = 2 or 3, ``cells`` nodes (n_cells, d + 1), ``facets`` those of
+:func:`sort_facets`, and ``name`` is that of the mesh, for messages.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +25,7 @@ FLAT = 1e-12  # volume over (longest edge)^d: far above round-off (1e-16), far b
 
 
 def signed_volumes(points: Floats, cells: Integers) -> Floats:
-    """V = det [x_1 - x_0, ..., x_d - x_0] / d! of each simplex, negative if inverted.
-
-    Args:
-        points: shape (n_points, d), d = 2 or 3 [m].
-        cells: shape (n_cells, d + 1).
-    """
+    """V = det [x_1 - x_0, ..., x_d - x_0] / d! of each simplex, negative if inverted."""
     edges = points[cells[:, 1:]] - points[cells[:, :1]]
     return np.asarray(np.linalg.det(edges) / math.factorial(points.shape[1]), dtype=np.float64)
 
@@ -45,12 +44,6 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
 
     Flat cells are refused always; inverted cells (also if all of them are) unless ``repair`` turns them round
     by swapping their last two nodes.
-
-    Args:
-        points: shape (n_points, d) [m].
-        cells: shape (n_cells, d + 1), left unchanged.
-        repair: turn inverted cells round.
-        name: name of the mesh for messages.
 
     Raises:
         MeshError: a coordinate is not finite, or a cell is flat or inverted.
@@ -143,9 +136,6 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
     Two boundary nodes are at one place if |x - y| <= tolerance h, h the shortest edge of the boundary cells at both.
 
     Args:
-        points: shape (n_points, d) [m].
-        cells: simplices, shape (n_cells, d + 1).
-        facets: their facets.
         tolerance: share of h, < 1/2 [1].
     """
     owners = cells[np.unique(facets.cells[facets.outer])]
@@ -173,9 +163,6 @@ def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
     """Boundary nodes inside a boundary facet, or an edge of one, that is not their own.
 
     Args:
-        points: shape (n_points, d) [m].
-        cells: simplices, shape (n_cells, d + 1).
-        facets: their facets.
         tolerance: largest distance from the facet over its longest edge, and least from its corners [1].
     """
     faces, owners = facets.nodes[facets.outer], cells[facets.cells[facets.outer]]
@@ -246,12 +233,6 @@ def find_parts(
     points: Floats, cells: Integers, facets: Facets, name: str
 ) -> tuple[npt.NDArray[np.int32], Parts] | None:
     """Label the cells of each facet-connected part from 0; None if the mesh is one part.
-
-    Args:
-        points: shape (n_points, d) [m].
-        cells: simplices, shape (n_cells, d + 1).
-        facets: their facets.
-        name: name of the mesh, for messages.
 
     Raises:
         MeshError: a facet has more than two cells.

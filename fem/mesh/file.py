@@ -89,8 +89,6 @@ def read_mesh(
     Collective. Rank 0 reads and checks.
 
     Args:
-        comm: communicator of the mesh.
-        path: mesh file in any format of meshio.
         scale: factor of all coordinates, e.g. 1e-3 for a file in millimetres.
         repair: turn inverted cells round instead of refusing them, and join doubled nodes instead of warning of them.
         seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].

@@ -56,7 +56,6 @@ def graded_line(cuts: Sequence[float], ends: Sequence[float], n: int, mu: float,
     Args:
         cuts: sorted coordinates, the first and last bound the line [m].
         ends: those towards which distances fall [m].
-        n: number of cells; raised to the number of stretches.
         mu: grading, 0 < mu <= 1 [1].
         radius: R [m].
     """
@@ -151,15 +150,7 @@ def even_cells(axis: Axis, h: float) -> int:
 
 
 def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: float, radius: float) -> TissueMesh:
-    """The structured box with lines at all cuts that crowd towards the ends; mu = 1: even between cuts. Collective.
-
-    Args:
-        comm: communicator.
-        scene: with a structured box.
-        cells: along each side.
-        mu: grading, see :func:`softgrasp.fem.mesh.grading.graded_line`.
-        radius: R [m].
-    """
+    """The structured box with lines at all cuts that crowd towards the ends; mu = 1: even between cuts. Collective."""
     axes, tissue = box_axes(scene), scene.tissue
     lines = [graded_line(a.cuts, a.ends, n, mu, radius) for a, n in zip(axes, cells, strict=True)]
     box = structured_mesh(comm, tissue.size or [], [len(line) - 1 for line in lines], tissue.origin)

@@ -94,8 +94,6 @@ def spread(
     """Distribute points and simplices, and mesh tags by name. Collective.
 
     Args:
-        comm: communicator.
-        d: dimension, on all ranks.
         body: points (n_points, d) [m] and cells (n_cells, d + 1) on rank 0, None elsewhere.
         marks: on rank 0, empty elsewhere.
     """

@@ -59,9 +59,6 @@ def by_lines(scene: Scene) -> bool:
 def refined_mesh(comm: MPI.Intracomm, scene: Scene, tolerance: float | None = None) -> TissueMesh:
     """The a-priori mesh of a scene with `[tissue.refine]`. Collective; rank 0 bisects.
 
-    Args:
-        tolerance: instead of the scene's.
-
     Raises:
         SceneError: even the coarsest mesh has more than ``tissue.refine.most`` unknowns.
         MeshError: the mesh file is wrong, or its cells cannot be bisected.
@@ -201,9 +198,6 @@ def _too_large(refine: Refine, count: int) -> SceneError:
 
 def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     """Singular ends of a scene's body, on all ranks; rank 0 looks at the whole mesh. Collective.
-
-    Args:
-        tissue: the mesh of the scene.
 
     Raises:
         MeshError: the mesh file cannot be read again.

@@ -107,9 +107,6 @@ class TissueMidpoint:
     the state.
 
     Args:
-        system: operators.
-        dt: step [s].
-        solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 

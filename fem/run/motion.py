@@ -44,8 +44,6 @@ def read_csv(path: Path, columns: int, end: float | None = None, key: str = "mot
     """Read times (steps,) and values (steps, columns) of a trajectory.
 
     Args:
-        path: the file.
-        columns: degrees of freedom of the hand.
         end: of the run [s]; None takes the file as long as it is, from 0 on.
         key: who names the file, for the messages.
 
@@ -174,8 +172,6 @@ class TableDrive:
     """Hand known beforehand: load l = -G (a - g + alpha v) with alpha only when damping drags in space.
 
     Args:
-        system: operators.
-        table: the hand's motion.
         force: that it comes from, (steps, n_s) [N, N m]; None when it is prescribed.
     """
 
@@ -318,12 +314,10 @@ def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float
     z'' = s (s w - z'_n), and G' z'_n follows from G' z'_{n+1} = 2 s G' w - G' z'_n, from rest on.
 
     Args:
-        system: operators, two-way.
         pulls: G' w of each step, (steps, n_s), w = (z_1 - z_0) / 2; or beside it that with (v_0 + v_1) / 2s, which
             differs where a step is divided, (steps, 2 n_s).
         v: velocity of the hand, (steps + 1, n_s).
         c: load of each step, -(a - g + alpha v_mid), (steps, n_s).
-        dt: step [s].
     """
     s = 2 / dt
     turn = np.where(np.arange(len(pulls) + 1) % 2 == 0, 1.0, -1.0)[:, None]

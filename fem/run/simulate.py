@@ -58,8 +58,6 @@ class Run(Stepped):
     """One run in progress: the TS context and what it carries.
 
     Args:
-        model: the model.
-        options: where files go, and whether to resume.
         force: feedback force on the hand; None takes the scene's motion.
 
     Attributes:

@@ -137,9 +137,7 @@ def held_operators(
 
     Args:
         S: matrix of the step, consumed.
-        whole: every rank holds all rows.
         ordered: in the order of elimination; all rows then.
-        parts: further matrices, consumed.
     """
     layout, D = system.layout, system.damping.matrix
     beside = () if D is None else (D, system.M_ee)

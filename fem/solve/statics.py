@@ -48,18 +48,12 @@ def solve_columns(
     solver: SolverName | None = None,
     reproducible: Reproducible = "auto",
 ) -> Array:
-    """Return the local rows of A^-1 X, A symmetric positive definite, Fortran order. Collective.
+    """Return the local rows (n_local, k) of A^-1 X, A symmetric positive definite, Fortran order. Collective.
 
     Factored once; columns of zeros cost nothing.
 
     Args:
-        A: distributed over the ranks of ``layout``.
-        layout: sizes and ownership.
-        X: local rows (n_local, k).
-        where: what it is for, in messages.
         rtol: of cg, where no direct solver fits.
-        solver: None takes the one that suits few solves.
-        reproducible: as for :func:`make_solver`.
 
     Raises:
         SolverError: the factorisation fails, or the solution has a large residual.

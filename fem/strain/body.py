@@ -32,9 +32,7 @@ class Kernel:
     """Points of one rank with their nodes.
 
     Args:
-        points: on a communicator of this rank alone.
         lam, mu: in every point [Pa], (Q,).
-        code: from :func:`compiled`.
 
     Attributes:
         J: det F at the end of the step tried last, (Q,).
@@ -82,8 +80,6 @@ class Body:
     """Points with materials; vectors have the distribution of the columns of B.
 
     Args:
-        points: of this rank, or all of them.
-        materials: one per layer.
         pattern: of the tangents; None: that of B'AB, which on some ranks has fewer columns of other ranks than K_ee.
 
     Attributes:
@@ -154,7 +150,6 @@ class Body:
         """Refuse a state that the law does not describe: an inverted cell, or one pressed too far. Collective.
 
         Args:
-            start: the law at the state.
             comm: ranks that share the points; None where each has them all.
 
         Raises:
