@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,7 +83,7 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None."""
-        result: dict[str, Any] = to_json(asdict(self))
+        result: dict[str, Any] = to_json(asdict(replace(self, equation=self.equation.plain())))
         return result
 
 

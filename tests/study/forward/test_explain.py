@@ -50,11 +50,11 @@ def scene_of(order: int = 1, material: dict[str, float] | None = None, **parts: 
 
 
 def stepped(scene: Scene) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-    return {name: (left, right) for name, left, right in equation(scene).stepped}
+    return {name: (left, right) for name, left, right in equation(scene).plain().stepped}
 
 
 def blocks(scene: Scene) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-    return {name: (left, right) for name, left, right in equation(scene).blocks}
+    return {name: (left, right) for name, left, right in equation(scene).plain().blocks}
 
 
 def test_bare_scene() -> None:
