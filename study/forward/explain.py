@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.effects import EFFECTS, Gate
-from softgrasp.fem.effects.sag import Sag
-from softgrasp.fem.fields.scales import measure
-from softgrasp.fem.fields.strain import SMALL_STRAIN
+from softgrasp.fem.effects.gate import Sag
+from softgrasp.fem.fields.scales import SMALL_STRAIN, measure
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import Need, factor_bytes, need
 from softgrasp.fem.run.motion import largest_acceleration
@@ -84,7 +83,7 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dicts, lists and numbers for JSON; what is not known is None."""
-        result: dict[str, Any] = to_json(asdict(self))
+        result: dict[str, Any] = to_json(asdict(replace(self, equation=self.equation.plain())))
         return result
 
 

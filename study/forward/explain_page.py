@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
 
-from softgrasp.fem.effects.sag import SMALL_SHARE
-from softgrasp.fem.fields.strain import SMALL_STRAIN
+from softgrasp.fem.effects.gate import SMALL_SHARE
+from softgrasp.fem.fields.scales import SMALL_STRAIN
 from softgrasp.fem.model.memory import size_text
 from softgrasp.study.forward.explain import EffectReport, Explanation, explain
 from softgrasp.study.forward.explain_mesh import mesh_lines
 from softgrasp.study.report.origin import origin
-from softgrasp.study.report.page import EQUATION, Section, equation_text
+from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import Table, listed
 from softgrasp.study.shell.session import Page, Session, list_files
 
@@ -92,7 +92,7 @@ def sections(result: Explanation) -> list[Section]:
     no_modes = "" if periods else "Not computed: the factor would not fit."
     return [
         Section("Warnings", text="\n\n".join(remarks(result)) or "Nothing stands out."),
-        Section(EQUATION, code=equation_text(result.equation)),
+        Section(EQUATION, code="\n".join(result.equation.plain().lines()), equation=result.equation),
         Section("Sizes", rows=sizes),
         Section("At rest under its weight, the hand held still", rows=sag_rows(result)),
         Section("Mesh", text="\n\n".join(mesh_lines(result.mesh, result.dimension))),

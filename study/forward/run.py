@@ -19,8 +19,7 @@ from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import speed_up
-from softgrasp.study.report.equation import equation
-from softgrasp.study.report.page import Section, captioned, equation_text
+from softgrasp.study.report.page import Section, captioned, of_scene
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Flags, Page, Session, list_files, show_warnings
 
@@ -114,6 +113,6 @@ def _sections(result: Simulation, numbers: Sequence[tuple[str, str]], drawn: lis
         Section("", figures=captioned(drawn, CAPTIONS | {"move.gif": move})),
         Section("Result", rows=numbers),
         *([Section("Warnings", text="\n\n".join(result.warnings))] if result.warnings else []),
-        Section("Equation", code=equation_text(equation(scene))),
+        of_scene(scene),
         Section("Effects", header=("effect", "on", "adds", "cost"), rows=effects),
     ]

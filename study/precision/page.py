@@ -37,8 +37,8 @@ from softgrasp.study.precision.tables import (
     reference_text,
     slope_table,
 )
-from softgrasp.study.reduce.times import PAPER_FULL, PAPER_REDUCED
-from softgrasp.study.report.equation_control import control_text
+from softgrasp.study.reduce.sweep import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.report.equation import controlled
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
 from softgrasp.study.report.page import EQUATION, Section
@@ -194,10 +194,12 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
     answered = {name: question for name, question in study.questions.items() if question.points}
     feedback = [name for name in answered if name in CONTROL]
     if feedback and len(feedback) == len(answered):
-        sections.insert(0, Section(EQUATION, code=control_text(study.scene)))  # nothing follows the scene's own motion
+        sections.insert(
+            0, Section(EQUATION, equation=controlled(study.scene))
+        )  # nothing follows the scene's own motion
     for name, question in answered.items():
         if feedback and len(feedback) < len(answered) and name == feedback[0]:
-            sections.append(Section(f"{EQUATION} under feedback", code=control_text(study.scene)))
+            sections.append(Section(f"{EQUATION} under feedback", equation=controlled(study.scene)))
         drawn = [(figures[f"work_{name}"], CAPTIONS[name])] if f"work_{name}" in figures else []
         text = reference_text(question, paper_of(study.scene) == "control")
         sections.append(question_table(name, question.points).section(text, TITLES[name], drawn))

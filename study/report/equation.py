@@ -1,4 +1,4 @@
-"""The equation of a scene with exactly its terms, as text.
+"""The equation of a scene with exactly its terms, in LaTeX.
 
 Two forms of one equation: the paper's blocks in q = [q_s; q_e], and the one that is stepped, in the displacement
 z = q_e - T q_s against the rigid motion of the hand.
@@ -6,22 +6,65 @@ z = q_e - T q_s against the rigid motion of the hand.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
-from softgrasp.fem.effects.damping import layered
+from softgrasp.fem.effects.catalog import layered
 from softgrasp.fem.scene.scene import Scene
 
+PLAIN = (  # pattern of LaTeX, what a terminal shows
+    (r"\\ddot (\w(_\w)?)", r"\1''"), (r"\\dot (\w(_\w)?)", r"\1'"), (r"\^\\top", "'"), (r"\\text|[\\${}]", ""),
+)  # fmt: skip
+FEEDBACK = (
+    ("state", (r"$E \dot x$",), ("$A x$", r"$B u$, $x = [q_s, \dot q_s, z, \dot z]$")),
+    ("output", ("$y$",), ("$C x$",)),
+    (
+        "cost",
+        ("$J$",),
+        (
+            r"$\int \langle y - y_\text{target}, Q (y - y_\text{target}) \rangle$",
+            r"$\langle u, R u \rangle \, dt$",
+        ),
+    ),
+    ("Riccati", (r"$A^\top P E$", r"$E^\top P A$", r"$- E^\top P B R^{-1} B^\top P E$", r"$C^\top Q C$"), ("$0$",)),
+    ("gain", ("$u$",), (r"$u_\text{target}$", r"$K (x - x_\text{target})$, $K = {-R^{-1}} B^\top P E$")),
+)
 Rows = tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
 
 
 @dataclass(frozen=True)
 class Equation:
-    """The equation of one scene, each row a left and a right side."""
+    """The equation of one scene: prose with formulas in LaTeX, each row the terms of a left and a right side."""
 
     blocks: Rows  # rows of the paper's block system in q_s, q_e, as (name, left terms, right terms)
     stepped: Rows  # the same in z, as it is solved
     where: tuple[str, ...]  # definitions of the symbols that occur
     feedback: Rows = ()  # the optimal control of the plant
+
+    def plain(self) -> Equation:
+        """The same for a terminal: derivatives and transposes by primes, Greek letters by their names."""
+        blocks, stepped = (
+            tuple((name, tuple(map(_plain, left)), tuple(map(_plain, right))) for name, left, right in rows)
+            for rows in (self.blocks, self.stepped)
+        )
+        return Equation(blocks, stepped, tuple(map(_plain, self.where)))
+
+    def lines(self) -> list[str]:
+        """A plain equation in blocks, as it is stepped, and what the symbols are."""
+        lines = []
+        for title, rows in (("in blocks:", self.blocks), ("stepped as:", self.stepped)):
+            wide = 1 + max(len(name) for name, _, _ in rows)
+            for name, *sides in rows:
+                left, right = (" + ".join(terms).replace("+ -", "-") for terms in sides)
+                lines.append(f"  {name + ':':<{wide}} {left} = {right}")
+            lines.insert(-len(rows), title)
+        return [*lines, "with:", *(f"  {text}" for text in self.where)]
+
+
+def _plain(text: str) -> str:
+    for pattern, shown in PLAIN:
+        text = re.sub(pattern, shown, text)
+    return text
 
 
 def equation(scene: Scene) -> Equation:
@@ -30,76 +73,99 @@ def equation(scene: Scene) -> Equation:
     free = scene.motion.drive == "force"
     damped, heavy, two_way = effects.damping is not None, effects.gravity is not None, effects.reaction
     dragged = effects.damping is not None and effects.damping.drag == "space" and effects.damping.alpha > 0
-    weight = ("M_hand g",) if effects.gravity is not None and effects.gravity.hand_weight else ()
+    weight = (r"$M_\text{hand} g$",) if effects.gravity is not None and effects.gravity.hand_weight else ()
 
-    tissue = ["M_es q_s''", "M_ee q_e''"] + (["D_es q_s'", "D_ee q_e'"] if damped else [])
-    tissue += ["K_es q_s", "K_ee q_e"]
-    hand, load = ["M_ss q_s''"], ["u"]
+    tissue = [r"$M_{es} \ddot q_s$", r"$M_{ee} \ddot q_e$"]
+    tissue += [r"$D_{es} \dot q_s$", r"$D_{ee} \dot q_e$"] if damped else []
+    tissue += ["$K_{es} q_s$", "$K_{ee} q_e$"]
+    hand, load = [r"$M_{ss} \ddot q_s$"], ["$u$"]
     if two_way:
-        hand += ["M_se q_e''"] + (["D_ss q_s'", "D_se q_e'"] if damped else []) + ["K_ss q_s", "K_se q_e"]
+        hand += [r"$M_{se} \ddot q_e$", *((r"$D_{ss} \dot q_s$", r"$D_{se} \dot q_e$") if damped else ())]
+        hand += ["$K_{ss} q_s$", "$K_{se} q_e$"]
     if (two_way and heavy) or weight:
-        load.append("f_s")
-    blocks = (("hand", tuple(hand), tuple(load)), ("tissue", tuple(tissue), ("f_e",) if heavy else ("0",)))
+        load.append("$f_s$")
+    blocks = (("hand", tuple(hand), tuple(load)), ("tissue", tuple(tissue), ("$f_e$",) if heavy else ("$0$",)))
 
-    fall = "(q_s'' - g)" if heavy else "q_s''"
-    drag = ("- alpha G q_s'",) if dragged else ()
-    left = ("M_ee z''", *(("D_ee z'",) if damped else ()), "f(z)" if effects.finite_strain else "K_ee z")
-    rows = [("tissue", left, (f"-G {fall}", *drag))]
-    forces = ["M_hand q_s''"]
+    fall = r"(\ddot q_s - g)" if heavy else r"\ddot q_s"
+    drag = (r"$- \alpha G \dot q_s$",) if dragged else ()
+    inner = "$f(z)$" if effects.finite_strain else "$K_{ee} z$"
+    left = (r"$M_{ee} \ddot z$", *((r"$D_{ee} \dot z$",) if damped else ()), inner)
+    rows = [("tissue", left, (f"$-G {fall}$", *drag))]
+    forces = [r"$M_\text{hand} \ddot q_s$"]
     if two_way:
-        forces += [f"M_r {fall}", "G' z''"] + (["alpha M_r q_s'", "alpha G' z'"] if dragged else [])
+        forces += [f"$M_r {fall}$", r"$G^\top \ddot z$"]
+        forces += [r"$\alpha M_r \dot q_s$", r"$\alpha G^\top \dot z$"] if dragged else []
     if free:
-        rows.append(("hand", tuple(forces), ("u(t)", *weight)))
+        rows.append(("hand", tuple(forces), ("$u(t)$", *weight)))
     else:
-        rows.append(("hand", ("q_s",), (_motion(scene),)))
+        rows.append(("hand", ("$q_s$",), (_motion(scene),)))
         if two_way:
-            rows.append(("force it takes", ("u",), (*forces, *(f"- {w}" for w in weight))))
+            rows.append(("force it takes", ("$u$",), (*forces, *(f"$- {w[1:]}" for w in weight))))
     return Equation(blocks, tuple(rows), _definitions(scene, dragged, free))
 
 
 def _motion(scene: Scene) -> str:
     motion = scene.motion
     if motion.profile == "quintic":
-        return "target s(t), s = 10 x^3 - 15 x^4 + 6 x^5, x = min(t / duration, 1)"
-    return "cubic spline through the csv table, at rest at both ends" if motion.profile == "csv" else "0"
+        return r"target $s(t)$, $s = 10 x^3 - 15 x^4 + 6 x^5$, $x = \text{min}(t / \text{duration}, 1)$"
+    return "cubic spline through the csv table, at rest at both ends" if motion.profile == "csv" else "$0$"
 
 
 def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
     effects, layers = scene.effects, "sum over layers of " if scene.tissue.layers else ""
     finite = effects.finite_strain
-    strain = [] if finite is None else [f"f(z) = dW/dz, W(F) {finite.law}, F = I + grad z"]
+    strain = [] if finite is None else [rf"$f(z) = dW/dz$, $W(F)$ {finite.law}, $F = I + \text{{grad }} z$"]
     result = [
         *strain,
-        "q_s: translations" + (" and small angles" if effects.rotation else "") + " of the hand",
-        "z = q_e - T q_s: displacement of the tissue against the rigid motion T q_s",
-        "G = M_es + M_ee T; K_es = -K_ee T",
-        f"K_ee = {layers}mu K_mu + lambda K_lambda, M_ee = {layers}rho M_1",
+        "$q_s$: translations" + (" and small angles" if effects.rotation else "") + " of the hand",
+        "$z = q_e - T q_s$: displacement of the tissue against the rigid motion $T q_s$",
+        "$G = M_{es} + M_{ee} T$; $K_{es} = {-K_{ee}} T$",
+        rf"$K_{{ee}} =$ {layers}$\mu K_\mu + \lambda K_\lambda$, $M_{{ee}} =$ {layers}$\rho M_1$",
     ]
     if effects.reaction:
-        result.append("two-way: M_se = M_es', K_se = K_es', M_ss = M_hand + R' M R, M_r: rigid tissue inertia")
-    else:
-        result.append("one-way: the hand does not feel the tissue, M_ss = M_hand, M_se = 0, K_ss = K_se = 0")
-    if effects.damping is not None:
-        beta = "beta K_ee" if not layered(scene) else "sum over layers of beta K"
-        damping = f"alpha M_ee + {beta}" if effects.damping.alpha else beta
         result.append(
-            f"D_ee = {damping}, D_es = -D_ee T"
-            + (" + alpha G: dragged in space" if dragged else ": a rigid move is free")
+            r"two-way: $M_{se} = M_{es}^\top$, $K_{se} = K_{es}^\top$, $M_{ss} = M_\text{hand} + R^\top M R$, "
+            "$M_r$: rigid tissue inertia"
         )
+    else:
+        result.append(
+            r"one-way: the hand does not feel the tissue, $M_{ss} = M_\text{hand}$, $M_{se} = 0$, $K_{ss} = K_{se} = 0$"
+        )
+    if effects.damping is not None:
+        beta = "sum over layers of $\\beta K$" if layered(scene) else r"$\beta K_{ee}$"
+        result.append(
+            "$D_{ee} =$ " + (r"$\alpha M_{ee} +$ " if effects.damping.alpha else "") + beta + ", $D_{es} = {-D_{ee}} T$"
+            + (r" $+ \alpha G$: dragged in space" if dragged else ": a rigid move is free")
+        )  # fmt: skip
         if effects.reaction:
-            result.append("D_se = D_es', D_ss = T' D_ee T" + (" + alpha (R' M R - T' M_ee T)" if dragged else ""))
+            more = r" $+ \alpha (R^\top M R - T^\top M_{ee} T)$" if dragged else ""
+            result.append(r"$D_{se} = D_{es}^\top$, $D_{ss} = T^\top D_{ee} T$" + more)
     if effects.gravity is not None:
-        result.append("f_e = G g" + ("; f_s = (R' M R + M_se T) g" if effects.reaction else ""))
+        result.append("$f_e = G g$" + (r"; $f_s = (R^\top M R + M_{se} T) g$" if effects.reaction else ""))
         if effects.gravity.hand_weight:
-            result.append("f_s " + ("also has" if effects.reaction else "=") + " M_hand g")
+            result.append("$f_s$ " + ("also has" if effects.reaction else "$=$") + r" $M_\text{hand} g$")
     if free:
         drive = {
             "csv": "csv table, straight lines between its rows",
-            "hold": "0",
-            "quintic": "M_hand q'' of the quintic move to the target",
+            "hold": "$0$",
+            "quintic": r"$M_\text{hand} \ddot q$ of the quintic move to the target",
         }
-        result.append(f"u(t): {drive[scene.motion.profile]}")
+        result.append(f"$u(t)$: {drive[scene.motion.profile]}")
     else:
         kept = ", which simulate writes to trajectory.csv" if effects.reaction else ""
-        result.append(f"the motion is prescribed: the hand's row only tells the force u{kept}")
+        result.append(f"the motion is prescribed: the hand's row only tells the force $u${kept}")
     return tuple(result)
+
+
+def controlled(scene: Scene) -> Equation:
+    """The scene's equation with a force on the hand, then cost, Riccati equation and gain.
+
+    u_target holds the body at rest at the target: the hand's weight, else nothing.
+    """
+    free = scene.model_copy(update={"motion": scene.motion.model_copy(update={"drive": "force", "profile": "hold"})})
+    plant = equation(free)
+    stepped = tuple(
+        (name, left, tuple(term.replace("u(t)", "u") for term in right)) for name, left, right in plant.stepped
+    )
+    where = tuple(text for text in plant.where if not text.startswith("$u(t)$:"))
+    return Equation(plant.blocks, stepped, where, FEEDBACK)

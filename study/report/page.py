@@ -17,7 +17,7 @@ from PIL import Image
 
 from softgrasp.fem.scene.file import resolved_toml
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.report.equation import Equation, Rows, equation
+from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.origin import made_with
 from softgrasp.study.report.typeset import equation_html
 from softgrasp.study.report.words import words_of
@@ -25,7 +25,7 @@ from softgrasp.study.report.words import words_of
 TEMPLATE = Path(__file__).with_name("page.html")
 KINDS = {".png": "image/png", ".gif": "image/gif"}
 PIXELS_PER_INCH = 135  # width of a figure on the screen against its width in print
-EQUATION = "Equation"  # first word of the heading of a section whose code is an equation
+EQUATION = "Equation"
 HOW = (
     "Run it in a checkout, after make env, with OMP_NUM_THREADS=1. All numbers of this page are in {numbers} beside "
     "it. Sizes, counts and errors come out again up to rounding, which the number of ranks changes; times depend on "
@@ -48,7 +48,8 @@ class Section:
 
     title: str  # heading; empty for none
     text: str = ""  # paragraphs, parted by empty lines
-    code: str = ""  # text shown as it is; under the heading Equation it is set as one, see `equation_text`
+    code: str = ""  # text shown as it is
+    equation: Equation | None = None  # shown on the page in place of the code
     header: Sequence[str] = ()  # names of the columns; without it two columns are label and value
     rows: Sequence[Sequence[Any]] = ()  # a table; every row as long as the header. Numbers are shown with four digits.
     figures: Sequence[tuple[Path, str]] = ()  # (picture file, caption); the files are embedded
@@ -61,22 +62,9 @@ def captioned(files: Sequence[Path], captions: Mapping[str, str]) -> list[tuple[
     return [(drawn[name], text) for name, text in captions.items() if name in drawn]
 
 
-def equation_text(rows: Equation) -> str:
-    """An equation as lines of text: in blocks, as it is stepped, and what the symbols are."""
-    lines = ["in blocks:", *_lines(rows.blocks), "", "stepped as:", *_lines(rows.stepped), ""]
-    lines += ["controlled by:", *_lines(rows.feedback), ""] if rows.feedback else []
-    return "\n".join([*lines, "with:", *(f"  {text}" for text in rows.where)])
-
-
-def _lines(rows: Rows) -> list[str]:
-    sides = [[" + ".join(terms).replace("+ -", "-") for terms in (left, right)] for _, left, right in rows]
-    wide = max(len(name) for name, _, _ in rows)
-    return [f"  {row[0] + ':':<{wide + 1}} {left} = {right}" for row, (left, right) in zip(rows, sides, strict=True)]
-
-
 def of_scene(scene: Scene) -> Section:
     """The section with the equation of a scene."""
-    return Section(EQUATION, code=equation_text(equation(scene)))
+    return Section(EQUATION, equation=equation(scene))
 
 
 def outside(page: str) -> list[str]:
@@ -165,7 +153,7 @@ def _prepared(section: Section) -> dict[str, Any]:
         "title": section.title,
         "paragraphs": [part.strip() for part in section.text.split("\n\n") if part.strip()],
         "code": section.code,
-        "equation": equation_html(section.code) if section.title.startswith(EQUATION) and section.code else "",
+        "equation": "" if section.equation is None else equation_html(section.equation),
         "header": section.header,
         "rows": rows,
         "unfolded": [rows[i] for i in section.best or range(SHOWN)] if section.header and len(rows) > MOST_ROWS else [],

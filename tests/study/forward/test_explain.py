@@ -11,8 +11,8 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.effects.sag import SMALL_SHARE
-from softgrasp.fem.fields.strain import gradient, slowest
+from softgrasp.fem.effects.gate import SMALL_SHARE
+from softgrasp.fem.fields.scales import gradient, slowest
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import factor_bytes
 from softgrasp.fem.petsc import PETSc
@@ -50,11 +50,11 @@ def scene_of(order: int = 1, material: dict[str, float] | None = None, **parts: 
 
 
 def stepped(scene: Scene) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-    return {name: (left, right) for name, left, right in equation(scene).stepped}
+    return {name: (left, right) for name, left, right in equation(scene).plain().stepped}
 
 
 def blocks(scene: Scene) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-    return {name: (left, right) for name, left, right in equation(scene).blocks}
+    return {name: (left, right) for name, left, right in equation(scene).plain().blocks}
 
 
 def test_bare_scene() -> None:

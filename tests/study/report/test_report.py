@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pytest
 from rich.console import Console
 
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
+from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.run import run_simulate
-from softgrasp.study.report.equation import equation
-from softgrasp.study.report.equation_control import control_text
+from softgrasp.study.report.equation import Equation, controlled, equation
 from softgrasp.study.report.origin import versions
-from softgrasp.study.report.page import Section, equation_text, of_scene, outside, write_report
-from softgrasp.study.report.typeset import equation_html, formula, terms
+from softgrasp.study.report.page import Section, outside, write_report
+from softgrasp.study.report.typeset import equation_html, prose, terms
 from tests.helpers.browser import DESK, PHONE, Browser, faults, find_chromium
 
 pytestmark = pytest.mark.serial
@@ -23,42 +24,44 @@ pytestmark = pytest.mark.serial
 # --- equations
 
 
-def test_symbols_are_set_and_words_are_not() -> None:
-    assert formula("M_ee z''") == "<i>M</i><sub><i>ee</i></sub> <i>z</i>″"
-    assert formula("q_s'' - g") == "<i>q</i>″<sub><i>s</i></sub> − <i>g</i>"
-    assert formula("R' M R") == "<i>R</i><sup>⊤</sup> <i>M</i> <i>R</i>"  # of a matrix: transposed
-    assert formula("-alpha M_hand x^3") == "−<i>α</i> <i>M</i><sub>hand</sub> <i>x</i><sup>3</sup>"
-    text = "a rigid move is free: the hand's row only tells"
-    assert formula(text) == text
-    assert formula("<u, R u> & z") == "⟨<i>u</i>, <i>R</i> <i>u</i>⟩ &amp; <i>z</i>"
-    assert formula("A^T P - R^-1") == "<i>A</i><sup>⊤</sup> <i>P</i> − <i>R</i><sup>−1</sup>"
-    assert formula("min(t / duration, 1)") == "min(<i>t</i> / duration, 1)"
+def test_formulas_are_set_and_words_are_not() -> None:
+    html = str(prose(r"the hand's row: $M_{ee} \ddot z$ & $R^\top$"))
+    assert html.startswith("the hand&#39;s row: <math")
+    assert "<msub><mi>M</mi><mrow><mi>e</mi><mi>e</mi></mrow></msub><mover><mi>z</mi>" in html
+    assert "</math> &amp; <math" in html
+    assert "<msup><mi>R</mi><mo>&#x022A4;</mo></msup>" in html  # of a matrix: transposed
 
 
-def test_lines_break_before_operators_outside_brackets() -> None:
-    pieces = [str(piece) for piece in terms("K z + D z' = -G (a - g) - u")]
-    assert [piece[:1] for piece in pieces] == ["<", "+", "=", "−"]
-    assert "<i>g</i>)" in pieces[2]
+def test_lines_break_before_operators() -> None:
+    pieces = [str(piece) for piece in terms(["$-G (a - g)$", "$- u$", "$w$"], "=")]
+    assert [piece.removeprefix('<span class="term">')[:1] for piece in pieces] == ["=", "−", "+"]
+    assert "<mi>g</mi>" in pieces[0]
 
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
-def test_every_symbol_of_every_scene_is_set(name: str) -> None:
-    """Nothing of the notation of text is left in the page: no underscore, prime or power."""
-    html = str(equation_html(equation_text(equation(load_scene(shipped_scenes()[name])))))
-    text = html.replace("hand's", "")
-    assert not any(mark in text for mark in ("_", "'", "^"))
-    assert html.count("<i>") == html.count("</i>")
+@pytest.mark.parametrize("kind", [equation, controlled])
+def test_every_symbol_of_every_scene_is_set(name: str, kind: Callable[[Scene], Equation]) -> None:
+    """Nothing of the notation of LaTeX or of text is left in the page: no dollar, backslash, underscore or power."""
+    html = str(equation_html(kind(load_scene(shipped_scenes()[name]))))
+    assert not any(mark in html for mark in ("_", "$", "^", "\\", "{"))
+    assert html.count("<math") == html.count("</math>") > 20
+    ET.fromstring(html)  # well formed
     assert "tissue" in html
 
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
+def test_a_terminal_shows_no_latex(name: str) -> None:
+    text = "\n".join(equation(load_scene(shipped_scenes()[name])).plain().lines())
+    assert not any(mark in text for mark in ("\\", "$", "{", "}"))
+
+
+@pytest.mark.parametrize("name", sorted(shipped_scenes()))
 def test_control_has_its_cost_and_riccati_equation(name: str) -> None:
-    text = control_text(load_scene(shipped_scenes()[name]))
-    html = str(equation_html(text)).replace("hand's", "")
-    assert not any(mark in html for mark in ("_", "'", "^", "int "))
-    assert "prescribed" not in text  # a force moves the hand, whatever moves it in `simulate`
-    assert "hand:   M_hand q_s''" in text
-    assert text.index("Riccati") < text.index("with:")
+    rows = controlled(load_scene(shipped_scenes()[name]))
+    assert "prescribed" not in " ".join(rows.where)  # a force moves the hand, whatever moves it in `simulate`
+    assert any(line.startswith("  hand:   M_hand q_s''") for line in rows.plain().lines())
+    html = str(equation_html(rows))
+    assert html.index("Riccati") < html.index(">with<")
 
 
 # --- nothing from outside
@@ -93,7 +96,7 @@ def test_versions_name_what_the_numbers_come_from() -> None:
 def test_the_equation_comes_from_the_scene(tmp_path: Path) -> None:
     scene = load_scene(shipped_scenes()["paper_forward"])
     page = write_report(tmp_path / "r.html", title="t", summary=(), scene=scene, reproduce="softgrasp").read_text()
-    assert str(equation_html(of_scene(scene).code)) in page
+    assert str(equation_html(equation(scene))) in page
     assert "<h2>Made with</h2>" in page
 
 
