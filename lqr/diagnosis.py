@@ -8,13 +8,17 @@ from typing import Literal
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array, total
-from softgrasp.lqr.dense.modal import modes_of_plant
-from softgrasp.lqr.dense.poles import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence
+from softgrasp.fem.petsc import Array
+from softgrasp.lqr.dense.modal import (
+    ENOUGH,
+    ModeRates,
+    closed_loop_rates,
+    enough_damping,
+    lost_sentence,
+    lowest_plant,
+)
 from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
-from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.modal_loop import modal_damping
 
 MODES = 60
 WEAK = ENOUGH / 4  # damping ratio of the first mode where the low-rank solvers begin to need many hundred solves
@@ -59,14 +63,9 @@ def diagnose(problem: RiccatiProblem, modes: int = MODES) -> Diagnosis:
     unusable = _data(problem)
     if unusable:
         return Diagnosis(tuple(unusable), None, float("nan"))
-    system, comm = problem.system, problem.layout.comm
-    findings = _outputs(problem)
-    k = min(modes, system.layout.n_e)
-    omega, Phi, _ = modes_of_plant(problem, k)
-    damping = np.diag(modal_damping(problem, Phi))
-    g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
-    rates = closed_loop_rates(problem, omega, damping, g, c, largest=_largest_frequency(problem))
-    findings += _damping(problem, rates)
+    plant = lowest_plant(problem, min(modes, problem.layout.n_e))
+    rates = closed_loop_rates(problem, plant, largest=_largest_frequency(problem))
+    findings = _outputs(problem) + _damping(problem, rates)
     findings.sort(key=lambda f: f.kind != "error")
     return Diagnosis(tuple(findings), rates, enough_damping(rates))
 

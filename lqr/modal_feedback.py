@@ -6,17 +6,14 @@ import time
 
 import numpy as np
 
-from softgrasp.fem.petsc import on_root, total
-from softgrasp.lqr.dense.care import care
-from softgrasp.lqr.dense.modal import factor_psd, modes_of_plant
-from softgrasp.lqr.dense.poles import closed_loop_rates
+from softgrasp.fem.petsc import on_root
+from softgrasp.lqr.dense.care import care_of
+from softgrasp.lqr.dense.modal import closed_loop_rates, factor_psd, lowest_plant
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.checks import ControlError, check_weights
-from softgrasp.lqr.plant.operators import modal_inputs
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import modal_basis
 from softgrasp.lqr.reduced.riccati import full_gain, project_plant
-from softgrasp.lqr.spectrum.modal_loop import modal_damping
 
 
 def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) -> RiccatiSolution:
@@ -43,20 +40,18 @@ def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) ->
     if modes < 0:
         raise ControlError(f"modal_lqr: modes = {modes} must be 0 or more")
     k = min(max(candidates, modes, 1), system.layout.n_e)
-    omega, Phi, massed = modes_of_plant(problem, k)
-    g, c = modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
-    rates = closed_loop_rates(problem, omega, np.diag(modal_damping(problem, Phi)), g, c)
-    good = np.flatnonzero(rates.lost == 0)
+    plant = lowest_plant(problem, k)
+    good = np.flatnonzero(closed_loop_rates(problem, plant).lost == 0)
     if len(good) < modes:
         raise ControlError(
             f"modal_lqr: only {len(good)} of the lowest {k} modes can be stabilised, {modes} are asked for; ask for at "
             f"most {len(good)}"
         )
     pick = good[:modes]
-    basis = modal_basis(problem, "modal_lqr", omega[pick], Phi[:, pick], massed[:, pick])
+    basis = modal_basis(problem, "modal_lqr", plant, pick)
     m = project_plant(problem, basis)
     middle = time.perf_counter()
-    P_N = on_root(comm, lambda: care(m.A, m.B, m.C, m.Q, m.R, m.E).X)
+    P_N = on_root(comm, lambda: care_of(m).X)
     Z = basis.W.times(on_root(comm, lambda: factor_psd(P_N)))
     gain = full_gain(problem, basis, P_N)
     left = system.layout.n_e - modes

@@ -9,10 +9,10 @@ from typing import Literal, Protocol
 from softgrasp.fem.errors import SolverError
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.diagnosis import diagnose
-from softgrasp.lqr.lowrank.adi import Progress
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
+from softgrasp.lqr.lowrank.solver import Progress
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 

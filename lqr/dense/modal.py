@@ -1,4 +1,4 @@
-"""The whole Riccati equation of a small scene, dense: the oracle of the low-rank solvers."""
+"""The plant in its modes, their closed-loop poles, and the whole Riccati equation, dense: the low-rank oracle."""
 
 from __future__ import annotations
 
@@ -10,24 +10,28 @@ import scipy.linalg
 
 from softgrasp.fem.errors import ResourceError, SolverError, agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_scipy
+from softgrasp.fem.petsc import Array, PETSc, rows_on_root, times_columns, to_scipy, total
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.lqr.dense.care import DenseSolution as DenseSolution
-from softgrasp.lqr.dense.care import care as care
-from softgrasp.lqr.dense.poles import closed_loop_rates, lost_sentence
-from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.checks import EPS, ControlError, check_finite, check_weights, square_root
-from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.dense.care import StateSpace, care_of
+from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.operators import damp
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 DENSE_MODES = 600  # a tenth of a second; SLEPc on several ranks is slower there
 FACTOR_TOLERANCE = 1e-10  # of the singular values of Z, hence 1e-20 of those of X
+# A rate below this share of the largest frequency is rounding: an error eps |H| of the Hamiltonian matrix moves a pole
+# by as much, and a dense eigenvalue solver makes some ten times that.
+LOST = 30 * EPS
+# Damping ratio of the first mode from which the low-rank solvers converge in a few hundred solves (measured: 4e-4 does,
+# 4e-5 does not).
+ENOUGH = 4e-4
 NOISE = 100 * EPS  # of the largest row of Z: an entry of X beside it is rounding of X
 
 
 @dataclass(frozen=True)
 class TissueMatrices:
-    """Dense M_ee, K_ee, D_ee (n_e, n_e); G (n_e, n_s); C_z (n_e, p); B_z (n_e, m), in global numbering."""
+    """Dense M_ee, K_ee, D_ee (k, k); G (k, n_s); C_z (k, p); B_z (k, m), in global numbering or any basis of z."""
 
     M: Array
     K: Array
@@ -35,16 +39,6 @@ class TissueMatrices:
     G: Array
     C_z: Array
     B_z: Array | None = None
-
-
-@dataclass(frozen=True)
-class StateSpace:
-    """E x' = A x + B u, y = C x, dense."""
-
-    E: Array
-    A: Array
-    B: Array
-    C: Array
 
 
 @dataclass(frozen=True)
@@ -83,21 +77,19 @@ def gather_tissue(problem: RiccatiProblem) -> TissueMatrices | None:
     return TissueMatrices(M, K, D, G, C_z, B_z)
 
 
-def assemble_space(
-    problem: RiccatiProblem, M: Array, K: Array, D: Array, G: Array, C_z: Array, B_z: Array | None = None
-) -> StateSpace:
-    """E, A, B, C of x = [q_s, v_s, z, v_z] from dense blocks of the tissue in any basis of z.
+def assemble_space(problem: RiccatiProblem, tissue: TissueMatrices) -> StateSpace:
+    """E, A, B, C of x = [q_s, v_s, z, v_z].
 
     With drag = "space" and two-way coupling the hand row carries alpha M_rigid and alpha G' as well.
     """
-    system = problem.system
+    system, M, G, B_z = problem.system, tissue.M, tissue.G, tissue.B_z
     n_s, n = system.layout.n_s, len(M)
     s, v, z, w = (slice(a, b) for a, b in ((0, n_s), (n_s, 2 * n_s), (2 * n_s, 2 * n_s + n), (2 * n_s + n, None)))
     E = np.eye(2 * (n_s + n))
     A = np.zeros_like(E)
     E[v, v], E[w, w], E[w, v] = problem.M_s, M, G
     A[s, v], A[z, w] = np.eye(n_s), np.eye(n)
-    A[w, z], A[w, w] = -K, -D
+    A[w, z], A[w, w] = -tissue.K, -tissue.D
     if system.damping.in_space:
         A[w, v] = -system.damping.alpha * G
     if system.two_way:
@@ -109,25 +101,24 @@ def assemble_space(
         B[v] = np.eye(n_s)
     else:
         B[w] = B_z
-    C = np.hstack([problem.C_s, np.zeros_like(problem.C_s), C_z.T, np.zeros_like(C_z.T)])
-    return StateSpace(E, A, B, C)
+    C_z = tissue.C_z.T
+    C = np.hstack([problem.C_s, np.zeros_like(problem.C_s), C_z, np.zeros_like(C_z)])
+    return StateSpace(E, A, B, C, problem.Q, problem.R)
 
 
 def relative_space(problem: RiccatiProblem) -> StateSpace | None:
     """E, A, B, C in hand-relative coordinates, dense on rank 0, None elsewhere. Collective."""
     tissue = gather_tissue(problem)
-    if tissue is None:
-        return None
-    return assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
+    return None if tissue is None else assemble_space(problem, tissue)
 
 
 def modal_plant(
-    problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, ...]
+    problem: RiccatiProblem, omega: Array, Phi: Array, massed: Array, parts: tuple[Array, Array, Array]
 ) -> ModalPlant:
     """The plant restricted to modes. ``parts``: Phi' D_ee Phi, Phi' G (without a hand Phi' B_z) and C_z' Phi."""
     D, g, c = parts
     G, B_z = (g, None) if problem.B_z is None else (g[:, :0], g)
-    space = assemble_space(problem, np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z)
+    space = assemble_space(problem, TissueMatrices(np.eye(len(omega)), np.diag(omega**2), D, G, c.T, B_z))
     return ModalPlant(omega, Phi, massed, D, g, c, in_energy(space, omega))
 
 
@@ -136,7 +127,7 @@ def in_energy(space: StateSpace, omega: Array) -> StateSpace:
     k = len(omega)
     L = np.concatenate([np.ones(len(space.E) - 2 * k), omega, np.ones(k)])
     S = 1 / L
-    return StateSpace(L[:, None] * space.E * S, L[:, None] * space.A * S, space.B, space.C * S)
+    return replace(space, E=L[:, None] * space.E * S, A=L[:, None] * space.A * S, C=space.C * S)
 
 
 def dense_modes(problem: RiccatiProblem, tissue: TissueMatrices) -> ModalPlant:
@@ -172,9 +163,84 @@ def modes_of_plant(problem: RiccatiProblem, k: int) -> tuple[Array, Array, Array
     return omega, Phi, times_columns(system.M_ee, Phi)
 
 
+def lowest_plant(problem: RiccatiProblem, k: int) -> ModalPlant:
+    """The plant in its k lowest modes, Phi and massed with local rows. Collective."""
+    comm, (omega, Phi, massed) = problem.layout.comm, modes_of_plant(problem, k)
+    inputs = problem.system.G if problem.B_z is None else problem.B_z
+    D, g, c = (total(comm, part) for part in (Phi.T @ damp(problem.system, Phi), Phi.T @ inputs, problem.C_z.T @ Phi))
+    return modal_plant(problem, omega, Phi, massed, (D, g, c))
+
+
 def _check_held(lowest: float, largest: float) -> None:
     if not lowest > 1e-12 * largest:  # rounding of eigh is about n eps of the largest
         raise SolverError(f"the stiffness has the eigenvalue {lowest:.1e}; the contact zone must hold the body")
+
+
+@dataclass(frozen=True)
+class ModeRates:
+    """Decay of each mode in the closed loop.
+
+    Re p_k = -sqrt(delta_k^2 + f_k^2), |p_k| = omega_k, delta_k = phi_k' D phi_k / 2,
+    f_k = |R^{-1/2} M_s^{-1} g_k| |Q^{1/2} c_k| / (2 omega_k)
+    """
+
+    omega: Array  # natural frequencies [1/s], (k,)
+    own: Array  # delta_k, decay by the tissue's damping [1/s]
+    feedback: Array  # f_k, what optimal feedback would add alone [1/s]
+    size: float  # frequency scale of the whole plant, for rounding [1/s]
+
+    @property
+    def rate(self) -> Array:
+        """-Re p_k [1/s]."""
+        return np.asarray(np.hypot(self.own, self.feedback))
+
+    @property
+    def lost(self) -> Array:
+        """Which modes double precision cannot tell from undamped ones."""
+        return np.asarray(self.rate <= LOST * self.size)
+
+    @property
+    def poles(self) -> np.ndarray:
+        """One pole p_k of each pair, Im >= 0; overdamped modes give the slower real pole."""
+        imag = np.sqrt(np.maximum(self.omega**2 - self.rate**2, 0.0))
+        slow = np.where(self.rate > self.omega, self.omega**2 / (2 * self.rate), self.rate)
+        return np.asarray(-np.where(imag > 0, self.rate, slow) + 1j * imag)
+
+
+def closed_loop_rates(problem: RiccatiProblem, plant: ModalPlant, largest: float = 0.0) -> ModeRates:
+    """Estimate the closed-loop pole of every mode; good to 3 or 4 digits when modes do not overlap.
+
+    ``largest``: largest frequency of the whole plant [1/s]; that of the modes when 0.
+    """
+    # (m, k); two-way: the rigid inertia moves too
+    force = np.linalg.solve(problem.M_s, plant.g.T) if problem.B_z is None else plant.g.T
+    weighted = scipy.linalg.solve_triangular(np.linalg.cholesky(problem.R), force, lower=True)
+    seen = square_root(problem.Q) @ plant.c
+    product = np.linalg.norm(weighted, axis=0) * np.linalg.norm(seen, axis=0)
+    # what symmetry makes zero is rounding in the arrays
+    noise = (
+        1e3 * EPS * np.linalg.norm(weighted, axis=0).max(initial=0.0) * np.linalg.norm(seen, axis=0).max(initial=0.0)
+    )
+    product = np.where(product > noise, product, 0.0)
+    size = max(largest, float(plant.omega.max(initial=0.0)))
+    return ModeRates(plant.omega, np.diag(plant.D) / 2, product / (2 * plant.omega), size)
+
+
+def lost_sentence(rates: ModeRates) -> str:
+    """The modes that feedback cannot stabilise, the damping that would be enough, and the way out."""
+    lost = np.flatnonzero(rates.lost)
+    shown = ", ".join(f"{i + 1} (omega = {rates.omega[i]:.4g}/s)" for i in lost[:3])
+    more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
+    return (
+        f"{len(lost)} of {len(rates.omega)} modes cannot be stabilised in double precision, mode {shown}{more}: they "
+        "are neither damped nor both reached by the hand and seen by the outputs; set effects.damping.beta >= "
+        f"{enough_damping(rates):.2g} s, or control only the lowest modes with {MODAL_KEY}"
+    )
+
+
+def enough_damping(rates: ModeRates) -> float:
+    """Kelvin-Voigt time beta [s] that gives the first mode the damping ratio :data:`ENOUGH`."""
+    return float(2 * ENOUGH / rates.omega.min())
 
 
 def factor_psd(X: Array) -> Array:
@@ -238,20 +304,18 @@ class DenseRiccati:
         begin = time.perf_counter()
         check_finite(M=tissue.M, K=tissue.K, D=tissue.D, G=tissue.G, C=tissue.C_z)
         plant = dense_modes(problem, tissue)
-        rates = closed_loop_rates(problem, plant.omega, np.diag(plant.D), plant.g, plant.c)
+        rates = closed_loop_rates(problem, plant)
         if rates.lost.any():
             raise ControlError(lost_sentence(rates))
         middle = time.perf_counter()
-        space = plant.space
-        solution = care(space.A, space.B, space.C, problem.Q, problem.R, space.E)
+        solution = care_of(plant.space)
         n_s, k = problem.layout.n_s, len(plant.omega)
         hand, q, v = slice(0, 2 * n_s), slice(2 * n_s, 2 * n_s + k), slice(2 * n_s + k, None)
         small = factor_psd(solution.X)
         Z = np.vstack([small[hand], plant.massed @ (plant.omega[:, None] * small[q]), plant.Phi @ small[v]])
         K_z = plant.massed @ (plant.omega[:, None] * solution.K[:, q].T)
         K_v = plant.massed @ solution.K[:, v].T
-        relative = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
-        residual = dense_residual(problem, relative, Z)
+        residual = dense_residual(problem, assemble_space(problem, tissue), Z)
         if not residual <= self.tolerance:
             raise SolverError(
                 f"dense: the true residual is {residual:.1e}, allowed is {self.tolerance:.1e}; raise control.tolerance "

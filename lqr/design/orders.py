@@ -9,7 +9,7 @@ import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.loop.responses import Notify as Notify
+from softgrasp.lqr.loop.gap import Notify as Notify
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import GainReport

@@ -14,7 +14,7 @@ from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.sealed import write_arrays
-from softgrasp.lqr.loop.small_plant import SmallPlant
+from softgrasp.lqr.loop.small import SmallPlant
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 
@@ -94,7 +94,7 @@ class Controller:
                 raise ControlError(f"{name} of the controller must be finite and of shape {shape}, not {value.shape}")
         if not self.plant.hand_first:
             raise ControlError(
-                "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small_plant.galerkin"
+                "the plant of a controller must begin with q_s and v_s; make it with lqr.loop.small.galerkin"
             )
         if not self.period > 0:
             raise ControlError(f"period = {self.period} s of the controller must be positive")

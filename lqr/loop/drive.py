@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from abc import ABC, abstractmethod
+from functools import cached_property
+from typing import Any, cast
 
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
+from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
-
-if TYPE_CHECKING:
-    from softgrasp.lqr.loop.finite import FiniteDrive
 
 
 class PlantStep:
@@ -48,19 +47,23 @@ class PlantStep:
             self.GY = (GY + GY.T) / 2
             self.L = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
         self.inverse = np.linalg.inv(self.L)
-        self.finite: FiniteDrive | None = None  # of a pushed hand that feels a tissue of finite strain
+
+    @cached_property
+    def finite(self) -> FiniteStep:
+        """Of a pushed hand that feels a tissue of finite strain."""
+        return FiniteStep(self, None)
 
 
-class LoopDrive:
+class LoopDrive(ABC):
     """Solves one step for hand and tissue; ``q``, ``v`` and ``u`` are the histories."""
 
     def __init__(self, plant: PlantStep, steps: int) -> None:
         self.plant, n_s = plant, plant.system.layout.n_s
         self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
 
+    @abstractmethod
     def solve(self, n: int, state: TissueState) -> None:
         """Leave w and load of step n in the midpoint; fill row n of u, row n + 1 of q and v. Collective."""
-        raise NotImplementedError
 
     def move(self, n: int, u: Array, a: Array) -> None:
         """Midpoint rule of the hand."""
@@ -78,12 +81,7 @@ class LoopDrive:
         plant, midpoint, system = self.plant, self.plant.midpoint, self.plant.system
         c_0 = plant.alpha * self.v[n] - plant.g
         if system.two_way and system.points is not None:
-            if plant.finite is None:
-                from softgrasp.lqr.loop.finite import FiniteDrive  # only plants of finite strain pay for it
-
-                plant.finite = FiniteDrive(plant, None, None, None, 0)
-            plant.finite.v = self.v
-            self.move(n, u, plant.finite.respond(n, u, np.zeros(len(u), dtype=bool), state)[0])
+            self.move(n, u, plant.finite.respond(self.v[n], u, np.zeros(len(u), dtype=bool), state)[0])
             return
         if not system.two_way:
             a = plant.inverse @ (u + plant.weight)
@@ -96,7 +94,18 @@ class LoopDrive:
         self.finish(n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
 
 
-class ImplicitDrive(LoopDrive):
+class GainDrive(LoopDrive):
+    """The input is u_bar + K (x - x_bar) = offset + K x, with or without limits."""
+
+    def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
+        super().__init__(plant, steps)
+        self.gain, self.bound, n_s = gain, bound, plant.system.layout.n_s
+        self.K_q, self.K_v = gain.K_s[:, :n_s], gain.K_s[:, n_s:]
+        rest = target.state
+        self.offset = target.u - self.K_q @ rest.q_s - total(plant.comm, gain.K_z.T @ rest.z)
+
+
+class ImplicitDrive(GainDrive):
     """u = clip(u_bar + K (x_mid - x_bar)), the law at the midpoint of every step.
 
     x_mid is [q + dt/2 v + dt^2/4 a, v + dt/2 a, z + w, s w], so with N = K_z + s K_v
@@ -109,15 +118,13 @@ class ImplicitDrive(LoopDrive):
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
-        super().__init__(plant, steps)
-        self.gain, n_s, dt = gain, plant.system.layout.n_s, plant.dt
-        self.K_q, self.K_v = gain.K_s[:, :n_s], gain.K_s[:, n_s:]
+        super().__init__(plant, gain, target, bound, steps)
+        n_s, dt = plant.system.layout.n_s, plant.dt
         self.N = gain.K_z + plant.s * gain.K_v
         self.NY = total(plant.comm, self.N.T @ plant.Y)
         F = dt**2 / 4 * self.K_q + dt / 2 * self.K_v - plant.kappa * self.NY
         self.FL = F @ plant.inverse
         self.input = ImplicitInput(self.FL, bound)
-        self.offset = target.u - self.K_q @ target.state.q_s - total(plant.comm, gain.K_z.T @ target.state.z)
         self.sums = np.zeros(3 * n_s if plant.system.two_way else 2 * n_s)
 
     def solve(self, n: int, state: TissueState) -> None:
@@ -141,34 +148,27 @@ class ImplicitDrive(LoopDrive):
         self.finish(n, u, plant.inverse @ (u + f))
 
 
-class HeldDrive(LoopDrive):
+class HeldDrive(GainDrive):
     """u = clip(u_bar + K (x - x_bar)) sampled at the start of a tick and held, if asked for one tick later.
 
     ``target``: x_bar and u_bar; u_bar acts until the first command arrives.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
-        super().__init__(plant, steps)
-        self.gain, n_s = gain, plant.system.layout.n_s
-        self.bound, self.every, self.delay = actuation.bound(n_s), actuation.ticks(plant.dt), actuation.delay
+        super().__init__(plant, gain, target, actuation.bound(plant.system.layout.n_s), steps)
+        self.every, self.delay = actuation.ticks(plant.dt), actuation.delay
         self.K = np.vstack([gain.K_z, gain.K_v])
-        state = target.state
-        self.offset = target.u - gain.K_s[:, :n_s] @ state.q_s - total(plant.comm, gain.K_z.T @ state.z)
         self.held = self.waiting = self._clip(target.u)
 
     def _clip(self, u: Array) -> Array:
         return np.array(u) if self.bound is None else np.clip(u, -self.bound, self.bound)
 
-    def command(self, n: int, state: TissueState) -> Array:
-        """The input that the law asks for at step n. Collective."""
-        tissue = total(self.plant.comm, self.K.T @ state.array)
-        hand = self.gain.K_s @ np.concatenate([self.q[n], self.v[n]])
-        return self._clip(self.offset + hand + tissue)
-
     def solve(self, n: int, state: TissueState) -> None:
         """One step. Collective."""
         if n % self.every == 0:
-            new = self.command(n, state)
+            tissue = total(self.plant.comm, self.K.T @ state.array)
+            hand = self.gain.K_s @ np.concatenate([self.q[n], self.v[n]])
+            new = self._clip(self.offset + hand + tissue)
             self.held, self.waiting = (self.waiting, new) if self.delay else (new, new)
         self.push(n, self.held, state)
 
@@ -183,3 +183,71 @@ class OpenDrive(LoopDrive):
     def solve(self, n: int, state: TissueState) -> None:
         """One step. Collective."""
         self.push(n, self.u[n], state)
+
+
+class FiniteStep:
+    """The step of a plant of finite strain: the law becomes part of the equation of the tissue.
+
+    With w = z_mid - z_n, p = [K_z'w; s K_v'w; G'w], N'w the sum of the first two and F = dt^2/4 K_q + dt/2 K_v the law
+    at the midpoint is
+
+        u = u_bar + K_q (q + dt/2 v - q_bar) + K_v v + K_z'(z - z_bar) + F a + N'w,
+
+    and the hand's equation (M_hand [+ kappa M_rigid] - F) a = .. + N'w [- theta G'w] turns the load -G c of the tissue,
+    c = kappa a + c_0, into G (c_1 + C p). ``gain``: None for inputs that are known.
+    """
+
+    def __init__(self, plant: PlantStep, gain: Gain | None) -> None:
+        system, dt, n_s = plant.system, plant.dt, plant.system.layout.n_s
+        self.plant, self.midpoint = plant, cast(Any, plant.midpoint)  # that of finite strain
+        self.inertia = system.M_hand + (plant.kappa * system.M_rigid if system.two_way else 0.0)
+        K_z = K_v = np.zeros_like(system.G)
+        self.F = np.zeros((n_s, n_s))
+        if gain is not None:
+            K_z, K_v = gain.K_z, plant.s * gain.K_v
+            self.F = dt**2 / 4 * gain.K_s[:, :n_s] + dt / 2 * gain.K_s[:, n_s:]
+        self.N = self.midpoint.hold(np.hstack([K_z, K_v, system.G]))
+        self.speed = np.repeat([0.0, 1.0, plant.s**2 / plant.theta], n_s)
+
+    def respond(self, v: Array, known: Array, free: Array, state: TissueState) -> tuple[Array, Array]:
+        """The step with u = known, where ``free`` with the part F a + N'w of the law; a and the law. Collective."""
+        plant, system, n_s = self.plant, self.plant.system, len(known)
+        c_0 = plant.alpha * v - plant.g
+        right, C = known + plant.weight, np.zeros((n_s, 3 * n_s))
+        C[:, :n_s] = C[:, n_s : 2 * n_s] = np.diag(free)
+        if system.two_way:
+            right = right - system.M_rigid @ c_0
+            right += plant.s * total(plant.comm, system.G.T @ state.array[system.layout.n_local :])
+            C[:, 2 * n_s :] = -plant.theta * np.eye(n_s)
+        inverse = np.linalg.inv(self.inertia - free[:, None] * self.F)
+        feedback = Feedback(-plant.kappa * inverse @ C, self.N, self.speed)
+        self.midpoint.solve_midpoint(-(plant.kappa * inverse @ right + c_0), feedback)
+        a = -(self.midpoint.c + c_0) / plant.kappa
+        return a, known + self.F @ a + self.midpoint.sensed[:n_s] + self.midpoint.sensed[n_s : 2 * n_s]
+
+
+class FiniteDrive(GainDrive):
+    """u = clip(u_bar + K (x_mid - x_bar)) on a plant of finite strain.
+
+    Inputs beyond their limits are fixed there, and the step is solved once more.
+    """
+
+    def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
+        super().__init__(plant, gain, target, bound, steps)
+        self.step = FiniteStep(plant, gain)
+        self.limit = np.full(len(self.offset), np.inf) if bound is None else bound
+
+    def solve(self, n: int, state: TissueState) -> None:
+        """One step. Collective."""
+        layout, q, v = self.plant.system.layout, self.q[n], self.v[n]
+        tissue = total(self.plant.comm, self.gain.K_z.T @ state.array[: layout.n_local])
+        known = self.offset + self.K_q @ (q + self.plant.dt / 2 * v) + self.K_v @ v + tissue
+        free = np.ones(layout.n_s, dtype=bool)
+        while True:
+            a, law = self.step.respond(v, known, free, state)
+            over_limit = free & (np.abs(law) > self.limit)
+            if not over_limit.any():
+                break
+            free &= ~over_limit
+            known[over_limit] = (np.sign(law) * self.limit)[over_limit]
+        self.move(n, np.where(free, law, known), a)

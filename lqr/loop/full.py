@@ -20,8 +20,7 @@ from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.solve.solvers import Reproducible, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
-from softgrasp.lqr.loop.drive import HeldDrive, ImplicitDrive, LoopDrive, PlantStep
-from softgrasp.lqr.loop.finite import FiniteDrive
+from softgrasp.lqr.loop.drive import FiniteDrive, HeldDrive, ImplicitDrive, LoopDrive, PlantStep
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,9 +15,8 @@ from softgrasp.lqr.lowrank.compress import compress, gram
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import WINDOW, ShiftQueue
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Block
 
-Progress = Callable[[dict[str, float]], None]
 SQUEEZE = 480  # columns of Z from which it is compressed on the way: memory of a large scene
 SHARE = 0.02  # of the tolerance that one compression on the way may use up
 GROWTH = 1e6  # of the residual against its start: the closed loop of the given gain is unstable

@@ -12,37 +12,20 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex, total
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Block
 
 
-@dataclass(frozen=True)
-class Right:
-    """A right-hand side W together with a = K_ee^{-1} of its z-row."""
-
-    hand: Array  # rows of the hand, (2 n_s, k), on every rank
-    rows: Array  # local rows of z as they stand, of v_z and of a, one below the other, (3 n_local, k)
-
-    @property
-    def columns(self) -> int:
-        """Number of columns."""
-        return int(self.hand.shape[1])
+class Right(Block):
+    """A right-hand side W; below its rows z, as they stand, and v_z those of a = K_ee^{-1} W_z, (3 n_local, k)."""
 
     @property
     def block(self) -> Block:
         """W alone (views)."""
-        return Block(self.hand, self.rows[: 2 * len(self.rows) // 3])
-
-    def __getitem__(self, part: slice) -> Right:
-        return Right(self.hand[:, part], self.rows[:, part])
+        return Block(self.hand, self.tall[: 2 * len(self.tall) // 3])
 
     def plus(self, E_V: Right, small: Array) -> Right:
         """W + E'V small."""
-        return Right(self.hand + E_V.hand @ small, self.rows + E_V.rows @ small)
-
-    @classmethod
-    def join(cls, parts: list[Right]) -> Right:
-        """Columns side by side."""
-        return Right(np.hstack([p.hand for p in parts]), np.hstack([p.rows for p in parts]))
+        return Right(self.hand + E_V.hand @ small, self.tall + E_V.tall @ small)
 
 
 @dataclass(frozen=True)
@@ -54,11 +37,6 @@ class Solution:
     b: Complex  # open loop, local rows (n_local, k), rows side by side in memory
     a: Array  # a_0 = K_ee^{-1} of the z-rows, local rows (n_local, k)
     mix: Complex  # (k, q), of the Sherman-Morrison-Woodbury formula
-
-    @property
-    def columns(self) -> int:
-        """Number of columns of V."""
-        return int(self.mix.shape[1])
 
     def real(self, coefficients: Complex) -> Block:
         """Re(V c) for a (q, l) matrix c, without V: one real product each for a and b."""
@@ -91,7 +69,7 @@ def _total(plant: Plant, X: Array, b: Complex) -> Complex:
 
 
 def _solve_small(A: Complex, B: Complex) -> Complex:
-    """A^{-1} B for a matrix of a few rows; LAPACK itself, because the checks around it take longer."""
+    """A^{-1} B by LAPACK itself, because the checks around it take longer than matrices of this order."""
     if A.size == 0:
         return np.zeros(B.shape, dtype=complex)
     _, _, X, info = scipy.linalg.lapack.zgesv(A, B)
@@ -131,7 +109,7 @@ def open_adjoint(
     n, s, q = plant.n_local, plant.n_s, W.columns
     p = complex(p)
     factor, hand = p - plant.drag_es, W.hand
-    F = np.asarray(p * W.rows[n : 2 * n] - W.rows[:n], dtype=complex)
+    F = np.asarray(p * W.tall[n : 2 * n] - W.tall[:n], dtype=complex)
     if plant.two_way:
         F = np.hstack([F, plant.G])
     b = np.ascontiguousarray(tissue.solve(p, F, ahead))
@@ -163,4 +141,4 @@ def closed_adjoint(
     m = plant.inputs
     small = _solve_small(np.eye(m, dtype=complex) - B_V[:, :m], B_V[:, m:])
     mix = np.vstack([small, np.eye(right.columns - m)])
-    return Solution(complex(p), hand, b, right.rows[2 * plant.n_local :], mix)
+    return Solution(complex(p), hand, b, right.tall[2 * plant.n_local :], mix)

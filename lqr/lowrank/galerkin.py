@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,14 +11,12 @@ import scipy.linalg
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank import modal_start
-from softgrasp.lqr.lowrank.adi import Progress
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
+from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import shift_range
-from softgrasp.lqr.lowrank.solution import Iterate, make_solution
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.lowrank.solver import Iterate, LowRankSolver
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import normalising
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
 ROUNDING = 1e-13  # of a Gram matrix: columns independent to 3e-7
@@ -142,9 +139,9 @@ def frequencies(low: float, high: float, count: int) -> Array:
     return np.asarray(low * (high / low) ** qmc.Halton(1, scramble=False).random(count + 1)[1:, 0])
 
 
-@dataclass(frozen=True)
-class StructuredGalerkin:
-    """Solve the Riccati equation on z = V eta, v_z = V eta' with V of modes and responses to the outputs.
+@dataclass(frozen=True, kw_only=True)
+class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
+    """Galerkin on z = V eta, v_z = V eta' with V of modes and responses to the outputs.
 
     V starts with the lowest modes and K_ee^{-1} C_z and grows by S(p)^{-1} C_z (one complex solve each) at
     frequencies between the last mode and the highest one, until the gain changes by less than the tolerance between
@@ -153,64 +150,35 @@ class StructuredGalerkin:
     is reported, not judged.
     """
 
+    method = "galerkin"
+    by_residual = False
     tol: float = 1e-6  # bound on the relative change of the gain between the last two spaces, see gain_change
     max_iterations: int = 24  # bound on the number of spaces
     modes: int = modal_start.MODES  # number of modes
     per_step: int = 2  # responses added at a time
-    tissue: str = "auto"  # gathered, distributed or auto, see softgrasp.lqr.lowrank.shifted
-    progress: Progress | None = None  # called on every rank after each space with the history entry
 
-    def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
-        """Grow the space until the gain settles. Collective. The problem is not changed.
-
-        Raises:
-            ControlError: weights or data are refused, no damping, not stabilisable or not detectable.
-            SolverError: the gain has not settled within the bound.
-        """
-        begin = time.perf_counter()
-        plant = Plant(problem)
+    def prepare(self, plant: Plant) -> tuple[Space, Array]:
+        """The space of the lowest modes, and their frequencies. Collective."""
         modal_start.check_damped(plant)
         omega, Phi = modal_start.plant_modes(plant, min(self.modes, plant.layout.n_e))
-        space = Space(Phi, plant.mass(Phi), plant.stiff(Phi))
-        seconds = {"start": time.perf_counter() - begin}
-        history: list[dict[str, float]] = []
-        tissue = make_shifted(plant.system, self.tissue)
-        try:
-            level, solves = self._grow(plant, tissue, space, (float(omega[0]), float(omega[-1])), history)
-            counts = {"newton_steps": 0, "adi_steps": 0, "solves": solves, "factorisations": tissue.factors}
-            counts |= {"basis": level.small.order, "spaces": len(history) + 1}
-            seconds |= tissue.seconds
-        finally:
-            tissue.destroy()
-        about = f"{level.small.order} basis vectors, gain settled to {history[-1]['change']:.1e}"
-        if level.small.order == plant.layout.n_e:
-            about = f"all {level.small.order} basis vectors that there are"
-        iterate = Iterate(level.Z, level.gain, "galerkin", about, 1e-10, history, counts, seconds, lean=True)
-        return make_solution(plant, iterate, begin, check=False)
+        return Space(Phi, plant.mass(Phi), plant.stiff(Phi)), omega
 
-    def _grow(
-        self,
-        plant: Plant,
-        tissue: ShiftedTissue,
-        space: Space,
-        span: tuple[float, float],
-        history: list[dict[str, float]],
-    ) -> tuple[Level, int]:
-        """Spaces one after the other; returns the last level and the number of solves."""
-        first, low = span
-        limits = shift_range(plant, [])
-        count = self.per_step * self.max_iterations
-        if plant.viscous is not None:
-            low = first  # the modes do not decouple, so the responses have to cover their range too
-        grid = frequencies(low, max(limits.fastest, 2 * low), count).tolist()
+    def iterate(self, plant: Plant, tissue: ShiftedTissue, start: tuple[Space, Array]) -> Iterate:
+        """Spaces one after the other until the gain settles. Collective."""
+        space, omega = start
+        # where the modes do not decouple, the responses have to cover their range too
+        low = float(omega[-1] if plant.viscous is None else omega[0])
+        high = max(shift_range(plant, []).fastest, 2 * low)
+        grid = frequencies(low, high, self.per_step * self.max_iterations).tolist()
         # two-way the reaction of the hand loads the tissue as well
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
         level, space = solve_level(plant, space)
-        change, used, whole = np.inf, 0, plant.layout.n_e
+        history, change, used, whole = list[dict[str, float]](), np.inf, 0, plant.layout.n_e
         if level.small.order == whole:
             history.append({"basis": float(whole), "solve": 0.0, "change": 0.0})
-            return level, used
         for i in range(self.max_iterations):
+            if change <= self.tol or level.small.order == whole:
+                break
             # the static response first; shift number k + 1 belongs to frequency number k
             take = [0j] if i == 0 else [_response_shift(plant, w) for w in grid[used - 1 :][: self.per_step]]
             for j, p in enumerate(take):
@@ -222,16 +190,17 @@ class StructuredGalerkin:
                 continue
             new, space = solve_level(plant, space, level)
             change, level = gain_change(plant, new, level), new
-            entry = {"basis": float(new.small.order), "solve": float(used), "change": change}
-            history.append(entry)
-            if self.progress is not None:
-                self.progress(entry)
-            if change <= self.tol or level.small.order == whole:
-                return level, used
-        raise SolverError(
-            f"galerkin: the gain still changes by {change:.1e} at {level.small.order} basis vectors, tolerance "
-            f"{self.tol:.0e}; allow more iterations, or use newton_adi"
-        )
+            self.record(history, {"basis": float(new.small.order), "solve": float(used), "change": change})
+        order = level.small.order
+        if not (change <= self.tol or order == whole):
+            raise SolverError(
+                f"galerkin: the gain still changes by {change:.1e} at {order} basis vectors, tolerance {self.tol:.0e}; "
+                "allow more iterations, or use newton_adi"
+            )
+        settled = f"{order} basis vectors, gain settled to {history[-1]['change']:.1e}"
+        about = f"all {order} basis vectors that there are" if order == whole else settled
+        counts = {"solves": used, "basis": order, "spaces": len(history) + 1}
+        return Iterate(level.Z, level.gain, about, history, counts)
 
 
 def _response_shift(plant: Plant, omega: float) -> complex:

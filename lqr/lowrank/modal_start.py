@@ -11,12 +11,11 @@ import scipy.linalg
 from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.dense.care import care, lyapunov, riccati_residual
-from softgrasp.lqr.dense.modal import StateSpace, assemble_space, in_energy
-from softgrasp.lqr.dense.small_care import FAST_RESIDUAL, ReducedMatrices, fast_solution
+from softgrasp.lqr.dense.care import FAST_RESIDUAL, StateSpace, fast_solution, lyapunov, riccati_residual, solve_reduced
+from softgrasp.lqr.dense.modal import TissueMatrices, assemble_space, in_energy
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY, ControlError
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import damp
 
 MODES = 30
@@ -95,13 +94,14 @@ def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> ModalSubspace:
     products = total(plant.comm, V.T @ np.hstack(columns))
     M, D, G, C_z = np.split(products, [r, 2 * r, 2 * r + plant.n_s], axis=1)
     folded = replace(plant.problem, C_s=plant.C_s)  # weights are in the outputs already
-    space = in_energy(assemble_space(folded, (M + M.T) / 2, np.diag(omega**2), (D + D.T) / 2, G, C_z), omega)
+    tissue = TissueMatrices((M + M.T) / 2, np.diag(omega**2), (D + D.T) / 2, G, C_z)
+    space = in_energy(assemble_space(folded, tissue), omega)
     B = np.zeros((len(space.E), plant.inputs))
     if plant.B_z is None:
         B[plant.n_s : 2 * plant.n_s] = plant.B
     else:
         B[2 * plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
-    return ModalSubspace(V, omega, replace(space, B=B))
+    return ModalSubspace(V, omega, replace(space, B=B, Q=np.eye(len(space.C)), R=np.eye(plant.inputs)))
 
 
 def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) -> SmallSolution:
@@ -111,14 +111,10 @@ def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) 
     """
 
     def solve() -> SmallSolution:
-        E, A, B, C = small.space.E, small.space.A, small.space.B, small.space.C
-        start = _few_modes(small) if guess is None else guess
-        X = None if start is None else _corrected(small.space, start)
-        if X is None:
-            X = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
-        if X is None:
-            X = care(A, B, C, np.eye(len(C)), np.eye(B.shape[1]), E).X
-        return SmallSolution(X, B.T @ X @ E)
+        space, start = small.space, _few_modes(small) if guess is None else guess
+        X = None if start is None else _corrected(space, start)
+        X = solve_reduced(space) if X is None else X
+        return SmallSolution(X, space.B.T @ X @ space.E)
 
     return on_root(plant.comm, solve)
 
@@ -128,12 +124,12 @@ def _few_modes(small: ModalSubspace) -> Array | None:
 
     With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
     """
-    N, r, k = len(small.space.E), small.order, FEW_MODES
+    m, N, r, k = small.space, small.space.N, small.order, FEW_MODES
     if r < 2 * k:
         return None
     at = np.r_[: N - 2 * r + k, N - r : N - r + k]
-    E, A, B, C = (small.space.E[np.ix_(at, at)], small.space.A[np.ix_(at, at)], small.space.B[at], small.space.C[:, at])
-    solution = fast_solution(ReducedMatrices(E, A, B, C, np.eye(len(C)), np.eye(B.shape[1])))
+    few = replace(m, E=m.E[np.ix_(at, at)], A=m.A[np.ix_(at, at)], B=m.B[at], C=m.C[:, at])
+    solution = fast_solution(few)
     if solution is None:
         return None
     X = np.zeros((N, N))

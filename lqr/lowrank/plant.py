@@ -8,8 +8,8 @@ import numpy as np
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 

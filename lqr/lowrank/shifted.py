@@ -2,43 +2,298 @@
 
 from __future__ import annotations
 
+import os
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import psutil
+import scipy.sparse
+import scipy.sparse.linalg
+from mpi4py import MPI
+from numpy.typing import NDArray
 
-from softgrasp.fem.errors import ResourceError, SolverError
+from softgrasp.fem.errors import ResourceError, SolverError, agree
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, Complex
+from softgrasp.fem.petsc import Array, Complex, PETSc, petsc_options, whole_copy
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.lowrank.shifted_distributed import DistributedTissue
-from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue
+from softgrasp.lqr.lowrank.factor_ahead import FactorsAhead
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
+PREFIX = "softgrasp_shifted_"
 # Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
 # in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
 # (softgrasp.study.bench.switches). Beyond, a whole factor on each rank costs too much memory.
 GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
+# n_e up to which SuperLU works column by column in 2D, where it is the faster way; in 3D it needs its panels
+THIN_UP_TO = 20_000
+AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next factors
+# Threads that do: two in 2D, where this rank would wait for one. Up to four factors are then alive at a time, too much
+# memory in 3D.
+THREADS = {1: 2, 2: 2, 3: 1}
+_SYMMETRIC = {"SymmetricMode": True, "Equil": False}
 
 
-class ShiftedTissue(Protocol):
+class ShiftedTissue(ABC):
     """Solves S(p) B = F for distributed F."""
 
     name: str  # gathered or distributed
-    seconds: dict[str, float]  # time by stage, factor and solve [s]
-    factors: int  # factorisations made by this rank's communicator
+
+    def __init__(self, system: BlockSystem) -> None:
+        layout, self.damping = system.layout, system.damping
+        self.comm, self.n_local, self.n_e = layout.comm, layout.n_local, layout.n_e
+        self.seconds = {"factor": 0.0, "solve": 0.0}  # time by stage [s]
+        self.factors = 0  # factorisations made by this rank's communicator
 
     def solve(self, p: complex, F: Array | Complex, ahead: Sequence[complex] = ()) -> Complex:
-        """Local rows of S(p)^{-1} F, (n_local, k). Collective.
+        """Local rows of S(p)^{-1} F, (n_local, k), complex even where p is real. Collective.
 
         Args:
             p: shift; 0 gives K_ee^{-1}.
             ahead: shifts that will probably come next.
-        """
 
+        Raises:
+            SolverError: the factorisation or the solve fails.
+        """
+        p = complex(p)
+        begin = time.perf_counter()
+        self._factor([p, *(complex(q) for q in ahead)])
+        middle = time.perf_counter()
+        result = self._solve(p, F)
+        self.seconds["factor"] += middle - begin
+        self.seconds["solve"] += time.perf_counter() - middle
+        return result
+
+    @abstractmethod
+    def _factor(self, shifts: list[complex]) -> None:
+        """Have the factor of the first shift, made now or before. Collective."""
+
+    @abstractmethod
+    def _solve(self, p: complex, F: Array | Complex) -> Complex:
+        """S(p)^{-1} F with that factor. Collective."""
+
+    @abstractmethod
     def destroy(self) -> None:
         """Free the factors. Collective."""
+
+    def _combined(self, p: complex, K: Any, M: Any, D: Any) -> Any:
+        """S(p) from the matrices or their entries; D None without a damping matrix."""
+        S = (1.0 - p * self.damping.beta) * K + (p * p - p * self.damping.alpha) * M
+        return S if D is None else S - p * D
+
+
+class GatheredTissue(ShiftedTissue):
+    """Every rank holds all rows; the factors of ``comm.size`` shifts are made at the same time, one a rank.
+
+    SuperLU in complex numbers with diagonal pivots and one fill-reducing order (nested dissection) for all shifts. A
+    program of one rank that may use another core makes the next factors there while it works with the present one.
+    """
+
+    name = "gathered"
+
+    def __init__(self, system: BlockSystem) -> None:
+        super().__init__(system)
+        layout, matrix = system.layout, system.damping.matrix
+        self.counts = np.array(self.comm.allgather(layout.n_local))
+        parts, self.order = self._permuted([system.K_ee, system.M_ee] + ([] if matrix is None else [matrix]))
+        self.K, self.M, self.D = (*parts, None)[:3]
+        self.same = all(
+            np.array_equal(A.indptr, self.K.indptr) and np.array_equal(A.indices, self.K.indices) for A in parts
+        )
+        thin = layout.dimension < 3 and layout.n_e <= THIN_UP_TO
+        self.blocking = {"panel_size": 1, "relax": 16} if thin else {}
+        self.cache: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]] = {}
+        self.ahead: FactorsAhead | None = None
+        threads = THREADS[layout.dimension]
+        if MPI.COMM_WORLD.size == 1 and layout.n_e >= AHEAD_FROM and _cores() > 1:
+            self.ahead = FactorsAhead(self._make, threads)
+        # one for each thread, filled anew for each shift, because making one checks its indices
+        self.shells = [scipy.sparse.csc_matrix(self.K) for _ in range(1 if self.ahead is None else threads)]
+
+    def _permuted(self, matrices: Sequence[PETSc.Mat]) -> tuple[list[scipy.sparse.csc_matrix], NDArray[np.int64]]:
+        """All rows on every rank in the nested dissection order of the first, and that order. Collective."""
+        copies = [whole_copy(A) for A in matrices] if self.comm.size > 1 else []
+        whole = copies or matrices
+        rows, columns = whole[0].getOrdering("nd")
+        parts = []
+        for A in whole:
+            permuted = A.permute(rows, rows)
+            indptr, indices, values = permuted.getValuesCSR()
+            permuted.destroy()
+            # the matrix is symmetric, so its rows serve as columns
+            parts.append(scipy.sparse.csc_matrix((values, indices, indptr), shape=A.getSize()))
+        order = np.array(rows.getIndices(), dtype=np.int64)
+        for item in (rows, columns, *copies):
+            item.destroy()
+        return parts, order
+
+    def _make(self, p: complex, shell: int = 0) -> scipy.sparse.linalg.SuperLU:
+        p = p if p.imag else p.real
+        if self.same:
+            S = self.shells[shell]
+            S.data = self._combined(p, self.K.data, self.M.data, None if self.D is None else self.D.data)
+        else:
+            S = self._combined(p, self.K, self.M, self.D).tocsc()
+        try:
+            return scipy.sparse.linalg.splu(
+                S, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC, **self.blocking
+            )
+        except RuntimeError as error:
+            raise SolverError(f"the factorisation of S(p) failed at the shift p = {p:.4g} ({error})") from error
+
+    def _factor(self, shifts: list[complex]) -> None:
+        """One shift a rank, unless the first is there. Collective."""
+        if shifts[0] in self.cache:
+            return
+        distinct = list(dict.fromkeys(shifts))
+        shifts = distinct[: self.comm.size]
+        if self.comm.size == 1:
+            self._forget()
+            self.cache[shifts[0]] = (0, self._make(shifts[0]) if self.ahead is None else self.ahead.take(distinct))
+        else:
+            self.cache = {}
+            fresh: dict[complex, tuple[int, scipy.sparse.linalg.SuperLU | None]]
+            fresh = {p: (rank, None) for rank, p in enumerate(shifts)}
+            with agree(self.comm):
+                if self.comm.rank < len(shifts):
+                    p = shifts[self.comm.rank]
+                    fresh[p] = (self.comm.rank, self._make(p))
+            self.cache = fresh
+        self.factors += len(shifts)
+
+    def _forget(self) -> None:
+        old, self.cache = self.cache, {}
+        if self.ahead is not None and old:
+            (_, factor) = old.popitem()[1]
+            box: list[object] = [factor]
+            del factor
+            self.ahead.free(box)
+
+    def _solve(self, p: complex, F: Array | Complex) -> Complex:
+        """On several ranks: rows to the owner of the factor, solve there, rows back. Collective."""
+        owner, lu = self.cache[p]
+        real = p.imag == 0
+        if self.comm.size == 1:
+            return _lu_solve(lu, F, self.order, real)
+        k = F.shape[1]
+        local = np.ascontiguousarray(F, dtype=complex)
+        owner_here = self.comm.rank == owner
+        whole = np.empty((int(self.counts.sum()), k), dtype=complex) if owner_here else None
+        sizes = self.counts * k
+        self.comm.Gatherv(local, None if whole is None else [whole, sizes], root=owner)
+        if whole is not None and lu is not None:
+            whole = np.ascontiguousarray(_lu_solve(lu, whole, self.order, real))
+        result = np.empty((self.n_local, k), dtype=complex)
+        self.comm.Scatterv(None if whole is None else [whole, sizes], result, root=owner)
+        return result
+
+    def destroy(self) -> None:
+        """Free the factors."""
+        self._forget()
+        if self.ahead is not None:
+            self.ahead.close()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _lu_solve(lu: scipy.sparse.linalg.SuperLU, F: Array | Complex, order: NDArray[np.int64], real: bool) -> Complex:
+    """Solve with a factor of the permuted matrix; real factors take real and imaginary part one after the other."""
+    right = F[order]
+    result = np.empty(F.shape, dtype=complex)
+    if not real:
+        result[order] = lu.solve(np.asfortranarray(right, dtype=complex))
+    elif np.iscomplexobj(right):
+        result.real[order] = lu.solve(np.asfortranarray(right.real))
+        result.imag[order] = lu.solve(np.asfortranarray(right.imag))
+    else:
+        result[order] = lu.solve(np.asfortranarray(right))
+    return result
+
+
+class DistributedTissue(ShiftedTissue):
+    """MUMPS on the symmetric real form of twice the order, [X, -Y; -Y, -X] for S = X + iY, unknowns interleaved.
+
+    One matrix object for all shifts: the symbolic factorisation is made once, and nothing is made ahead.
+    """
+
+    name = "distributed"
+
+    def __init__(self, system: BlockSystem) -> None:
+        super().__init__(system)
+        self.indptr, self.columns, self.K = system.K_ee.getValuesCSR()
+        matrix = system.damping.matrix
+        self.M, self.D = self._values(system.M_ee), None if matrix is None else self._values(matrix)
+        self.shift: complex | None = None
+        S, n = self._real_form(0.0), self.n_local
+        self.S = PETSc.Mat().createAIJ(((2 * n, 2 * self.n_e),) * 2, csr=(S.indptr, S.indices, S.data), comm=self.comm)
+        self.S.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.ksp = PETSc.KSP().create(self.comm)
+        self.ksp.setOptionsPrefix(PREFIX)
+        self.ksp.setOperators(self.S)
+        self.ksp.setType("preonly")
+        pc = self.ksp.getPC()
+        pc.setType("cholesky")  # LDL' for an indefinite matrix
+        pc.setFactorSolverType("mumps")
+        # compressed ordering of 2 x 2 pivots: two to three times faster on these matrices than the default
+        with petsc_options(PREFIX, {"mat_mumps_icntl_12": 1, "mat_mumps_icntl_14": 40}):
+            self.ksp.setFromOptions()
+
+    def _values(self, A: PETSc.Mat) -> Array:
+        indptr, columns, values = A.getValuesCSR()
+        with agree(self.comm):
+            if not (np.array_equal(indptr, self.indptr) and np.array_equal(columns, self.columns)):
+                raise SolverError("mass, stiffness and damping have different sparsity patterns; assemble them on one")
+        return np.asarray(values)
+
+    def _real_form(self, p: complex) -> scipy.sparse.csr_matrix:
+        """Local rows of the real form of S(p), a block of 2 x 2 an entry."""
+        S = np.asarray(self._combined(p, self.K, self.M, self.D), dtype=complex)
+        blocks = np.stack([S.real, -S.imag, -S.imag, -S.real], axis=-1).reshape(-1, 2, 2)
+        shape = (2 * self.n_local, 2 * self.n_e)
+        return scipy.sparse.bsr_matrix((blocks, self.columns, self.indptr), shape=shape).tocsr()
+
+    def _factor(self, shifts: list[complex]) -> None:
+        p = shifts[0]
+        if p == self.shift:
+            return
+        S = self._real_form(p)
+        self.S.setValuesCSR(S.indptr, S.indices, S.data)
+        self.S.assemble()
+        self.ksp.setOperators(self.S)  # without it setUp takes the old factor for good
+        try:
+            self.ksp.setUp()
+        except PETSc.Error as error:
+            raise SolverError(f"MUMPS failed at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
+        if self.ksp.getPC().getFailedReason():
+            raise SolverError(f"MUMPS failed at the shift p = {p:.4g}: S(p) is singular or memory ran out")
+        self.shift = p
+        self.factors += 1
+
+    def _solve(self, p: complex, F: Array | Complex) -> Complex:
+        n, k = self.n_local, F.shape[1]
+        right = np.empty((2 * n, k), order="F")
+        right[0::2], right[1::2] = F.real, -F.imag
+        sizes = ((2 * n, 2 * self.n_e), (None, k))
+        answer = np.zeros((2 * n, k), order="F")
+        B, X = (PETSc.Mat().createDense(sizes, array=array, comm=self.S.comm) for array in (right, answer))
+        try:
+            self.ksp.getPC().getFactorMatrix().matSolve(B, X)
+        except PETSc.Error as error:
+            raise SolverError(f"MUMPS failed to solve at the shift p = {p:.4g} (PETSc error {error.ierr})") from error
+        finally:
+            B.destroy()
+            X.destroy()
+        return answer[0::2] + 1j * answer[1::2]
+
+    def destroy(self) -> None:
+        """Free matrix and factor. Collective."""
+        self.ksp.destroy()
+        self.S.destroy()
 
 
 def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:

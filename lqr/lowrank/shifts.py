@@ -12,7 +12,7 @@ from mpi4py import MPI
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Block
 
 WINDOW = 10  # blocks of Z whose Ritz values give the next shifts
 EARLY = 1  # shifts still to come when the next are chosen: another core or rank can factor ahead meanwhile
@@ -163,7 +163,6 @@ class ShiftQueue:
 
     limits: ShiftRange  # admissible range
     pending: list[complex] = field(default_factory=list)  # shifts to come
-    projections: int = 0  # how often Ritz values were computed
 
     @classmethod
     def start(cls, limits: ShiftRange, poles: Sequence[complex] | np.ndarray) -> ShiftQueue:
@@ -186,7 +185,6 @@ class ShiftQueue:
         clipped = self.limits.clip(values[upper])
         weights = sizes[upper] * np.abs(clipped)  # from the energy norm to the 2-norm of the residual
         self.pending += on_root(plant.comm, partial(choose_shifts, clipped, weights, BATCH, self.pending))
-        self.projections += 1
 
     def next(self) -> tuple[complex, list[complex]]:
         """The next shift and those after it."""

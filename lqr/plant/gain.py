@@ -1,14 +1,39 @@
-"""State x and feedback u = K x of the plant, by parts and as columns."""
+"""Columns of the size of the state, hand and tissue apart: state x and feedback u = K x of the plant."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.lqr.plant.block import Block
+
+
+@dataclass(frozen=True)
+class Block:
+    """A few columns of the size of the state."""
+
+    hand: Array  # rows of q_s and v_s, (2 n_s, k), on every rank
+    tall: Array  # local rows of z and v_z, one below the other, (2 n_local, k)
+
+    @property
+    def columns(self) -> int:
+        """Number of columns."""
+        return int(self.hand.shape[1])
+
+    def __getitem__(self, part: slice | Array) -> Self:
+        return type(self)(self.hand[:, part], self.tall[:, part])
+
+    def times(self, small: Array) -> Block:
+        """Block @ small."""
+        return Block(self.hand @ small, self.tall @ small)
+
+    @classmethod
+    def join(cls, blocks: list[Self]) -> Self:
+        """Columns side by side."""
+        return cls(np.hstack([b.hand for b in blocks]), np.hstack([b.tall for b in blocks]))
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
-from softgrasp.lqr.dense.modal import modes_of_plant
-from softgrasp.lqr.dense.poles import closed_loop_rates
+from softgrasp.lqr.dense.modal import ModalPlant, closed_loop_rates, lowest_plant
 from softgrasp.lqr.lowrank.compress import gram, triangular
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import costates_to_absolute, costates_to_relative, states_to_relative
-from softgrasp.lqr.plant.operators import modal_inputs
+from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.operators import costates_to_absolute, costates_to_relative, states_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.modal_loop import modal_damping
 from softgrasp.reduction.bases.engines import EPS, factor, small_svd
 from softgrasp.reduction.bases.states import BasisError
 
@@ -184,27 +182,20 @@ def structured(problem: RiccatiProblem) -> BasisFamily:
     No Riccati equation is solved. States [q_s, v_s, Phi eta, Phi eta'], costates [q_s, v_s, M Phi omega, Phi]: the
     reduced plant is a second-order system with definite matrices, stable for every N, in energy scaling. Collective.
     """
-    system = problem.system
-    k = min(STRUCTURED_MODES, system.layout.n_e)
-    omega, Phi, massed = modes_of_plant(problem, k)
-    damping = np.diag(modal_damping(problem, Phi))
-    c = total(system.layout.comm, problem.C_z.T @ Phi)
-    g = modal_inputs(problem, Phi)
-    rates = closed_loop_rates(problem, omega, damping, g, c)
-    floor = np.finfo(float).tiny
-    weight = np.sum(c**2, axis=0) * np.sum(g**2, axis=1) / (np.maximum(rates.rate, floor) * omega**2)
-    order = np.argsort(-weight, kind="stable")
-    n_s = system.layout.n_s
+    plant = lowest_plant(problem, min(STRUCTURED_MODES, problem.layout.n_e))
+    rate = np.maximum(closed_loop_rates(problem, plant).rate, np.finfo(float).tiny)
+    weight = np.sum(plant.c**2, axis=0) * np.sum(plant.g**2, axis=1) / (rate * plant.omega**2)
+    order, n_s = np.argsort(-weight, kind="stable"), problem.layout.n_s
 
     def make(N: int) -> RiccatiBasis:
-        pick = order[: (N - 2 * n_s) // 2]
-        return modal_basis(problem, A_PRIORI, omega[pick], Phi[:, pick], massed[:, pick])
+        return modal_basis(problem, A_PRIORI, plant, order[: (N - 2 * n_s) // 2])
 
-    return BasisFamily(A_PRIORI, 2 * n_s, 2 * n_s + 2 * k, 2, (weight[order],), make)
+    return BasisFamily(A_PRIORI, 2 * n_s, 2 * n_s + 2 * len(order), 2, (weight[order],), make)
 
 
-def modal_basis(problem: RiccatiProblem, name: str, omega: Array, Phi: Array, massed: Array) -> RiccatiBasis:
+def modal_basis(problem: RiccatiProblem, name: str, plant: ModalPlant, pick: NDArray[np.int64]) -> RiccatiBasis:
     """States [q_s, v_s, Phi/omega, Phi] and costates [q_s, v_s, M Phi omega, Phi] of some modes."""
+    omega, Phi, massed = plant.omega[pick], plant.Phi[:, pick], plant.massed[:, pick]
     n_s, n, k = problem.layout.n_s, problem.layout.n_local, len(omega)
     N = 2 * (n_s + k)
     hand = np.hstack([np.eye(2 * n_s), np.zeros((2 * n_s, 2 * k))])

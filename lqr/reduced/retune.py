@@ -10,10 +10,9 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.dense.care import StateSpace, solve_reduced
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.plant.gain import Block, Gain
 from softgrasp.lqr.plant.operators import descriptor_adjoint
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
@@ -72,7 +71,7 @@ class Retuner:
             result += m.mu * (mu[0] + m.beta * mu[1]) + m.lam * (lam[0] + m.beta * lam[1])
         return result
 
-    def at(self, materials: Materials) -> ReducedMatrices:
+    def at(self, materials: Materials) -> StateSpace:
         """The reduced equation for other Lame constants and viscosities.
 
         Raises ControlError: the number of layers or a density differs from the reference.

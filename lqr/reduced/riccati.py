@@ -8,13 +8,19 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.dense.small_care import ReducedMatrices, solve_reduced
+from softgrasp.lqr.dense.care import StateSpace, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.coordinates import costates_to_absolute, gain_to_absolute
-from softgrasp.lqr.plant.gain import Gain
-from softgrasp.lqr.plant.operators import descriptor, descriptor_adjoint, dynamics, inputs_adjoint, outputs
+from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.operators import (
+    costates_to_absolute,
+    descriptor,
+    descriptor_adjoint,
+    dynamics,
+    gain_to_absolute,
+    inputs_adjoint,
+    outputs,
+)
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
@@ -29,7 +35,7 @@ class ReducedRiccati:
     """P_hat = V P_N V' and its gain."""
 
     basis: RiccatiBasis  # the basis, scaled to energy
-    matrices: ReducedMatrices  # E_N, A_N, B_N, C_N with the weights
+    matrices: StateSpace  # E_N, A_N, B_N, C_N with the weights
     P_N: Array  # (N, N)
     gain: Gain  # K_hat on the full plant
 
@@ -46,7 +52,7 @@ class GainQuality:
     sampled: SampledRadius | None = None  # the loop from tick to tick, where its instants are known
     gain: Gain | None = None  # K_hat; None where there is none
     cost_excess_at_most: float = NAN  # bound on the excess; nan where not asked for
-    cost_excess_proved: float = NAN  # the part that is proved, see softgrasp.lqr.design.bounds.with_bounds
+    cost_excess_proved: float = NAN  # the part that is proved, see softgrasp.lqr.design.duration.with_bounds
 
     @property
     def stable(self) -> bool:
@@ -73,13 +79,13 @@ class GainReport(GainQuality):
     N: int  # order of the reduced equation
     error_P: float = NAN  # noqa: N815  ||P - P_hat||_F / ||P||_F in the paper's coordinates
     time_are: float = NAN  # seconds of one solution of the reduced equation, for who measures it
-    matrices: ReducedMatrices | None = None  # of the reduced equation; None where they are not kept
+    matrices: StateSpace | None = None  # of the reduced equation; None where they are not kept
 
 
-def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> ReducedMatrices:
+def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> StateSpace:
     """E_N = W'EU, A_N = W'AU, B_N = W'B, C_N = CU. Collective."""
     comm, W, U = problem.layout.comm, basis.W, basis.U
-    return ReducedMatrices(
+    return StateSpace(
         E=gram(comm, W, descriptor(problem, U)),
         A=gram(comm, W, dynamics(problem, U)),
         B=np.ascontiguousarray(inputs_adjoint(problem, W).T),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
@@ -10,16 +10,8 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
-from softgrasp.lqr.dense.modal import (
-    ModalPlant,
-    TissueMatrices,
-    dense_modes,
-    gather_tissue,
-    modal_plant,
-    modes_of_plant,
-)
-from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.operators import damp, modal_inputs
+from softgrasp.lqr.dense.modal import ModalPlant, TissueMatrices, dense_modes, gather_tissue, lowest_plant
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
@@ -75,8 +67,7 @@ class ModalLoop:
         self.problem, self.comm = problem, problem.layout.comm
         n_e = problem.layout.n_e
         self.complete = n_e <= (ALL_MODES if modes is None else min(modes, DENSE_LIMIT))
-        parts = _all(problem) if self.complete else _lowest(problem, min(modes or SOME_MODES, n_e))
-        self.Phi, self.massed, self.plant = parts
+        self.plant = _all(problem) if self.complete else lowest_plant(problem, min(modes or SOME_MODES, n_e))
         space = self.plant.space
         solved = np.linalg.solve(space.E, np.hstack([space.A, space.B]))
         self.A, self.B = solved[:, : len(space.A)], solved[:, len(space.A) :]
@@ -84,13 +75,13 @@ class ModalLoop:
     def gain(self, K: Block) -> Array:
         """K on modal states from a transposed gain in hand-relative coordinates, (n_s, 2 n_s + 2 k). Collective."""
         n = self.problem.layout.n_local
-        z, v = total(self.comm, np.stack([self.Phi.T @ K.tall[:n], self.Phi.T @ K.tall[n:]]))
+        z, v = total(self.comm, np.stack([self.plant.Phi.T @ K.tall[:n], self.plant.Phi.T @ K.tall[n:]]))
         return np.asarray(np.vstack([K.hand, z / self.plant.omega[:, None], v]).T)
 
     def state(self, x: Block) -> Array:
         """Modal states of full ones. Collective."""
         n = self.problem.layout.n_local
-        z, v = total(self.comm, np.stack([self.massed.T @ x.tall[:n], self.massed.T @ x.tall[n:]]))
+        z, v = total(self.comm, np.stack([self.plant.massed.T @ x.tall[:n], self.plant.massed.T @ x.tall[n:]]))
         return np.asarray(np.vstack([x.hand, z * self.plant.omega[:, None], v]))
 
     def poles(self, K: Block) -> np.ndarray:
@@ -127,20 +118,9 @@ class ModalLoop:
         return on_root(self.comm, judge)
 
 
-def _all(problem: RiccatiProblem) -> tuple[Array, Array, ModalPlant]:
+def _all(problem: RiccatiProblem) -> ModalPlant:
+    """All modes, of Phi and massed the local rows. Collective."""
     layout, tissue = problem.layout, gather_tissue(problem)
     plant: ModalPlant = on_root(layout.comm, lambda: dense_modes(problem, cast(TissueMatrices, tissue)))
     rows = slice(layout.start, layout.start + layout.n_local)
-    return plant.Phi[rows], plant.massed[rows], plant
-
-
-def _lowest(problem: RiccatiProblem, k: int) -> tuple[Array, Array, ModalPlant]:
-    comm = problem.layout.comm
-    omega, Phi, massed = modes_of_plant(problem, k)
-    parts = modal_damping(problem, Phi), modal_inputs(problem, Phi), total(comm, problem.C_z.T @ Phi)
-    return Phi, massed, modal_plant(problem, omega, Phi, massed, parts)
-
-
-def modal_damping(problem: RiccatiProblem, Phi: Array) -> Array:
-    """Phi' D_ee Phi. Collective."""
-    return total(problem.layout.comm, Phi.T @ damp(problem.system, Phi))
+    return replace(plant, Phi=plant.Phi[rows], massed=plant.massed[rows])

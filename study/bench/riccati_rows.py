@@ -25,9 +25,8 @@ from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
-from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.coordinates import costates_to_relative, gain_to_absolute
-from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.operators import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.study.bench.driver import Failure

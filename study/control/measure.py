@@ -14,13 +14,12 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import on_root
-from softgrasp.lqr.dense.small_care import solve_reduced
-from softgrasp.lqr.design.bounds import with_bounds
+from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
-from softgrasp.lqr.design.duration import LoopPlan, largest_cost
+from softgrasp.lqr.design.duration import LoopPlan, largest_cost, with_bounds
 from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.design.linearise import finite_problem
 from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains, fast_order, reduce_gains
+from softgrasp.lqr.design.scene import finite_problem
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory

@@ -35,7 +35,7 @@ def exact_gain(problem: RiccatiProblem) -> Array:
     tissue = gather_tissue(problem)
     if tissue is None or np.count_nonzero(problem.R - np.diag(np.diag(problem.R))):
         raise ValueError("the exact gain needs one rank and a diagonal R")
-    space = assemble_space(problem, tissue.M, tissue.K, tissue.D, tissue.G, tissue.C_z, tissue.B_z)
+    space = assemble_space(problem, tissue)
     modal = dense_modes(problem, tissue)
     start = care(modal.space.A, modal.space.B, modal.space.C, problem.Q, problem.R, modal.space.E)
     one = np.eye(2 * problem.layout.n_s)

@@ -24,8 +24,7 @@ from softgrasp.lqr.design.orders import fast_order, orders
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
-from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory
-from softgrasp.lqr.loop.small_plant import SmallPlant, galerkin
+from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory, SmallPlant, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import BasisFamily, make_family

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.petsc import on_root
-from softgrasp.lqr.dense.small_care import solve_reduced
+from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.feedback import Design, check, design
 from softgrasp.lqr.design.orders import orders
 from softgrasp.lqr.diagnosis import Diagnosis

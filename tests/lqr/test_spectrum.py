@@ -15,7 +15,7 @@ from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.certificate import certified_abscissa
@@ -120,7 +120,7 @@ def test_no_unstable_mode_is_missed() -> None:
         direction = loop.plant.g[mode]
         size = 4 * (0.003 * loop.plant.omega[mode] ** 2) / np.linalg.norm(np.linalg.solve(problem.M_s, direction))
         tall = K.tall.copy()
-        tall[n:] -= size * np.outer(loop.massed[:, mode], direction / np.linalg.norm(direction))
+        tall[n:] -= size * np.outer(loop.plant.massed[:, mode], direction / np.linalg.norm(direction))
         loud = Block(K.hand, tall)
         exact, found = loop.poles(loud).real.max(), certified_abscissa(problem, loud)
         assert exact > 0

@@ -20,8 +20,7 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller, layout_hash, load_gain, save_gain
 from softgrasp.lqr.loop.full import ClosedLoop
-from softgrasp.lqr.loop.small import ReducedLoop
-from softgrasp.lqr.loop.small_plant import Shapes, SmallPlant, galerkin
+from softgrasp.lqr.loop.small import ReducedLoop, Shapes, SmallPlant, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem

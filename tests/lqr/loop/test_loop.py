@@ -14,8 +14,7 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
-from softgrasp.lqr.loop.small import ReducedLoop
-from softgrasp.lqr.loop.small_plant import galerkin, m_orthonormal
+from softgrasp.lqr.loop.small import ReducedLoop, galerkin, m_orthonormal
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.target import hand_target, output_target, rest

@@ -9,7 +9,7 @@ import scipy.linalg
 
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.loop.margins import loop_margins, sampled
-from softgrasp.lqr.loop.small_plant import SmallPlant
+from softgrasp.lqr.loop.small import SmallPlant
 
 Array = np.ndarray
 M, C_D, K_T = 2.0, 0.05, 30.0  # hand mass, damping and stiffness of a tissue of one shape

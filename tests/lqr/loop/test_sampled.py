@@ -13,7 +13,7 @@ from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions
-from softgrasp.lqr.loop.small_plant import galerkin, m_orthonormal
+from softgrasp.lqr.loop.small import galerkin, m_orthonormal
 from softgrasp.lqr.lowrank.plant import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import hand_target

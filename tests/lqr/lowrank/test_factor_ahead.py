@@ -13,9 +13,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import build
-from softgrasp.lqr.lowrank import shifted_gathered
+from softgrasp.lqr.lowrank import shifted
 from softgrasp.lqr.lowrank.factor_ahead import FactorsAhead
-from softgrasp.lqr.lowrank.shifted_gathered import GatheredTissue
+from softgrasp.lqr.lowrank.shifted import GatheredTissue
 from tests.helpers.models import make_scene
 
 pytestmark = pytest.mark.serial
@@ -84,8 +84,8 @@ def test_solutions_do_not_depend_on_the_threads(
     F = np.random.default_rng(0).standard_normal((system.layout.n_local, 3))
     alone = GatheredTissue(system)
     assert alone.ahead is None
-    monkeypatch.setattr(shifted_gathered, "AHEAD_FROM", 0)
-    monkeypatch.setattr(shifted_gathered, "_cores", lambda: 2)
+    monkeypatch.setattr(shifted, "AHEAD_FROM", 0)
+    monkeypatch.setattr(shifted, "_cores", lambda: 2)
     helped = GatheredTissue(system)
     assert helped.ahead is not None
     assert len(helped.shells) == len(helped.ahead.threads) == 2
