@@ -9,14 +9,7 @@ from typing import Literal
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.modal import (
-    ENOUGH,
-    ModeRates,
-    closed_loop_rates,
-    enough_damping,
-    lost_sentence,
-    lowest_plant,
-)
+from softgrasp.lqr.dense.modal import ENOUGH, ModeRates, closed_loop_rates, enough_damping, lost_sentence, lowest_plant
 from softgrasp.lqr.plant.checks import EPS, MODAL_KEY, ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.problem import RiccatiProblem
 

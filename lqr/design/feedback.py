@@ -12,12 +12,11 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.scene import actuation, problem, sampling, scene_target
 from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.gain import Block, Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainJudge
-from softgrasp.lqr.riccati import Method, choose, solve
+from softgrasp.lqr.riccati import Method, choose, modal_lqr, solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality, ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
 

@@ -90,12 +90,7 @@ def feedback_inputs(law: Responses) -> Array:
 
 
 def responses(
-    problem: RiccatiProblem,
-    W: Block,
-    start: Block,
-    dt: float,
-    steps: int,
-    notify: Notify | None = None,
+    problem: RiccatiProblem, W: Block, start: Block, dt: float, steps: int, notify: Notify | None = None
 ) -> Responses:
     """One factor and n_s runs of the full plant, one more where the start moves by itself. Collective.
 

@@ -162,8 +162,7 @@ class ReducedLoop:
         self.seconds = time.perf_counter()
         try:
             columns = np.linalg.solve(
-                plant.E - dt / 2 * plant.A,
-                np.hstack([plant.E, dt / 2 * plant.B, dt / 2 * plant.f[:, None]]),
+                plant.E - dt / 2 * plant.A, np.hstack([plant.E, dt / 2 * plant.B, dt / 2 * plant.f[:, None]])
             )
         except np.linalg.LinAlgError as error:
             raise ControlError(f"E - dt/2 A of the reduced plant is singular for dt = {dt:g} s") from error

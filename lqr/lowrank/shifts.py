@@ -10,8 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.lowrank.adjoint import Right
-from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.lowrank.plant import Plant, Right
 from softgrasp.lqr.plant.gain import Block
 
 WINDOW = 10  # blocks of Z whose Ritz values give the next shifts

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
@@ -102,3 +104,33 @@ class RiccatiSolution:
         """Method, what it did and why it was chosen, in one line."""
         about = f": {self.about}" if self.about else ""
         return f"{self.method}{about}" + (f" (chosen: {self.reason})" if self.reason else "")
+
+
+def rigid_gains(problem: RiccatiProblem, solution: RiccatiSolution) -> tuple[Array, Array]:
+    """Gain u for the whole body displaced by unit translations [N/m], and moving so [N s/m], (n_s, d) each."""
+    n_s, d, K = problem.layout.n_s, problem.layout.dimension, solution.gain.K_s
+    return K[:, :d], K[:, n_s : n_s + d]
+
+
+def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float:
+    """||(K x_T)'R(K x_T) - C_s'QC_s|| / ||C_s'QC_s||, zero for every mesh, material and damping.
+
+    For x_T = [I; 0; 0; 0] (the whole body displaced rigidly by unit motions of the hand) and v_T = [0; I; 0; 0] (moving
+    rigidly) A x_T = 0 and, without damping against space, A v_T = E x_T: the Riccati equation between them.
+    """
+    K = solution.gain.K_s[:, : problem.layout.n_s]
+    exact = problem.C_s.T @ problem.Q @ problem.C_s
+    return float(np.linalg.norm(K.T @ problem.R @ K - exact) / (np.linalg.norm(exact) or 1.0))
+
+
+def velocity_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float | None:
+    """||(K x_T)'R(K v_T) - x_T'E'XE x_T|| / ||x_T'E'XE x_T||.
+
+    None when the damping drags against space: the identity does not hold then.
+    """
+    if problem.system.damping.in_space and problem.system.damping.alpha > 0:
+        return None
+    n_s = problem.layout.n_s
+    left = solution.gain.K_s[:, :n_s].T @ problem.R @ solution.gain.K_s[:, n_s:]
+    right = solution.factor.hand[:n_s] @ solution.factor.hand[:n_s].T
+    return float(np.linalg.norm(left - right) / (np.linalg.norm(right) or 1.0))

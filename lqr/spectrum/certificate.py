@@ -52,27 +52,9 @@ class Abscissa:
 
 
 def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
-    """Largest real part of the spectrum of x' = (A + B K) x [1/s], see :func:`certified_abscissa`. Collective.
+    """Largest real part of the spectrum of x' = (A + B K) x [1/s], with a certificate of its sign. Collective.
 
-    Args:
-        problem: the plant; damped in every layer for a certificate.
-        gain: u = K x.
-
-    Raises:
-        ControlError: the plant has no hand.
-        SolverError: no eigenvalue converges.
-
-    >>> import softgrasp as sg
-    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
-    >>> sg.abscissa(problem, sg.solve(problem).gain).value < 0
-    True
-    """
-    return certified_abscissa(problem, gain.block)
-
-
-def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
-    """Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it. Collective.
-
+    Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it:
     :class:`softgrasp.lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle
     |s - sigma| <= d with d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely
     many eigenvalues accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them
@@ -84,13 +66,18 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
 
     Args:
         problem: the plant; damped in every layer for a certificate.
-        K: gain, transposed, hand-relative.
+        gain: u = K x, K = [K_q, K_v] on the hand (n_s, 2 n_s) and on the tissue's local rows (n_local, n_s).
 
     Raises:
         ControlError: the plant has no hand.
         SolverError: no eigenvalue converges.
+
+    >>> import softgrasp as sg
+    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
+    >>> sg.abscissa(problem, sg.solve(problem).gain).value < 0
+    True
     """
-    n_s = problem.layout.n_s
+    n_s, K = problem.layout.n_s, gain.block
     if n_s == 0:
         raise ControlError(
             "the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop"
