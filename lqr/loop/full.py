@@ -161,19 +161,12 @@ class ClosedLoop:
         actuation, options = actuation or Actuation(), options or LoopOptions()
         if not isinstance(target, Target):
             target = hand_target(self.problem, np.asarray(target, dtype=np.float64))
-        bound = actuation.bound(self.problem.layout.n_s)
-        held = actuation.ticks(self.dt) > 0
-        start = start or rest(self.problem.system)
-        drive: LoopDrive = (
-            HeldDrive(self.plant, gain, target, actuation, steps)
-            if held
-            else FiniteDrive(self.plant, gain, target, bound, steps)
-            if self.problem.system.points is not None
-            else ImplicitDrive(self.plant, gain, target, bound, steps)
-        )
-        run = LoopRun(self, drive, start, steps, options, target)
+        implicit = ImplicitDrive if self.problem.system.points is None else FiniteDrive
+        kind = HeldDrive if actuation.ticks(self.dt) else implicit
+        drive = kind(self.plant, gain, target, actuation, steps)
+        run = LoopRun(self, drive, start or rest(self.problem.system), steps, options, target)
         run.execute()
-        return run.trajectory(bound)
+        return run.trajectory(actuation)
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
@@ -217,8 +210,7 @@ class LoopRun(Stepped):
     def execute(self) -> None:
         """Let TS run to the last step, in segments. Collective.
 
-        Raises:
-            SolverError: a solve failed, the state is no longer finite, or the cost leaves its bound.
+        Raises SolverError: a solve failed, the state is no longer finite, or the cost leaves its bound.
         """
         frames = {int(n) for n in self.options.frames} if self.options.frame is not None else set()
         ends = set(np.linspace(0, self.steps, min(CHUNKS, self.steps) + 1).round().astype(int).tolist())
@@ -281,17 +273,12 @@ class LoopRun(Stepped):
         u = self.drive.u[first : first + len(outputs) - 1] - self.target.u
         return accumulated_cost(outputs - self.target.y, u, self.problem.Q, self.problem.R, self.dt)
 
-    def trajectory(self, bound: Array | None) -> LoopTrajectory:
+    def trajectory(self, actuation: Actuation) -> LoopTrajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
         problem, drive = self.problem, self.drive
         comm, n = problem.layout.comm, problem.layout.n_local
         rigid, outputs = drive.q @ problem.C_s.T, self._outputs(0, self.steps)
-        cost = self._cost(outputs, 0)
-        times = np.asarray(self.dt * np.arange(self.steps + 1), dtype=np.float64)
-        saturated = 0.0
-        if bound is not None:
-            saturated = float((np.abs(drive.u) >= bound).any(axis=1).mean())
-        array = self.state.array
+        times, array = np.asarray(self.dt * np.arange(self.steps + 1), dtype=np.float64), self.state.array
         return LoopTrajectory(
             times=times,
             q_s=drive.q,
@@ -300,10 +287,10 @@ class LoopRun(Stepped):
             outputs=outputs,
             outputs_rigid=rigid,
             columns=problem.columns,
-            cost=cost,
+            cost=self._cost(outputs, 0),
             final=PlantState(drive.q[-1].copy(), drive.v[-1].copy(), array[:n].copy(), array[n:].copy()),
             snapshots=self.store.finish(times, drive.q, drive.v),
-            saturated=saturated,
+            saturated=actuation.saturated(drive.u),
             residuals=(self.residual_first, self.residual_last),
             solver=self.solver,
             newton=self.midpoint.figures(),

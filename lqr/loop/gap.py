@@ -99,8 +99,7 @@ def responses(
         start: x(0) as a difference to a state of rest, one column.
         notify: called with the number of steps done and in all.
 
-    Raises:
-        SolverError: a solve failed.
+    Raises SolverError: a solve failed.
     """
     n_s, n = problem.layout.n_s, problem.layout.n_local
     # differences of two states feel no gravity
@@ -203,8 +202,7 @@ def duality_gaps(
         factor: Z; None takes the cost up to the end alone.
         notify: called with the number of steps done and in all.
 
-    Raises:
-        SolverError: a solve failed.
+    Raises SolverError: a solve failed.
     """
     p, n_s, n = len(problem.Q), problem.layout.n_s, problem.layout.n_local
     hand, tall = np.zeros((2 * n_s, p)), np.zeros((2 * n, p))

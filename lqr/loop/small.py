@@ -215,7 +215,6 @@ class ReducedLoop:
                 "not stabilise the plant at this rate, delay and limit"
             )
         outputs = states @ plant.C.T
-        saturated = 0.0 if bound is None else float((np.abs(inputs) >= bound).any(axis=1).mean())
         cost = accumulated_cost(outputs - plant.C @ x_bar, inputs - u_bar, *weights, self.dt)
         return ReducedLoopTrajectory(
             times=np.asarray(self.dt * np.arange(steps + 1), dtype=np.float64),
@@ -224,7 +223,7 @@ class ReducedLoop:
             inputs=inputs,
             outputs=outputs,
             cost=cost,
-            saturated=saturated,
+            saturated=actuation.saturated(inputs),
             seconds={"prepare": self.seconds, "steps": time.perf_counter() - begin},
         )
 

@@ -109,8 +109,7 @@ class ShiftedTissue(ABC):
             p: shift; 0 gives K_ee^{-1}.
             ahead: shifts that will probably come next.
 
-        Raises:
-            SolverError: the factorisation or the solve fails.
+        Raises SolverError: the factorisation or the solve fails.
         """
         p = complex(p)
         begin = time.perf_counter()

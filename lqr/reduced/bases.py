@@ -286,8 +286,7 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
         name: key of :data:`BASES`.
         Z: factor of X in hand-relative coordinates, see :class:`softgrasp.lqr.plant.problem.RiccatiSolution`.
 
-    Raises:
-        ControlError: the name is unknown, or the method does not apply.
+    Raises ControlError: the name is unknown, or the method does not apply.
     """
     if name not in BASES:
         raise ControlError(f"basis '{name}' is unknown; choose one of {', '.join(BASES)}")

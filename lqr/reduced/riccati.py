@@ -304,8 +304,7 @@ class Retuner:
     def solve(self, materials: Materials) -> Tuned:
         """Combine, solve, gain.
 
-        Raises:
-            ControlError: the setting is refused, or its reduced equation has no stabilising solution.
+        Raises ControlError: the setting is refused, or its reduced equation has no stabilising solution.
         """
         begin = time.perf_counter()
         m = self.at(materials)

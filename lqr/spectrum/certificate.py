@@ -234,8 +234,7 @@ class Resolvent:
 
         Collective.
 
-        Raises:
-            SolverError: none converges, or an eigenpair has a large residual.
+        Raises SolverError: none converges, or an eigenpair has a large residual.
         """
         eps = SLEPc.EPS().create(self.comm)
         eps.setOptionsPrefix(PREFIX)
