@@ -164,8 +164,7 @@ class Controller:
     def load(cls, path: str | Path, scene_hash: str | None = None, layout_hash: str | None = None) -> Controller:
         """Read a file of :meth:`save`.
 
-        Args:
-            scene_hash, layout_hash: refuse a controller that was made for another scene or mesh.
+        ``scene_hash``, ``layout_hash``: refuse a controller that was made for another scene or mesh.
 
         Raises ControlError: the file is missing, damaged, or made for something else.
         """

@@ -49,40 +49,24 @@ class LoopOptions:
 
 @dataclass(frozen=True)
 class LoopTrajectory:
-    """What a closed-loop run returns; small arrays are on every rank.
+    """What a closed-loop run returns; small arrays are on every rank."""
 
-    Attributes:
-        times: grid [s], (steps + 1,).
-        q_s, v_s: hand, (steps + 1, n_s).
-        inputs: u of each step [N, N m], (steps, n_s).
-        outputs: y = C_s q_s + C_z' z [m, rad], (steps + 1, p).
-        outputs_rigid: C_s q_s, the same without deformation, (steps + 1, p).
-        columns: one per output component.
-        cost: J up to each grid point, (steps + 1,).
-        final: the state at the end.
-        snapshots: stored states, or None.
-        saturated: share of the steps in which an input sat at its limit.
-        residuals: relative residual of the first and the last solve.
-        solver: name and reason.
-        seconds: factor (with the responses) and steps; the slowest rank.
-        newton: how the steps of finite strain converged, or None.
-    """
-
-    times: Array
+    times: Array  # grid [s], (steps + 1,)
+    # q_s, v_s: hand, (steps + 1, n_s)
     q_s: Array
     v_s: Array
-    inputs: Array
-    outputs: Array
-    outputs_rigid: Array
-    columns: Columns
-    cost: Array
-    final: PlantState
-    snapshots: Snapshots | None
-    saturated: float
-    residuals: tuple[float, float]
-    solver: tuple[str, str]
-    seconds: dict[str, float] = field(default_factory=dict)
-    newton: NewtonFigures | None = None
+    inputs: Array  # u of each step [N, N m], (steps, n_s)
+    outputs: Array  # y = C_s q_s + C_z' z [m, rad], (steps + 1, p)
+    outputs_rigid: Array  # C_s q_s, the same without deformation, (steps + 1, p)
+    columns: Columns  # one per output component
+    cost: Array  # J up to each grid point, (steps + 1,)
+    final: PlantState  # the state at the end
+    snapshots: Snapshots | None  # stored states, or None
+    saturated: float  # share of the steps in which an input sat at its limit
+    residuals: tuple[float, float]  # relative residual of the first and the last solve
+    solver: tuple[str, str]  # name and reason
+    seconds: dict[str, float] = field(default_factory=dict)  # factor (with the responses) and steps; the slowest rank
+    newton: NewtonFigures | None = None  # how the steps of finite strain converged, or None
 
     @property
     def output_names(self) -> tuple[str, ...]:

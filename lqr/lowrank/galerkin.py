@@ -96,9 +96,7 @@ def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
 def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[Level, Space]:
     """Project, solve and expand: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
 
-    Args:
-        space: the Ritz basis of ``old`` and more.
-        old: the level before, near the solution.
+    ``space``: the Ritz basis of ``old`` and more; ``old``: the level before, near the solution.
     """
     ritz, omega, S = space.ritz(plant)
     small = modal_start.restrict(plant, ritz.V, omega, ritz.M_V)

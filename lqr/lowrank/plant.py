@@ -213,9 +213,7 @@ def closed_adjoint(
 
     [N, L] = (A + pE)^{-T} [K', W],  V = L + N (I - B'N)^{-1} B'L. Collective.
 
-    Args:
-        right: [K', W].
-        ahead: shifts that will probably come next.
+    ``right``: [K', W]; ``ahead``: shifts that will probably come next.
     """
     hand, b = open_adjoint(plant, tissue, p, right, ahead)
     B_V = plant.B.T @ hand[plant.n_s :] if plant.B_z is None else _total(plant, plant.B_z, b)

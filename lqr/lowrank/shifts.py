@@ -66,10 +66,7 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
     H^{-1}, H = blkdiag(1, M_s, K_ee, M_ee): without feedback the plant is dissipative in this product, so no Ritz value
     is unstable. Collective.
 
-    Args:
-        V: columns of Z, costate form.
-        W: residual factor.
-        gain: K', None for K = 0.
+    ``V``: columns of Z, costate form; ``W``: residual factor; ``gain``: K', None for K = 0.
 
     Returns the values, and the norm of the component of W along each Ritz vector.
     """

@@ -28,23 +28,15 @@ class RiccatiProblem:
 
     A second-order system without a hand, M_ee z'' + D_ee z' + K_ee z = B_z u, is the case n_s = 0, B = [0; B_z]; see
     :func:`softgrasp.lqr.plant.second_order.second_order`.
-
-    Attributes:
-        system: the operators; never a dense n x n array.
-        C_s: outputs of the hand's displacement, (p, n_s), on every rank.
-        C_z: outputs of the relative displacement, transposed, local rows (n_local, p).
-        Q: (p, p), symmetric positive semidefinite [1/(m2 s)].
-        R: (m, m), symmetric positive definite [1/(N2 s)], m = n_s.
-        columns: one per output component, or none.
-        B_z: forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None.
     """
 
-    system: BlockSystem
-    C_s: Array
-    C_z: Array
-    Q: Array
-    R: Array
-    columns: Columns = ()
+    system: BlockSystem  # the operators; never a dense n x n array
+    C_s: Array  # outputs of the hand's displacement, (p, n_s), on every rank
+    C_z: Array  # outputs of the relative displacement, transposed, local rows (n_local, p)
+    Q: Array  # (p, p), symmetric positive semidefinite [1/(m2 s)]
+    R: Array  # (m, m), symmetric positive definite [1/(N2 s)], m = n_s
+    columns: Columns = ()  # one per output component, or none
+    # forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None
     B_z: Array | None = None
 
     @property
@@ -70,29 +62,17 @@ class RiccatiProblem:
 
 @dataclass(frozen=True)
 class RiccatiSolution:
-    """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`.
+    """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`."""
 
-    Attributes:
-        factor: Z, hand rows [q_s, v_s] and local tissue rows [z; v_z], ``rank`` columns.
-        gain: K = -R^{-1} B'XE.
-        residual: true relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z at the end.
-        method: the solver.
-        about: what the solver did, in words.
-        reason: why this solver was chosen; empty when the caller made it.
-        history: one dictionary per iteration.
-        counts: newton_steps, adi_steps, solves.
-        seconds: time by stage.
-    """
-
-    factor: Block
-    gain: Gain
-    residual: float
-    method: SolverName
-    about: str = ""
-    reason: str = ""
-    history: tuple[dict[str, float], ...] = ()
-    counts: dict[str, int] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
+    factor: Block  # Z, hand rows [q_s, v_s] and local tissue rows [z; v_z], ``rank`` columns
+    gain: Gain  # K = -R^{-1} B'XE
+    residual: float  # true relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z at the end
+    method: SolverName  # the solver
+    about: str = ""  # what the solver did, in words
+    reason: str = ""  # why this solver was chosen; empty when the caller made it
+    history: tuple[dict[str, float], ...] = ()  # one dictionary per iteration
+    counts: dict[str, int] = field(default_factory=dict)  # newton_steps, adi_steps, solves
+    seconds: dict[str, float] = field(default_factory=dict)  # time by stage
 
     @property
     def rank(self) -> int:

@@ -256,9 +256,7 @@ class Retuner:
     K_ee and D_ee are affine in the Lame constants; E, B, C and the rigid extension T do not depend on them. Nothing of
     the size of the tissue is touched in :meth:`solve`. Collective to make, not collective to use.
 
-    Args:
-        problem: the plant at the reference materials.
-        basis: the basis built there.
+    ``problem``: the plant at the reference materials; ``basis``: the basis built there.
     """
 
     def __init__(self, problem: RiccatiProblem, basis: RiccatiBasis) -> None:

@@ -170,9 +170,7 @@ class SampledLoop:
         y+ = step y + accelerated (v+ - v) + dragged (v+ + v) runs beside the plant. One-way the hand does not feel the
         plant's own tissue, so that hand and y decide alone and the small plant of the controller is exact.
 
-        Args:
-            K: as it would be saved.
-            law: instants of the plant; one tick is the controller's period.
+        ``K``: as it would be saved; ``law``: instants of the plant; one tick is the controller's period.
         """
         loop = self._modes() if self.problem.system.two_way else None
         space = K.plant if loop is None else loop.plant.space
