@@ -105,7 +105,7 @@ def responses(
     # differences of two states feel no gravity
     problem = replace(problem, system=replace(problem.system, gravity=None, hand_weight=False))
     rest = PlantState(np.zeros(n_s), np.zeros(n_s), np.zeros(n), np.zeros(n))
-    begin = PlantState(start.hand[:n_s, 0], start.hand[n_s:, 0], start.tall[:n, 0], start.tall[n:, 0])
+    begin = PlantState(*(part[:, 0] for part in start.parts))
     inputs = np.zeros((n_s + 1, steps, n_s))
     inputs[range(n_s), 0, range(n_s)] = 1.0
     runs = [(rest, u) for u in inputs[:n_s]]

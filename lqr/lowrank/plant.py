@@ -82,14 +82,13 @@ class Plant:
 
         ``out``: room for the tissue rows of the result.
         """
-        n, s = self.n_local, self.n_s
-        a, b, b_s = V.tall[:n], V.tall[n:], V.hand[s:]
+        n, (a_s, b_s, a, b) = self.n_local, V.parts
         tall = np.empty(V.tall.shape) if out is None else out
         tall[:n] = self.stiff(a)
         tall[n:] = self.mass(b)
         if self.two_way:
             tall[n:] += self.G @ b_s
-        return Block(np.vstack([V.hand[:s], self.M_s @ b_s + total(self.comm, self.G.T @ b)]), tall)
+        return Block(np.vstack([a_s, self.M_s @ b_s + total(self.comm, self.G.T @ b)]), tall)
 
 
 def _values(A: PETSc.Mat) -> Array:

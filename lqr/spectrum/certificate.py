@@ -193,12 +193,11 @@ class Resolvent:
 
     def _open(self, b: Block) -> Block:
         """(sigma E - A)^{-1} b for one column. Collective."""
-        system, sigma, n, s = self.system, self.shift, self.n, self.n_s
-        a_s, a, b_s, f = b.hand[:s], b.tall[:n], b.hand[s:], b.tall[n:]
+        system, sigma, (a_s, b_s, a, f) = self.system, self.shift, b.parts
         # v = sigma q - a: the displacements alone remain
-        moved = descriptor(self.problem, Block(np.concatenate([0 * a_s, a_s]), np.concatenate([0 * a, a])))
-        right = b_s + sigma * moved.hand[s:]
-        force = f + sigma * moved.tall[n:] + damp(system, a) + self.drag * (system.G @ a_s)
+        _, moved_s, _, moved = descriptor(self.problem, Block.of_parts(0 * a_s, a_s, 0 * a, a)).parts
+        right = b_s + sigma * moved_s
+        force = f + sigma * moved + damp(system, a) + self.drag * (system.G @ a_s)
         if system.two_way and self.drag:
             right = right + self.drag * (system.M_rigid @ a_s + total(self.comm, system.G.T @ a))
         factor = sigma**2 + sigma * self.drag
@@ -209,7 +208,7 @@ class Resolvent:
         else:
             q_s = self.hand @ right
             z = self._solve((force - factor * (system.G @ q_s))[:, 0])[:, None]
-        return Block(np.concatenate([q_s, sigma * q_s - a_s]), np.concatenate([z, sigma * z - a]))
+        return Block.of_parts(q_s, sigma * q_s - a_s, z, sigma * z - a)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply y = (sigma E - A - B K)^{-1} E x. Collective."""

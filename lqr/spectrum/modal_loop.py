@@ -74,14 +74,12 @@ class ModalLoop:
 
     def gain(self, K: Block) -> Array:
         """K on modal states from a transposed gain in hand-relative coordinates, (n_s, 2 n_s + 2 k). Collective."""
-        n = self.problem.layout.n_local
-        z, v = total(self.comm, np.stack([self.plant.Phi.T @ K.tall[:n], self.plant.Phi.T @ K.tall[n:]]))
+        z, v = total(self.comm, np.stack([self.plant.Phi.T @ part for part in K.parts[2:]]))
         return np.asarray(np.vstack([K.hand, z / self.plant.omega[:, None], v]).T)
 
     def state(self, x: Block) -> Array:
         """Modal states of full ones. Collective."""
-        n = self.problem.layout.n_local
-        z, v = total(self.comm, np.stack([self.plant.massed.T @ x.tall[:n], self.plant.massed.T @ x.tall[n:]]))
+        z, v = total(self.comm, np.stack([self.plant.massed.T @ part for part in x.parts[2:]]))
         return np.asarray(np.vstack([x.hand, z * self.plant.omega[:, None], v]))
 
     def poles(self, K: Block) -> np.ndarray:
