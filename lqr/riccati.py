@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
-from softgrasp.lqr.lowrank.solver import Progress
+from softgrasp.lqr.lowrank.solver import LowRankSolver, Progress
 from softgrasp.lqr.plant.checks import ControlError, check_weights
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
@@ -33,13 +33,6 @@ DENSE_STATES = 200
 # A complex factorisation a shift: beyond these sizes 70 to 100 of them take more than a quarter of an hour on two ranks
 # (softgrasp.study.bench.switches --large times one), while Galerkin needs about 5.
 LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 40_000}  # 1: systems without a mesh
-
-
-class Solver(Protocol):
-    """What every method offers."""
-
-    def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
-        """Solve. Collective."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,7 @@ def choose(problem: RiccatiProblem, method: Method = "auto") -> SolverChoice:
 
 def make_solver(
     method: Method, tol: float | None = None, progress: Progress | None = None, checkpoint: Path | None = None
-) -> Solver:
+) -> DenseRiccati | LowRankSolver[Any]:
     """The solver object.
 
     Args:

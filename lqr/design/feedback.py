@@ -33,9 +33,8 @@ class Design:
     model: Model  # the built scene
     problem: RiccatiProblem  # plant, outputs and weights
     solution: RiccatiSolution  # Riccati solution and gain
-    # target, start: where the loop goes and where it begins
-    target: Target
-    start: PlantState
+    target: Target  # where the loop goes
+    start: PlantState  # where it begins
     error: Block  # start minus target, one column
     diagnosis: Diagnosis  # what was known before the solve
     judge: GainJudge  # compares gains with the optimal one

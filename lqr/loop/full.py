@@ -52,8 +52,7 @@ class LoopTrajectory:
     """What a closed-loop run returns; small arrays are on every rank."""
 
     times: Array  # grid [s], (steps + 1,)
-    # q_s, v_s: hand, (steps + 1, n_s)
-    q_s: Array
+    q_s: Array  # hand, (steps + 1, n_s)
     v_s: Array
     inputs: Array  # u of each step [N, N m], (steps, n_s)
     outputs: Array  # y = C_s q_s + C_z' z [m, rad], (steps + 1, p)

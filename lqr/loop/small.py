@@ -26,15 +26,13 @@ from softgrasp.reduction.lti import LTI, make_lti
 class SmallPlant:
     """E x' = A x + B u + f, y = C x, q_s = S_q x, v_s = S_v x, of dimension N."""
 
-    # E, A: (N, N)
-    E: Array
-    A: Array
+    E: Array  # (N, N)
+    A: Array  # (N, N)
     B: Array  # (N, n_s)
     C: Array  # (p, N)
     f: Array  # constant load, gravity (N,)
-    # S_q, S_v: (n_s, N)
-    S_q: Array
-    S_v: Array
+    S_q: Array  # (n_s, N)
+    S_v: Array  # (n_s, N)
     names: tuple[str, ...] = ()  # one per output
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.errors import SolverError, agree
-from softgrasp.fem.petsc import Array, Complex, PETSc, on_root, times_columns, total
+from softgrasp.fem.petsc import Array, Complex, on_root, times_columns, total
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
 from softgrasp.lqr.plant.gain import Block
@@ -41,7 +41,7 @@ class Plant:
         with agree(self.comm):
             check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
             check_finite(C_s=problem.C_s, C_z=problem.C_z, G=system.G, M_hand=system.M_hand, B_z=problem.B_z)
-            check_finite(K_ee=_values(system.K_ee), M_ee=_values(system.M_ee))
+            check_finite(K_ee=system.K_ee, M_ee=system.M_ee)
         weight = np.linalg.inv(np.linalg.cholesky(problem.R)).T
         self.B = weight if problem.B_z is None else np.zeros((0, len(weight)))
         self.B_z = None if problem.B_z is None else problem.B_z @ weight
@@ -89,10 +89,6 @@ class Plant:
         if self.two_way:
             tall[n:] += self.G @ b_s
         return Block(np.vstack([a_s, self.M_s @ b_s + total(self.comm, self.G.T @ b)]), tall)
-
-
-def _values(A: PETSc.Mat) -> Array:
-    return np.asarray(A.getValuesCSR()[2])
 
 
 class Right(Block):

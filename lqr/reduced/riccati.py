@@ -99,7 +99,7 @@ def project_plant(problem: RiccatiProblem, basis: RiccatiBasis) -> StateSpace:
 
 
 def full_gain(problem: RiccatiProblem, basis: RiccatiBasis, P_N: Array) -> Gain:
-    """K_hat' = -E'W P_N (W'B) R^{-1}. Collective."""
+    """K_hat' = -E'W P_N (W'B) R^{-1}; no material enters but by P_N. Collective."""
     small = -P_N @ np.linalg.solve(problem.R, inputs_adjoint(problem, basis.W)).T
     return Gain.of_block(descriptor_adjoint(problem, basis.W).times(small))
 
@@ -274,12 +274,6 @@ class Retuner:
                 pairs.append((-elastic, -viscous))
             self.parts.append((pairs[0], pairs[1]))
         self.A_0 = self.matrices.A - self._stiffness(self.reference)
-        self.columns = descriptor_adjoint(problem, basis.W)
-
-    @property
-    def N(self) -> int:
-        """Order of the reduced equation."""
-        return self.basis.N
 
     def _stiffness(self, materials: Materials) -> Array:
         result = np.zeros_like(self.matrices.A)
@@ -309,10 +303,6 @@ class Retuner:
         P_N = solve_reduced(m)
         K_N = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
         return Tuned(P_N, K_N, time.perf_counter() - begin)
-
-    def full_gain(self, tuned: Tuned) -> Gain:
-        """K_hat of the full plant: E'W does not depend on the materials."""
-        return Gain.of_block(self.columns.times(-tuned.P_N @ np.linalg.solve(self.problem.R, self.matrices.B.T).T))
 
 
 @dataclass(frozen=True)
@@ -345,4 +335,6 @@ def retuned_gain(
         return RetunedGain(materials, reason=str(error))
     problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
     judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
-    return judge.with_quality(RetunedGain(materials, tuned.seconds), retuner.full_gain(tuned))
+    return judge.with_quality(
+        RetunedGain(materials, tuned.seconds), full_gain(retuner.problem, retuner.basis, tuned.P_N)
+    )

@@ -11,8 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.petsc import Array
-from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.dense.paper import paper_form
+from softgrasp.lqr.dense.modal import DenseRiccati, paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.diagnosis import diagnose
 from softgrasp.lqr.lowrank.newton import NewtonADI
