@@ -15,8 +15,7 @@ from softgrasp.fem.accuracy.small import Small, reduced
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.bisect import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
-from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.mesh_estimate import MeshEstimate
+from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
 from softgrasp.fem.petsc import Array
 
@@ -38,8 +37,6 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
     With ``passes = 0`` the mesh is the a-priori one, which nothing estimates here.
 
     Args:
-        scene: the scene.
-        comm: communicator.
         steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:

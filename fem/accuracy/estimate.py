@@ -21,9 +21,8 @@ from mpi4py import MPI
 from softgrasp.fem.accuracy.small import Small, reduced, run_small
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.model.build import Model, build
+from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.contact import contact_facets
-from softgrasp.fem.model.mesh_estimate import MeshEstimate
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.tissue import Refine
 
@@ -43,7 +42,6 @@ def estimate(model: Model, coarse: Small | None = None, finer: Small | None = No
     """Estimate the error that the mesh leaves in the outputs of the scene's run. Collective.
 
     Args:
-        model: the model.
         coarse: its small model, if there is one.
         finer: that of :func:`next_order`, likewise, for scenes with ``tissue.refine``.
 
@@ -111,7 +109,6 @@ def difference(small: Small, other: Small, finer: Array | None = None) -> tuple[
     Outputs that are the hand's count only where there are no others.
 
     Args:
-        small, other: the two models.
         finer: deformation (steps + 1, p) instead of that of the other's run.
     """
     finer = other.run.deformation if finer is None else finer

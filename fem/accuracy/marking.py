@@ -33,7 +33,6 @@ def marked_cells(small: Small, finer: Small, factor: float) -> npt.NDArray[np.in
     """Cells to split, in the order of the mesh on rank 0; None on other ranks. Collective.
 
     Args:
-        small: small model of the mesh.
         finer: that of elements of the next order on the same cells.
         factor: by which the error should fall, below 1.
     """

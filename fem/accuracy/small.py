@@ -142,10 +142,6 @@ class SmallRun:
 def run_small(small: Small, steps: int | None = None) -> SmallRun:
     """Run the scene's motion or force with the midpoint rule, as the full model does.
 
-    Args:
-        small: the model.
-        steps: instead of the scene's.
-
     Raises:
         SceneError: a CSV file of the motion does not fit.
     """
@@ -185,7 +181,7 @@ def _table(small: Small, scene: Scene, dt: float) -> HandTable:
 
 
 def _driven(small: Small, scene: Scene, z: Array, dt: float) -> SmallRun:
-    """Hand and tissue together, as in :class:`softgrasp.fem.run.drive.ForceDrive`."""
+    """Hand and tissue together, as in :class:`softgrasp.fem.run.motion.ForceDrive`."""
     system, s, n_s = small.model.system, 2 / dt, small.G.shape[1]
     u = force_values(scene, n_s, system.M_hand)
     g = np.zeros(n_s) if system.gravity is None else system.gravity

@@ -72,9 +72,6 @@ def write_vtu(
     """Write one file, in which each rank's grid is a piece. Collective.
 
     Args:
-        comm: ranks that write.
-        path: replaced if there.
-        grid: of this rank.
         points, cells: fields of this rank, one row a point or a cell.
         whole: fields of the whole file, the same on every rank.
 
@@ -131,7 +128,6 @@ class Collection:
     """The files of a series against time, a whole ``.pvd`` file after each `add`; rank 0 only.
 
     Args:
-        path: of the file.
         note: a remark kept in it; no "--".
     """
 

@@ -15,11 +15,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError
-from softgrasp.fem.mesh.check import FLAT, counted, longest_edges, place_text, signed_volumes
-from softgrasp.fem.mesh.parts import find_parts
-from softgrasp.fem.mesh.seams import sort_facets
-from softgrasp.fem.mesh.spread import Marks, spread
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
+from softgrasp.fem.mesh.check import FLAT, counted, find_parts, longest_edges, place_text, signed_volumes, sort_facets
+from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -31,7 +28,6 @@ def bisect(whole: Whole, marked: Ints) -> Whole:
     """Split the marked cells, and others until no node hangs, through their longest edges [PC00].
 
     Args:
-        whole: the mesh.
         marked: numbers of the cells to split, in the order of ``whole.simplices``.
 
     Raises:
@@ -62,13 +58,7 @@ def bisect(whole: Whole, marked: Ints) -> Whole:
 
 
 def bisect_to(whole: Whole, size: Callable[[Floats], Floats], slack: float, most: int) -> Whole:
-    """Bisect until no cell is larger than its size by a factor.
-
-    Args:
-        whole: the mesh.
-        size: sizes [m] at points (n, d).
-        slack: the factor.
-        most: cells; bisection ends when there are more.
+    """Bisect until no cell is larger than ``slack`` times its size(points (n, d)) [m], or there are more than ``most``.
 
     Raises:
         MeshError: see :func:`bisect`.
@@ -83,14 +73,9 @@ def bisect_to(whole: Whole, size: Callable[[Floats], Floats], slack: float, most
 
 
 def distribute(comm: MPI.Intracomm, whole: Whole | None, dimension: int) -> TissueMesh:
-    """Spread a mesh from rank 0 over the ranks, with all it carries. Collective.
+    """Spread a mesh from rank 0 over the ranks (None on the others), with all it carries. Collective.
 
     ``mesh.topology.original_cell_index`` of the result counts the cells as ``whole.simplices`` does.
-
-    Args:
-        comm: communicator.
-        whole: on rank 0, None elsewhere.
-        dimension: 2 or 3, on all ranks.
     """
     facts, body = None, None
     marks: Marks = {}

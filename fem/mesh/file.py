@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import meshio
@@ -10,7 +11,6 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, agree
-from softgrasp.fem.mesh.arrays import Floats, Integers, MeshArrays, Sets, Tags
 from softgrasp.fem.mesh.cells import (
     check_interfaces,
     check_straight,
@@ -20,12 +20,52 @@ from softgrasp.fem.mesh.cells import (
     shape_of,
     simplices,
 )
-from softgrasp.fem.mesh.check import check_cells
+from softgrasp.fem.mesh.check import (
+    SEAM,
+    Parts,
+    check_cells,
+    doubled_nodes,
+    doubled_text,
+    find_parts,
+    hanging_nodes,
+    hanging_text,
+    sort_facets,
+)
 from softgrasp.fem.mesh.foreign import read_foreign
-from softgrasp.fem.mesh.parts import find_parts
-from softgrasp.fem.mesh.seams import SEAM, doubled_nodes, doubled_text, hanging_nodes, hanging_text, sort_facets
-from softgrasp.fem.mesh.spread import Marks, spread
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, spread
+from softgrasp.fem.sealed import digest
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Tags = npt.NDArray[np.int32]
+Sets = dict[int | str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """A simplex mesh in arrays, before distribution."""
+
+    points: Floats  # shape (n_points, d) [m]
+    cells: Integers  # shape (n_cells, d + 1)
+    cell_tags: Tags | None  # one integer a cell, or None
+    facets: Integers  # tagged facets, shape (n_facets, d)
+    facet_tags: Tags | None  # one integer a tagged facet, or None
+    part_tags: Tags | None  # number of the facet-connected part of each cell, or None if there is one part only
+    parts: Parts | None  # what is known of these parts, or None
+    facet_sets: Sets  # marks in ``facet_tags`` of each tag number and named set
+    cell_sets: Sets  # marks in ``cell_tags`` of each tag number and named set
+    notes: tuple[str, ...] = ()  # warnings, one sentence each
+
+    def digest(self) -> str:
+        """SHA-256 of coordinates, cells, tags and sets, which some formats spread over several files; 64 hex digits."""
+        sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (self.cell_sets, self.facet_sets)]
+        return digest(self.points, self.cells, self.cell_tags, self.facets, self.facet_tags, *sets)
+
+
+def _text(sets: Sets) -> str:
+    """The same for equal sets, in whatever order they were read."""
+    return repr(sorted((repr(name), tuple(int(mark) for mark in marks)) for name, marks in sets.items()))
+
 
 _MARKS = ("facets", "cells", "parts")
 _TAG_NAMES = ("gmsh:physical", "medit:ref", "CellEntityIds")  # preferred names of integer cell data
@@ -49,8 +89,6 @@ def read_mesh(
     Collective. Rank 0 reads and checks.
 
     Args:
-        comm: communicator of the mesh.
-        path: mesh file in any format of meshio.
         scale: factor of all coordinates, e.g. 1e-3 for a file in millimetres.
         repair: turn inverted cells round instead of refusing them, and join doubled nodes instead of warning of them.
         seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].

@@ -50,9 +50,7 @@ def structured_mesh(
     Collective.
 
     Args:
-        comm: communicator of the mesh.
         size: side lengths, 2 or 3 positive numbers [m].
-        cells: cells per side.
         origin: lower corner [m]; zero if None or empty.
 
     Raises:

@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from softgrasp.fem.errors import MeshError, SceneError, agree
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.check import counted, place_text
-from softgrasp.fem.mesh.parts import Parts
+from softgrasp.fem.mesh.check import Parts, counted, place_text
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.scene.scene import Contact
 
@@ -75,9 +74,6 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
 
     Collective.
 
-    Args:
-        facets: owned contact facets, from `contact_facets`.
-
     Raises:
         MeshError: parts that share no node with the rest have no contact facet, or parts are joined to the rest
             by so few nodes that they can turn.
@@ -110,7 +106,6 @@ def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
 
     Args:
         held: whether a part has a contact facet, shape (n_parts,).
-        source: name of the mesh, for messages.
 
     Raises:
         MeshError: see `held_check`.
@@ -195,8 +190,6 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
     (-y, x, 0) in 3D.
 
     Args:
-        points: coordinates, shape (n_nodes, 2 or 3) [m].
-        rotation: append the rotations.
         reference: point the hand turns about, ``dimension`` entries [m].
 
     Returns:

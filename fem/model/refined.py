@@ -17,11 +17,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.bisect import bisect_to, distribute
-from softgrasp.fem.mesh.check import longest_edges
-from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField
-from softgrasp.fem.mesh.lines import box_axes, box_of_lines, even_cells
+from softgrasp.fem.mesh.check import longest_edges, sort_facets
+from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField, box_axes, box_of_lines, even_cells
 from softgrasp.fem.mesh.make import make_mesh
-from softgrasp.fem.mesh.seams import sort_facets
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.assembly import cells_of_layers
@@ -60,9 +58,6 @@ def by_lines(scene: Scene) -> bool:
 
 def refined_mesh(comm: MPI.Intracomm, scene: Scene, tolerance: float | None = None) -> TissueMesh:
     """The a-priori mesh of a scene with `[tissue.refine]`. Collective; rank 0 bisects.
-
-    Args:
-        tolerance: instead of the scene's.
 
     Raises:
         SceneError: even the coarsest mesh has more than ``tissue.refine.most`` unknowns.
@@ -203,9 +198,6 @@ def _too_large(refine: Refine, count: int) -> SceneError:
 
 def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     """Singular ends of a scene's body, on all ranks; rank 0 looks at the whole mesh. Collective.
-
-    Args:
-        tissue: the mesh of the scene.
 
     Raises:
         MeshError: the mesh file cannot be read again.

@@ -25,7 +25,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, PETSc, total
-from softgrasp.fem.solve.held import held_operators
+from softgrasp.fem.solve.order import held_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from softgrasp.fem.system import BlockSystem
 
@@ -107,9 +107,6 @@ class TissueMidpoint:
     the state.
 
     Args:
-        system: operators.
-        dt: step [s].
-        solver: name of the linear solver.
         rtol: tolerance of an iterative solver.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 

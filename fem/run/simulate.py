@@ -17,10 +17,18 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
-from softgrasp.fem.run.drive import Drive, Force, ForceDrive, TableDrive, force_taken
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.midpoint import make_midpoint
-from softgrasp.fem.run.motion import driven_table, force_values, motion_table
+from softgrasp.fem.run.motion import (
+    Drive,
+    Force,
+    ForceDrive,
+    TableDrive,
+    driven_table,
+    force_taken,
+    force_values,
+    motion_table,
+)
 from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
@@ -50,8 +58,6 @@ class Run(Stepped):
     """One run in progress: the TS context and what it carries.
 
     Args:
-        model: the model.
-        options: where files go, and whether to resume.
         force: feedback force on the hand; None takes the scene's motion.
 
     Attributes:

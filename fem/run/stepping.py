@@ -20,9 +20,6 @@ class Stepped(ABC):
     """A run whose steps TS counts.
 
     Args:
-        layout: sizes and ownership.
-        dt: step [s].
-        steps: number of steps.
         midpoint: factored step.
         store: where the states go.
         solver: name and reason.

@@ -189,7 +189,6 @@ def make_solver(
     Args:
         S: symmetric positive definite, owned by the solver from here on.
         name: cholesky (PETSc, every rank by itself), mumps (see ``reproducible``) or cg (GAMG [VMB96]).
-        layout: sizes and node coordinates.
         rtol: relative tolerance of cg.
         reproducible: see :func:`factor_on_every_rank`.
         ordered: cholesky, S on one rank: its rows are in the order of elimination already, in blocks (BAIJ).

@@ -31,7 +31,6 @@ from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.inner import Rows, Weight
 from softgrasp.reduction.bases.pod import pod_part
 from softgrasp.reduction.bases.states import BasisError
-from softgrasp.reduction.bases.truncation import Columns
 from softgrasp.reduction.galerkin import symmetric
 from softgrasp.reduction.model import Lift, ModelError
 from softgrasp.reduction.online import ReducedTrajectory
@@ -208,10 +207,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
         q, p = (float(layout.comm.allreduce(np.vdot(Y, times_columns(system.M_ee, Y)))) for Y in (X, V))
         X = np.asfortranarray(np.hstack([X, V * (q / p) ** 0.5 if p > 0 else V]))
     rows, mass = Rows(layout, 1, hand=False), Weight(system.M_hand, system.M_ee)
-    empty = np.zeros((0, 0))
-    part = pod_part(
-        "deformation", rows, X, (mass,), "tsqr", lambda halves: Columns(empty, empty, halves[0][1], empty), k
-    )
+    part = pod_part("deformation", rows, X, (mass,), "tsqr", (0,), k)
     if k > part.rank:
         most = 2 * (layout.n_s + part.rank)
         raise BasisError(f"more displacements than the snapshots carry above rounding; ask for N <= {most}", most=most)

@@ -11,8 +11,7 @@ import numpy as np
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.run.drive import Force
-from softgrasp.fem.run.motion import motion_table
+from softgrasp.fem.run.motion import Force, motion_table
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene

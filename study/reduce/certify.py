@@ -31,9 +31,7 @@ from softgrasp.reduction.certified.trainer import (
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
 from softgrasp.study.reduce.certify_check import BoxCheck, check_box
-from softgrasp.study.reduce.result import head_of
-from softgrasp.study.report.files import to_json
-from softgrasp.study.report.origin import peak_memory_mb
+from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -153,7 +151,6 @@ def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | No
     first, comm = model.system.materials[0], model.system.layout.comm
     with watch.stage("full"):
         full = run_at(model, first.lam, first.mu)
-    head, _ = head_of(model, full.trajectory)
     run = certified.run(allow=True)
     assert certified.drive is not None
     query = median_seconds(comm, lambda: certified.run(allow=True), REPEATS)
@@ -170,25 +167,21 @@ def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | No
         "sentence": certificate.sentence(),
         "reasons": certificate.reasons,
     }
-    result = head | {
-        "certified": {
-            "k": certified.k,
-            "N": certified.coarse.N,
-            "k2": certified.k2,
-            "N2": certified.fine.N,
-            "certify": certified.certify,
-            "tolerance": certified.tolerance,
-            "norm": certified.norm,
-            "box": asdict(certified.box) if certified.box is not None else None,
-            "mesh": None if certified.mesh is None else asdict(certified.mesh),
-            "own": own,
-            **{key: value for key, value in training.items() if key not in ("known", "points", "key")},
-        },
-        "tests": None if check is None else asdict(check),
-        "time": {**watch.seconds, "query": query},
-        "memory_peak_mb": peak_memory_mb(comm),
+    about = {
+        "k": certified.k,
+        "N": certified.coarse.N,
+        "k2": certified.k2,
+        "N2": certified.fine.N,
+        "certify": certified.certify,
+        "tolerance": certified.tolerance,
+        "norm": certified.norm,
+        "box": asdict(certified.box) if certified.box is not None else None,
+        "mesh": None if certified.mesh is None else asdict(certified.mesh),
+        "own": own,
+        **{key: value for key, value in training.items() if key not in ("known", "points", "key")},
     }
-    return dict(to_json(result))
+    tests = None if check is None else asdict(check)
+    return reduce_result(full, {"certified": about, "tests": tests}, {**watch.seconds, "query": query})
 
 
 def tests_table(check: BoxCheck) -> Table:

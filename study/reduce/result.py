@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.bases.registry import Method
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.replay import FullRun
 from softgrasp.study.forward.result import simulate_result
+from softgrasp.study.report.files import to_json
+from softgrasp.study.report.origin import peak_memory_mb
 
 COMPARED = 14  # N at which methods are compared: the paper's
 KEPT = ("scene", "scene_hash", "version", "ranks", "machine", "n_s", "n_e", "states", "cells", "steps", "dt", "solver")
 LARGER = 30  # N of the second model that is tested at other parameters
+N_NOTE = (
+    "N counts all columns of V for every method, as in the paper, also the hand's own 2 n_s of bases with fixed solid "
+    "modes. V_e: those without the hand's (N_tissue), for componentwise POD displacements + velocities."
+)
 
 
 @dataclass(frozen=True)
@@ -58,19 +62,26 @@ class MethodSweep:
     N_energy: int | None = None  # N that keeps the scene's share of the energy; None without snapshots
     inner: str = ""  # inner product of the bases
 
+    @property
+    def about(self) -> dict[str, Any]:
+        """One entry of "about" in ``result.json``."""
+        return {
+            "title": self.method.title,
+            "paper": self.method.paper,
+            "structure_preserving": self.method.preserving,
+            "inner": self.inner,
+            "N_energy": self.N_energy,
+            "N_refused": {N: f"N = {N}: {reason}" for N, reason in self.refused.items()},
+        }
+
 
 @dataclass(frozen=True)
 class TestedModel:
     """One reduced model that is tested at other parameters."""
 
     method: Method  # of its basis
-    several: bool  # whether runs at several parameters trained it
+    several: bool  # whether runs at several parameters trained it; with the same method the bases are nested
     model: ReducedModel  # itself
-
-    @property
-    def family(self) -> tuple[str, bool]:
-        """Models of one family have nested bases."""
-        return self.method.key, self.several
 
 
 @dataclass(frozen=True)
@@ -107,6 +118,17 @@ class BoxTests:
     ranges: tuple[Sequence[float], Sequence[float]] = ((), ())  # of lambda and mu [Pa]
     none: str = ""  # why there are no tests; empty when there are
 
+    def to_json(self) -> dict[str, Any]:
+        """The entry "box" in ``result.json``."""
+        models = [{"method": m.method.key, "N": m.model.N, "several": m.several} for m in self.models]
+        points = [
+            {"lambda": p.lam, "mu": p.mu, "trained": p.trained}
+            | {"errors": [m | {"error_deformation": e} for m, e in zip(models, p.errors, strict=True)]}
+            for p in self.points
+        ]
+        summary = [asdict(e) for e in self.summary]
+        return {"reason_for_none": self.none, "trained_at": self.trained_at, "summary": summary, "points": points}
+
 
 @dataclass(frozen=True)
 class FullTimes:
@@ -122,6 +144,10 @@ class FullTimes:
         """
         whole, new = self.factor + self.steps, setup + online
         return self.steps / online, whole / new, offline / (whole - new) if whole > new else None
+
+    def to_json(self) -> dict[str, float]:
+        """In "time" of ``result.json``."""
+        return {"full_steps_median": self.steps, "full_factor_median": self.factor}
 
 
 @dataclass(frozen=True)
@@ -139,8 +165,12 @@ class Speed:
         """One entry of "speed" in ``result.json``."""
         keys = ("N", "N_tissue", "stable", "time_offline", "time_setup", "time_online")
         pays = ("speedup_same_model", "speedup_new_parameter", "break_even_runs")
-        numbers = {key: getattr(self.point, key) for key in keys} | {key: getattr(self, key) for key in pays}
-        return {"method": self.method.key, "title": self.method.title, **numbers}
+        return {
+            "method": self.method.key,
+            "title": self.method.title,
+            **{key: getattr(self.point, key) for key in keys},
+            **{key: getattr(self, key) for key in pays},
+        }
 
 
 @dataclass(frozen=True)
@@ -155,12 +185,37 @@ class ReductionStudy:
     findings: tuple[str, ...]  # what the numbers show, in sentences
     speed_notes: tuple[str, ...]  # what the times are measured against
 
+    def result(self, seconds: dict[str, float]) -> dict[str, Any]:
+        """The keys of ``result.json``; ``seconds`` of the stages. Collective."""
+        full, stages = self.full.trajectory.seconds, ("mesh", "assembly", "factor", "steps", "per_step")
+        return reduce_result(
+            self.full,
+            {
+                "N_means": N_NOTE,
+                "methods": {s.method.key: [asdict(p) for p in s.points] for s in self.sweeps},
+                "about": {s.method.key: s.about for s in self.sweeps},
+                "findings": self.findings,
+                "speed": [speed.to_json() for speed in self.speeds],
+                "speed_notes": self.speed_notes,
+                "box": self.box.to_json(),
+            },
+            {key: full[key] for key in stages} | self.times.to_json() | seconds,
+        )
 
-def head_of(model: Model, run: Trajectory) -> tuple[dict[str, Any], dict[str, Any]]:
-    """First keys of ``result.json``, and the seconds of a full run. Collective."""
-    whole = simulate_result(model, run).to_json()
-    options = model.scene.reduction.model_dump(mode="json")
-    return {"command": "reduce", **{key: whole[key] for key in KEPT}, "reduction": options}, whole["time"]
+
+def reduce_result(full: FullRun, own: dict[str, Any], seconds: dict[str, float]) -> dict[str, Any]:
+    """``result.json`` of any reduction: scene and sizes of the full run, what is its own, times, memory. Collective."""
+    model = full.model
+    whole = simulate_result(model, full.trajectory).to_json()
+    return dict(
+        to_json(
+            {"command": "reduce"}
+            | {key: whole[key] for key in KEPT}
+            | {"reduction": model.scene.reduction.model_dump(mode="json")}
+            | own
+            | {"time": seconds, "memory_peak_mb": peak_memory_mb(model.system.layout.comm)}
+        )
+    )
 
 
 def nearest(points: Sequence[Point], N: int = COMPARED, stable: bool = True) -> int | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -12,32 +12,20 @@ from rich.progress import MofNCompleteColumn, Progress
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import Run
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
-from softgrasp.reduction.replay import FullRun
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.reduce import tables
-from softgrasp.study.reduce.box import measure_box
 from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.page import sections
-from softgrasp.study.reduce.result import BoxTests, FullTimes, MethodSweep, ReductionStudy, best, head_of
-from softgrasp.study.reduce.sweep import chosen_methods, sweep
-from softgrasp.study.reduce.times import measured_run, speed_notes, speed_of
+from softgrasp.study.reduce.result import N_NOTE, MethodSweep, ReductionStudy, best
+from softgrasp.study.reduce.sweep import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
 from softgrasp.study.reduce.views import gather_views
-from softgrasp.study.report.files import to_json
-from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 
 def check_scene(scene: Scene) -> tuple[str, ...]:
-    """Methods of the scene.
-
-    Raises:
-        SceneError: the scene keeps no snapshots that a basis could be built from.
-        BasisError: a method is unknown.
-    """
+    """Methods of the scene. Raises SceneError: it keeps no snapshots for a basis. BasisError: a method is unknown."""
     if scene.output.snapshots != "memory":
         raise SceneError(
             f"output.snapshots is '{scene.output.snapshots}'; it must be 'memory' for a reduction, which builds its "
@@ -77,18 +65,17 @@ def run_reduce(
         from softgrasp.study.reduce.strain_run import run_strain  # models of another kind
 
         return run_strain(session, scene)
-    model = session.model(scene)
-    watch = Stopwatch(session.comm)
+    model, watch = session.model(scene), Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
         study, drawn = reduce_model(session, model, names, bar, watch)
     with watch.stage("models"):
         models = save_models(out, study.sweeps)
-    result = reduce_result(study, watch)
+    result = study.result(watch.seconds)
 
     def page() -> Page:
         files = drawn()
-        parts = sections(study, files)
         points = {"points.csv": tables.point_table(study)}
+        parts = tables.sections(study, files)
         return Page(f"{scene.name}: reduced models", tables.summary(study), parts, points, [*files, *models])
 
     show(console, study)
@@ -102,56 +89,35 @@ def reduce_model(
     """Full run, every method, errors over the box, beside which pictures are drawn. Collective.
 
     Returned with the study: what waits for the pictures on rank 0.
-
-    Raises:
-        SolverError: a solve failed or a factorisation did.
-        ResourceError: the snapshots do not fit.
     """
-    scene = model.scene
-    task = bar.add_task("full run", total=scene.time.steps)
+    options, task = model.scene.reduction, bar.add_task("full run", total=None)
+    size = len(options.N)
 
-    def stepped(run: Run) -> None:
-        bar.update(task, completed=run.reached)
+    def say(what: str, done: int, of: int) -> None:
+        bar.update(task, description=what, completed=done, total=of)
+
+    def swept(i: int, done: int, of: int) -> None:
+        say(names[i], size * i + size * done // of, size * len(names))
 
     with watch.stage("full"):
-        full, times = measured_run(model, stepped)
-    bar.remove_task(task)
-    size = len(scene.reduction.N)
-    task = bar.add_task("bases", total=size * len(names))
-    sweeps: list[MethodSweep] = []
+        full, times = measured_run(model, lambda run: say("full run", run.reached, run.steps))
     with watch.stage("sweep"):
-        for name in names:
+        sweeps = tuple(sweep(name, full, options, partial(swept, i)) for i, name in enumerate(names))
+    drawn: Callable[[], list[Path]] = list
+    if session.pictures:
+        views = gather_views(model, full, sweeps)
 
-            def reduced(key: str, done: int, of: int) -> None:
-                bar.update(task, completed=size * len(sweeps) + size * done // of, description=key)
+        def draw_all(folder: Path) -> list[Path]:
+            from softgrasp.study.reduce.plots import draw  # brings Matplotlib
 
-            sweeps.append(sweep(name, full, scene.reduction, reduced))
-            bar.update(task, completed=size * len(sweeps))
-    bar.remove_task(task)
-    drawn = _drawn(session, full, sweeps, times)
-    task = bar.add_task("other parameters", total=None)
+            return draw(folder, sweeps, times.steps, views)
+
+        drawn = beside(session.comm, session.out, draw_all)
     with watch.stage("box"):
-        box = measure_box(full, sweeps, lambda done, of: bar.update(task, completed=done, total=of))
-    bar.remove_task(task)
+        box = measure_box(full, sweeps, partial(say, "other parameters"))
     speeds = tuple(speed for s in sweeps if (speed := speed_of(s, times)) is not None)
-    notes = speed_notes(model.system.layout.n_e, scene.time.steps, times, speeds)
-    return ReductionStudy(full, tuple(sweeps), times, speeds, box, findings(sweeps), notes), drawn
-
-
-def _drawn(
-    session: Session, full: FullRun, sweeps: Sequence[MethodSweep], times: FullTimes
-) -> Callable[[], list[Path]]:
-    """Begin to draw on rank 0. Collective."""
-    if not session.pictures:
-        return list
-    views = gather_views(full.model, full, sweeps)
-
-    def draw_all(out: Path) -> list[Path]:
-        from softgrasp.study.reduce.pictures import draw  # brings Matplotlib
-
-        return draw(out, sweeps, times.steps, views)
-
-    return beside(session.comm, session.out, draw_all)
+    notes = speed_notes(model.system.layout.n_e, model.scene.time.steps, times, speeds)
+    return ReductionStudy(full, sweeps, times, speeds, box, findings(sweeps), notes), drawn
 
 
 def save_models(out: Path, sweeps: Sequence[MethodSweep]) -> list[Path]:
@@ -165,65 +131,11 @@ def save_models(out: Path, sweeps: Sequence[MethodSweep]) -> list[Path]:
     return files
 
 
-def reduce_result(study: ReductionStudy, watch: Stopwatch) -> dict[str, Any]:
-    """The keys of ``result.json``. Collective."""
-    model = study.full.model
-    head, seconds = head_of(model, study.full.trajectory)
-    result = head | {
-        "N_means": tables.N_NOTE,
-        "methods": {s.method.key: [asdict(p) for p in s.points] for s in study.sweeps},
-        "about": {s.method.key: _about(s) for s in study.sweeps},
-        "findings": study.findings,
-        "speed": [speed.to_json() for speed in study.speeds],
-        "speed_notes": study.speed_notes,
-        "box": _box_result(study.box),
-        "time": {
-            **{key: seconds[key] for key in ("mesh", "assembly", "factor", "steps", "per_step")},
-            "full_steps_median": study.times.steps,
-            "full_factor_median": study.times.factor,
-            **watch.seconds,
-        },
-        "memory_peak_mb": peak_memory_mb(model.system.layout.comm),
-    }
-    return dict(to_json(result))
-
-
-def _about(s: MethodSweep) -> dict[str, Any]:
-    return {
-        "title": s.method.title,
-        "paper": s.method.paper,
-        "structure_preserving": s.method.preserving,
-        "inner": s.inner,
-        "N_energy": s.N_energy,
-        "N_refused": {N: f"N = {N}: {reason}" for N, reason in s.refused.items()},
-    }
-
-
-def _box_result(box: BoxTests) -> dict[str, Any]:
-    models = [{"method": m.method.key, "N": m.model.N, "several": m.several} for m in box.models]
-    return {
-        "reason_for_none": box.none,
-        "trained_at": box.trained_at,
-        "summary": [asdict(e) for e in box.summary],
-        "points": [
-            {
-                "lambda": p.lam,
-                "mu": p.mu,
-                "trained": p.trained,
-                "errors": [m | {"error_deformation": e} for m, e in zip(models, p.errors, strict=True)],
-            }
-            for p in box.points
-        ],
-    }
-
-
 def show(console: Console, study: ReductionStudy) -> None:
     """Print the tables."""
     energy, box = study.full.model.scene.reduction.energy, study.box
     _print(console, tables.error_table(study.sweeps, energy, narrow=True))
-    note = (
-        f"{tables.error_note(energy)} fixed: with fixed solid modes. {tables.N_NOTE} {tables.inner_note(study.sweeps)}"
-    )
+    note = f"{tables.error_note(energy)} fixed: with fixed solid modes. {N_NOTE} {tables.inner_note(study.sweeps)}"
     console.print(note, style="dim", markup=False)
     for sentence in study.findings:
         console.print(sentence, markup=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -16,12 +16,12 @@ from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.compare import Reference, errors_of, reference_of
-from softgrasp.reduction.strain.model import StrainModel
+from softgrasp.reduction.strain.model import StrainModel, TrainedBox
 from softgrasp.reduction.strain.training import Training, replay_strain, train
 from softgrasp.study.reduce.result import FullTimes
-from softgrasp.study.reduce.strain_result import StrainFamily, StrainPoint, StrainStudy, Test
 from softgrasp.study.shell.timing import median_seconds
 
+TITLES = {"own": "trained on the scene's run", "box": "trained over the box"}
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
 CELLS_AT = (14, 24)  # N at which tau is varied
 TAUS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
@@ -35,28 +35,89 @@ Place = tuple[float, float]
 Say = Callable[[str, int, int], None]
 """Called with what is done, its number and how many there are."""
 
+HeldOut = tuple[str, FullRun]
+"""A full run that trained no model, after what is new in it: "material" or "motion"."""
+
 
 @dataclass(frozen=True)
-class HeldOutRun:
-    """A full run that trained no model."""
+class StrainPoint:
+    """One model; errors are relative and in z unless they say otherwise, times in seconds."""
 
-    kind: str
-    full: FullRun
+    N: int  # N, k: dimension with the hand's 2 n_s, and displacements
+    k: int
+    tau: float  # tau, residual: of the weights, asked for and reached
+    residual: float
+    cells: int  # that carry a weight
+    # error_own, error_own_velocity, error_own_energy_norm: on the scene's own run, which trained the model: of z, of v
+    # in M_ee, of (z, v) in (z'K_ee z + v'M_ee v)^(1/2)
+    error_own: float
+    error_own_velocity: float
+    error_own_energy_norm: float
+    error_training: float  # over all training runs
+    error_galerkin: float  # the same of the model on all cells
+    floor: float  # of the basis, on the scene's own run
+    error_materials: float | None  # error_materials, error_motions: largest on held-out runs; None without any
+    error_motions: float | None
+    # largest change of the model's own energy that neither load nor damping explains, over all training runs
+    drift: float
+    evaluations: float  # of the force in a step
+    engine: str  # of the stepper, "C" or "NumPy"
+    time_offline: float  # basis, model on all cells, forces and weights, after the full runs
+    time_setup: float  # time_setup, time_online: a new parameter before its run, and a run
+    time_online: float
+
+
+@dataclass(frozen=True)
+class Test:
+    """A full run that trained no model of its family."""
+
+    kind: str  # "material" or "motion", whichever is new
+    lam: float  # lam, mu: of the first layer [Pa]
+    mu: float
+    target: tuple[float, ...]  # where the hand ends [m]
+    errors: dict[int, float | None]  # in z by N; None where the model refuses the run or fails
+
+
+@dataclass(frozen=True)
+class StrainFamily:
+    """Models of all N from the same training runs."""
+
+    key: str  # "own", the scene's run alone, or "box", runs at other materials and motions too
+    box: TrainedBox  # what they answer for
+    runs: int  # full runs that trained them
+    points: tuple[StrainPoint, ...]  # with tau from the model on all cells, one for each N
+    curves: tuple[StrainPoint, ...]  # those, and others of some N with given tau
+    tests: tuple[Test, ...]  # held-out runs
+    models: dict[int, StrainModel]  # those of ``points`` by N
+    refused: dict[int, str]  # reason by N
+
+
+@dataclass(frozen=True)
+class StrainStudy:
+    """All that is measured."""
+
+    full: FullRun  # the scene's own full run
+    families: tuple[StrainFamily, ...]  # one or two
+    times: FullTimes  # of the full run
+    linear: float  # error in z of linear elasticity on the same scene
+    none: str  # why there are no runs at other materials; empty when there are
+
+    def speed_up(self, p: StrainPoint) -> tuple[float, float, float | None]:
+        """See :meth:`softgrasp.study.reduce.result.FullTimes.against`."""
+        return self.times.against(p.time_offline, p.time_setup, p.time_online)
 
 
 def measure_strain(model: Model, own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
     """Train, test and time. Collective.
 
-    Raises:
-        SolverError: a full or a reduced run did not converge.
-        ReductionError: the snapshots carry no model.
+    Raises SolverError: a run did not converge. ReductionError: the snapshots carry no model.
     """
     sizes = sizes_of(model)
     box_runs, held, none = _box_runs(model, own, say)
     first, near = model.system.materials[0], []
     for share in SHARES if _has_target(model) else ():
         target = [share * x for x in model.scene.motion.target or []]
-        near.append(HeldOutRun("motion", _full(model, (first.lam, first.mu), target)))
+        near.append(("motion", _full(model, (first.lam, first.mu), target)))
     families = []
     for key, runs, tests in (("own", [own], near), ("box", box_runs, held)):
         if len(runs) > 1 or key == "own":
@@ -95,7 +156,7 @@ def _full(model: Model, place: Place, target: list[float] | None) -> FullRun:
         ) from error
 
 
-def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list[HeldOutRun], str]:
+def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list[HeldOut], str]:
     """Training runs over the box of materials and motions, held-out runs inside it, and why there are none."""
     reason, first = outside(model), model.system.materials[0]
     places = [] if reason else training_of(model)
@@ -108,12 +169,11 @@ def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list
         jobs += [("material", place, None) for place in tests if not np.allclose(place, here)]
     if targets:
         jobs += [("motion", here, target) for target in _inside(model)]
-    done: list[HeldOutRun] = []
+    done: list[HeldOut] = []
     for i, (kind, place, target) in enumerate(jobs):
         say("full runs", i, len(jobs))
-        done.append(HeldOutRun(kind, _full(model, place, target)))
-    held = [h for h in done if h.kind != "train"]
-    return [own, *(h.full for h in done if h.kind == "train")], held, reason
+        done.append((kind, _full(model, place, target)))
+    return [own, *(full for kind, full in done if kind == "train")], [h for h in done if h[0] != "train"], reason
 
 
 def _has_target(model: Model) -> bool:
@@ -129,7 +189,7 @@ def _inside(model: Model) -> list[list[float]]:
 
 
 def _family(
-    key: str, model: Model, runs: Sequence[FullRun], held: Sequence[HeldOutRun], sizes: Sequence[int], say: Say
+    key: str, model: Model, runs: Sequence[FullRun], held: Sequence[HeldOut], sizes: Sequence[int], say: Say
 ) -> StrainFamily:
     refused: dict[int, str] = {}
     training = None
@@ -141,39 +201,39 @@ def _family(
             refused[N] = error.reason
     if training is None:
         raise ReductionError(f"no N of {list(sizes)} fits: {'; '.join(refused.values())}")
-    references = [reference_of(h.full, training.Phi) for h in held]
+    references = [reference_of(full, training.Phi) for _, full in held]
     fitting = [N for N in sizes if N not in refused]
-    points, curves, models = [], [], {}
+    points, curves, models, missed = [], [], {}, {}
     for i, N in enumerate(fitting):
         say(f"models trained on {len(runs)} run(s)", i, len(fitting))
         try:
             roms = training.family(N, [None, *TAUS] if N in CELLS_AT else [None])
-            points.append(_measure(training, roms[0], held, references))
+            missed[N] = _missed(roms[0], held, references)
+            points.append(_measure(training, roms[0], held, missed[N]))
         except SolverError as error:  # on all cells, or on those sampled by default
             refused[N] = str(error)
             continue
         models[N] = roms[0]
         for rom in roms[1:]:
             with suppress(SolverError):  # a model of few cells may fail, and has no error then
-                curves.append(_measure(training, rom, held, references))
+                curves.append(_measure(training, rom, held, _missed(rom, held, references)))
     if not points:
         raise ReductionError(f"no N of {list(sizes)} gives a model: {'; '.join(refused.values())}")
-    curves += points
-    tests = tuple(_test(h, reference, models.values()) for h, reference in zip(held, references, strict=True))
-    return StrainFamily(key, training.whole.box, len(runs), tuple(points), tuple(curves), tests, models, refused)
+    tests = tuple(_test(*h, {N: missed[N][j] for N in models}) for j, h in enumerate(held))
+    whole = (*curves, *points)
+    return StrainFamily(key, training.whole.box, len(runs), tuple(points), whole, tests, models, refused)
 
 
 def _measure(
-    training: Training, rom: StrainModel, held: Sequence[HeldOutRun], references: Sequence[Reference]
+    training: Training, rom: StrainModel, held: Sequence[HeldOut], missed: Sequence[float | None]
 ) -> StrainPoint:
     """Errors on training runs and on held-out ones, drift, times."""
     pairs = list(zip(training.references, training.runs, strict=True))
     done = [replay_strain(rom, run, outside=True) for _, run in pairs]
     trained = errors_of([r.missed(x.a, x.v) for (r, _), x in zip(pairs, done, strict=True)])
     own = training.references[0].errors(done[0].a, done[0].v)
-    errors = [(h.kind, _error(rom, h, r)) for h, r in zip(held, references, strict=True)]
-    worst = {key: max((e for kind, e in errors if kind == key and e is not None), default=None)
-             for key in ("material", "motion")}  # fmt: skip
+    worst = {key: max((e for (kind, _), e in zip(held, missed, strict=True) if kind == key and e is not None),
+                      default=None) for key in ("material", "motion")}  # fmt: skip
     full, comm = training.runs[0], training.model.system.layout.comm
     small = rom.at(full.dt, outside=True)  # few cells may overshoot
     start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
@@ -190,16 +250,19 @@ def _measure(
     )  # fmt: skip
 
 
-def _error(rom: StrainModel, held: HeldOutRun, reference: Reference) -> float | None:
-    """Error in z on a held-out run; None where the model refuses it or fails."""
-    try:
-        run = replay_strain(rom, held.full)
-    except (ReductionError, SolverError):
-        return None
-    return reference.errors(run.a, run.v).z
+def _missed(rom: StrainModel, held: Sequence[HeldOut], references: Sequence[Reference]) -> list[float | None]:
+    """Errors in z on held-out runs; None where the model refuses one or fails."""
+    errors: list[float | None] = []
+    for (_, full), reference in zip(held, references, strict=True):
+        try:
+            run = replay_strain(rom, full)
+        except (ReductionError, SolverError):
+            errors.append(None)
+        else:
+            errors.append(reference.errors(run.a, run.v).z)
+    return errors
 
 
-def _test(held: HeldOutRun, reference: Reference, models: Iterable[StrainModel]) -> Test:
-    first = held.full.model.system.materials[0]
-    target = tuple(held.full.trajectory.q_s[-1].tolist())
-    return Test(held.kind, first.lam, first.mu, target, {m.N: _error(m, held, reference) for m in models})
+def _test(kind: str, full: FullRun, errors: dict[int, float | None]) -> Test:
+    first = full.model.system.materials[0]
+    return Test(kind, first.lam, first.mu, tuple(full.trajectory.q_s[-1].tolist()), errors)

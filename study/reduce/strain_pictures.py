@@ -17,9 +17,7 @@ from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
 from softgrasp.study.reduce.plots import FULL
-from softgrasp.study.reduce.strain_measure import CELLS_AT
-from softgrasp.study.reduce.strain_page import TITLES
-from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy
+from softgrasp.study.reduce.strain_measure import CELLS_AT, TITLES, StrainPoint, StrainStudy
 
 
 def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Path]:

@@ -1,8 +1,11 @@
-"""``softgrasp reduce`` on a scene with effects.finite_strain."""
+"""``softgrasp reduce`` on a scene with effects.finite_strain: run, tables, sentences, page."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +15,34 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
-from softgrasp.study.reduce.result import head_of
-from softgrasp.study.reduce.strain_measure import measure_strain
-from softgrasp.study.reduce.strain_page import cell_table, error_table, sections, sentences, summary, time_table
-from softgrasp.study.reduce.strain_result import StrainPoint, StrainStudy
-from softgrasp.study.reduce.times import measured_run
-from softgrasp.study.report.files import to_json
-from softgrasp.study.report.origin import peak_memory_mb
+from softgrasp.study.reduce.result import reduce_result
+from softgrasp.study.reduce.strain_measure import (
+    CELLS_AT,
+    TITLES,
+    StrainFamily,
+    StrainPoint,
+    StrainStudy,
+    measure_strain,
+)
+from softgrasp.study.reduce.sweep import measured_run
+from softgrasp.study.reduce.tables import TIMES, time_cells
+from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
+
+CAPTIONS = {
+    "strain_errors.png": "Error of the deformation z against N, and against the number of sampled cells at some N. "
+    "Filled: over the runs that trained the models; open: largest of the held-out runs. Dotted: the same models on all "
+    "cells. Grey: linear elasticity on the same scene.",
+    "cells.png": "Cells that the models evaluate, and their weights: for how many cells of the body each of them is. "
+    "In 3D a dot stands for a cell.",
+}
+NOTE = (
+    "N counts the hand's 2 n_s, as for linear models. cells: those with a weight. own: error of z on the scene's own "
+    "run, which trained the model; energy: of (z, v) in the energy norm. all cells: error of z over the training runs "
+    "without sampling. new material, new motion: largest error of z on full runs inside the box that trained no model; "
+    "-: there are none, or the model refuses them. drift: of the model's own energy."
+)
 
 
 def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
@@ -31,7 +53,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         )
     model, watch = session.model(scene), Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
-        task = bar.add_task("full run", total=scene.time.steps)
+        task = bar.add_task("full run", total=None)
 
         def say(what: str, done: int, of: int) -> None:
             bar.update(task, description=what, completed=done, total=of)
@@ -41,8 +63,9 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         with watch.stage("reduced"):
             study = measure_strain(model, full, times, say)
     last = study.families[-1]
-    models = [session.out / "models" / f"{f.key}_N{N}.h5" for f in study.families for N in f.models]
-    for path, rom in zip(models, [rom for f in study.families for rom in f.models.values()], strict=True):
+    folder = session.out / "models"
+    models = {folder / f"{f.key}_N{N}.h5": rom for f in study.families for N, rom in f.models.items()}
+    for path, rom in models.items():
         save(rom, path)
     picture = None
     if session.pictures:
@@ -50,11 +73,11 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         from softgrasp.study.reduce.strain_pictures import draw  # brings Matplotlib
 
         picture = gather_picture(model)
-    result = strain_result(study, watch)
+    result = strain_result(study, watch.seconds)
 
     def page() -> Page:
         files = draw(session.out, study, picture) if session.pictures else []
-        names = tuple(StrainPoint.__dataclass_fields__)
+        names = tuple(field.name for field in fields(StrainPoint))
         rows = [(f.runs, *asdict(p).values()) for f in study.families for p in f.curves]
         points = {"points.csv": Table(("runs", *names), rows)}
         title = f"{scene.name}: reduced models at finite strain, {last.points[0].engine} stepper"
@@ -68,14 +91,11 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
     return result
 
 
-def strain_result(study: StrainStudy, watch: Stopwatch) -> dict[str, Any]:
+def strain_result(study: StrainStudy, seconds: dict[str, float]) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
-    model = study.full.model
-    head, _ = head_of(model, study.full.trajectory)
-    families = {}
+    families, pays = {}, ("again", "new", "break_even_runs")
     for f in study.families:
-        names = ("again", "new", "break_even_runs")
-        speeds = [dict(zip(names, study.speed_up(p), strict=True)) for p in f.points]
+        speeds = [dict(zip(pays, study.speed_up(p), strict=True)) for p in f.points]
         families[f.key] = {
             "runs": f.runs,
             "box": {key: np.asarray(value).tolist() for key, value in asdict(f.box).items()},
@@ -84,12 +104,116 @@ def strain_result(study: StrainStudy, watch: Stopwatch) -> dict[str, Any]:
             "held_out": [asdict(t) for t in f.tests],
             "refused": f.refused,
         }
-    result = head | {
+    own = {
         "finite_strain": families,
         "error_linear": study.linear,
         "reason_for_none": study.none,
         "findings": sentences(study),
-        "time": {"full_steps_median": study.times.steps, "full_factor_median": study.times.factor, **watch.seconds},
-        "memory_peak_mb": peak_memory_mb(model.system.layout.comm),
     }
-    return dict(to_json(result))
+    return reduce_result(study.full, own, study.times.to_json() | seconds)
+
+
+def error_table(study: StrainStudy) -> Table:
+    """One line for each family and N."""
+    header = ("runs", "N", "cells", "own", "energy", "all cells", "new material", "new motion", "drift")
+    rows = [
+        (
+            f.runs, p.N, p.cells, f"{p.error_own:.1e}", f"{p.error_own_energy_norm:.1e}", f"{p.error_galerkin:.1e}",
+            _short(p.error_materials), _short(p.error_motions), f"{p.drift:.0e}",
+        )
+        for f in study.families
+        for p in f.points
+    ]  # fmt: skip
+    return Table(header, rows, "Errors")
+
+
+def cell_table(study: StrainStudy) -> Table:
+    """Error against the number of cells where tau was varied."""
+    header = ("runs", "N", "tau", "cells", "own", "new material", "new motion", "run [ms]")
+    rows = [
+        (
+            f.runs, p.N, f"{p.tau:.1e}", p.cells, f"{p.error_own:.1e}", _short(p.error_materials),
+            _short(p.error_motions), f"{1e3 * p.time_online:.2f}",
+        )
+        for f in study.families
+        for p in sorted((p for p in f.curves if p.N in CELLS_AT), key=lambda p: (p.N, -p.tau))
+    ]  # fmt: skip
+    return Table(header, rows, "Cells")
+
+
+def time_table(study: StrainStudy) -> Table:
+    """Seconds and speed-ups, costs counted whole."""
+    rows = [
+        (f.runs, p.N, p.cells, *time_cells(p.time_offline, p.time_setup, p.time_online, study.speed_up(p)))
+        for f in study.families
+        for p in f.points
+    ]
+    return Table(("runs", "N", "cells", *TIMES), rows, "Times")
+
+
+def test_table(family: StrainFamily) -> Table:
+    """Every held-out run with a column for each N."""
+    sizes = [p.N for p in family.points]
+    rows = [
+        (t.kind, f"{t.lam:.4g}", f"{t.mu:.4g}", ", ".join(f"{x:.3g}" for x in t.target), *(t.errors[N] for N in sizes))
+        for t in family.tests
+    ]
+    return Table(("new", "lambda [Pa]", "mu [Pa]", "target [m]", *(f"N = {N}" for N in sizes)), rows)
+
+
+def _short(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1e}"
+
+
+def sentences(study: StrainStudy) -> list[str]:
+    """What the numbers say."""
+    full = study.full
+    law = full.model.system.points.law if full.model.system.points is not None else ""
+    lines = [
+        f"Law: {law}. Linear elasticity misses the deformation of this scene by {100 * study.linear:.3g} %.",
+        f"Full model: {len(full.trajectory.times) - 1} steps in {study.times.steps:.3g} s, factorisation "
+        f"{1e3 * study.times.factor:.3g} ms. x again: its steps over a run of the same reduced model again. x new: "
+        "factorisation and steps over a new parameter with its run. offline: basis, model on all cells, forces and "
+        "weights; the full runs that train a model come on top.",
+    ]
+    for f in study.families:
+        lam, mu, load = f.box.lam[0], f.box.mu[0], np.abs(f.box.load).max(axis=1)
+        inside = (
+            f"lambda = {lam[0]:.4g}, mu = {mu[0]:.4g} Pa only" if f.key == "own" and lam[0] == lam[1] and mu[0] == mu[1]
+            else f"lambda in [{lam[0]:.4g}, {lam[1]:.4g}] and mu in [{mu[0]:.4g}, {mu[1]:.4g}] Pa"
+        )  # fmt: skip
+        reach = ", ".join(f"{x:.3g}" for x in load)
+        lines.append(
+            f"Models {TITLES[f.key]} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
+            f"accelerations of the hand up to {reach} by degree of freedom; they refuse what lies outside."
+        )
+        errors = {N: [e for t in f.tests if (e := t.errors.get(N)) is not None] for N in f.models}
+        best = min(((statistics.median(e), N) for N, e in errors.items() if e), default=None)
+        if best is not None:
+            lines.append(f"Median error over {len(f.tests)} held-out runs: least at N = {best[1]}, {best[0]:.1e}.")
+        lines += [f"N = {N} refused: {reason}." for N, reason in f.refused.items()]
+    if {p.engine for f in study.families for p in f.points} == {"NumPy"}:
+        lines.append("No C compiler was found, so the reduced runs stepped in NumPy, about thirty times slower.")
+    if study.none:
+        lines.append(f"No runs at other materials: {study.none}.")
+    return lines
+
+
+def summary(study: StrainStudy) -> list[str]:
+    """What came out, in three sentences."""
+    p, f = min(((p, f) for f in study.families for p in f.points), key=lambda pair: pair[0].error_own)
+    again, new, _ = study.speed_up(p)
+    return [
+        f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
+        f"The most accurate reduced model, {TITLES[f.key]}, is {p.error_own:.2%} off with N = {p.N} columns and "
+        f"{p.cells} sampled cells.",
+        f"It runs {again:.3g} times as fast as the full model, and {new:.3g} times at a new parameter.",
+    ]
+
+
+def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
+    """Parts of the page."""
+    parts = [error_table(study).section(NOTE), Section("What holds", text="\n\n".join(sentences(study)))]
+    parts += [Section("", figures=captioned(files, CAPTIONS)), time_table(study).section(), cell_table(study).section()]
+    parts += [test_table(f).section(title=f"Held-out runs, models {TITLES[f.key]}") for f in study.families if f.tests]
+    return parts

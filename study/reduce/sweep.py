@@ -1,15 +1,19 @@
-"""Every basis at every N against the full run: errors, times, stability."""
+"""Every basis at every N against the full run, and the best of them over the box: errors, times, stability."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.control import Reduction
 from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
@@ -18,16 +22,35 @@ from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.errors import Comparison
 from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
+from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs
-from softgrasp.study.reduce.result import MethodSweep, Point, kept_points
+from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs, replay_linear
+from softgrasp.study.reduce.result import (
+    COMPARED,
+    LARGER,
+    BoxErrors,
+    BoxPoint,
+    BoxTests,
+    FullTimes,
+    MethodSweep,
+    Point,
+    Speed,
+    TestedModel,
+    kept_points,
+    nearest,
+)
 from softgrasp.study.shell.timing import median_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
 REPEATS, SETUPS = 15, 7  # behind each median of the online time and of the set-up
+METHODS_TESTED = 4  # over the box
+FULL_REPEATS = 3  # behind the median of the full run
+PATIENCE = 2.0  # seconds of a full run above which one is enough
+PAPER_FULL, PAPER_REDUCED = 16.22, 0.097  # seconds of [SBRH21]: 2n = 1916, 600 steps, and PSD at N = 14
+LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 
-Progress = Callable[[str, int, int], None]
-"""Called with the method, what is done and what there is."""
+Progress = Callable[[int, int], None]
+"""Called with what is done and what there is."""
 
 
 def chosen_methods(options: Reduction) -> tuple[str, ...]:
@@ -97,22 +120,20 @@ def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = 
     )
 
 
-def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | None = None) -> MethodSweep:
+def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None) -> MethodSweep:
     """One method at all its N. Collective. Raises SolverError: a factorisation failed."""
     scene, system, method = full.model.scene, full.model.system, registry.METHODS[name]
     states = States(system, ((system, full.snapshots),))
     refused = registry.impossible_sizes(method, system.layout.n_s, options.N)
-    bases, kept = bases_of(
-        name, states, registry.possible_sizes(method, system.layout.n_s, options.N), options, refused
-    )
+    sizes = registry.possible_sizes(method, system.layout.n_s, options.N)
+    bases, kept = bases_of(name, states, sizes, options, refused)
     outputs, key = make_outputs(scene, system), scene_hash(scene)
     points: list[Point] = []
     models: dict[int, ReducedModel] = {}
     # smaller bases are leading columns of the largest: one factorisation gives the errors of all
     comparison = comparison_of(project(bases[-1], system, outputs, key), full) if bases else None
     for i, basis in enumerate(bases):
-        if progress is not None:
-            progress(name, i, len(bases))
+        progress(i, len(bases))
         model = project(basis, system, outputs, key)
         try:
             points.append(measure(model, full, comparison))
@@ -121,12 +142,130 @@ def sweep(name: str, full: FullRun, options: Reduction, progress: Progress | Non
             continue
         models[len(points) - 1] = model
         models = {j: models[j] for j in models if j in kept_points(points)}
-    return MethodSweep(
-        method=method,
-        points=tuple(points),
-        models=models,
-        sigma=bases[0].sigma if bases else (),
-        refused=dict(sorted(refused.items())),
-        N_energy=kept,
-        inner=bases[0].inner if bases else "",
+    sigma, inner = (bases[0].sigma, bases[0].inner) if bases else ((), "")
+    return MethodSweep(method, tuple(points), models, sigma, dict(sorted(refused.items())), kept, inner)
+
+
+def best_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
+    """The methods with the least deformation error of a stable model at the N that is compared."""
+
+    def error(s: MethodSweep, i: int) -> float:
+        value = s.points[i].error_deformation
+        return value if np.isfinite(value) else np.inf
+
+    order = [(error(s, i), k, s) for k, s in enumerate(sweeps) if (i := nearest(s.points)) is not None]
+    return [s for _, _, s in sorted(order)[:METHODS_TESTED]]
+
+
+def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
+    """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
+    scene, system, models = full.model.scene, full.model.system, []
+    outputs = make_outputs(scene, system)
+    for s in best_methods(sweeps):
+        numbers = {nearest(s.points, N) for N in (COMPARED, LARGER)}
+        own = [s.models[i] for i in sorted(i for i in numbers if i is not None)]
+        models += [TestedModel(s.method, False, model) for model in own]
+        if states is None or not s.method.snapshots:
+            continue
+        bases, _ = bases_of(s.method.key, states, [model.N for model in own], scene.reduction, {})
+        models += [TestedModel(s.method, True, project(b, system, outputs)) for b, _ in zip(bases, own, strict=False)]
+    return models
+
+
+def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]:
+    """Deformation errors of all models at the parameter of one full run, without any new projection. Collective."""
+    largest = {(m.method.key, m.several): m.model for m in sorted(models, key=lambda m: m.model.N)}
+    comparisons = {family: comparison_of(model, full) for family, model in largest.items()}
+    errors = []
+    for m in models:
+        with np.errstate(all="ignore"):  # may be unstable away from the training parameter
+            reduced = replay_linear(m.model, full.model, full, allow_unstable=True)
+            small, comparison = m.model.at(full.model.system.materials), comparisons[m.method.key, m.several]
+            errors.append(comparison.state_error("deformation", m.model, small, reduced))
+    return tuple(errors)
+
+
+def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress = lambda done, of: None) -> BoxTests:
+    """Train, and test over the box. Collective.
+
+    Raises:
+        SolverError: a full run failed, or a factorisation did.
+        ResourceError: the snapshots do not fit.
+    """
+    scene = full.model
+    reason = outside(scene) or ("" if best_methods(sweeps) else "no method has a stable model")
+    if reason:
+        return BoxTests(none=reason)
+    first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
+    models = box_models(full, sweeps, training_states(full, training) if training else None)
+    trained_at = ((first.lam, first.mu), *training)
+    points = []
+    for k, (lam, mu) in enumerate(grid):
+        progress(k, len(grid))
+        trained = any(np.allclose((lam, mu), place) for place in trained_at)
+        points.append(BoxPoint(lam, mu, trained, errors_at(run_at(scene, lam, mu), models)))
+    own, tests, summary = errors_at(full, models), [p for p in points if not p.trained] or points, []
+    for i, m in enumerate(models):
+        errors = [p.errors[i] for p in tests]
+        runs = len(trained_at) if m.several else int(m.method.snapshots)
+        largest = max(errors, key=lambda e: (not np.isfinite(e), e))
+        summary.append(BoxErrors(m.method.key, m.model.N, runs, own[i], statistics.median(errors), largest))
+    return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
+
+
+def measured_run(model: Model, progress: Callable[[Run], None]) -> tuple[FullRun, FullTimes]:
+    """The full run, and its seconds in the median of several when it is short. Collective."""
+    first = simulate(model, RunOptions(progress=progress))
+    comm, runs = model.system.layout.comm, [first]
+    repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
+    runs += [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
+    factors = [run.seconds["factor"] for run in runs]
+    times = FullTimes(statistics.median(map(steps_seconds, runs)), statistics.median(factors))
+    return full_run(model, first), times
+
+
+def steps_seconds(run: Trajectory) -> float:
+    """Seconds of all steps; the first is not among those measured, since it sets up the solver."""
+    n = len(run.times) - 1
+    return run.seconds["steps"] / max(n - 1, 1) * n
+
+
+def speed_of(sweep: MethodSweep, full: FullTimes) -> Speed | None:
+    """Compare times; None for a method without points."""
+    i = nearest(sweep.points)
+    i = nearest(sweep.points, stable=False) if i is None else i
+    if i is None:
+        return None
+    p = sweep.points[i]
+    return Speed(sweep.method, p, *full.against(p.time_offline, p.time_setup, p.time_online))
+
+
+def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) -> tuple[str, ...]:
+    """What the speed-up is measured against, the mesh that pays, and the paper's figure beside ours."""
+    against = (
+        f"Full model, prefactored: {steps} steps in {1e3 * full.steps:.1f} ms; its factorisation takes "
+        f"{1e3 * full.factor:.1f} ms. new: a new parameter, small matrices, test of stability and propagator with the "
+        "run. x again: steps of the full model over a run of the same small model again, all made beforehand on both "
+        "sides. x new: factorisation and steps over new. Break-even runs = offline / (full - new), at new parameters; "
+        "the full run that gives the snapshots is one more."
+    )
+    stable = [s for s in speeds if s.point.stable]
+    chosen = next((s for s in stable if s.method.key == "psd"), None) or next(iter(stable), None)
+    if chosen is None:
+        return (against,)
+    # tissue unknowns at which a full run would take as long as a reduced one, at this mesh's time per unknown
+    p = chosen.point
+    mesh, model = n_e * p.time_online / full.steps, f"{chosen.method.title}, N = {p.N}"
+    if mesh < LEAST_MESH:
+        pays = f"the reduced run ({model}) is faster than a full run on every mesh"
+    else:
+        pays = f"a full run of n_e = {mesh:.0f} would take as long as the reduced one ({model})"
+    return (
+        against,
+        f"Break-even mesh: {pays}, at this mesh's time per unknown. The reduced time does not grow with the mesh, see "
+        "python -m softgrasp.study.bench meshes.",
+        f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
+        f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
+        f"{1e3 * (full.factor + full.steps):.1f} ms against {1e3 * (p.time_setup + p.time_online):.2f} ms, "
+        f"a speed-up of {chosen.speedup_new_parameter:.0f} for a new parameter ({model}).",
     )

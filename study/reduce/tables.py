@@ -1,23 +1,49 @@
-"""Tables of ``softgrasp reduce``: errors, stability, times against our own full model, and all points."""
+"""Tables, sentences and page of ``softgrasp reduce``."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, fields
+from pathlib import Path
 
 import numpy as np
 
-from softgrasp.study.reduce.result import COMPARED, BoxTests, MethodSweep, Point, ReductionStudy, Speed, nearest
+from softgrasp.reduction.bases.registry import Method
+from softgrasp.study.reduce.result import (
+    COMPARED,
+    N_NOTE,
+    BoxTests,
+    MethodSweep,
+    Point,
+    ReductionStudy,
+    Speed,
+    nearest,
+)
+from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 
 LEVELS = (1e-1, 1e-2, 1e-3)  # of the error of the deformation, for which the least N is named
 LEVEL_NAMES = tuple(f"{level:.0e}".replace("e-0", "e-") for level in LEVELS)
 TIMES = ("run [ms]", "new [ms]", "offline [s]", "x again", "x new", "break-even")
-N_NOTE = (
-    "N counts all columns of V for every method, as in the paper, also the hand's own 2 n_s of bases with fixed solid "
-    "modes. V_e: those without the hand's (N_tissue), for componentwise POD displacements + velocities."
-)
+CAPTIONS = {
+    "errors.png": "Error of the deformation of the paper's six methods against N, all columns of V counted. A curve "
+    "is dotted where its model is unstable (crosses). Errors above 1 are drawn at 1.",
+    "errors_beyond.png": "The same for the methods beyond the paper, beside its best.",
+    "errors_state.png": "Further errors of the paper's six methods: of the state [q_s, v_s, q_e, v_e], which is the "
+    "paper's, of [q_s, p_s, q_e, p_e], and of the energy of the tissue.",
+    "times.png": "Error of the deformation of all stable models against the time of a run, and against offline plus "
+    "online time. Bold: the models that no other beats in both. Dashed: the full run with its matrix factored "
+    "beforehand.",
+    "sigma.png": "Singular values over the first of each decomposition; thin lines are its further parts. Those of "
+    "PSD are symplectic or of complex snapshots, each a pair of columns.",
+    "modes.png": "First modes of the best method of the paper that keeps the hand apart, and of Craig-Bampton or the "
+    "best beyond the paper, scaled to the same largest displacement. Colour: displacement relative to the hand. The "
+    "paper's modes hold absolute displacements of the tissue alone, and columns of their own move the hand: here the "
+    "hand stands where the tissue beside it goes.",
+    "compare.png": "Reduced bodies under the outline of the full one, at instants of large deformation or error.",
+    "compare.gif": "The same in motion.",
+}
 
 
 def least_size(points: Sequence[Point], level: float) -> int | None:
@@ -32,6 +58,11 @@ def short(value: float | None, digits: int = 2) -> str:
     return f"{value:.{digits}g}" if np.isfinite(value) else "overflow"
 
 
+def title_of(method: Method, narrow: bool) -> str:
+    """The name of a method in a table, short in a narrow one."""
+    return method.short_title if narrow else method.title
+
+
 def stability(points: Sequence[Point]) -> str:
     """At which N a method is stable, in few words."""
     bad = [p.N for p in points if not p.stable]
@@ -44,20 +75,24 @@ def stability(points: Sequence[Point]) -> str:
     return "not " + ", ".join(map(str, bad))
 
 
+def _size(p: Point) -> str:
+    return str(p.N) if p.stable else f"{p.N} !"
+
+
 def error_table(sweeps: Sequence[MethodSweep], energy: float, narrow: bool = False) -> Table:
     """N by energy, errors at the N nearest to the one compared, least N for some errors, stability."""
     header = ("method", share(energy), "N", "V_e", "deform.", "state", "energy", *LEVEL_NAMES, "stable N")
     rows: list[tuple[str, ...]] = []
     for s in sweeps:
         i = nearest(s.points, stable=False)
-        title, kept = s.method.short_title if narrow else s.method.title, "-" if s.N_energy is None else str(s.N_energy)
+        title, kept = title_of(s.method, narrow), "-" if s.N_energy is None else str(s.N_energy)
         if i is None:
             rows.append((title, kept, *[""] * 8, "refused" if s.refused else "no model"))
             continue
         p = s.points[i]
         sizes = ["-" if (n := least_size(s.points, level)) is None else str(n) for level in LEVELS]
         errors = [f"{value:.1e}" for value in (p.error_deformation, p.error, p.error_energy)]
-        size = (f"{p.N}" if p.stable else f"{p.N} !", "+".join(map(str, p.split)))
+        size = (_size(p), "+".join(map(str, p.split)))
         rows.append((title, kept, *size, *errors, *sizes, stability(s.points)))
     return Table(header, rows, "Errors")
 
@@ -85,8 +120,7 @@ def refused_table(sweeps: Sequence[MethodSweep], narrow: bool = False) -> Table:
         for N, reason in s.refused.items():
             reasons.setdefault(reason, []).append(N)
         for reason, sizes in reasons.items():
-            title = s.method.short_title if narrow else s.method.title
-            groups.setdefault((", ".join(map(str, sizes)), reason), []).append(title)
+            groups.setdefault((", ".join(map(str, sizes)), reason), []).append(title_of(s.method, narrow))
     rows = [(sizes, "; ".join(titles), reason) for (sizes, reason), titles in groups.items()]
     return Table(("N", "method", "reason"), rows, "Refused")
 
@@ -124,17 +158,15 @@ def time_table(speeds: Sequence[Speed], narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
     rows = []
     for s in speeds:
-        p, title = s.point, s.method.short_title if narrow else s.method.title
-        pays = (s.speedup_same_model, s.speedup_new_parameter, s.break_even_runs)
+        p, pays = s.point, (s.speedup_same_model, s.speedup_new_parameter, s.break_even_runs)
         cells = time_cells(p.time_offline, p.time_setup, p.time_online, pays)
-        rows.append((title, str(p.N) if p.stable else f"{p.N} !", *cells))
+        rows.append((title_of(s.method, narrow), _size(p), *cells))
     return Table(("method", "N", *TIMES), rows, "Times")
 
 
 def box_table(box: BoxTests, narrow: bool = False) -> Table:
     """Errors at other parameters, trained by one run or by several."""
-    methods = {m.method.key: m.method for m in box.models}
-    titles = {key: m.short_title if narrow else m.title for key, m in methods.items()}
+    titles = {m.method.key: title_of(m.method, narrow) for m in box.models}
     rows = [
         (titles[e.method], str(e.N), str(e.runs or "-"), *map(short, (e.own, e.median, e.largest))) for e in box.summary
     ]
@@ -188,3 +220,33 @@ def point_table(study: ReductionStudy) -> Table:
     units = {"spectral_abscissa": " [1/s]", "time_offline": " [s]", "time_setup": " [s]", "time_online": " [s]"}
     names = tuple(f.name + units.get(f.name, "") for f in fields(Point))
     return Table(("method", *names), [(s.method.key, *astuple(p)) for s in study.sweeps for p in s.points])
+
+
+def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
+    """Parts of the page. Rank 0 only."""
+    energy = study.full.model.scene.reduction.energy
+    text = (
+        f"{N_NOTE}\n\n{error_note(energy)} Each method is built from the snapshots of one run and "
+        f"repeats it, driven by the same hand. {inner_note(study.sweeps)}"
+    )
+    parts = [
+        error_table(study.sweeps, energy).section(text),
+        Section("What holds", text="\n\n".join(study.findings)),
+        Section("", figures=captioned(files, CAPTIONS)),
+        time_table(study.speeds).section("\n\n".join(study.speed_notes)),
+    ]
+    refused = refused_table(study.sweeps)
+    if refused.rows:
+        parts.append(refused.section())
+    return [*parts, *box_sections(study)]
+
+
+def box_sections(study: ReductionStudy) -> list[Section]:
+    """Errors at other parameters: a summary, and one table for each N with a column for each basis."""
+    box = study.box
+    if box.none:
+        return [Section("Other parameters", f"No tests at other parameters: {box.none}.")]
+    text = box_note(box)
+    text += " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
+    points = [table.section(f"All parameters, N = {N}.") for N, table in box_point_tables(box)]
+    return [box_table(box).section(text), *points]
