@@ -84,8 +84,7 @@ def measure_sag(model: Model, a: Array) -> tuple[Sag, Gradient]:
     Args:
         a: largest acceleration of the hand, (n_s,).
 
-    Raises:
-        SolverError: the solve failed or missed its tolerance.
+    Raises SolverError: the solve failed or missed its tolerance.
     """
     scene, system = model.scene, model.system
     layout, d = system.layout, system.layout.dimension
@@ -110,8 +109,7 @@ def measure(model: Model, omega: Array, Phi: Array, a: Array) -> Problem:
         Phi: their M-orthonormal modes, local rows (n_local, k).
         a: largest acceleration of the hand, (n_s,).
 
-    Raises:
-        SolverError: the static problem cannot be solved.
+    Raises SolverError: the static problem cannot be solved.
     """
     mesh, system = model.space.mesh, model.system
     low, high = bounding_box(mesh.mesh.comm, mesh.mesh.geometry.x[:, : mesh.dimension])

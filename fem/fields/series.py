@@ -107,10 +107,7 @@ class SeriesWriter:
     in the cells ``strain`` [1], ``stress`` and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's
     displacement. Cells keep the order of the elements.
 
-    Collective.
-
-    Raises:
-        OSError: the directory cannot be made.
+    Collective. Raises OSError: the directory cannot be made.
     """
 
     def __init__(self, model: Model, directory: str | Path, name: str = "fields") -> None:

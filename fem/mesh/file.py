@@ -94,9 +94,8 @@ def read_mesh(
         seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].
         limit: longest processor time for a file that meshio may never end [s]; by its size if None.
 
-    Raises:
-        MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or curved
-            cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
+    Raises MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or
+    curved cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
     """
     arrays: MeshArrays | None = None
     with agree(comm):
@@ -122,11 +121,7 @@ def read_mesh(
 
 
 def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
-    """Read and check a mesh file.
-
-    Raises:
-        MeshError: see `read_mesh`.
-    """
+    """Read and check a mesh file. Raises MeshError: see `read_mesh`."""
     raw = _read(path, limit)
     kinds = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]

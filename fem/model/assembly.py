@@ -131,10 +131,8 @@ def _component(space: Discretisation, A: PETSc.Mat, thickness: float) -> Compone
 def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple[LayerBlocks, ...]:
     """Assemble K_mu, K_lambda and M_1, once per layer; a uniform body is one layer. Collective.
 
-    One form is compiled for each component: layers share it and differ in their cells only.
-
-    Raises:
-        SceneError: a layer has no cells, or some cells belong to no layer.
+    One form is compiled for each component: layers share it and differ in their cells only. Raises SceneError: a layer
+    has no cells, or some cells belong to no layer.
     """
     domain = space.mesh.mesh
     layers = cells_of_layers(space.mesh, scene) if scene.tissue.layers else {"tissue": None}
@@ -183,8 +181,7 @@ def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
 def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
     """Owned cells of each layer; later layers win where boxes overlap, the rest is ``tissue``. Collective.
 
-    Raises:
-        SceneError: a layer holds no cell.
+    Raises SceneError: a layer holds no cell.
     """
     owned = mesh.mesh.topology.index_map(mesh.dimension).size_local
     label = np.full(owned, -1)

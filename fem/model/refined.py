@@ -16,9 +16,18 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError, agree
-from softgrasp.fem.mesh.bisect import bisect_to, distribute
 from softgrasp.fem.mesh.check import longest_edges, sort_facets
-from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField, box_axes, box_of_lines, even_cells
+from softgrasp.fem.mesh.grading import (
+    BISECTION,
+    LINES,
+    SLACK,
+    SizeField,
+    bisect_to,
+    box_axes,
+    box_of_lines,
+    distribute,
+    even_cells,
+)
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
@@ -199,8 +208,7 @@ def _too_large(refine: Refine, count: int) -> SceneError:
 def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     """Singular ends of a scene's body, on all ranks; rank 0 looks at the whole mesh. Collective.
 
-    Raises:
-        MeshError: the mesh file cannot be read again.
+    Raises MeshError: the mesh file cannot be read again.
     """
     ends: Ends | None = None
     with agree(comm):

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.bisect import bisect, distribute
+from softgrasp.fem.mesh.grading import bisect, distribute
 from softgrasp.fem.mesh.make import make_mesh, structured_mesh
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, spread
 from softgrasp.fem.model.assembly import cells_of_layers
