@@ -123,7 +123,7 @@ def _finer(small: Small, finer: Small, refine: Refine, aim: float, factor: float
                 whole = None
     if not comm.bcast(whole is not None):
         return None
-    return distribute(comm, whole, model.space.mesh.dimension)
+    return distribute(comm, whole)
 
 
 def _more_lines(model: Model, aim: float) -> TissueMesh | None:

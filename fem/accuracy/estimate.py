@@ -32,7 +32,6 @@ from mpi4py import MPI
 from softgrasp.fem.accuracy.small import Small, reduced, run_small, static_solves
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.contact import contact_facets
@@ -232,15 +231,11 @@ def indicators(small: Small, finer: Small) -> Array:
 
 def prolong(model: Model, finer: Model, X: Array) -> Array:
     """Columns of the mesh's space in that of the next order, local rows. Collective."""
-    d = model.space.mesh.dimension
-    u, v = dolfinx.fem.Function(model.space.V), dolfinx.fem.Function(finer.space.V)
+    v = dolfinx.fem.Function(finer.space.V)
     Y = np.empty((finer.system.layout.n_local, X.shape[1]), order="F")
     for j in range(X.shape[1]):
-        u.x.array[:] = 0.0
-        u.x.array.reshape(-1, d)[model.space.free] = X[:, j].reshape(-1, d)
-        u.x.scatter_forward()
-        v.interpolate(u)
-        Y[:, j] = v.x.array.reshape(-1, d)[finer.space.free].ravel()
+        v.interpolate(model.space.nodal(X[:, j]))
+        Y[:, j] = v.x.array.reshape(-1, model.space.mesh.dimension)[finer.space.free].ravel()
     return Y
 
 
@@ -254,16 +249,12 @@ def cell_products(model: Model, X: Array) -> Array:
     shape = basix.CellType.triangle if d == 2 else basix.CellType.tetrahedron
     points, weights = basix.make_quadrature(shape, max(2 * (element.degree - 1), 1))
     D = element.tabulate(1, points)[1 : d + 1, :, :, 0]
-    x = tissue.mesh.geometry.x[cell_nodes(tissue.mesh)[:cells], :d]
+    x = tissue.vertices
     J = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
     inverse, scale = np.linalg.inv(J), np.abs(np.linalg.det(J))[:, None] * weights * model.scene.tissue.thickness
     u = np.zeros((cells, D.shape[2], d, X.shape[1]))
-    f = dolfinx.fem.Function(V)
     for j in range(X.shape[1]):
-        f.x.array[:] = 0.0
-        f.x.array.reshape(-1, d)[model.space.free] = X[:, j].reshape(-1, d)
-        f.x.scatter_forward()
-        u[..., j] = f.x.array.reshape(-1, d)[V.dofmap.list[:cells]]
+        u[..., j] = model.space.nodal(X[:, j]).x.array.reshape(-1, d)[V.dofmap.list[:cells]]
     E = np.zeros((cells, X.shape[1], X.shape[1]))
     for q in range(len(weights)):  # one point at a time: gradients of all at once would be large
         gradient = np.einsum("an,cab,cnik->cibk", D[:, q], inverse, u, optimize=True)

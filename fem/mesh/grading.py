@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import dolfinx.mesh
 import numpy as np
@@ -79,38 +79,20 @@ def bisect_to(whole: Whole, size: Callable[[Floats], Floats], slack: float, most
     return whole
 
 
-def distribute(comm: MPI.Intracomm, whole: Whole | None, dimension: int) -> TissueMesh:
+def distribute(comm: MPI.Intracomm, whole: Whole | None) -> TissueMesh:
     """Spread a mesh from rank 0 over the ranks (None on the others), with all it carries. Collective.
 
     ``mesh.topology.original_cell_index`` of the result counts the cells as ``whole.simplices`` does.
     """
-    facts, body = None, None
-    marks: Marks = {}
-    if whole is not None:
-        body = points, cells = whole.points, whole.simplices
-        parts = find_parts(points, cells, sort_facets(cells), whole.source)
-        marks = {f"{name} of cells": (dimension, cells, values) for name, values in whole.cells.items()}
-        for name, tags in whole.facets.items():
-            marks[f"{name} of facets"] = dimension - 1, whole.facet_nodes(name), tags.values
-        if parts is not None:
-            marks["parts"] = dimension, cells, parts[0]
-        facts = whole.source, None if parts is None else parts[1], whole.facet_sets, whole.cell_sets
-    source, known, facet_sets, cell_sets = comm.bcast(facts)
-    mesh, found = spread(comm, dimension, body, marks)
-    return TissueMesh(
-        mesh=mesh,
-        dimension=dimension,
-        facet_tags=found.get("tags of facets"),
-        cell_tags=found.get("tags of cells"),
-        source=source,
-        part_tags=found.get("parts"),
-        parts=known,
-        facet_sets=facet_sets,
-        cell_sets=cell_sets,
-        contact=found.get("contact of facets"),
-        layers=found.get("layers of cells"),
-        whole=whole,
-    )
+    if whole is None:
+        return spread(comm, None, {}, {})
+    points, cells, d = whole.points, whole.simplices, whole.dimension
+    marks: Marks = {name: (d, cells, values) for name, values in whole.cells.items()}
+    marks |= {name: (d - 1, whole.facet_nodes(name), tags.values) for name, tags in whole.facets.items()}
+    known: dict[str, Any] = {name: getattr(whole, name) for name in ("source", "facet_sets", "cell_sets")}
+    if (parts := find_parts(points, cells, sort_facets(cells), whole.source)) is not None:
+        marks["part_tags"], known["parts"] = (d, cells, parts[0]), parts[1]
+    return replace(spread(comm, (points, cells), marks, known), whole=whole)
 
 
 # mu < alpha / p with alpha about 1/2 gives elements of order p their full order; below it the cells next to the end

@@ -69,4 +69,4 @@ def structured_mesh(
         mesh = dolfinx.mesh.create_rectangle(comm, corners, list(cells))
     else:
         mesh = dolfinx.mesh.create_box(comm, corners, list(cells))
-    return TissueMesh(mesh, dimension, None, None, "structured")
+    return TissueMesh(mesh, dimension, "structured")

@@ -78,7 +78,7 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
     mesh, dimension = tissue.mesh, tissue.dimension
     mesh.topology.create_connectivity(dimension - 1, dimension)
     facet_cells = mesh.topology.connectivity(dimension - 1, dimension)
-    labels = np.zeros(mesh.topology.index_map(dimension).size_local, dtype=np.int64)
+    labels = np.zeros(tissue.owned, dtype=np.int64)
     owned = tags.indices < len(labels)
     labels[tags.indices[owned]] = tags.values[owned]
     # An owned exterior facet has one cell, and that cell is owned too.
@@ -206,7 +206,7 @@ def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
 
     Raises SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
     """
-    owned = np.arange(tissue.mesh.topology.index_map(tissue.dimension).size_local, dtype=np.int32)
+    owned = np.arange(tissue.owned, dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, owned)[:, : tissue.dimension]
     if layer.tag is not None:
         if tissue.cell_tags is None:
