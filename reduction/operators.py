@@ -39,7 +39,7 @@ def relative_rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array]:
 def layer_products(system: BlockSystem, component: str, Y: Array, *tests: Array) -> list[Array]:
     """X' A_l Y stacked over the layers l, (layers, .., ..), for each X of ``tests``. Collective.
 
-    ``component``: "K_mu", "K_lambda" or "M_1" of :class:`softgrasp.fem.system.Layer`.
+    ``component``: "K_mu", "K_lambda" or "M_1" of :class:`softgrasp.fem.system.LayerBlocks`.
     """
     products: list[list[Array]] = []
     for layer in system.layers:
