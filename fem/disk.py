@@ -18,13 +18,11 @@ def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve:
     """See that the disk, and the limit of the size of a file, leave room for more. Collective.
 
     Args:
-        comm: ranks that write.
         files: what this rank writes to, in one folder that exists; a file may be a folder of files.
         needed: bytes that come on top, of this rank.
         reserve: bytes that must stay free besides, of all ranks.
 
-    Raises:
-        ResourceError: the room is too small.
+    Raises ResourceError: the room is too small.
     """
     total = comm.allreduce(needed) + MARGIN + reserve
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]

@@ -1,25 +1,45 @@
-"""One HDF5 file for a reduced model: small matrices, and the lift with the nodes it belongs to."""
+"""One HDF5 file for a reduced model of any kind: small matrices, the lift with its nodes, SHA-256 of all of it."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import h5py
+import numpy as np
+from mpi4py import MPI
+from scipy.spatial import cKDTree
 
+from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.files import LINEAR, STRAIN, read_lift, reading, write_model
-from softgrasp.reduction.model import Outputs, ReducedModel
+from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
+from softgrasp.reduction.operators import Lift
 
 if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
-KEYS = (
+LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 2"
+SEALS = ("sha256", "sha256_lift")  # attributes: of everything but the lift, and of the lift
+ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns
+# what a file says of a model in JSON, beside its materials and the names of its outputs
+LINEAR_KEYS = (
     "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
     "hand_weight", "two_way", "scene_hash", "seconds",
 )  # fmt: skip
+STRAIN_KEYS = ("cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "seconds")
+STRAIN_ARRAYS = {
+    "cells": ("B", "weight", "xi", "layer", "cell", "centre"),
+    "box": ("lam", "mu", "load", "reach"),
+    "parts": ("K_mu", "K_lambda", "G"),
+}
 
 
 def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
@@ -45,23 +65,34 @@ def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
         OSError: the file cannot be written.
     """
     if isinstance(model, ReducedModel):
-        write_model(Path(path), LINEAR, about(model), model.lift, lambda file: write_small(model, file))
+        kind, lift = LINEAR, model.lift
     else:
-        from softgrasp.reduction.strain.archive import save_strain  # only scenes with finite strain pay for it
-
-        save_strain(model, Path(path))
-
-
-def about(model: ReducedModel) -> dict[str, Any]:
-    """What a file says of a linear model in JSON."""
-    data: dict[str, Any] = {key: getattr(model, key) for key in KEYS}
-    return data | {"materials": [asdict(m) for m in model.materials], "names": list(model.outputs.names)}
+        kind, lift = STRAIN, None
+        if model.Phi is not None and model.layout is not None:
+            lift = Lift(model.layout, model.Phi, model.Phi[:, :0])
+    write_model(Path(path), kind, about(model), lift, partial(write_small, model))
 
 
-def write_small(model: ReducedModel, file: h5py.File) -> None:
-    """The arrays of a linear model that are no lift."""
-    for key, value in model.parts.items():
-        file[f"parts/{key}"] = value
+def about(model: ReducedModel | StrainModel) -> dict[str, Any]:
+    """What a file says of a model in JSON."""
+    linear = isinstance(model, ReducedModel)
+    data: dict[str, Any] = {key: getattr(model, key) for key in (LINEAR_KEYS if linear else STRAIN_KEYS)}
+    data |= {"materials": [asdict(m) for m in model.materials], "names": list(model.outputs.names)}
+    return data if isinstance(model, ReducedModel) else data | {"law": model.cells.law}
+
+
+def write_small(model: ReducedModel | StrainModel, file: h5py.File) -> None:
+    """The arrays of a model that are no lift."""
+    if isinstance(model, ReducedModel):
+        groups = {"parts": model.parts}
+    else:
+        groups = {
+            group: {key: getattr(model if group == "parts" else getattr(model, group), key) for key in keys}
+            for group, keys in STRAIN_ARRAYS.items()
+        }
+    for group, arrays in groups.items():
+        for key, value in arrays.items():
+            file[f"{group}/{key}"] = value
     file["outputs/C_z"], file["outputs/C_s"] = model.outputs.C_z, model.outputs.C_s
     if model.gravity is not None:
         file["gravity"] = model.gravity
@@ -87,21 +118,168 @@ def load(
     True
     """
     with reading(Path(path), layout, scene_hash) as (file, data):
-        if file.attrs["format"] == STRAIN:
-            from softgrasp.reduction.strain.archive import read_strain
-
-            return read_strain(file, data, layout)
-        return read_linear(file, data, layout)
+        return (read_strain if file.attrs["format"] == STRAIN else read_linear)(file, data, layout)
 
 
 def read_linear(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> ReducedModel:
     """A linear model of an open file and its :func:`about`."""
-    names, materials = tuple(data.pop("names")), tuple(LayerMaterial(**m) for m in data.pop("materials"))
-    return ReducedModel(
-        **data | {"split": tuple(data["split"])},
-        parts={key: value[()] for key, value in file["parts"].items()},
-        materials=materials,
-        outputs=Outputs(file["outputs/C_z"][()], file["outputs/C_s"][()], names),
-        gravity=file["gravity"][()] if "gravity" in file else None,
-        lift=None if layout is None else read_lift(file, layout),
+    shared, lift = _read_shared(file, data), None if layout is None else read_lift(file, layout)
+    parts = {key: value[()] for key, value in file["parts"].items()}
+    return ReducedModel(**data | shared | {"split": tuple(data["split"])}, parts=parts, lift=lift)
+
+
+def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> StrainModel:
+    """The same at finite strain."""
+    from softgrasp.reduction.strain.cells import Cells  # only scenes with finite strain pay for it
+    from softgrasp.reduction.strain.model import StrainModel, TrainedBox
+
+    cells, box, parts = ({key: file[f"{group}/{key}"][()] for key in keys} for group, keys in STRAIN_ARRAYS.items())
+    shared, law = _read_shared(file, data), data.pop("law")
+    Phi = None if layout is None else np.asarray(read_lift(file, layout).L_q)
+    return StrainModel(
+        cells=Cells(law, **cells), box=TrainedBox(**box), **parts, **shared, **data, layout=layout, Phi=Phi
     )
+
+
+def _read_shared(file: h5py.File, data: dict[str, Any]) -> dict[str, Any]:
+    outputs = Outputs(file["outputs/C_z"][()], file["outputs/C_s"][()], tuple(data.pop("names")))
+    materials = tuple(LayerMaterial(**m) for m in data.pop("materials"))
+    gravity = file["gravity"][()] if "gravity" in file else None
+    return {"outputs": outputs, "materials": materials, "gravity": gravity}
+
+
+def write_model(
+    path: Path, kind: str, about: dict[str, Any], lift: Lift | None, small: Callable[[h5py.File], None]
+) -> None:
+    """Write a file beside its place and move it there whole. Collective with a lift.
+
+    Args:
+        path: of the file; folders are created.
+        kind: :data:`LINEAR` or :data:`STRAIN`.
+        about: what goes into JSON, the scene's hash among it.
+        lift: every rank adds its rows in turn.
+        small: writes the arrays, on one rank.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    comm = MPI.COMM_SELF if lift is None else lift.layout.comm
+    partial = path.with_name(path.name + ".part")
+    try:
+        with agree(comm):
+            if comm.rank == 0:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with h5py.File(partial, "w") as file:
+                    file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
+                    small(file)
+        for rank in range(comm.size):
+            # one file, one writer at a time: the file library here is not a parallel one
+            with agree(comm):
+                if lift is not None and comm.rank == rank:
+                    _write_rows(lift, partial)
+        with agree(comm):
+            if comm.rank == 0:
+                with h5py.File(partial, "r+") as file:
+                    seal(file)
+                partial.replace(path)
+    finally:  # of a file that was not written whole
+        if comm.rank == 0:
+            partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def reading(
+    path: Path, layout: BlockLayout | None, scene_hash: str | None = None
+) -> Iterator[tuple[h5py.File, dict[str, Any]]]:
+    """A file that is what was written, and what it says about its model. Collective over ``layout.comm``.
+
+    The block must not communicate. The hash of the lift counts where a layout takes it.
+
+    Raises ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
+    """
+    comm = MPI.COMM_SELF if layout is None else layout.comm
+    with agree(comm):
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") not in (LINEAR, STRAIN):
+                    raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
+                # one rank reads a lift twice, not all of them
+                for name in SEALS if layout is not None and comm.rank == 0 else SEALS[:1]:
+                    if file.attrs[name] != _digest(file, name == SEALS[1]):
+                        raise ModelError(f"{path} is damaged: it is not what was written; reduce the scene again")
+                about = json.loads(file.attrs["model"])
+                if scene_hash is not None and about["scene_hash"] != scene_hash:
+                    other = about["scene_hash"][:12]
+                    raise ModelError(f"{path} was made for another scene (hash {other}); reduce the scene again")
+                yield file, about
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            reason = f"{error} is missing" if isinstance(error, KeyError) else error
+            raise ModelError(f"{path} cannot be read as a reduced model ({reason}); reduce the scene again") from error
+
+
+def seal(file: h5py.File) -> None:
+    """Write the hashes of all that a file holds."""
+    for name in SEALS:
+        file.attrs[name] = _digest(file, name == SEALS[1])
+
+
+def _digest(file: h5py.File, lift: bool) -> str:
+    """SHA-256 of the numbers of the lift, or of all others with their attributes."""
+    names: list[str] = []
+    file.visit(names.append)
+    digest = hashlib.sha256()
+    for name in ["/", *sorted(names)]:
+        item = file[name]
+        if name.startswith("lift") is lift:
+            attributes = sorted((key, str(value)) for key, value in item.attrs.items() if key not in SEALS)
+            digest.update(repr((name, attributes)).encode())
+            if isinstance(item, h5py.Dataset):
+                digest.update(repr(item.shape).encode())
+                for at in range(0, item.shape[0] if item.ndim else 1, ROWS):
+                    digest.update(np.ascontiguousarray(item[at : at + ROWS] if item.ndim else item[()]))
+    return digest.hexdigest()
+
+
+def _write_rows(lift: Lift, path: Path) -> None:
+    layout, d = lift.layout, lift.layout.dimension
+    parts = {"nodes": layout.nodes, "L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
+    with h5py.File(path, "r+") as file:
+        for key, part in parts.items():
+            if part is None:
+                continue
+            n, start = (layout.n_e // d, layout.start // d) if key == "nodes" else (layout.n_e, layout.start)
+            rows = file.require_dataset(f"lift/{key}", (n, part.shape[1]), "f8")
+            for at in range(0, len(part), ROWS):
+                rows[start + at : start + min(at + ROWS, len(part))] = part[at : at + ROWS]
+
+
+def read_lift(file: h5py.File, layout: BlockLayout) -> Lift:
+    """Rows of this rank, found by the coordinates of its nodes."""
+    path, d = file.filename, layout.dimension
+    if "lift" not in file:
+        raise ModelError(f"{path} holds no basis on the mesh; load it without a layout, or reduce the scene again")
+    nodes = file["lift/nodes"][()]
+    if nodes.shape != (layout.n_e // d, d):
+        raise ModelError(
+            f"{path} belongs to a mesh of {len(nodes)} free nodes in {nodes.shape[1]}D, this one has "
+            f"{layout.n_e // d} in {d}D; load it with its own scene"
+        )
+    distance, index = cKDTree(nodes).query(layout.nodes) if len(layout.nodes) else (np.zeros(0), np.zeros(0, int))
+    size = float(np.ptp(nodes, axis=0).max())
+    # coordinates are read back bit for bit; another partition may have computed them with other rounding
+    if distance.max(initial=0.0) > 1e-9 * size or len(np.unique(index)) != len(index):
+        raise ModelError(f"{path} belongs to another mesh: its nodes lie elsewhere; load it with its own scene")
+    rows = (index[:, None] * d + np.arange(d)).ravel()
+    arrays = {key: _pick(file[f"lift/{key}"], rows) for key in ("L_q", "L_v", "W_G") if f"lift/{key}" in file}
+    return Lift(layout, arrays["L_q"], arrays["L_v"], arrays.get("W_G"))
+
+
+def _pick(dataset: h5py.Dataset, rows: np.ndarray) -> Array:
+    """Rows of a dataset, read slab by slab."""
+    result = np.empty((len(rows), dataset.shape[1]), order="F")
+    slab = rows // ROWS
+    for s in np.unique(slab):
+        block = dataset[s * ROWS : (s + 1) * ROWS]
+        inside = np.flatnonzero(slab == s)
+        result[inside] = block[rows[inside] - s * ROWS]
+    return result

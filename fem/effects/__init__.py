@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from softgrasp.fem.effects.damping import Damping
-from softgrasp.fem.effects.finite_strain import FiniteStrain
+from softgrasp.fem.effects.catalog import Damping, FiniteStrain, Gravity, Layers, Reaction, Rotation
 from softgrasp.fem.effects.gate import Effect, Gate, Problem
-from softgrasp.fem.effects.gravity import Gravity
-from softgrasp.fem.effects.layers import Layers
-from softgrasp.fem.effects.reaction import Reaction
-from softgrasp.fem.effects.rotation import Rotation
 
 __all__ = ["EFFECTS", "Effect", "Gate", "Problem"]
 

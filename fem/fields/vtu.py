@@ -72,14 +72,10 @@ def write_vtu(
     """Write one file, in which each rank's grid is a piece. Collective.
 
     Args:
-        comm: ranks that write.
-        path: replaced if there.
-        grid: of this rank.
         points, cells: fields of this rank, one row a point or a cell.
         whole: fields of the whole file, the same on every rank.
 
-    Raises:
-        OSError: the file cannot be written.
+    Raises OSError: the file cannot be written.
     """
     parts = grid.fields() | {"PointData": points, "CellData": cells}
     own = b"".join(field.block() for fields in parts.values() for field in fields)
@@ -131,7 +127,6 @@ class Collection:
     """The files of a series against time, a whole ``.pvd`` file after each `add`; rank 0 only.
 
     Args:
-        path: of the file.
         note: a remark kept in it; no "--".
     """
 

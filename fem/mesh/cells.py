@@ -1,4 +1,8 @@
-"""Cells of any type meshio names, cut into linear lines, triangles or tetrahedra (numpy only, not collective)."""
+"""Cells of any type meshio names, cut into linear lines, triangles or tetrahedra (numpy only, not collective).
+
+``points`` are those of the whole mesh (n_points, 2 or 3) [m], ``cells`` corner nodes (n_cells, corners) unless said
+otherwise, ``shape`` is that of :func:`shape_of`, and ``name`` that of the mesh, for messages.
+"""
 
 from __future__ import annotations
 
@@ -71,11 +75,8 @@ def check_straight(points: Floats, cells: Integers, shape: str, kind: str, name:
     other nodes lie. Inner nodes do not shape a cell.
 
     Args:
-        points: all points, shape (n_points, 2 or 3) [m].
         cells: all nodes of the cells, shape (n_cells, nodes of a cell): corners, edges, faces, inside.
-        shape: see `shape_of`.
         kind: meshio's name of the cell type, for messages.
-        name: name of the mesh, for messages.
 
     Raises:
         MeshError: the number of nodes fits no order, or a cell is curved by more than `STRAIGHT` of its longest edge.
@@ -156,18 +157,9 @@ def simplices(cells: Integers, shape: str, turn: int = 0) -> tuple[Integers, Int
 def cut_cells(points: Floats, cells: Integers, shape: str, name: str) -> tuple[Integers, Integers]:
     """`simplices` of the cells of a mesh, whose volumes must have one sign within each cell.
 
-    A quadrilateral that its smallest node cuts badly (a concave one) is cut by its other diagonal. Wedges are
-    turned as needed, since formats disagree on their orientation. The volume of a cell with flat faces is kept;
-    warped faces are replaced by two triangles.
-
-    Args:
-        points: shape (n_points, d) [m].
-        cells: corner nodes, shape (n_cells, corners).
-        shape: see `shape_of`.
-        name: name of the mesh, for messages.
-
-    Raises:
-        MeshError: a cell is so distorted that its parts overlap.
+    A quadrilateral that its smallest node cuts badly (a concave one) is cut by its other diagonal. Wedges are turned as
+    needed, since formats disagree on their orientation. The volume of a cell with flat faces is kept; warped faces are
+    replaced by two triangles. Raises MeshError: a cell is so distorted that its parts overlap.
     """
     cut, parents = simplices(cells, shape)
     if cells.shape[1] == cut.shape[1]:
@@ -201,12 +193,9 @@ def check_interfaces(points: Floats, blocks: list[tuple[Integers, str]], name: s
     """Refuse a mesh in which two triangles meet a quadrilateral face that `simplices` cuts by its other diagonal.
 
     Args:
-        points: all points, shape (n_points, 3) [m].
         blocks: corner nodes and shape of the cells of each type.
-        name: name of the mesh, for messages.
 
-    Raises:
-        MeshError: there are such faces; the body would be open there.
+    Raises MeshError: there are such faces; the body would be open there.
     """
     faces = [cells[:, face] for cells, shape in blocks if _DIMENSIONS[shape] == 3 for face in _FACES[shape]]
     quads = [face for face in faces if face.shape[1] == 4]

@@ -1,13 +1,20 @@
-"""Quality checks of simplex meshes given as arrays (numpy only, not collective)."""
+"""What may be wrong with a simplex mesh in arrays: flat or inverted cells, open seams, loose parts (not collective).
+
+``points`` are coordinates (n_points, d) [m], d = 2 or 3, ``cells`` nodes (n_cells, d + 1), ``facets`` those of
+:func:`sort_facets`, and ``name`` is that of the mesh, for messages.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from softgrasp.fem.errors import MeshError
 
@@ -18,12 +25,7 @@ FLAT = 1e-12  # volume over (longest edge)^d: far above round-off (1e-16), far b
 
 
 def signed_volumes(points: Floats, cells: Integers) -> Floats:
-    """V = det [x_1 - x_0, ..., x_d - x_0] / d! of each simplex, negative if inverted.
-
-    Args:
-        points: shape (n_points, d), d = 2 or 3 [m].
-        cells: shape (n_cells, d + 1).
-    """
+    """V = det [x_1 - x_0, ..., x_d - x_0] / d! of each simplex, negative if inverted."""
     edges = points[cells[:, 1:]] - points[cells[:, :1]]
     return np.asarray(np.linalg.det(edges) / math.factorial(points.shape[1]), dtype=np.float64)
 
@@ -40,17 +42,8 @@ def longest_edges(points: Floats, cells: Integers) -> Floats:
 def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Integers:
     """Return cells of positive volume, or refuse the mesh.
 
-    Flat cells are refused always; inverted cells (also if all of them are) unless ``repair`` turns them round
-    by swapping their last two nodes.
-
-    Args:
-        points: shape (n_points, d) [m].
-        cells: shape (n_cells, d + 1), left unchanged.
-        repair: turn inverted cells round.
-        name: name of the mesh for messages.
-
-    Raises:
-        MeshError: a coordinate is not finite, or a cell is flat or inverted.
+    Flat cells are refused always; inverted cells (also if all of them are) unless ``repair`` turns them round by
+    swapping their last two nodes. Raises MeshError: a coordinate is not finite, or a cell is flat or inverted.
     """
     bad_points = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad_points.size:
@@ -105,3 +98,163 @@ def place_text(point: Floats) -> str:
 
 def _middle(points: Floats, cells: Integers, cell: int) -> str:
     return place_text(points[cells[cell]].mean(axis=0))
+
+
+SEAM = 1e-4  # of the shortest edge: above coordinates of 6 digits, far below any cell
+
+
+@dataclass(frozen=True)
+class Facets:
+    """The facets of all cells, sorted so that equal ones are neighbours."""
+
+    nodes: Integers  # sorted nodes of each facet, shape ((d + 1) n_cells, d)
+    cells: Integers  # the cell of each facet
+    same: npt.NDArray[np.bool_]  # whether a facet equals the next one, shape ((d + 1) n_cells - 1,)
+
+    @property
+    def outer(self) -> npt.NDArray[np.bool_]:
+        """The facets that bound one cell only."""
+        pair = np.concatenate([[False], self.same, [False]])
+        return np.asarray(~(pair[1:] | pair[:-1]))
+
+
+def sort_facets(cells: Integers) -> Facets:
+    """The facets of simplices, shape (n_cells, d + 1)."""
+    n, corners = cells.shape
+    nodes = np.sort(np.concatenate([np.delete(cells, i, axis=1) for i in range(corners)]), axis=1)
+    order = np.lexsort(nodes.T)
+    nodes = nodes[order]
+    return Facets(nodes, order % n, (nodes[1:] == nodes[:-1]).all(axis=1))
+
+
+def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: float) -> Integers:
+    """The node that stands for each node: itself, or the first of the boundary nodes at its place.
+
+    Two boundary nodes are at one place if |x - y| <= tolerance h, h the shortest edge of the boundary cells at both.
+
+    Args:
+        tolerance: share of h, < 1/2 [1].
+    """
+    owners = cells[np.unique(facets.cells[facets.outer])]
+    h = np.full(len(points), np.inf)
+    for i, j in combinations(range(cells.shape[1]), 2):
+        length = np.linalg.norm(points[owners[:, i]] - points[owners[:, j]], axis=1)
+        np.minimum.at(h, owners[:, i], length)
+        np.minimum.at(h, owners[:, j], length)
+    nodes = np.unique(facets.nodes[facets.outer])
+    tree = cKDTree(points[nodes])
+    radius = tolerance * h[nodes]
+    near = np.flatnonzero(tree.query_ball_point(points[nodes], radius, return_length=True) > 1)
+    lists = tree.query_ball_point(points[nodes[near]], radius[near])
+    one = nodes[np.repeat(near, [len(entry) for entry in lists])]
+    other = nodes[np.concatenate([*lists, []]).astype(np.int64)]
+    close = np.linalg.norm(points[one] - points[other], axis=1) <= tolerance * h[other]
+    n = len(points)
+    graph = coo_array((np.ones(int(close.sum()), dtype=np.int8), (one[close], other[close])), shape=(n, n))
+    _, labels = connected_components(graph.tocsr(), directed=False)
+    _, first = np.unique(labels, return_index=True)
+    return np.asarray(first[labels], dtype=np.int64)
+
+
+def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: float) -> Integers:
+    """Boundary nodes inside a boundary facet, or an edge of one, that is not their own.
+
+    Args:
+        tolerance: largest distance from the facet over its longest edge, and least from its corners [1].
+    """
+    faces, owners = facets.nodes[facets.outer], cells[facets.cells[facets.outer]]
+    nodes = np.unique(faces)
+    middles = points[faces].mean(axis=1)
+    radii = np.linalg.norm(points[faces] - middles[:, None], axis=2).max(axis=1)
+    lists = cKDTree(points[nodes]).query_ball_point(middles, radii)  # its corners lie on that ball, and count not
+    face = np.repeat(np.arange(len(faces)), [len(entry) for entry in lists])
+    node = nodes[np.concatenate([*lists, []]).astype(np.int64)]
+    foreign = (node[:, None] != owners[face]).all(axis=1)
+    face, node = face[foreign], node[foreign]
+    start = points[faces[face, 0]]
+    edges = (points[faces[face, 1:]] - start[:, None]).transpose(0, 2, 1)
+    away = points[node] - start
+    shares = np.einsum("nij,nj->ni", np.linalg.pinv(edges), away)  # barycentric coordinates but the first
+    off = np.linalg.norm(away - np.einsum("nji,ni->nj", edges, shares), axis=1)
+    shares = np.column_stack([1 - shares.sum(axis=1), shares])
+    on = (off <= tolerance * longest_edges(points, faces)[face]) & (shares.min(axis=1, initial=1) >= -tolerance)
+    return np.unique(node[on & (shares.max(axis=1, initial=0) < 1 - tolerance)])
+
+
+def doubled_text(points: Floats, first: Integers, tolerance: float, joined: bool, name: str) -> list[str]:
+    """The warning about doubled nodes, from :func:`doubled_nodes`; empty if there are none."""
+    nodes = np.flatnonzero(first != np.arange(len(first)))
+    if not nodes.size:
+        return []
+    count, place = counted(nodes.size, "doubled node"), _where(points[first[nodes]])
+    near = f"closer than {tolerance:g} of the shortest edge to another"
+    if joined:
+        return [f"{name} had {count} {place}, {near}: tissue.repair joined {'it' if nodes.size == 1 else 'them'}."]
+    return [
+        f"{name} has {count} {place}, {near}, and the body is open there as along a crack: "
+        "set tissue.repair = true to join them, unless a crack is meant."
+    ]
+
+
+def hanging_text(points: Floats, nodes: Integers, name: str) -> list[str]:
+    """The warning about hanging nodes, from :func:`hanging_nodes`; empty if there are none."""
+    if not nodes.size:
+        return []
+    return [
+        f"{name} has {counted(nodes.size, 'hanging node')} {_where(points[nodes])} on a side of a cell that has no "
+        "corner there, and the body is open there as along a crack: remesh so that cells meet corner to corner."
+    ]
+
+
+def _where(x: Floats) -> str:
+    low, high = place_text(x.min(axis=0)), place_text(x.max(axis=0))
+    return f"at {low}" if low == high else f"between {low} and {high}"
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of a mesh that hang together through facets; small, replicated on all ranks.
+
+    Parts of one group share nodes, but no facet: they may turn about each other.
+    """
+
+    cells: Integers  # number of cells of each part, shape (n_parts,)
+    middles: Floats  # mean of the cell midpoints of each part, shape (n_parts, d) [m]
+    radii: Floats  # largest distance of a node from the middle, shape (n_parts,) [m]
+    groups: Integers  # number of the group of each part, shape (n_parts,)
+    points: Floats  # nodes that several parts share, shape (n_shared, d) [m]
+    joints: Integers  # rows (shared node, part), sorted, shape (n, 2)
+
+
+def find_parts(
+    points: Floats, cells: Integers, facets: Facets, name: str
+) -> tuple[npt.NDArray[np.int32], Parts] | None:
+    """Label the cells of each facet-connected part from 0; None if the mesh is one part.
+
+    Raises MeshError: a facet has more than two cells.
+    """
+    n = len(cells)
+    if (crowded := facets.same[1:] & facets.same[:-1]).any():
+        place = points[facets.nodes[np.argmax(crowded)]].mean(axis=0)
+        raise MeshError(
+            f"{name} has facets with more than two cells, the first around {place_text(place)}: remove doubled cells."
+        )
+    one, other = facets.cells[:-1][facets.same], facets.cells[1:][facets.same]
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
+    count, labels = connected_components(graph.tocsr(), directed=False)
+    if count == 1:
+        return None
+    total = np.bincount(labels, minlength=count)
+    midpoints = points[cells].mean(axis=1)
+    middles = np.stack([np.bincount(labels, weights=x, minlength=count) for x in midpoints.T], axis=1) / total[:, None]
+    radii = np.zeros(count)
+    np.maximum.at(radii, labels, np.linalg.norm(points[cells] - middles[labels, None], axis=2).max(axis=1))
+    groups = np.zeros(count, dtype=np.int64)
+    groups[labels] = components(cells, len(points))[1]
+    pairs = np.unique(cells.astype(np.int64) * count + labels[:, None])  # (node, part) in one number, sorted
+    nodes, parts = np.divmod(pairs, count)
+    shared, times = np.unique(nodes, return_counts=True)
+    shared = shared[times > 1]
+    kept = np.isin(nodes, shared)
+    joints = np.stack([np.searchsorted(shared, nodes[kept]), parts[kept]], axis=1)
+    return labels.astype(np.int32), Parts(total, middles, radii, groups, points[shared], joints)

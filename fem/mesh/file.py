@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import meshio
@@ -10,7 +11,6 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, agree
-from softgrasp.fem.mesh.arrays import Floats, Integers, MeshArrays, Sets, Tags
 from softgrasp.fem.mesh.cells import (
     check_interfaces,
     check_straight,
@@ -20,14 +20,52 @@ from softgrasp.fem.mesh.cells import (
     shape_of,
     simplices,
 )
-from softgrasp.fem.mesh.check import check_cells
+from softgrasp.fem.mesh.check import (
+    SEAM,
+    Parts,
+    check_cells,
+    doubled_nodes,
+    doubled_text,
+    find_parts,
+    hanging_nodes,
+    hanging_text,
+    sort_facets,
+)
 from softgrasp.fem.mesh.foreign import read_foreign
-from softgrasp.fem.mesh.parts import find_parts
-from softgrasp.fem.mesh.seams import SEAM, doubled_nodes, doubled_text, hanging_nodes, hanging_text, sort_facets
-from softgrasp.fem.mesh.spread import Marks, spread
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.mesh.tissue_mesh import Marks, Sets, TissueMesh, spread
+from softgrasp.fem.sealed import digest
 
-_MARKS = ("facets", "cells", "parts")
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Tags = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """A simplex mesh in arrays, before distribution."""
+
+    points: Floats  # shape (n_points, d) [m]
+    cells: Integers  # shape (n_cells, d + 1)
+    cell_tags: Tags | None  # one integer a cell, or None
+    facets: Integers  # tagged facets, shape (n_facets, d)
+    facet_tags: Tags | None  # one integer a tagged facet, or None
+    part_tags: Tags | None  # number of the facet-connected part of each cell, or None if there is one part only
+    parts: Parts | None  # what is known of these parts, or None
+    facet_sets: Sets  # marks in ``facet_tags`` of each tag number and named set
+    cell_sets: Sets  # marks in ``cell_tags`` of each tag number and named set
+    notes: tuple[str, ...] = ()  # warnings, one sentence each
+
+    def digest(self) -> str:
+        """SHA-256 of coordinates, cells, tags and sets, which some formats spread over several files; 64 hex digits."""
+        sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (self.cell_sets, self.facet_sets)]
+        return digest(self.points, self.cells, self.cell_tags, self.facets, self.facet_tags, *sets)
+
+
+def _text(sets: Sets) -> str:
+    """The same for equal sets, in whatever order they were read."""
+    return repr(sorted((repr(name), tuple(int(mark) for mark in marks)) for name, marks in sets.items()))
+
+
 _TAG_NAMES = ("gmsh:physical", "medit:ref", "CellEntityIds")  # preferred names of integer cell data
 _NOT_TAGS = ("gmsh:geometrical",)  # numbers of CAD entities, not marks of the user
 
@@ -49,46 +87,32 @@ def read_mesh(
     Collective. Rank 0 reads and checks.
 
     Args:
-        comm: communicator of the mesh.
-        path: mesh file in any format of meshio.
         scale: factor of all coordinates, e.g. 1e-3 for a file in millimetres.
         repair: turn inverted cells round instead of refusing them, and join doubled nodes instead of warning of them.
         seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].
         limit: longest processor time for a file that meshio may never end [s]; by its size if None.
 
-    Raises:
-        MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or curved
-            cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
+    Raises MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or
+    curved cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
     """
     arrays: MeshArrays | None = None
     with agree(comm):
         if comm.rank == 0:
             arrays = load_arrays(path, scale, repair, seam, limit)
-    facts, body = None, None
-    marks: Marks = {}
-    if arrays is not None:
-        d, body = arrays.points.shape[1], (arrays.points, arrays.cells)
-        tagged = (
-            (d - 1, arrays.facets, arrays.facet_tags),
-            (d, arrays.cells, arrays.cell_tags),
-            (d, arrays.cells, arrays.part_tags),
-        )
-        marks = {
-            name: (k, nodes, tags) for name, (k, nodes, tags) in zip(_MARKS, tagged, strict=True) if tags is not None
-        }
-        facts = (d, arrays.parts, arrays.facet_sets, arrays.cell_sets, arrays.notes, arrays.digest())
-    dimension, *known = comm.bcast(facts)
-    mesh, found = spread(comm, dimension, body, marks)
-    facet_tags, cell_tags, part_tags = (found.get(name) for name in _MARKS)
-    return TissueMesh(mesh, dimension, facet_tags, cell_tags, path.name, part_tags, *known)
+    if arrays is None:
+        return spread(comm, None, {}, {})
+    d, cells = arrays.points.shape[1], arrays.cells
+    entities = {"facet_tags": (d - 1, arrays.facets), "cell_tags": (d, cells), "part_tags": (d, cells)}
+    marks: Marks = {
+        name: (*where, tags) for name, where in entities.items() if (tags := getattr(arrays, name)) is not None
+    }
+    known = {name: getattr(arrays, name) for name in ("parts", "facet_sets", "cell_sets", "notes")}
+    known |= {"source": path.name, "digest": arrays.digest()}
+    return spread(comm, (arrays.points, cells), marks, known)
 
 
 def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
-    """Read and check a mesh file.
-
-    Raises:
-        MeshError: see `read_mesh`.
-    """
+    """Read and check a mesh file. Raises MeshError: see `read_mesh`."""
     raw = _read(path, limit)
     kinds = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]

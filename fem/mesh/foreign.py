@@ -35,7 +35,6 @@ def read_foreign(path: Path, limit: float | None = None) -> meshio.Mesh:
     """Read a mesh file of any format of meshio.
 
     Args:
-        path: the file.
         limit: longest processor time for formats that may never end [s]; by size if None.
 
     Raises:

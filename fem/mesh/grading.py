@@ -1,17 +1,99 @@
-"""Cell sizes that fall towards singular ends, and lines of a box that follow them (numpy only, not collective)."""
+"""Graded meshes: cell sizes that fall towards singular ends, bisection down to them, boxes whose lines meet the ends.
+
+DOLFINx bisects distributed meshes too, but passes tags on only where no cell is shared by ranks, and keeps children on
+the rank of their parent. On rank 0 the mesh is the same for every rank count and is spread evenly; contact zone, tags
+and layers pass to the children.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
+import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
+from softgrasp.fem.errors import MeshError, SceneError
+from softgrasp.fem.mesh.check import FLAT, counted, find_parts, longest_edges, place_text, signed_volumes, sort_facets
+from softgrasp.fem.mesh.make import structured_mesh
 from softgrasp.fem.mesh.singular import Ends
+from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread
+
+if TYPE_CHECKING:
+    from softgrasp.fem.scene.scene import Scene
+
 
 Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
+
+MOST_LEVELS = 60  # each halves the longest edge at most; 2^-30 of a body is below any useful cell
+
+
+def bisect(whole: Whole, marked: Ints) -> Whole:
+    """Split the marked cells, and others until no node hangs, through their longest edges [PC00].
+
+    Args:
+        marked: numbers of the cells to split, in the order of ``whole.simplices``.
+
+    Raises MeshError: a child would be flat to rounding.
+    """
+    mesh, d = whole.mesh, whole.dimension
+    for a, b in ((d, 1), (1, d), (d - 1, d), (d, d - 1)):
+        mesh.topology.create_connectivity(a, b)
+    edges = dolfinx.mesh.compute_incident_entities(mesh.topology, np.sort(marked).astype(np.int32), d, 1)
+    option = dolfinx.mesh.RefinementOption.parent_cell_and_facet
+    fine, parent, parent_facet = dolfinx.mesh.refine(mesh, edges, option=option)
+    for a, b in ((d - 1, d), (d, d - 1)):
+        fine.topology.create_connectivity(a, b)
+    facets = {
+        name: dolfinx.mesh.transfer_meshtag(tags, fine, parent, parent_facet) for name, tags in whole.facets.items()
+    }
+    above = parent[fine.topology.original_cell_index]  # DOLFINx numbers parents in the order before its own reordering
+    result = replace(whole, mesh=fine, cells={k: v[above] for k, v in whole.cells.items()}, facets=facets)
+    points, cells = result.points, result.simplices
+    quality = np.abs(signed_volumes(points, cells)) / longest_edges(points, cells) ** d
+    if (flat := quality <= FLAT).any():
+        place = place_text(points[cells[int(np.argmin(quality))]].mean(axis=0))
+        raise MeshError(
+            f"{whole.source} cannot be bisected further: {counted(int(flat.sum()), 'cell')} would be flat, the worst "
+            f"around {place}; remesh the body there or take a larger tissue.refine.tolerance."
+        )
+    return result
+
+
+def bisect_to(whole: Whole, size: Callable[[Floats], Floats], slack: float, most: int) -> Whole:
+    """Bisect until no cell is larger than ``slack`` times its size(points (n, d)) [m], or there are more than ``most``.
+
+    Raises MeshError: see :func:`bisect`.
+    """
+    for _ in range(MOST_LEVELS):
+        points, cells = whole.points, whole.simplices
+        large = longest_edges(points, cells) > slack * size(points[cells].mean(axis=1))
+        if not large.any() or len(cells) > most:
+            break
+        whole = bisect(whole, np.flatnonzero(large).astype(np.int32))
+    return whole
+
+
+def distribute(comm: MPI.Intracomm, whole: Whole | None) -> TissueMesh:
+    """Spread a mesh from rank 0 over the ranks (None on the others), with all it carries. Collective.
+
+    ``mesh.topology.original_cell_index`` of the result counts the cells as ``whole.simplices`` does.
+    """
+    if whole is None:
+        return spread(comm, None, {}, {})
+    points, cells, d = whole.points, whole.simplices, whole.dimension
+    marks: Marks = {name: (d, cells, values) for name, values in whole.cells.items()}
+    marks |= {name: (d - 1, whole.facet_nodes(name), tags.values) for name, tags in whole.facets.items()}
+    known: dict[str, Any] = {name: getattr(whole, name) for name in ("source", "facet_sets", "cell_sets")}
+    if (parts := find_parts(points, cells, sort_facets(cells), whole.source)) is not None:
+        marks["part_tags"], known["parts"] = (d, cells, parts[0]), parts[1]
+    return replace(spread(comm, (points, cells), marks, known), whole=whole)
+
 
 # mu < alpha / p with alpha about 1/2 gives elements of order p their full order; below it the cells next to the end
 # shrink so fast that the floor, not mu, decides where they stop.
@@ -47,7 +129,6 @@ def graded_line(cuts: Sequence[float], ends: Sequence[float], n: int, mu: float,
     Args:
         cuts: sorted coordinates, the first and last bound the line [m].
         ends: those towards which distances fall [m].
-        n: number of cells; raised to the number of stretches.
         mu: grading, 0 < mu <= 1 [1].
         radius: R [m].
     """
@@ -85,3 +166,65 @@ def merged(cuts: Sequence[float], others: Sequence[float], gap: float) -> list[f
         if all(abs(other - c) > gap for c in result):
             result.append(other)
     return sorted(result)
+
+
+SAME = 1e-9  # of the side: far above rounding of coordinates, far below any cell
+CLOSE = 0.1  # of the side: a line through a point of an output keeps this distance from others
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of a box."""
+
+    cuts: tuple[float, ...]  # coordinates that a line must meet, the sides first and last [m]
+    ends: tuple[float, ...]  # those of them where the contact zone ends [m]
+
+
+def box_axes(scene: Scene) -> tuple[Axis, ...]:
+    """What the lines of a structured box must meet.
+
+    Lines meet the box of the contact zone, the boxes of layers and the points of outputs, and the zone ends at its
+    sides and at its box. Raises SceneError: the scene has no structured box.
+    """
+    tissue, contact = scene.tissue, scene.contact
+    if tissue.size is None:
+        raise SceneError("tissue.refine.method = 'lines' needs tissue.size; a mesh file can only be bisected.")
+    d = len(tissue.size)
+    origin = tissue.origin or [0.0] * d
+    sides = contact.axes(d)
+    result = []
+    for axis, (low, length) in enumerate(zip(origin, tissue.size, strict=True)):
+        high = low + length
+
+        def inner(values: Sequence[float], low: float = low, high: float = high) -> list[float]:
+            return [v for v in values if low + SAME * (high - low) < v < high - SAME * (high - low)]
+
+        ends = [high if end > 0 else low for a, end in sides if a == axis]
+        across = {a for a, _ in sides} - {axis} or not sides
+        if across:
+            ends += [low, high]
+            if contact.box is not None:
+                lo, hi = (corner[axis] for corner in contact.box)
+                ends = [e for e in ends if lo - SAME * length <= e <= hi + SAME * length] + inner([lo, hi])
+        cuts = [low, high, *inner(ends)]
+        cuts += inner([corner[axis] for layer in tissue.layers.values() for corner in layer.box or []])
+        points = [o.point[axis] for o in (scene.control.outputs if scene.control else []) if o.point is not None]
+        unique = merged([], sorted(cuts), SAME * length)
+        result.append(Axis(tuple(merged(unique, inner(points), CLOSE * length)), tuple(sorted(set(ends)))))
+    return tuple(result)
+
+
+def even_cells(axis: Axis, h: float) -> int:
+    """Number of cells no longer than h between the cuts."""
+    return sum(int(np.ceil((b - a) / h - SAME)) for a, b in pairwise(axis.cuts))
+
+
+def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: float, radius: float) -> TissueMesh:
+    """The structured box with lines at all cuts that crowd towards the ends; mu = 1: even between cuts. Collective."""
+    axes, tissue = box_axes(scene), scene.tissue
+    lines = [graded_line(a.cuts, a.ends, n, mu, radius) for a, n in zip(axes, cells, strict=True)]
+    box = structured_mesh(comm, tissue.size or [], [len(line) - 1 for line in lines], tissue.origin)
+    x = box.mesh.geometry.x
+    for i, (line, length) in enumerate(zip(lines, tissue.size or [], strict=True)):
+        x[:, i] = line[np.rint((x[:, i] - line[0]) / length * (len(line) - 1)).astype(np.int64)]
+    return box

@@ -49,9 +49,6 @@ def expected_order(ends: Ends, order: int, graded: bool, edges: bool = False) ->
     """Order of the outputs in n_e^(1/d): 2 p on graded meshes, min(2 p, 2 alpha) on even ones.
 
     Args:
-        ends: singular ends of the body.
-        order: p of the elements.
-        graded: whether cells shrink towards the ends.
         edges: whether they do so by bisection in 3D, where small cells along an edge are many: at most 3.
     """
     full = 2.0 * order
@@ -113,8 +110,6 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
     """Ends of the contact zone, re-entrant corners or edges, and corners of layer interfaces.
 
     Args:
-        points: shape (n_points, d) [m].
-        cells: simplices, shape (n_cells, d + 1).
         held: contact facets, shape (n, d).
         layers: number of the layer of each cell, shape (n_cells,).
         nu: Poisson's ratio of each cell [1], shape (n_cells,).

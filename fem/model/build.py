@@ -7,27 +7,48 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.effects.damping import operator as damping_operator
-from softgrasp.fem.effects.gravity import acceleration
-from softgrasp.fem.effects.rotation import hand_mass
+from softgrasp.fem.effects.catalog import acceleration, hand_mass
+from softgrasp.fem.effects.catalog import operator as damping_operator
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
-from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise
+from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
+from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.system import BlockSystem, LayerBlocks, LayerMaterial, coupling, tissue_matrices
 
-if TYPE_CHECKING:
-    from softgrasp.fem.model.mesh_estimate import MeshEstimate
-    from softgrasp.fem.strain.points import Points
+
+@dataclass(frozen=True)
+class MeshEstimate:
+    """Error of the deformation: outputs against the hand, over the largest of them."""
+
+    estimate: float  # largest |delta y| over the run, relative [1]
+    bound: float  # what the error has not exceeded wherever it could be checked, relative [1]
+    # estimate of y - y_h at the time steps, (steps + 1, p) [m, rad]; y_h + delta is the corrected output
+    delta: Array = field(repr=False)
+    # relative errors of the two lowest frequencies that the run can see, omega_h / omega - 1 [1]
+    omega: tuple[float, ...]
+    time_error: float  # error of the time steps, relative like ``estimate`` [1]
+    shift: float  # largest distance of the ends of the zone held from ``contact.box`` [m]
+    n_e: int  # tissue unknowns of the mesh judged
+    finer: int  # tissue unknowns of the mesh it was compared with
+    by: str  # "order" (elements of the next order on the same cells) or "graded" (another mesh, which meets the zone)
+    tolerance: float | None = None  # of the scene, or None
+    passes: int = 0  # refinements after the first estimate
+    obstacle: str = ""  # why the tolerance was not reached, or ""
+    offer: tuple[float, int] | None = None  # tolerance and unknowns of a graded mesh that does better, or None
+    seconds: float = 0.0  # what the estimate took, the slowest rank
+
+    def corrected(self, outputs: Array) -> Array:
+        """Outputs y_h + delta y (steps + 1, p) [m, rad]."""
+        return np.asarray(outputs + self.delta)
 
 
 @dataclass
@@ -86,8 +107,7 @@ class Model:
             lam, mu: Lame parameters [Pa]; None keeps those of each layer.
             rho: density [kg/m^d]; None keeps it.
 
-        Raises:
-            SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
+        Raises SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
         """
         changes = {key: value for key, value in (("lam", lam), ("mu", mu), ("rho", rho)) if value is not None}
         d = self.system.layout.dimension
@@ -112,16 +132,6 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
         own = None if layer is None or damping is None else layer.beta
         result.append(LayerMaterial(m.lam, m.mu, m.rho, beta if own is None else own))
     return tuple(result)
-
-
-def _points(space: Discretisation, scene: Scene, inventory: Inventory) -> Points | None:
-    effect = scene.effects.finite_strain
-    if effect is None:
-        return None
-    from softgrasp.fem.model.points import make_points  # only scenes with finite strain pay for it
-
-    inventory.operators.append("B")
-    return make_points(space, scene, effect)
 
 
 def _scene_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
@@ -183,6 +193,10 @@ def build(
         damping = damping_operator(scene, layers, materials)
         if damping.matrix is not None:
             inventory.operators.append("D_ee")
+        points, law = None, scene.effects.finite_strain
+        if law is not None:
+            points = make_points(space, scene, law)
+            inventory.operators.append("B")
         system = BlockSystem(
             layout=layout,
             layers=layers,
@@ -198,6 +212,6 @@ def build(
             hand_weight=bool(scene.effects.gravity is not None and scene.effects.gravity.hand_weight),
             two_way=scene.effects.reaction,
             graded=scene.tissue.refine is not None and scene.tissue.refine.grading != "off",
-            points=_points(space, scene, inventory),
+            points=points,
         )
     return Model(scene, space, system, inventory, watch)

@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from softgrasp.fem.errors import MeshError, SceneError, agree
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.check import counted, place_text
-from softgrasp.fem.mesh.parts import Parts
+from softgrasp.fem.mesh.check import Parts, counted, place_text
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.scene.scene import Contact
 
@@ -31,10 +30,7 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     and inside ``contact.box``; or if it carries ``contact.facet_tag``. What is not given does not restrict. A bisected
     mesh has inherited its zone.
 
-    Collective.
-
-    Raises:
-        SceneError: a side is unknown, the tag is absent, or no facet is in the zone.
+    Collective. Raises SceneError: a side is unknown, the tag is absent, or no facet is in the zone.
     """
     mesh, fdim = tissue.mesh, tissue.dimension - 1
     mesh.topology.create_connectivity(fdim, fdim + 1)
@@ -73,14 +69,8 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
 def held_check(tissue: TissueMesh, facets: Ints) -> None:
     """Refuse a mesh of which a part could move freely, alone or about the nodes by which it hangs on the rest.
 
-    Collective.
-
-    Args:
-        facets: owned contact facets, from `contact_facets`.
-
-    Raises:
-        MeshError: parts that share no node with the rest have no contact facet, or parts are joined to the rest
-            by so few nodes that they can turn.
+    Collective. Raises MeshError: parts that share no node with the rest have no contact facet, or parts are joined to
+    the rest by so few nodes that they can turn.
     """
     tags, parts = tissue.part_tags, tissue.parts
     if tags is None or parts is None:
@@ -88,7 +78,7 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
     mesh, dimension = tissue.mesh, tissue.dimension
     mesh.topology.create_connectivity(dimension - 1, dimension)
     facet_cells = mesh.topology.connectivity(dimension - 1, dimension)
-    labels = np.zeros(mesh.topology.index_map(dimension).size_local, dtype=np.int64)
+    labels = np.zeros(tissue.owned, dtype=np.int64)
     owned = tags.indices < len(labels)
     labels[tags.indices[owned]] = tags.values[owned]
     # An owned exterior facet has one cell, and that cell is owned too.
@@ -110,10 +100,8 @@ def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
 
     Args:
         held: whether a part has a contact facet, shape (n_parts,).
-        source: name of the mesh, for messages.
 
-    Raises:
-        MeshError: see `held_check`.
+    Raises MeshError: see `held_check`.
     """
     groups = int(parts.groups.max()) + 1
     loose = np.setdiff1d(np.arange(groups), parts.groups[held])
@@ -195,8 +183,6 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
     (-y, x, 0) in 3D.
 
     Args:
-        points: coordinates, shape (n_nodes, 2 or 3) [m].
-        rotation: append the rotations.
         reference: point the hand turns about, ``dimension`` entries [m].
 
     Returns:
@@ -218,10 +204,9 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
 def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
     """Owned cells with the layer's ``tag``, or with their midpoint in its ``box``; sorted, maybe empty here.
 
-    Raises:
-        SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
+    Raises SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
     """
-    owned = np.arange(tissue.mesh.topology.index_map(tissue.dimension).size_local, dtype=np.int32)
+    owned = np.arange(tissue.owned, dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, owned)[:, : tissue.dimension]
     if layer.tag is not None:
         if tissue.cell_tags is None:

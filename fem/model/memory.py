@@ -60,12 +60,7 @@ def simplices(cells: list[int]) -> int:
 
 
 def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: bool) -> Need:
-    """Estimate the memory of a model and, if it will run, of its steps.
-
-    Args:
-        cells: triangles or tetrahedra in all.
-        run: the steps are taken.
-    """
+    """Estimate the memory of a model and, if it will run, of its steps."""
     kind, d = (dimension, scene.tissue.order), dimension
     n_e = max(int(kind[1] ** d / math.factorial(d) * cells * d), 1)  # p^d / d! nodes a cell in large regular meshes
     n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)
@@ -104,12 +99,7 @@ def free_bytes(scene: Scene) -> float:
 def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int) -> None:
     """Refuse a model or run that the memory of some node cannot hold. Collective.
 
-    Args:
-        run: the steps are taken.
-        cells: triangles or tetrahedra in all.
-
-    Raises:
-        ResourceError: on all ranks, with the key, the estimate, what the node has, and what would fit.
+    Raises ResourceError: on all ranks, with the key, the estimate, what the node has, and what would fit.
     """
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
     ranks, free = node.size, node.bcast(free_bytes(scene))

@@ -65,7 +65,6 @@ def load_scene(path: str | Path, overrides: Sequence[str] = ()) -> Scene:
     """Read and validate a scene file, without MPI; under MPI use :func:`load_scene_collective`.
 
     Args:
-        path: the TOML file, or the name of a scene that ships.
         overrides: each ``a.b.c=value`` with a TOML value, as after ``--set``; a bare word is a string, and ``false``
             switches off an optional table.
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.scene.scene import Time
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem
+
+if TYPE_CHECKING:
+    from softgrasp.fem.strain.body import Body
 
 
 def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Time | None = None) -> Array:
@@ -24,8 +30,6 @@ def equilibrium(system: BlockSystem, solver: SolverName | None = None, time: Tim
     if system.gravity is None:
         return np.zeros(system.layout.n_local)
     if system.points is not None:
-        from softgrasp.fem.solve.finite_statics import finite_equilibrium
-
         return finite_equilibrium(system, solver)
     load, where = (system.G @ system.gravity)[:, None], "the static equilibrium"
     time = time or Time(steps=1, rtol=1e-12)
@@ -44,34 +48,103 @@ def solve_columns(
     solver: SolverName | None = None,
     reproducible: Reproducible = "auto",
 ) -> Array:
-    """Return the local rows of A^-1 X, A symmetric positive definite, Fortran order. Collective.
+    """Return the local rows (n_local, k) of A^-1 X, A symmetric positive definite, Fortran order. Collective.
 
     Factored once; columns of zeros cost nothing.
 
     Args:
-        A: distributed over the ranks of ``layout``.
-        layout: sizes and ownership.
-        X: local rows (n_local, k).
-        where: what it is for, in messages.
         rtol: of cg, where no direct solver fits.
-        solver: None takes the one that suits few solves.
-        reproducible: as for :func:`make_solver`.
 
-    Raises:
-        SolverError: the factorisation fails, or the solution has a large residual.
+    Raises SolverError: the factorisation fails, or the solution has a large residual.
     """
     name = solver or choose_solver(layout, few=True)[0]
     static = make_solver(A.copy(), name, layout, "softgrasp_static_", rtol, reproducible)
-    b, x = A.createVecs()
-    result = np.zeros(X.shape, order="F")
     try:
-        for j in np.flatnonzero(total(layout.comm, np.abs(X).sum(axis=0)) != 0):
-            b.array_w[:] = X[:, j]
-            static.solve(b, x)
-            static.check(b, x, where)
-            result[:, j] = x.array_r
+        return static.columns(X, where)
     finally:
         static.destroy()
-        b.destroy()
-        x.destroy()
-    return result
+
+
+SMALLEST = 2.0**-10  # step of the load, and part of a correction
+MOST = 25  # iterations of a load
+TOL = 1e-11  # |f - t G g| over |G g|
+
+
+def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) -> Array:
+    """Z with f(z) = G g, stable under small motions of the load; local rows (n_local,) [m]. Collective.
+
+    The load t G g grows from 0 to 1 by steps that are halved where Newton's method fails and doubled where it does not.
+    Raises SolverError: no step of the load converges; the message names its share t, the cell with the smallest J, and
+    J.
+    """
+    from softgrasp.fem.strain.body import Body  # only scenes with finite strain pay for it
+
+    assert system.points is not None
+    assert system.gravity is not None
+    body, comm = Body(system.points, system.materials), system.layout.comm
+    name = solver or choose_solver(system.layout, few=True)[0]
+    z, f = system.K_ee.createVecs()
+    load = z.duplicate()
+    load.array_w[:] = system.G @ system.gravity
+    t, step, answer = 0.0, 1.0, np.array(z.array_r)
+    while t < 1.0:
+        aim = min(t + step, 1.0)
+        if _newton(body, system, name, z, f, load, aim):
+            t, step, answer = aim, 2 * step, np.array(z.array_r)
+            continue
+        z.array_w[:] = answer
+        step = (aim - t) / 2
+        if step < SMALLEST:
+            J, place = body.lowest(1 + body.start(z).j, comm)
+            raise SolverError(
+                f"finite strain ({body.law.name}): no equilibrium beyond {t:.3g} of the weight; in the cell at {place} "
+                f"det F = {J:.3g}: take a stiffer material, or time.start = 'rest'"
+            )
+    body.refuse(body.start(z), comm)
+    for item in (z, f, load):
+        item.destroy()
+    body.destroy()
+    return answer
+
+
+def _newton(
+    body: Body, system: BlockSystem, name: SolverName, z: PETSc.Vec, f: PETSc.Vec, load: PETSc.Vec, t: float
+) -> bool:
+    """Newton from z on for the load t G g, each correction halved until |f - t G g| falls; z moves. Collective."""
+    comm, trial, p = system.layout.comm, z.duplicate(), z.duplicate()
+    target = max(TOL * load.norm(), 4 * body.rounding)
+
+    def residual(x: PETSc.Vec) -> float:
+        J, _ = body.lowest(1 + body.start(x).j, comm)
+        if not J > 0:
+            return np.inf
+        body.force(x, f)
+        f.axpy(-t, load)
+        return float(f.norm())
+
+    try:
+        norm = residual(z)
+        for _ in range(MOST):
+            if norm <= target:
+                return True
+            tangent = make_solver(body.tangent(z).copy(), name, system.layout, "softgrasp_static_")
+            residual(z)
+            tangent.solve(f, p)
+            tangent.destroy()
+            part = 1.0
+            while True:
+                trial.waxpy(-part, p, z)
+                new = residual(trial)
+                if new < norm:
+                    break
+                part /= 2
+                if part < SMALLEST:
+                    return False
+            trial.copy(z)
+            norm = new
+    except SolverError:  # a singular tangent
+        return False
+    finally:
+        trial.destroy()
+        p.destroy()
+    return bool(norm <= target)

@@ -1,6 +1,7 @@
 """Hyperelastic laws as plain arrays over quadrature points: energy, stress, tangent, and a discrete gradient.
 
-With F = I + H, H = grad z of shape (d, d, Q), J = det F, j = J - 1, and W the energy per volume of the rest state:
+Tensors are arrays (d, d, Q), the points last. With F = I + H, H = grad z, J = det F, j = J - 1, and W the energy per
+volume of the rest state:
 
     neo-hooke            W = mu/2 (|F|^2 - d) - mu ln J + lam/2 (ln J)^2      [BW08]
     neo-hooke-quadratic  W = mu/2 (|F|^2 - d) - mu ln J + lam/2 (J - 1)^2     keeps its convexity in J beyond J = e
@@ -23,8 +24,53 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from softgrasp.fem.strain.arrays import Array, cofactor, double_dot, identity, invariants, volume_change
+Array = NDArray[np.float64]
+SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])[:, :, None]
+
+
+def identity(H: Array) -> Array:
+    """F = I + H."""
+    F = H.copy()
+    for i in range(len(H)):
+        F[i, i] += 1.0
+    return F
+
+
+def double_dot(A: Array, B: Array) -> Array:
+    """A : B, (Q,)."""
+    return np.asarray(np.einsum("ijq,ijq->q", A, B))
+
+
+def cofactor(A: Array) -> Array:
+    """Cof A = det(A) A^-T, (d, d, Q)."""
+    if len(A) == 2:
+        return np.asarray(SIGNS * A[::-1, ::-1])
+    C = np.empty_like(A)
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            k, m = (j + 1) % 3, (j + 2) % 3
+            np.multiply(A[a, k], A[b, m], out=C[i, j])
+            C[i, j] -= A[a, m] * A[b, k]
+    return C
+
+
+def invariants(H: Array) -> tuple[Array, Array]:
+    """Tr H and det(I + H) - 1 - tr H, (Q,) each: their sum is J - 1 without cancellation."""
+    if len(H) == 2:
+        return H[0, 0] + H[1, 1], H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
+    C = cofactor(H)
+    rest = C[0, 0] + C[1, 1] + C[2, 2] + H[0, 0] * C[0, 0] + H[0, 1] * C[0, 1] + H[0, 2] * C[0, 2]
+    return H[0, 0] + H[1, 1] + H[2, 2], rest
+
+
+def volume_change(H: Array) -> Array:
+    """J = det(I + H) - 1, (Q,)."""
+    trace, rest = invariants(H)
+    return trace + rest
+
 
 LawName = Literal["neo-hooke", "neo-hooke-quadratic", "stvk"]
 TINY = 1e-300  # instead of x = 0 in log1p(x)/x

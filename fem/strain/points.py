@@ -53,7 +53,6 @@ def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: t
     """The matrix B of :class:`Points` from the gradients of the nodes' shape functions. Collective.
 
     Args:
-        comm: ranks.
         gradients: dN_a/dX_j in every point of every cell, (cells, points, nodes, d).
         nodes: global number of each cell's nodes among the free ones, negative for nodes that follow the hand,
             (cells, nodes).
@@ -79,8 +78,6 @@ def whole_points(points: Points, comm: MPI.Intracomm, columns: Ints | None = Non
     """All points on this rank alone, the columns of B in another order. Collective.
 
     Args:
-        points: distributed.
-        comm: their ranks.
         columns: number of each column in the layout's order; None keeps it.
     """
     every = whole_copy(points.B)

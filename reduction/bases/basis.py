@@ -65,8 +65,3 @@ class Basis:
     def N(self) -> int:
         """Number of basis vectors, the hand's own included: the dimension of the first-order reduced model."""
         return int(self.V_q.shape[1])
-
-    @property
-    def N_tissue(self) -> int:
-        """Columns without the hand's own 2 n_s; all of them where hand and tissue share their columns."""
-        return self.N - (2 * self.layout.n_s if self.fixed_solid else 0)

@@ -51,10 +51,10 @@ class Factor:
 
 def magnitude(comm: MPI.Intracomm, *blocks: Array) -> float:
     """Power of two next to the largest entry over all ranks; 1 when all are zero. Collective."""
-    largest = max((float(max(X.max(), -X.min())) for X in blocks if X.size), default=0.0)
-    largest = comm.allreduce(largest, MPI.MAX)
-    if not np.isfinite(largest):
+    own = float(np.max([max(X.max(), -X.min()) for X in blocks if X.size], initial=0.0))
+    if comm.allreduce(not np.isfinite(own), MPI.LOR):
         raise BasisError("the snapshots hold NaN or infinity; a basis needs finite snapshots")
+    largest = comm.allreduce(own, MPI.MAX)
     # 2^-1000 .. 2^1000 so that the inverse is finite too
     return float(2.0 ** np.clip(np.frexp(largest)[1], -1000, 1000)) if largest > 0 else 1.0
 
@@ -72,8 +72,6 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
     """
     if engine not in ENGINES:
         raise BasisError(f"engine '{engine}' is unknown; choose one of {', '.join(ENGINES)}")
-    if not comm.allreduce(bool(np.isfinite(X).all()), MPI.LAND):
-        raise BasisError("the snapshots hold NaN or infinity; a basis needs finite snapshots")
     scale = magnitude(comm, X)
     X = np.asfortranarray(X) if scale == 1.0 else np.asfortranarray(X / scale)
     square = float(comm.allreduce(float(np.vdot(X, X))))
@@ -97,7 +95,6 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
 
 
 def _dense(comm: MPI.Intracomm, X: Array, rows: int) -> PETSc.Mat:
-    """PETSc view of a Fortran-ordered array."""
     A = PETSc.Mat().createDense(((X.shape[0], rows), (None, X.shape[1])), array=X, comm=comm)
     A.assemble()
     return A

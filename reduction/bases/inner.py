@@ -35,7 +35,6 @@ from softgrasp.fem.petsc import Array, PETSc, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.bases.states import BasisError
 
 InnerName = Literal["euclidean", "mass", "energy"]
 INNERS: tuple[InnerName, ...] = get_args(InnerName)
@@ -50,17 +49,12 @@ class Weight:
 
 
 def weights(system: BlockSystem, inner: InnerName) -> tuple[Weight, Weight] | None:
-    """Weights of displacement and velocity in (q, v); None for the Euclidean product. Collective.
-
-    Raises BasisError: the name is unknown.
-    """
+    """Weights of displacement and velocity in (q, v); None for the Euclidean product. Collective."""
     if inner == "euclidean":
         return None
     mass = Weight(system.M_hand, system.M_ee)
     if inner == "mass":
         return mass, mass
-    if inner != "energy":
-        raise BasisError(f"inner product '{inner}' is unknown; choose one of {', '.join(INNERS)}")
     K_ss = total(system.layout.comm, system.T.T @ times_columns(system.K_ee, system.T))
     return Weight((K_ss + K_ss.T) / 2, system.K_ee), mass
 
@@ -151,18 +145,3 @@ def orthonormality(basis: Basis, system: BlockSystem) -> float:
     else:
         W_V = rows.weigh(V, by)
     return float(np.abs(rows.gram(V, W_V) - np.eye(V.shape[1])).max(initial=0.0))
-
-
-def symplecticity(basis: Basis) -> float:
-    """Largest entry of V' J V - J, with the tissue's columns alone when the solid modes are fixed. Collective.
-
-    J = [0 I; -I 0] on the rows (q; p) and on the columns (first half; second half).
-    """
-    rows = Rows(basis.layout, 1, hand=True)
-    first = 2 * basis.layout.n_s if basis.fixed_solid else 0
-    q = rows.stack((basis.V_sq, basis.V_q))[:, first:]
-    p = rows.stack((basis.V_sv, basis.V_p))[:, first:]
-    form = rows.gram(q, p)
-    k = form.shape[0] // 2
-    J = np.eye(2 * k, k=k) - np.eye(2 * k, k=-k)
-    return float(np.abs(form - form.T - J).max(initial=0.0))

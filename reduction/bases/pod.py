@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +13,8 @@ from softgrasp.fem.petsc import Array, on_root
 from softgrasp.reduction.bases.basis import Coordinates
 from softgrasp.reduction.bases.engines import EngineName, Factor, factor, small_svd
 from softgrasp.reduction.bases.inner import InnerName, Rows, Weight, weights
-from softgrasp.reduction.bases.states import BasisError, Blocks, States
-from softgrasp.reduction.bases.truncation import Columns, Part
-
-Halves = list[tuple[Array, Array]]
+from softgrasp.reduction.bases.states import BasisError, Columns, States
+from softgrasp.reduction.bases.truncation import Part
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class PartsRequest:
     """What a builder of parts gets."""
 
     states: States  # system and snapshots
-    blocks: Blocks  # the snapshots in the coordinates and the frame of the method
+    snapshots: Columns  # in the coordinates and the frame of the method
     hand: bool  # whether the hand's rows take part in the decomposition
     coordinates: Coordinates  # "qv" or "qp"
     inner: InnerName  # inner product
@@ -71,7 +69,7 @@ def pod_part(
     X: Array,
     by: tuple[Weight, ...] | None,
     engine: EngineName,
-    place: Callable[[Halves], Columns],
+    blocks: Sequence[int],
     k: int | None = None,
 ) -> Part:
     """POD_k(X): the k leading left singular vectors in the inner product W, U' W U = I. Collective.
@@ -81,16 +79,21 @@ def pod_part(
     Args:
         X: snapshots, local rows (rows.local, m).
         by: weight of every half; None is Euclidean.
-        place: puts the rows of U into the rows of a basis.
+        blocks: which halves of a basis the rows of U are: 0 displacement, 1 velocity; the others are zero.
         k: leading triplets that are enough, None for all.
     """
     comm = rows.layout.comm
 
-    def empty(_: int) -> tuple[Columns, ...]:
-        return (place(rows.split(np.zeros((rows.local, 0)))),)
+    def place(U: Array) -> tuple[Columns, ...]:
+        halves = dict(zip(blocks, rows.split(U), strict=True))
+        (hand, tissue), *_ = halves.values()
+        (s_q, e_q), (s_p, e_p) = (
+            halves[i] if i in halves else (np.zeros_like(hand), np.zeros_like(tissue)) for i in (0, 1)
+        )
+        return (Columns(s_q, s_p, e_q, e_p),)
 
     if not comm.allreduce(bool(np.any(X)), MPI.LOR):
-        return Part(title, np.zeros(0), 0.0, 0, empty)
+        return Part(title, np.zeros(0), 0.0, 0, lambda _: place(np.zeros((rows.local, 0))))
     f, L = weighted_factor(rows, X, by, engine, k)
     u, s, _ = small_svd(comm, f.R if L is None else L.T @ f.R)
     C = u if L is None else scipy.linalg.solve_triangular(L.T, u)
@@ -101,25 +104,10 @@ def pod_part(
             # one more step takes the rounding of L^-1 out; it is triangular, so the nested spans stay
             repair = cholesky_of(comm, rows.gram(U, rows.weigh(U, by)))
             U = U @ np.linalg.inv(repair.T)
-        return (place(rows.split(U)),)
+        return place(U)
 
     square = f.square if L is None else float(np.sum(s**2))
     return Part(title, s, square, int(np.count_nonzero(s > f.noise * s[0])), columns, f.scale)
-
-
-def _whole(halves: Halves) -> Columns:
-    (s_q, e_q), (s_p, e_p) = halves
-    return Columns(s_q, s_p, e_q, e_p)
-
-
-def _displacement(halves: Halves) -> Columns:
-    ((s, e),) = halves
-    return Columns(s, np.zeros_like(s), e, np.zeros_like(e))
-
-
-def _velocity(halves: Halves) -> Columns:
-    ((s, e),) = halves
-    return Columns(np.zeros_like(s), s, np.zeros_like(e), e)
 
 
 def joint_parts(request: PartsRequest) -> tuple[Part, ...]:
@@ -128,11 +116,10 @@ def joint_parts(request: PartsRequest) -> tuple[Part, ...]:
     With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e = POD_k(X_e), X_e = [q_e; v_e].
     V' W V = I over displacement and velocity rows together. Collective.
     """
-    b, layout = request.blocks, request.states.layout
-    rows = Rows(layout, 2, request.hand)
+    b, rows = request.snapshots, Rows(request.states.layout, 2, request.hand)
     X = rows.stack((b.s_q, b.e_q), (b.s_p, b.e_p))
     by = weights(request.states.system, request.inner)
-    return (pod_part("states", rows, X, by, request.engine, _whole, request.k),)
+    return (pod_part("states", rows, X, by, request.engine, (0, 1), request.k),)
 
 
 def componentwise_parts(request: PartsRequest) -> tuple[Part, ...]:
@@ -141,11 +128,10 @@ def componentwise_parts(request: PartsRequest) -> tuple[Part, ...]:
     With fixed solid modes V = blkdiag(I, V_e), I of order 2 n_s for the hand, V_e the same of the tissue's rows.
     V_q' W_q V_q = I and V_v' W_v V_v = I. Collective.
     """
-    b, layout = request.blocks, request.states.layout
-    rows = Rows(layout, 1, request.hand)
+    b, rows = request.snapshots, Rows(request.states.layout, 1, request.hand)
     by = weights(request.states.system, request.inner)
     q, v = (None, None) if by is None else ((by[0],), (by[1],))
     return (
-        pod_part("displacements", rows, rows.stack((b.s_q, b.e_q)), q, request.engine, _displacement, request.k),
-        pod_part("velocities", rows, rows.stack((b.s_p, b.e_p)), v, request.engine, _velocity, request.k),
+        pod_part("displacements", rows, rows.stack((b.s_q, b.e_q)), q, request.engine, (0,), request.k),
+        pod_part("velocities", rows, rows.stack((b.s_p, b.e_p)), v, request.engine, (1,), request.k),
     )

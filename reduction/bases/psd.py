@@ -22,8 +22,9 @@ from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.reduction.bases.engines import Factor, magnitude, small_svd
 from softgrasp.reduction.bases.inner import Rows, Weight, weights
 from softgrasp.reduction.bases.pod import PartsRequest, cholesky_of, weighted_factor
+from softgrasp.reduction.bases.states import Columns
 from softgrasp.reduction.bases.svd_like import svd_like_pairs, symplectic_repair
-from softgrasp.reduction.bases.truncation import Columns, Part
+from softgrasp.reduction.bases.truncation import Part
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Canonical:
 
 def canonical(request: PartsRequest) -> Canonical:
     """Factor [q~, y~] once, as real columns side by side: no Gram matrix, no complex arithmetic. Collective."""
-    b, system = request.blocks, request.states.system
+    b, system = request.snapshots, request.states.system
     rows, m = Rows(system.layout, 1, request.hand), b.e_q.shape[1]
     both = weights(system, request.inner)
     by = None if both is None else both[0]

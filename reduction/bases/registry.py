@@ -8,15 +8,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.reduction.bases.basis import Basis, Coordinates, Frame, Structure
-from softgrasp.reduction.bases.craig_bampton import craig_bampton_parts
 from softgrasp.reduction.bases.engines import EngineName
 from softgrasp.reduction.bases.inner import INNERS, InnerName
 from softgrasp.reduction.bases.pod import PartsRequest, componentwise_parts, joint_parts
 from softgrasp.reduction.bases.psd import complex_svd_parts, cotangent_lift_parts, svd_like_parts
-from softgrasp.reduction.bases.states import BasisError, Blocks, States
-from softgrasp.reduction.bases.truncation import PAPER_ENERGY, Columns, Part, Truncation, counts_of
+from softgrasp.reduction.bases.states import BasisError, Columns, States
+from softgrasp.reduction.bases.truncation import PAPER_ENERGY, Part, Truncation, counts_of
+
+
+def craig_bampton_parts(request: PartsRequest) -> tuple[Part, ...]:
+    """Clamped modes K_ee phi = omega^2 M_ee phi by SLEPc, used for z and for v_z: V_e = blkdiag(Phi, Phi) [CB68].
+
+    No snapshots. The static modes -K_ee^-1 K_es are T, the rigid motion of the hand, because K_ee T + K_es = 0. In the
+    hand-relative frame they are the hand's own unit columns and z = Phi a. Phi' M_ee Phi = I and
+    Phi' K_ee Phi = diag(omega^2): V is orthonormal in the mass product. Collective.
+    """
+    system, layout = request.states.system, request.states.layout
+
+    def columns(k: int) -> tuple[Columns, ...]:
+        Phi = lowest_modes(system, k)[1] if k else np.zeros((layout.n_local, 0))
+        zero, hand = np.zeros_like(Phi), np.zeros((layout.n_s, k))
+        return Columns(hand, hand, Phi, zero), Columns(hand, hand, zero, Phi)
+
+    return (Part("clamped modes", np.zeros(0), 1.0, layout.n_e, columns),)
 
 
 @dataclass(frozen=True)
@@ -149,13 +165,13 @@ def make_bases(
             name,
         )
     hand, tissue = np.zeros((n_s, 0)), np.zeros((states.layout.n_local, 0))
-    blocks = Blocks(hand, hand, tissue, tissue)
+    snapshots = Columns(hand, hand, tissue, tissue)
     if method.snapshots:
-        blocks = states.blocks(method.coordinates, method.frame)
+        snapshots = states.columns(method.coordinates, method.frame)
     clock.append(time.perf_counter())
     count = max((rule.N for rule in rules if rule.N is not None), default=None)
     share = min((rule.share for rule in rules if rule.N is None), default=None)
-    request = PartsRequest(states, blocks, not method.fixed, method.coordinates, metric, engine, count, share)
+    request = PartsRequest(states, snapshots, not method.fixed, method.coordinates, metric, engine, count, share)
     parts = method.build(request)
     if not method.snapshots and share is not None:
         raise BasisError(f"{name} uses no snapshots, so it has no energy to keep; give N")
@@ -189,18 +205,10 @@ def _cut(whole: Basis, columns: Sequence[tuple[Columns, ...]], counts: tuple[int
         tissue = np.zeros((n, 2 * n_s))
         sets.insert(0, Columns(np.eye(n_s, 2 * n_s), np.eye(n_s, 2 * n_s, k=n_s), tissue, tissue))
 
-    def joined(blocks: list[Array]) -> Array:
-        return np.asfortranarray(np.hstack(blocks))
-
+    V, split = Columns.beside(sets), tuple((2 if whole.pairs else 1) * k for k in counts)
     return replace(
-        whole,
-        V_sq=joined([c.s_q for c in sets]),
-        V_sv=joined([c.s_p for c in sets]),
-        V_q=joined([c.e_q for c in sets]),
-        V_p=joined([c.e_p for c in sets]),
-        split=tuple((2 if whole.pairs else 1) * k for k in counts),
-        seconds=dict(whole.seconds),
-    )
+        whole, V_sq=V.s_q, V_sv=V.s_p, V_q=V.e_q, V_p=V.e_p, split=split, seconds=dict(whole.seconds)
+    )  # fmt: skip
 
 
 def impossible_sizes(method: Method, n_s: int, sizes: Sequence[int]) -> dict[int, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,13 +28,27 @@ class BasisError(ReductionError):
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """Snapshot columns in the rows of :class:`softgrasp.reduction.bases.basis.Basis`."""
+class Columns:
+    """Snapshots or basis vectors in the row blocks of :class:`softgrasp.reduction.bases.basis.Basis`."""
 
     s_q: Array  # hand displacement, (n_s, m), on every rank [m, rad]
     s_p: Array  # hand velocity, or momentum in canonical coordinates, (n_s, m), on every rank
     e_q: Array  # tissue displacement, local rows (n_local, m) [m]
     e_p: Array  # tissue velocity [m/s] or momentum [kg m/s], local rows (n_local, m)
+
+    def first(self, k: int) -> Columns:
+        """The leading k columns."""
+        return Columns(self.s_q[:, :k], self.s_p[:, :k], self.e_q[:, :k], self.e_p[:, :k])
+
+    @staticmethod
+    def beside(parts: Sequence[Columns]) -> Columns:
+        """All columns side by side, in Fortran order, which stays contiguous for PETSc."""
+        joined = []
+        for key in ("s_q", "s_p", "e_q", "e_p"):
+            blocks = [getattr(part, key) for part in parts]
+            whole = np.empty((len(blocks[0]), sum(block.shape[1] for block in blocks)), order="F")
+            joined.append(np.concatenate(blocks, axis=1, out=whole))
+        return Columns(*joined)
 
 
 @dataclass(frozen=True)
@@ -52,12 +67,7 @@ class States:
         """Sizes and ownership."""
         return self.system.layout
 
-    @property
-    def columns(self) -> int:
-        """Number of snapshots over all runs."""
-        return sum(snapshots.Z.shape[1] for _, snapshots in self.runs)
-
-    def blocks(self, coordinates: Coordinates, frame: Frame) -> Blocks:
+    def columns(self, coordinates: Coordinates, frame: Frame) -> Columns:
         """Copy the snapshots into row blocks. Collective.
 
         With z = q_e - T q_s:
@@ -68,39 +78,21 @@ class States:
 
         p_z drops G v_s, which the hand's motion prescribes: it is canonical for the tissue with the hand as its input.
 
-        Args:
-            coordinates: "qv" gives velocities, "qp" momenta.
-            frame: "absolute" or "relative" to the rigid motion of the hand.
-
         Raises:
             BasisError: there are no snapshots, or one of them is not finite.
         """
-        if self.columns == 0:
+        if not any(snapshots.Z.shape[1] for _, snapshots in self.runs):
             raise BasisError("there are no snapshots; run with output.snapshots = 'memory', or use craig_bampton")
         with agree(self.layout.comm):
             for system, snapshots in self.runs:
                 _check(self.layout, system, snapshots)
-        parts = [_blocks(system, snapshots, coordinates, frame) for system, snapshots in self.runs]
-        if len(parts) == 1:
-            return parts[0]
-        return Blocks(
-            np.hstack([b.s_q for b in parts]),
-            np.hstack([b.s_p for b in parts]),
-            _beside([b.e_q for b in parts]),
-            _beside([b.e_p for b in parts]),
-        )
+        parts = [_columns(system, snapshots, coordinates, frame) for system, snapshots in self.runs]
+        return parts[0] if len(parts) == 1 else Columns.beside(parts)
 
 
 def states_of(system: BlockSystem, snapshots: Snapshots | None = None) -> States:
     """States of one run, or of none."""
     return States(system, () if snapshots is None else ((system, snapshots),))
-
-
-def _beside(parts: list[Array]) -> Array:
-    """Columns side by side in Fortran order, which stays contiguous for PETSc."""
-    result = np.empty((parts[0].shape[0], sum(p.shape[1] for p in parts)), order="F")
-    np.concatenate(parts, axis=1, out=result)
-    return result
 
 
 def _check(layout: BlockLayout, system: BlockSystem, snapshots: Snapshots) -> None:
@@ -125,13 +117,13 @@ def _check(layout: BlockLayout, system: BlockSystem, snapshots: Snapshots) -> No
             )
 
 
-def _blocks(system: BlockSystem, snapshots: Snapshots, coordinates: Coordinates, frame: Frame) -> Blocks:
+def _columns(system: BlockSystem, snapshots: Snapshots, coordinates: Coordinates, frame: Frame) -> Columns:
     n = system.layout.n_local
     q_s, v_s, z, v_z = snapshots.q_s, snapshots.v_s, snapshots.Z[:n], snapshots.Z[n:]
     absolute = frame == "absolute"
     e_q = np.asfortranarray(z + system.T @ q_s if absolute else z)
     if coordinates == "qv":
-        return Blocks(q_s, v_s, e_q, np.asfortranarray(v_z + system.T @ v_s if absolute else v_z))
+        return Columns(q_s, v_s, e_q, np.asfortranarray(v_z + system.T @ v_s if absolute else v_z))
     e_p = times_columns(system.M_ee, v_z)
     if absolute:
         e_p += system.G @ v_s
@@ -139,4 +131,4 @@ def _blocks(system: BlockSystem, snapshots: Snapshots, coordinates: Coordinates,
     if system.two_way and absolute:
         # dT/dv_s at fixed v_e = dT/dv_s at fixed v_z - T' dT/dv_z
         s_p = s_p + system.M_rigid @ v_s + total(system.layout.comm, system.G.T @ v_z - system.T.T @ e_p)
-    return Blocks(q_s, s_p, e_q, e_p)
+    return Columns(q_s, s_p, e_q, e_p)

@@ -8,23 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.fem.petsc import Array
-from softgrasp.reduction.bases.states import BasisError
+from softgrasp.reduction.bases.states import BasisError, Columns
 
 PAPER_ENERGY = 0.999  # of the POD functional [SBRH21]
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Equally many basis columns in the row blocks of :class:`softgrasp.reduction.bases.basis.Basis`."""
-
-    s_q: Array
-    s_p: Array
-    e_q: Array
-    e_p: Array
-
-    def first(self, k: int) -> Columns:
-        """The leading k columns."""
-        return Columns(self.s_q[:, :k], self.s_p[:, :k], self.e_q[:, :k], self.e_p[:, :k])
 
 
 @dataclass(frozen=True)
@@ -80,21 +66,11 @@ def needed(sigma: Array, total: float, share: float) -> int | None:
     return int(good[0]) if len(good) else None
 
 
-def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) -> tuple[int, ...]:
+def _allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) -> tuple[int, ...]:
     """Share N - hand columns equally among the parts, the first ones taking one more where it does not divide.
 
     What a part cannot carry goes to the others. Displacement and velocity need equally many vectors, whatever their
     singular values say: a displacement without its velocity cannot move.
-
-    Args:
-        width: columns of one unit.
-        hand: columns that the hand takes.
-
-    Returns:
-        Units of every part.
-
-    Raises:
-        BasisError: N is smaller than the hand's columns, not a multiple of the unit, or more than the rank.
     """
     free = N - hand
     if free < width or free % width:
@@ -119,10 +95,16 @@ def allocate(parts: Sequence[Part], width: int, N: int, hand: int, name: str) ->
 def counts_of(parts: Sequence[Part], width: int, hand: int, rule: Truncation, name: str) -> tuple[int, ...]:
     """Units of every part by the rule; parts are equal, so that each keeps at least its share.
 
-    Raises BasisError: N does not fit, or the rule asks for more than the rank.
+    Args:
+        width: columns of one unit.
+        hand: columns that the hand takes.
+
+    Raises:
+        BasisError: N is smaller than the hand's columns, no multiple of the unit, or the rule asks for more than the
+            rank.
     """
     if rule.N is not None:
-        return allocate(parts, width, rule.N, hand, name)
+        return _allocate(parts, width, rule.N, hand, name)
     counts = []
     for part in parts:
         k = needed(part.sigma, part.total, rule.share)

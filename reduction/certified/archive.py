@@ -16,12 +16,11 @@ import numpy as np
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.archive import about, read_linear, write_small
+from softgrasp.reduction.archive import LINEAR, about, read_linear, reading, write_model, write_small
 from softgrasp.reduction.certified.certificate import MeshNumber
 from softgrasp.reduction.certified.model import Box, CertifiedModel
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.residual import ResidualNorms
-from softgrasp.reduction.files import LINEAR, reading, write_model
 from softgrasp.reduction.model import ModelError
 
 FORMAT = "softgrasp certified model 3"

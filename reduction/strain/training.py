@@ -31,10 +31,9 @@ from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.inner import Rows, Weight
 from softgrasp.reduction.bases.pod import pod_part
 from softgrasp.reduction.bases.states import BasisError
-from softgrasp.reduction.bases.truncation import Columns
-from softgrasp.reduction.galerkin import symmetric
-from softgrasp.reduction.model import Lift, ModelError
+from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.operators import Lift, layer_products, symmetric
 from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun
@@ -68,10 +67,7 @@ class Training:
         """The largest model on the cells of this rank, every weight 1. Collective."""
         system, Phi = self.model.system, self.Phi
         comm, layout = system.layout.comm, system.layout
-        K_mu, K_lambda = (
-            np.stack([symmetric(total(comm, Phi.T @ times_columns(A, Phi))) for A in matrices])
-            for matrices in ([x.K_mu.ee for x in system.layers], [x.K_lambda.ee for x in system.layers])
-        )
+        K_mu, K_lambda = (symmetric(layer_products(system, key, Phi, Phi)[0]) for key in ("K_mu", "K_lambda"))
         outputs = project_outputs(make_outputs(self.model.scene, system), Lift(layout, Phi, Phi))
         G, K_mu, K_lambda = comm.bcast((total(comm, Phi.T @ system.G), K_mu, K_lambda))
         count = comm.allreduce(int(self.cells.cell.max(initial=-1)) + 1)
@@ -208,10 +204,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
         q, p = (float(layout.comm.allreduce(np.vdot(Y, times_columns(system.M_ee, Y)))) for Y in (X, V))
         X = np.asfortranarray(np.hstack([X, V * (q / p) ** 0.5 if p > 0 else V]))
     rows, mass = Rows(layout, 1, hand=False), Weight(system.M_hand, system.M_ee)
-    empty = np.zeros((0, 0))
-    part = pod_part(
-        "deformation", rows, X, (mass,), "tsqr", lambda halves: Columns(empty, empty, halves[0][1], empty), k
-    )
+    part = pod_part("deformation", rows, X, (mass,), "tsqr", (0,), k)
     if k > part.rank:
         most = 2 * (layout.n_s + part.rank)
         raise BasisError(f"more displacements than the snapshots carry above rounding; ask for N <= {most}", most=most)

@@ -14,8 +14,8 @@ from mpi4py import MPI
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, to_scipy, whole_copy
-from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
+from softgrasp.fem.run.motion import TableDrive
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes

@@ -12,8 +12,7 @@ from softgrasp.fem.accuracy.estimate import next_unknowns
 from softgrasp.fem.errors import SceneError, SoftgraspError
 
 if TYPE_CHECKING:
-    from softgrasp.fem.model.build import Model
-    from softgrasp.fem.model.mesh_estimate import MeshEstimate
+    from softgrasp.fem.model.build import MeshEstimate, Model
     from softgrasp.fem.run.trajectory import Trajectory
 
 CHEAP = 1.0  # [s]; what costs less is done unasked

@@ -9,9 +9,8 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.effects import EFFECTS, Gate
-from softgrasp.fem.effects.sag import Sag
-from softgrasp.fem.fields.scales import measure
-from softgrasp.fem.fields.strain import SMALL_STRAIN
+from softgrasp.fem.effects.gate import Sag
+from softgrasp.fem.fields.scales import SMALL_STRAIN, measure
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import Need, factor_bytes, need
 from softgrasp.fem.run.motion import largest_acceleration

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
 
-from softgrasp.fem.effects.sag import SMALL_SHARE
-from softgrasp.fem.fields.strain import SMALL_STRAIN
+from softgrasp.fem.effects.gate import SMALL_SHARE
+from softgrasp.fem.fields.scales import SMALL_STRAIN
 from softgrasp.fem.model.memory import size_text
 from softgrasp.study.forward.explain import EffectReport, Explanation, explain
 from softgrasp.study.forward.explain_mesh import mesh_lines

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.study.pictures.style import (
     BLUE,
     COLUMN,
@@ -22,12 +20,12 @@ from softgrasp.study.pictures.style import (
     paper_style,
     save,
 )
-from softgrasp.study.query.answer import Answer
+from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 
 LEAST = 1e-16  # of an error that is drawn
 
 
-def figure_answer(model: CertifiedModel, answer: Answer, out: Path) -> tuple[Path, ...]:
+def figure_answer(answer: CertifiedAnswer, out: Path) -> tuple[Path, ...]:
     """Deformation of the outputs with its band, bounds over time, and the three errors; only the last if refused."""
     c, run = answer.certificate, answer.run
     with paper_style():
@@ -39,7 +37,7 @@ def figure_answer(model: CertifiedModel, answer: Answer, out: Path) -> tuple[Pat
         )  # fmt: skip
         if rows == 3:
             assert run is not None
-            y, names = answer.deformation(model.fine.outputs.C_s), run.output_names
+            y, names = answer.deformation(), run.output_names
             factor, unit = length_unit(float(np.abs(y).max(initial=0.0)))
             (top,), (below,) = axes[:2]
             below.sharex(top)
@@ -61,7 +59,7 @@ def figure_answer(model: CertifiedModel, answer: Answer, out: Path) -> tuple[Pat
         return save(figure, out / ("answer.png" if rows == 3 else "errors.png"))
 
 
-def _three(ax: Any, answer: Answer) -> None:
+def _three(ax: Any, answer: CertifiedAnswer) -> None:
     """The errors of reduction, time step and mesh as bars, proofs filled."""
     c = answer.certificate
     mesh = None if c.mesh is None else c.mesh.largest
@@ -80,11 +78,11 @@ def _three(ax: Any, answer: Answer) -> None:
     few_ticks(ax.xaxis)
 
 
-def figure_batch(model: CertifiedModel, answers: Sequence[Answer], file: Path) -> tuple[Path, ...]:
+def figure_batch(answers: QueryResult, file: Path) -> tuple[Path, ...]:
     """Error of every answer at its lambda and mu."""
-    lam, mu = (np.array([getattr(a.materials[0], key) for a in answers]) for key in ("lam", "mu"))
-    errors = np.array([a.certificate.reduction for a in answers])
-    shown, refused = np.isfinite(errors) & (errors > 0), np.array([a.run is None for a in answers])
+    lam, mu = (np.array([getattr(a.materials[0], key) for a in answers.each]) for key in ("lam", "mu"))
+    errors = np.array([a.certificate.reduction for a in answers.each])
+    shown, refused = np.isfinite(errors) & (errors > 0), np.array([a.run is None for a in answers.each])
     with paper_style():
         figure, ax = plt.subplots(figsize=(COLUMN, 2.8), layout="constrained")
         if shown.any():
@@ -92,8 +90,8 @@ def figure_batch(model: CertifiedModel, answers: Sequence[Answer], file: Path) -
             points = ax.scatter(lam[shown], mu[shown], c=errors[shown], norm=norm, cmap="viridis_r", s=28)
             few_ticks(figure.colorbar(points, label="relative error of the reduction").ax.yaxis)
         ax.plot(lam[refused], mu[refused], "x", color=UNSTABLE, ms=8)
-        if model.box is not None:
-            (a, b), (c, d) = model.box.lam, model.box.mu
+        if answers.model.box is not None:
+            (a, b), (c, d) = answers.model.box.lam, answers.model.box.mu
             ax.plot([a, b, b, a, a], [c, c, d, d, c], color="#999999", lw=0.7)
         logarithmic = bool((lam > 0).all())
         ax.set(xscale="log" if logarithmic else "linear", yscale="log")

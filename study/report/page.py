@@ -94,21 +94,15 @@ def write_report(
 ) -> Path:
     """Write the page; what is empty is left out. Not collective: call on one rank.
 
-    The equation of the scene is added unless a section has it, and what the page was made with.
-
     Args:
-        path: the HTML file.
-        title, subtitle: first lines.
         summary: sentences that say what came out.
-        sections: what follows, in this order.
-        scene: what was run.
+        scene: what was run; its equation is added unless a section has it.
         reproduce: the commands that made this page.
         result: what result.json holds, for sizes and times.
         numbers: the files beside it that hold its numbers.
         files: what lies beside the page; the page links to it.
 
-    Raises:
-        ValueError: a row is not as long as its table's header or first row, or the page would load anything.
+    Raises ValueError: a row is not as long as its table's header or first row, or the page would load anything.
     """
     given = list(sections)
     if scene and all(section.title != EQUATION for section in given):

@@ -12,9 +12,10 @@ import shutil
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 from rich.console import Console
@@ -26,10 +27,8 @@ from softgrasp.study.shell.processes import IN_MPI_JOB, find_mpiexec, run_limite
 LAUNCH_LIMIT = 30.0  # [s] for two ranks that only say how many they are
 SAY_SIZE = "import sys, softgrasp.fem._stack; from mpi4py import MPI; sys.stdout.write(f'{MPI.COMM_WORLD.size}\\n')"
 MPI_FAMILIES = {
-    "MPICH": ("hydra", "mpich"),
-    "Open MPI": ("open mpi", "openrte", "open-mpi"),
-    "Intel MPI": ("intel(r) mpi",),
-}
+    "MPICH": ("hydra", "mpich"), "Open MPI": ("open mpi", "openrte", "open-mpi"), "Intel MPI": ("intel(r) mpi",),
+}  # fmt: skip
 INSTALL = "Install the solver stack with `pip install 'softgrasp[solver]'` or load the cluster's DOLFINx module."
 
 
@@ -43,6 +42,16 @@ class Check:
     cure: str = ""  # one sentence on what to do; empty when ok
 
 
+def _module(name: str) -> Any:
+    """A module of the solver stack, imported in an order that keeps one MPI."""
+    importlib.import_module("softgrasp.fem._stack")
+    return importlib.import_module(name)
+
+
+def _dotted(version: Sequence[int]) -> str:
+    return ".".join(map(str, version))
+
+
 def check_python() -> Check:
     """Python 3.12 or newer."""
     ok = sys.version_info >= (3, 12)
@@ -51,32 +60,26 @@ def check_python() -> Check:
 
 def check_dolfinx() -> Check:
     """DOLFINx 0.11; 0.10 differs in nothing that is called here."""
-    importlib.import_module("softgrasp.fem._stack")  # MPI before DOLFINx
-    version = str(importlib.import_module("dolfinx").__version__)
+    version = str(_module("dolfinx").__version__)
     ok = version.startswith(("0.10.", "0.11."))
     return Check("DOLFINx", ok, version, "" if ok else "softgrasp needs DOLFINx 0.11 or 0.10; install one of them.")
 
 
 def check_petsc() -> Check:
     """PETSc with real double scalars."""
-    importlib.import_module("softgrasp.fem._stack")  # MPI before petsc4py
-    petsc = importlib.import_module("petsc4py.PETSc")
-    np = importlib.import_module("numpy")
+    petsc, np = _module("petsc4py.PETSc"), _module("numpy")
     scalar, integer = np.dtype(petsc.ScalarType), np.dtype(petsc.IntType)
-    version = ".".join(str(part) for part in petsc.Sys.getVersion())
-    value = f"{version}, scalar {scalar.name}, {8 * integer.itemsize}-bit int"
+    value = f"{_dotted(petsc.Sys.getVersion())}, scalar {scalar.name}, {8 * integer.itemsize}-bit int"
     ok = scalar == np.float64
     return Check("PETSc", ok, value, "" if ok else "Use a PETSc that was built with real double scalars.")
 
 
 def check_slepc() -> Check:
     """SLEPc."""
-    importlib.import_module("softgrasp.fem._stack")
-    version = importlib.import_module("slepc4py.SLEPc").Sys.getVersion()
-    return Check("SLEPc", True, ".".join(str(part) for part in version))
+    return Check("SLEPc", True, _dotted(_module("slepc4py.SLEPc").Sys.getVersion()))
 
 
-def family(text: str) -> str:
+def _family(text: str) -> str:
     """Name the MPI family that a version text belongs to, or "unknown"."""
     low = text.lower()
     return next((name for name, words in MPI_FAMILIES.items() if any(word in low for word in words)), "unknown")
@@ -84,53 +87,57 @@ def family(text: str) -> str:
 
 def check_launcher() -> Check:
     """The mpiexec in use belongs to the MPI library of mpi4py."""
-    linked = family(importlib.import_module("mpi4py.MPI").Get_library_version())
+    linked = _family(importlib.import_module("mpi4py.MPI").Get_library_version())
     path = find_mpiexec()
     if path is None:
         return Check("mpiexec", False, "none", f"Put the mpiexec of {linked} on PATH, or `pip install mpich`.")
-    _, text = run_limited([path, "--version"], LAUNCH_LIMIT)
-    launcher = family(text)
-    # A launcher we cannot name (srun wrapper, vendor MPI) is judged by the launch alone.
-    if "unknown" in (launcher, linked) or launcher == linked:
-        first = shutil.which("mpiexec")
-        if first is not None and not os.path.samefile(first, path):
-            other = family(run_limited([first, "--version"], LAUNCH_LIMIT)[1])
-            if "unknown" not in (other, linked) and other != linked:
-                cure = f"A bare `mpiexec` starts {first} of {other}, the wrong one: call {path} by its full path."
-                return Check("mpiexec", False, f"{path} ({launcher}, library {linked})", cure)
-        return Check("mpiexec", True, f"{path} ({launcher}, library {linked})")
-    cure = f"This mpiexec is {launcher} but the library is {linked}: use the mpiexec of {linked} by its full path."
-    return Check("mpiexec", False, path, cure)
+
+    def wrong(launcher: str) -> bool:  # one we cannot name (srun wrapper, vendor MPI) is judged by the launch alone
+        return "unknown" not in (launcher, linked) and launcher != linked
+
+    launcher = _family(run_limited([path, "--version"], LAUNCH_LIMIT)[1])
+    if wrong(launcher):
+        cure = f"This mpiexec is {launcher} but the library is {linked}: use the mpiexec of {linked} by its full path."
+        return Check("mpiexec", False, path, cure)
+    value, first = f"{path} ({launcher}, library {linked})", shutil.which("mpiexec")
+    if first is not None and not os.path.samefile(first, path):
+        other = _family(run_limited([first, "--version"], LAUNCH_LIMIT)[1])
+        if wrong(other):
+            cure = f"A bare `mpiexec` starts {first} of {other}, the wrong one: call {path} by its full path."
+            return Check("mpiexec", False, value, cure)
+    return Check("mpiexec", True, value)
 
 
 def check_launch() -> Check:
     """Two ranks really find each other."""
-    name = "two ranks"
+
+    def fault(value: str, cure: str) -> Check:
+        return Check("two ranks", False, value, cure)
+
     if any(variable in os.environ for variable in IN_MPI_JOB):
-        return Check(name, True, "Not tried: this is already an MPI job, run doctor without mpiexec to try it.")
+        value = "Not tried: this is already an MPI job, run doctor without mpiexec to try it."
+        return Check("two ranks", True, value)
     path = find_mpiexec()
     if path is None:
-        return Check(name, False, "no mpiexec", "Make an mpiexec available as said above.")
+        return fault("no mpiexec", "Make an mpiexec available as said above.")
     status, output = run_limited([path, "-n", "2", sys.executable, "-c", SAY_SIZE], LAUNCH_LIMIT)
     if status is None:
-        return Check(name, False, f"no answer in {LAUNCH_LIMIT:g} s", f"Make `{path} -n 2 hostname` work first.")
-    sizes = output.split()
-    if status == 0 and sizes == ["2", "2"]:
-        return Check(name, True, "launched, found each other")
-    if status == 0 and sizes == ["1", "1"]:
+        return fault(f"no answer in {LAUNCH_LIMIT:g} s", f"Make `{path} -n 2 hostname` work first.")
+    if status == 0 and output.split() == ["2", "2"]:
+        return Check("two ranks", True, "launched, found each other")
+    if status == 0 and output.split() == ["1", "1"]:
         cure = f"{path} belongs to another MPI: use the mpiexec beside {sys.executable} or the library's own."
-        return Check(name, False, "two single ranks instead of one job", cure)
+        return fault("two single ranks instead of one job", cure)
     last = output.strip().splitlines()[-1:] or ["no output"]
-    return Check(name, False, f"exit status {status}: {last[0]}", f"Use an mpiexec that can start {sys.executable}.")
+    return fault(f"exit status {status}: {last[0]}", f"Use an mpiexec that can start {sys.executable}.")
 
 
 def check_threads() -> Check:
     """One BLAS thread a rank."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    value = ", ".join(f"{name}={os.environ.get(name, 'unset')}" for name in names)
-    ok = all(os.environ.get(name) == "1" for name in names)
+    values = {name: os.environ.get(name, "unset") for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    ok = set(values.values()) == {"1"}
     cure = "" if ok else "Export OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1, more threads fight with the ranks."
-    return Check("threads", ok, value, cure)
+    return Check("threads", ok, ", ".join(f"{name}={value}" for name, value in values.items()), cure)
 
 
 def check_compiler() -> Check:
@@ -142,25 +149,21 @@ def check_compiler() -> Check:
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder, "probe.c")
         source.write_text("#include <Python.h>\n")
-        include = f"-I{sysconfig.get_path('include')}"
-        target = str(Path(folder, "probe.o"))
-        status, _ = run_limited([path, *words[1:], include, "-c", str(source), "-o", target], LAUNCH_LIMIT)
-    if status != 0:
-        return Check("C compiler", False, path, "Install the headers of this Python (Debian, Ubuntu: python3-dev).")
-    return Check("C compiler", True, path)
+        command = [path, *words[1:], f"-I{sysconfig.get_path('include')}", "-c", str(source), "-o", f"{folder}/probe.o"]
+        ok = run_limited(command, LAUNCH_LIMIT)[0] == 0
+    cure = "" if ok else "Install the headers of this Python (Debian, Ubuntu: python3-dev)."
+    return Check("C compiler", ok, path, cure)
 
 
 def check_cache() -> Check:
     """The folder of compiled forms can be written."""
-    importlib.import_module("softgrasp.fem._stack")
-    folder = Path(importlib.import_module("dolfinx.jit").get_options()["cache_dir"])
+    folder = Path(_module("dolfinx.jit").get_options()["cache_dir"])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            pass
+            return Check("JIT cache", True, str(folder))
     except OSError:
         return Check("JIT cache", False, str(folder), "Set XDG_CACHE_HOME to a folder that you can write.")
-    return Check("JIT cache", True, str(folder))
 
 
 def check_memory() -> Check:

@@ -48,11 +48,7 @@ def end_all() -> None:
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Refuse what DOLFINx, which looks at all arguments, and Python could not read as text.
-
-    Raises:
-        SceneError: a word is no text.
-    """
+    """Raise SceneError for what DOLFINx, which looks at all arguments, and Python could not read as text."""
     for word in words:
         if not word.isascii() and any("\ud800" <= letter <= "\udfff" for letter in word):
             raise SceneError(f"{word}: this argument is not text here; rename the file or set LC_ALL=C.UTF-8")

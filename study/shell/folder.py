@@ -36,10 +36,7 @@ def remove_files(folder: Path, names: Iterable[str]) -> None:
 def claim(out: Path, command: str, scene: str, *, path: Path = Path(), empty: bool = False) -> None:
     """Refuse a folder that holds the run of another scene or command, or empty it. Not collective: call on one rank.
 
-    ``path``, the scene file, must not be removed.
-
-    Raises:
-        SceneError: the folder belongs to another run, or holds more than one run and is to be emptied.
+    ``path``, the scene file, must not be removed. Raises SceneError: the folder is of another run, or of several.
     """
     result = read_result(out)
     if not empty:

@@ -13,7 +13,7 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.bases.inner import InnerName
+from softgrasp.reduction.bases.inner import InnerName, Rows
 from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.reduction.bases.states import States, states_of
 from tests.helpers.models import Array, gather_matrix, gather_rows, make_scene
@@ -108,3 +108,18 @@ def gap(A: Array, B: Array) -> float:
     """Sine of the largest angle between two subspaces of one dimension."""
     Q_A, Q_B = np.linalg.qr(A)[0], np.linalg.qr(B)[0]
     return float(np.linalg.norm(Q_A - Q_B @ (Q_B.T @ Q_A), 2))
+
+
+def symplecticity(basis: Basis) -> float:
+    """Largest entry of V' J V - J, with the tissue's columns alone when the solid modes are fixed. Collective.
+
+    J = [0 I; -I 0] on the rows (q; p) and on the columns (first half; second half).
+    """
+    rows = Rows(basis.layout, 1, hand=True)
+    first = 2 * basis.layout.n_s if basis.fixed_solid else 0
+    q = rows.stack((basis.V_sq, basis.V_q))[:, first:]
+    p = rows.stack((basis.V_sv, basis.V_p))[:, first:]
+    form = rows.gram(q, p)
+    k = form.shape[0] // 2
+    J = np.eye(2 * k, k=k) - np.eye(2 * k, k=-k)
+    return float(np.abs(form - form.T - J).max(initial=0.0))

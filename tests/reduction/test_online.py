@@ -15,10 +15,9 @@ from mpi4py import MPI
 import softgrasp.reduction.online
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.archive import load, save
+from softgrasp.reduction.archive import LINEAR, load, save, write_model
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.files import LINEAR, write_model
 from softgrasp.reduction.modal import rotation
 from softgrasp.reduction.model import ModelError, SmallModel
 from softgrasp.reduction.online import Stepper, run, run_batch

@@ -16,10 +16,8 @@ from skfem.helpers import ddot, div, sym_grad
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.cells import check_straight, cut_cells, shape_of, simplices
-from softgrasp.fem.mesh.check import signed_volumes
+from softgrasp.fem.mesh.check import find_parts, signed_volumes, sort_facets
 from softgrasp.fem.mesh.file import load_arrays, read_mesh
-from softgrasp.fem.mesh.parts import find_parts
-from softgrasp.fem.mesh.seams import sort_facets
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.contact import cells_in, check_parts, contact_facets, held_check
 from softgrasp.fem.scene.scene import Scene

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from softgrasp.fem.errors import MeshError
-from softgrasp.fem.mesh.check import place_text
+from softgrasp.fem.mesh.check import doubled_nodes, place_text, sort_facets
 from softgrasp.fem.mesh.file import read_mesh
-from softgrasp.fem.mesh.seams import doubled_nodes, sort_facets
 from softgrasp.fem.model.contact import cells_in, contact_facets, held_check
 from tests.fem.mesh.test_mesh import COMM, WIDE, area, grid, volume, write, zone
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc, total
-from softgrasp.fem.run.drive import force_taken
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
-from softgrasp.fem.run.motion import force_values, motion_table
+from softgrasp.fem.run.motion import force_taken, force_values, motion_table
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
 from tests.helpers.models import (

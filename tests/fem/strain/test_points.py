@@ -12,11 +12,11 @@ import ufl
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.model.assembly import make_points
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.model.points import make_points
 from softgrasp.fem.petsc import SAME, PETSc, to_scipy, total
-from softgrasp.fem.strain.arrays import volume_change
 from softgrasp.fem.strain.body import Body
+from softgrasp.fem.strain.laws import volume_change
 from softgrasp.fem.strain.points import whole_points
 from tests.helpers.models import (
     CUBE,

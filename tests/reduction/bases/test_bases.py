@@ -12,7 +12,7 @@ import scipy.linalg
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.reduction.bases.engines import ENGINES, EngineName
-from softgrasp.reduction.bases.inner import INNERS, InnerName, orthonormality, symplecticity
+from softgrasp.reduction.bases.inner import INNERS, InnerName, orthonormality
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS, make_bases, make_basis
 from softgrasp.reduction.bases.states import BasisError, states_of
 from softgrasp.reduction.bases.svd_like import symplectic_repair
@@ -30,6 +30,7 @@ from tests.helpers.snapshots import (
     gap,
     halves,
     snapshot_rows,
+    symplecticity,
 )
 
 # --- structure of all bases
@@ -162,7 +163,7 @@ def _own(c: Case) -> Any:
 @pytest.mark.parametrize("coordinates", ["qv", "qp"])
 def test_blocks_follow_the_paper(coordinates: Any, frame: Any) -> None:
     c = case()
-    blocks = c.states.blocks(coordinates, frame)
+    blocks = c.states.columns(coordinates, frame)
     s_q, s_p, e_q, e_p = snapshot_rows(c, coordinates, frame)
     assert np.array_equal(blocks.s_q, s_q)
     assert np.array_equal(blocks.s_p, s_p)
@@ -177,7 +178,7 @@ def test_two_way_momentum_of_the_hand_is_that_of_the_whole_mass_matrix() -> None
     M_es = c.G - c.M @ c.T
     tissue = system.M_rigid - M_es.T @ c.T - c.T.T @ M_es - c.T.T @ c.M @ c.T  # R' M_h R on the contact nodes
     p_s = (system.M_hand + tissue) @ v_s + M_es.T @ (c.v + c.T @ v_s)
-    assert close(c.states.blocks("qp", "absolute").s_p, p_s) < 1e-12  # rounding
+    assert close(c.states.columns("qp", "absolute").s_p, p_s) < 1e-12  # rounding
     assert symplecticity(make_basis("psd", c.states, 8)) < 1e-12  # goal of the issue
     for key in ("psd_relative", "psd_svd_like_relative"):
         with pytest.raises(BasisError, match="no canonical momentum"):

@@ -9,9 +9,9 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import on_root, total
 from softgrasp.reduction.bases.engines import ENGINES, EngineName, factor, magnitude, small_svd
-from softgrasp.reduction.bases.states import BasisError
+from softgrasp.reduction.bases.states import BasisError, Columns
 from softgrasp.reduction.bases.svd_like import balanced, form, svd_like_pairs
-from softgrasp.reduction.bases.truncation import Columns, Part, Truncation, allocate, counts_of, needed
+from softgrasp.reduction.bases.truncation import Part, Truncation, counts_of, needed
 from tests.helpers.models import Array, close, same_everywhere
 
 pytestmark = pytest.mark.ranks
@@ -290,11 +290,14 @@ def test_needed_counts_the_tail() -> None:
 
 def test_parts_share_columns_equally() -> None:
     a, b = part([10.0, 1.0, 0.1]), part([1e-3, 9e-4, 8e-4])
-    assert allocate([a, b], 1, 1, 0, "x") == (1, 0)
-    assert allocate([a, b], 1, 4, 0, "x") == (2, 2)  # by sigma^2 over its sum the second would get 3
-    assert allocate([a, b], 1, 9, 4, "x") == (3, 2)
-    assert allocate([part([1.0, 0.5], 1), b], 1, 4, 0, "x") == (1, 3)  # what a part cannot carry goes to the other
-    assert allocate([part([1.0, 0.5, 0.1])], 2, 8, 4, "x") == (2,)
+    assert counts_of([a, b], 1, 0, Truncation(N=1), "x") == (1, 0)
+    assert counts_of([a, b], 1, 0, Truncation(N=4), "x") == (2, 2)  # by sigma^2 over its sum the second would get 3
+    assert counts_of([a, b], 1, 4, Truncation(N=9), "x") == (3, 2)
+    assert counts_of([part([1.0, 0.5], 1), b], 1, 0, Truncation(N=4), "x") == (
+        1,
+        3,
+    )  # what a part cannot carry goes to the other
+    assert counts_of([part([1.0, 0.5, 0.1])], 2, 4, Truncation(N=8), "x") == (2,)
     assert counts_of([a, b], 1, 0, Truncation(energy=0.98), "x") == (3, 3)  # alone the first needs 1
     assert counts_of([a, b], 1, 0, Truncation(tol=0.2), "x") == (3, 3)
     assert counts_of([a, b], 1, 0, Truncation(tol=0.6), "x") == (2, 2)

@@ -17,6 +17,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction import online
+from softgrasp.reduction.archive import seal
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.certified import bounds
@@ -27,7 +28,6 @@ from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.oscillators import march
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_any, certified_model
-from softgrasp.reduction.files import seal
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.reduce import project_scene
 from tests.helpers.certified import (

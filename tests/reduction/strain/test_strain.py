@@ -17,9 +17,8 @@ from softgrasp.fem.petsc import Array
 from softgrasp.fem.strain.compiled import library
 from softgrasp.fem.strain.laws import LAWS, LawName
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.archive import load, save
+from softgrasp.reduction.archive import load, save, seal
 from softgrasp.reduction.bases.basis import ReductionError
-from softgrasp.reduction.files import seal
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.strain import stepper
 from softgrasp.reduction.strain.cells import Cells, Potential

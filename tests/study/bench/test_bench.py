@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import to_scipy
-from softgrasp.fem.run.drive import TableDrive
 from softgrasp.fem.run.midpoint import midpoint_matrix
+from softgrasp.fem.run.motion import TableDrive
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.study.bench import driver
 from softgrasp.study.bench import forward as bench_forward

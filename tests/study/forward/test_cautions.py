@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softgrasp.fem.fields.strain import magnified
+from softgrasp.fem.fields.scales import magnified
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.forward.cautions import run_warnings

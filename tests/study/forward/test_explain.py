@@ -11,8 +11,8 @@ import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.effects.sag import SMALL_SHARE
-from softgrasp.fem.fields.strain import gradient, slowest
+from softgrasp.fem.effects.gate import SMALL_SHARE
+from softgrasp.fem.fields.scales import gradient, slowest
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import factor_bytes
 from softgrasp.fem.petsc import PETSc

@@ -28,11 +28,7 @@ MOST = 1_000_000  # steps of a run, which stands in memory as a whole
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, float]:
-    """Numbers of ``--set lambda=77``.
-
-    Raises:
-        SceneError: an unknown key, a key twice, or a value that is no number.
-    """
+    """Numbers of ``--set lambda=77``. Raises SceneError: an unknown key, a key twice, or a value that is no number."""
     numbers: dict[str, float] = {}
     for text in settings:
         key, equals, value = (part.strip() for part in text.partition("="))
@@ -57,11 +53,7 @@ def _number(text: str, where: str) -> float:
 
 
 def read_batch(path: Path) -> list[dict[str, float]]:
-    """Rows of a CSV table whose first line names lambda, mu, rho or some of them.
-
-    Raises:
-        SceneError: the file is missing, or no such table.
-    """
+    """Rows of a CSV table whose first line names lambda, mu, rho or some of them. Raises SceneError: no such table."""
     try:
         lines = [row for row in csv.reader(io.StringIO(read_text(path))) if row]
     except OSError as error:
@@ -85,8 +77,7 @@ def read_batch(path: Path) -> list[dict[str, float]]:
 def materials_of(model: CertifiedModel, setting: dict[str, float]) -> Materials:
     """Materials with these numbers in the first layer; what is not set is as in the model.
 
-    Raises:
-        SceneError: mu, rho or the bulk stiffness is not positive.
+    Raises SceneError: mu, rho or the bulk stiffness is not positive.
     """
     own = model.fine.materials[0]
     lam, mu, rho = (setting.get(key, value) for key, value in zip(KEYS, (own.lam, own.mu, own.rho), strict=True))
@@ -108,10 +99,9 @@ def drive_of(model: CertifiedModel, motion: Path | None = None, dt: float | None
         model: its drive says whether a file holds positions, joined by a cubic spline at rest at both ends, or forces,
             joined by straight lines.
         motion: time, then one column a degree of freedom of the hand; None takes the model's own.
-        dt: step [s]; None takes the model's own. It is adjusted so that steps fill the time of the motion.
+        dt: step [s], adjusted so that steps fill the time of the motion; None takes the model's own.
 
-    Raises:
-        SceneError: the file does not fit, dt is not positive or too small, or the model holds no motion.
+    Raises SceneError: the file does not fit, dt is not positive or too small, or the model holds no motion.
     """
     own = model.drive
     if dt is not None and not (math.isfinite(dt) and dt > 0):
