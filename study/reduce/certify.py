@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -10,7 +11,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from rich.progress import TaskProgressColumn
+from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, Stopwatch
@@ -157,22 +158,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     console.print(about, soft_wrap=True, markup=False)
     try:
         with watch.stage("greedy"), session.progress(TaskProgressColumn()) as bar:
-            task, goal = bar.add_task("greedy", total=1.0), SHARE * tolerance
-
-            def after(state: Greedy, so_far: CertifiedModel) -> None:
-                save_certified(so_far, file)
-                bounds = [r.bound for r in state.rounds if np.isfinite(r.bound)]
-                if bounds and bounds[-1] < bounds[0]:
-                    share = np.log(bounds[0] / bounds[-1]) / np.log(bounds[0] / min(goal, bounds[-1] * 0.999))
-                    bar.update(task, completed=float(min(share, 0.99)))
-                r, (lam, mu) = state.rounds[-1], trainer.points[state.rounds[-1].worst]
-                bar.console.print(
-                    f"round {len(state.rounds)}: k = {r.k}, largest bound {_shown(r.bound)} at ({lam:.3g}, {mu:.3g}), "
-                    f"{r.evaluations} evaluations, {r.seconds:.1f} s",
-                    markup=False,
-                )
-
-            certified = build_certified(trainer, tolerance, state, after)
+            certified = build_certified(trainer, tolerance, state, _saver(bar, trainer, file, SHARE * tolerance))
         training = dict(certified.training)
         if options.validation:
             with watch.stage("validation"):
@@ -207,6 +193,26 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         console.print(sentence, markup=False)
     list_files(console, session.write(scene, result, page))
     return result
+
+
+def _saver(bar: Progress, trainer: Trainer, file: Path, goal: float) -> Callable[[Greedy, CertifiedModel], None]:
+    """Called after every round: saves the model so far, and says how far its largest bound is on the way to a goal."""
+    task = bar.add_task("greedy", total=1.0)
+
+    def after(state: Greedy, so_far: CertifiedModel) -> None:
+        save_certified(so_far, file)
+        bounds = [r.bound for r in state.rounds if np.isfinite(r.bound)]
+        if bounds and bounds[-1] < bounds[0]:
+            share = np.log(bounds[0] / bounds[-1]) / np.log(bounds[0] / min(goal, bounds[-1] * 0.999))
+            bar.update(task, completed=float(min(share, 0.99)))
+        r, (lam, mu) = state.rounds[-1], trainer.points[state.rounds[-1].worst]
+        bar.console.print(
+            f"round {len(state.rounds)}: k = {r.k}, largest bound {_shown(r.bound)} at ({lam:.3g}, {mu:.3g}), "
+            f"{r.evaluations} evaluations, {r.seconds:.1f} s",
+            markup=False,
+        )
+
+    return after
 
 
 def _earlier(model: Model, file: Path) -> CertifiedModel | None:

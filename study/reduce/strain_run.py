@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Sequence
 from dataclasses import asdict, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,7 +65,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         from softgrasp.study.reduce.strain_pictures import draw  # brings Matplotlib
 
         picture = gather_picture(model)
-    told, tables = sentences(study), (error_table(study), time_table(study), cell_table(study))
+    told = sentences(study)
     result = reduce_result(
         study.full,
         {
@@ -77,29 +79,31 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
 
     def page() -> Page:
         files = draw(session.out, study, picture) if session.pictures else []
-        errors, seconds, cells = tables
-        held = [test_table(f).section(title=f"Held-out runs, models {f.title}") for f in study.families if f.tests]
-        parts = [
-            errors.section(NOTE),
-            Section("What holds", text="\n\n".join(told)),
-            Section("", figures=captioned(files, CAPTIONS)),
-            seconds.section(),
-            cells.section(),
-            *held,
-        ]
+        title = f"{scene.name}: reduced models at finite strain, {study.families[-1].points[0].engine} stepper"
         names = (field.name for field in fields(StrainPoint))
         rows = [(f.runs, *asdict(p).values()) for f in study.families for p in f.curves]
         points = {"points.csv": Table(("runs", *names), rows)}
-        engine = study.families[-1].points[0].engine
-        title = f"{scene.name}: reduced models at finite strain, {engine} stepper"
-        return Page(title, summary(study), parts, points, [*files, *models])
+        return Page(title, summary(study), sections(study, files), points, [*files, *models])
 
-    for table in tables:
+    for table in (error_table(study), time_table(study), cell_table(study)):
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))
     for sentence in told:
         session.console.print(sentence, markup=False)
     list_files(session.console, session.write(scene, result, page))
     return result
+
+
+def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
+    """Parts of the page."""
+    held = [test_table(f).section(title=f"Held-out runs, models {f.title}") for f in study.families if f.tests]
+    return [
+        error_table(study).section(NOTE),
+        Section("What holds", text="\n\n".join(sentences(study))),
+        Section("", figures=captioned(files, CAPTIONS)),
+        time_table(study).section(),
+        cell_table(study).section(),
+        *held,
+    ]
 
 
 def _family(study: StrainStudy, f: StrainFamily) -> dict[str, Any]:
