@@ -16,14 +16,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
@@ -41,6 +39,9 @@ from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.compare import Reference, StrainErrors, errors_of, reference_of
 from softgrasp.reduction.strain.model import SmallStrainModel, StrainModel, StrainRun, TrainedBox, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
 
 SNAPSHOTS = 400  # behind a basis, of all runs together
 STATES = 80  # of each run behind the weights
@@ -68,12 +69,12 @@ class Training:
         system, Phi = self.model.system, self.Phi
         comm, layout = system.layout.comm, system.layout
         K_mu, K_lambda = (symmetric(layer_products(system, key, Phi, Phi)[0]) for key in ("K_mu", "K_lambda"))
-        outputs = project_outputs(make_outputs(self.model.scene, system), Lift(layout, Phi, Phi))
+        outputs = project_outputs(self.model.outputs, Lift(layout, Phi, Phi))
         G, K_mu, K_lambda = comm.bcast((total(comm, Phi.T @ system.G), K_mu, K_lambda))
         count = comm.allreduce(int(self.cells.cell.max(initial=-1)) + 1)
         return StrainModel(
             self.cells, K_mu, K_lambda, G, system.materials, outputs, self._box(), count, system.damping.alpha,
-            system.damping.in_space, system.gravity, layout=layout, Phi=Phi, scene_hash=scene_hash(self.model.scene),
+            system.damping.in_space, system.gravity, layout=layout, Phi=Phi, scene_hash=self.model.scene_hash,
         )  # fmt: skip
 
     def _box(self) -> TrainedBox:
@@ -243,14 +244,14 @@ def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
     return Training(model, fulls, Phi, cells, offset, tuple(reference_of(run, Phi) for run in fulls), seconds)
 
 
-def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False, engine: str = "") -> StrainRun:
+def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False) -> StrainRun:
     """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
-    return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full, engine)
+    return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full)
 
 
-def _replay(small: SmallStrainModel, full: FullRun, engine: str = "") -> StrainRun:
+def _replay(small: SmallStrainModel, full: FullRun) -> StrainRun:
     a0 = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
-    return small.run(full.hand, a0=a0, engine=engine)
+    return small.run(full.hand, a0=a0)
 
 
 def errors_strain(rom: StrainModel, reduced_run: ReducedTrajectory, full: FullRun) -> StrainErrors:
