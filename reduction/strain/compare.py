@@ -90,13 +90,11 @@ def reference_of(full: FullRun, Phi: Array) -> Reference:
     Z, V = full.snapshots.Z[:n], full.snapshots.Z[n:]
     comm = system.layout.comm
     M_Phi = times_columns(system.M_ee, Phi)
+
+    def products(W_Phi: Array, W: PETSc.Mat, X: Array) -> Products:
+        square = sum(float(np.vdot(X[:, b], times_columns(W, X[:, b]))) for b in column_blocks(X.shape[1]))
+        return Products(total(comm, Phi.T @ W_Phi), total(comm, W_Phi.T @ X), float(comm.allreduce(square)))
+
     eye = Products(total(comm, Phi.T @ Phi), total(comm, Phi.T @ Z), float(comm.allreduce(float(np.vdot(Z, Z)))))
-    stiff = _products(Phi, times_columns(system.K_ee, Phi), system.K_ee, Z, full)
-    mass = _products(Phi, M_Phi, system.M_ee, V, full)
-    return Reference(full, eye, stiff, mass, total(comm, M_Phi.T @ Z).T)
-
-
-def _products(Phi: Array, W_Phi: Array, W: PETSc.Mat, X: Array, full: FullRun) -> Products:
-    comm = full.model.system.layout.comm
-    square = sum(float(np.vdot(X[:, b], times_columns(W, X[:, b]))) for b in column_blocks(X.shape[1]))
-    return Products(total(comm, Phi.T @ W_Phi), total(comm, W_Phi.T @ X), float(comm.allreduce(square)))
+    stiff = products(times_columns(system.K_ee, Phi), system.K_ee, Z)
+    return Reference(full, eye, stiff, products(M_Phi, system.M_ee, V), total(comm, M_Phi.T @ Z).T)

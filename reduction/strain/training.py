@@ -214,12 +214,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
 
 
 def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
-    """Basis for models up to dimension N, and all cells in its coordinates. Collective.
-
-    Args:
-        model: scene with effects.finite_strain.
-        runs: full runs to train on.
-        N: largest dimension, the hand's 2 n_s included.
+    """Basis for models up to dimension N, the hand's 2 n_s included, and all cells in its coordinates. Collective.
 
     Raises:
         ReductionError: the scene has no finite strain, or the snapshots carry fewer columns.
