@@ -20,8 +20,8 @@ from softgrasp.reduction.replay import FullRun, as_full, errors_linear, replay_l
 
 if TYPE_CHECKING:  # only scenes with finite strain pay for its models
     from softgrasp.fem.model.build import Model
-    from softgrasp.reduction.strain.compare import StrainErrors
     from softgrasp.reduction.strain.model import StrainModel, StrainRun
+    from softgrasp.reduction.strain.training import StrainErrors
 
 
 def reduce(
