@@ -63,11 +63,7 @@ def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array
 
     ``z``, ``v_z``: local rows (n_local, m); ``q_s``, ``v_s``: (n_s, m), the same on every rank.
     """
-    tissue, hand = np.ones((1, 1)), 1.0
-    if system.graded:
-        diagonal = system.M_ee.getDiagonal().array_r
-        whole = total(system.layout.comm, np.array([diagonal.sum(), len(diagonal)]))
-        tissue, hand = np.sqrt(diagonal)[:, None], float(np.sqrt(whole[0] / whole[1]))
+    tissue, hand = row_weights(system)
     if view == "deformation":
         return np.vstack([tissue * z, tissue * v_z])
     T, top = system.T, 1 if system.layout.comm.rank == 0 else 0  # the hand counts once
@@ -77,6 +73,15 @@ def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array
         second, p_s = times_columns(system.M_ee, v_z) + system.G @ v_s, system.M_hand @ v_s
     count, low = top * len(q_s), hand**2 / tissue if view == "momenta" else tissue
     return np.vstack([hand * q_s[:count], hand * p_s[:count], tissue * (z + T @ q_s), low * second])
+
+
+def row_weights(system: BlockSystem) -> tuple[Array, float]:
+    """Square roots of the diagonal d of the tissue mass (n_local, 1), and of its mean m; 1 on even meshes."""
+    if not system.graded:
+        return np.ones((1, 1)), 1.0
+    diagonal = system.M_ee.getDiagonal().array_r
+    whole = total(system.layout.comm, np.array([diagonal.sum(), len(diagonal)]))
+    return np.sqrt(diagonal)[:, None], float(np.sqrt(whole[0] / whole[1]))
 
 
 def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: BlockSystem) -> Array:
