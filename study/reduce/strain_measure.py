@@ -15,9 +15,8 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
 from softgrasp.reduction.replay import FullRun, full_run
-from softgrasp.reduction.strain.compare import Reference, errors_of, reference_of
 from softgrasp.reduction.strain.model import StrainModel, TrainedBox
-from softgrasp.reduction.strain.training import Training, replay_strain, train
+from softgrasp.reduction.strain.training import Reference, Training, errors_of, reference_of, replay_strain, train
 from softgrasp.study.reduce.result import FullTimes
 from softgrasp.study.shell.timing import median_seconds
 

@@ -249,7 +249,7 @@ def test_training_is_as_the_scene_says() -> None:
     states = training_states(against, training_of(against.model))
     assert [system.materials[0].mu for system, _ in states.runs] == [50.0, 60.0]
     assert [s.steps.tolist()[::30] for _, s in states.runs] == [[0, 120]] * 2  # 31 of 61 each, first and last
-    assert states.columns == 62
+    assert sum(s.Z.shape[1] for _, s in states.runs) == 62
     swept = [sweep("psd_fixed", against, wanted(against, [14]))]
     lonely = made(load_scene(PAPER, [*SMALL, "reduction.train=[]", "output.every=2"]))
     assert [case.several for case in box_models(lonely, swept, None)] == [False]
