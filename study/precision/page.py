@@ -37,7 +37,7 @@ from softgrasp.study.precision.tables import (
     reference_text,
     slope_table,
 )
-from softgrasp.study.reduce.sweep import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation import controlled
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb

@@ -17,8 +17,8 @@ from softgrasp.study.precision.fit import Slope, error_of, pareto, seconds_of, s
 from softgrasp.study.precision.forward import on_meshes, over_steps
 from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RunPoint, WorkPoint
 from softgrasp.study.precision.tables import error_outputs
+from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.reduce.plots import LOOKS, SPARE
-from softgrasp.study.reduce.sweep import PAPER_FULL, PAPER_REDUCED
 
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s"), 3: (GREEN, "^")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))

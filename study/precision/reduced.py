@@ -32,8 +32,8 @@ from softgrasp.study.precision.points import BasisPoint, ReducedPoint
 from softgrasp.study.precision.probe import Series, TimedRun, errors_of
 from softgrasp.study.precision.result import Question, Truth
 from softgrasp.study.precision.settings import Setting, own_setting
+from softgrasp.study.reduce.measure import bases_of, chosen_methods, measure
 from softgrasp.study.reduce.result import Point
-from softgrasp.study.reduce.sweep import bases_of, chosen_methods, measure
 from softgrasp.study.shell.timing import repeated
 
 CALLS = 2_000  # single steps of a reduced model that are timed

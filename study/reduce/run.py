@@ -17,8 +17,8 @@ from softgrasp.reduction.archive import save
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.reduce import tables
 from softgrasp.study.reduce.findings import findings
+from softgrasp.study.reduce.measure import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
 from softgrasp.study.reduce.result import N_NOTE, ReductionStudy, best
-from softgrasp.study.reduce.sweep import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
