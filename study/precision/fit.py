@@ -61,16 +61,25 @@ def series_of[P: WorkPoint](points: Sequence[P], name: Callable[[P], str] | None
 
 
 def slope(
-    question: str,
-    series: str,
+    line: Sequence[WorkPoint],
     against: str,
-    x: Sequence[float],
-    y: Sequence[float],
+    x: str,
+    y: str,
+    series: str = "",
     expected: float | None = None,
+    root: int = 1,
 ) -> list[Slope]:
-    """The slope of y against x; nothing where they do not tell one."""
-    power = power_law(x, y)
-    return [] if power is None else [Slope(question, series, against, power, len(x), expected)]
+    """The slope of one attribute y against another, x^(1 / root), over a line; nothing where they do not tell one."""
+    power = power_law([getattr(p, x) ** (1 / root) for p in line], [getattr(p, y) for p in line])
+    if power is None:
+        return []
+    return [Slope(line[0].question, series or line[0].series, against, power, len(line), expected)]
+
+
+def slopes(points: Sequence[WorkPoint], *relations: tuple[str, str, str]) -> tuple[Slope, ...]:
+    """Of every series of usable points and relation: what against what in words, and the attributes x and y."""
+    lines = series_of([p for p in points if p.ok]).values()
+    return tuple(s for line in lines for relation in relations for s in slope(line, *relation))
 
 
 def power_law(x: Sequence[float], y: Sequence[float]) -> float | None:

@@ -14,7 +14,7 @@ from softgrasp.fem.fields.probe import Probe, make_probe
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.cache import Cache, Guard
+from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.probe import Places, TimedRun, run_probed
 from softgrasp.study.precision.settings import Setting, own_setting, variant
 from softgrasp.study.shell.timing import medians
@@ -34,8 +34,8 @@ class Pace:
 class FullRuns:
     """Runs of one scene under many settings, cached; the model of the last mesh is kept. Collective."""
 
-    def __init__(self, scene: Scene, places: Places, reference: Array, cache: Cache, guard: Guard) -> None:
-        self.scene, self.places, self.cache, self.guard = scene, places, cache, guard
+    def __init__(self, scene: Scene, places: Places, reference: Array, cache: Cache) -> None:
+        self.scene, self.places, self.cache = scene, places, cache
         self.reference = reference.tolist() if scene.effects.rotation else None
         self.repeats, self.dimension = scene.study.repeats, places.dimension
         self._mesh: tuple[Setting, Model, Probe, dict[str, float]] | None = None
@@ -49,8 +49,7 @@ class FullRuns:
         """Times, sizes and the trajectory of a setting."""
         count = self.repeats if repeats is None else repeats
         key = {"setting": setting.parameters | {"rtol": setting.rtol}, "repeats": count}
-        self.guard.next(setting.label)
-        return self.cache.get("run", key, TimedRun, lambda: [self._measure(setting, count)])[0]
+        return self.cache.point(setting.label, "run", key, TimedRun, lambda: [self._measure(setting, count)])[0]
 
     def expected(self, setting: Setting) -> float:
         """Seconds of the steps of a setting, from its second one; the first sets up the solver."""

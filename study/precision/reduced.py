@@ -26,7 +26,7 @@ from softgrasp.reduction.online import Stepper, prepared, run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs
-from softgrasp.study.precision.fit import Slope, series_of, slope
+from softgrasp.study.precision.fit import slopes
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
 from softgrasp.study.precision.probe import Series, TimedRun, errors_of
@@ -76,7 +76,6 @@ class ReducedRuns:
 
     def points(self, name: str, sizes: Sequence[int], full: TimedRun) -> list[ReducedPoint]:
         """Every N of one basis. ``full`` is the full run behind it."""
-        self.runs.guard.next(f"{METHODS[name].title}, {self.setting.label}")
         section = self.scene.reduction.model_copy(update={"N": list(sizes)})
         key = {
             "method": name, "N": list(sizes), "inner": section.inner, "engine": section.engine,
@@ -93,7 +92,8 @@ class ReducedRuns:
             shared = comparison_of(models[-1], against) if models else None  # the largest holds the others
             return [_timed_model(m, measure(m, against, shared), against, probe) for m in models]
 
-        models = self.runs.cache.get("reduced", key, TimedModel, sweep)
+        label = f"{METHODS[name].title}, {self.setting.label}"
+        models = self.runs.cache.point(label, "reduced", key, TimedModel, sweep)
         return [self._point(name, model, full) for model in models]
 
     def _point(self, name: str, model: TimedModel, full: TimedRun) -> ReducedPoint:
@@ -151,12 +151,8 @@ def ask_reduced(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Q
     """
     reduced = ReducedRuns(scene, own_setting(scene), runs, truth)
     points = [p for name in chosen_methods(scene.reduction) for p in reduced.points(name, scene.reduction.N, full)]
-    slopes: list[Slope] = []
-    for name, line in series_of([p for p in points if p.ok]).items():
-        orders = [p.N for p in line]
-        slopes += slope("reduced", name, "error against N", orders, [p.error_outputs_full for p in line])
-        slopes += slope("reduced", name, "online seconds against N", orders, [p.seconds for p in line])
-    return Question(tuple(points), tuple(slopes), full)
+    relations = ("error against N", "N", "error_outputs_full"), ("online seconds against N", "N", "seconds")
+    return Question(tuple(points), slopes(points, *relations), full)
 
 
 def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Question:
@@ -171,7 +167,6 @@ def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Que
     reduced, comm = ReducedRuns(scene, own_setting(scene), runs, truth), runs.cache.comm
     points: list[BasisPoint] = []
     for engine in ENGINES:
-        runs.guard.next(f"engine {engine}")
         key = {"engine": engine, "setting": reduced.setting.parameters, "repeats": scene.study.repeats}
 
         def sweep(engine: EngineName = engine) -> list[BasisPoint]:
@@ -180,13 +175,9 @@ def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Que
                 return []
             return _factored(comm, X, engine, scene.study.repeats)
 
-        points += runs.cache.get("basis", key, BasisPoint, sweep)
-    slopes: list[Slope] = []
-    for name, line in series_of([p for p in points if p.ok]).items():
-        columns = [p.columns for p in line]
-        slopes += slope("bases", name, "left of the snapshots against vectors", columns, [p.error for p in line])
-        slopes += slope("bases", name, "seconds against vectors", columns, [p.seconds for p in line])
-    return Question(tuple(points), tuple(slopes), full)
+        points += runs.cache.point(f"engine {engine}", "basis", key, BasisPoint, sweep)
+    left = "left of the snapshots against vectors", "columns", "error"
+    return Question(tuple(points), slopes(points, left, ("seconds against vectors", "columns", "seconds")), full)
 
 
 def _factored(comm: MPI.Intracomm, X: Array, engine: EngineName, repeats: int) -> list[BasisPoint]:

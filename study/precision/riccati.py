@@ -29,7 +29,7 @@ from softgrasp.lqr.riccati import Method, solve
 from softgrasp.study.control.measure import with_time
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.control.result import report_dict
-from softgrasp.study.precision.cache import Cache, Guard
+from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import CONTROL, ReducedRiccatiPoint, RiccatiPoint
 from softgrasp.study.precision.result import Question, ReducedReference, RiccatiReference
@@ -78,12 +78,11 @@ class ControlRuns:
     Args:
         model: the scene's own mesh.
         cache: of measured points.
-        guard: asked before each of them.
         named: questions of ``--question``, which are answered at any size.
     """
 
-    def __init__(self, model: Model, cache: Cache, guard: Guard, named: Sequence[str] = ()) -> None:
-        self.model, self.cache, self.guard, self.named = model, cache, guard, named
+    def __init__(self, model: Model, cache: Cache, named: Sequence[str] = ()) -> None:
+        self.model, self.cache, self.named = model, cache, named
         self.scene, self.layout = model.scene, model.system.layout
         self.repeats = self.scene.study.repeats
         self.large = self.layout.n_e > LARGE[self.layout.dimension]
@@ -137,8 +136,8 @@ class ControlRuns:
             residuals = tuple(s.residual for s in tight.solutions.values())
             return [RiccatiReference(tuple(tight.names), tight.error, residuals)]
 
-        self.guard.next("Riccati reference")
-        return self.cache.get("riccati", {"reference": list(TIGHT)}, RiccatiReference, measure)[0]
+        key = {"reference": list(TIGHT)}
+        return self.cache.point("Riccati reference", "riccati", key, RiccatiReference, measure)[0]
 
 
 def make_reference(problem: RiccatiProblem) -> GainReference:
@@ -191,17 +190,13 @@ def ask_riccati(runs: ControlRuns) -> Question:
     reference, points = runs.reference_names(), []
     for method, tol in settings_of(runs):
         label = TITLES[method] if method == "dense" else f"{TITLES[method]}, tolerance {tol:g}"
-        runs.guard.next(label)
         key = {"method": method, "tolerance": tol, "repeats": runs.repeats}
 
-        def measure(method: Method = method, tol: float = tol, label: str = label) -> list[RiccatiPoint]:
-            return [_measure(runs, method, tol, label)]
-
-        points += runs.cache.get("riccati", key, RiccatiPoint, measure)
+        points += runs.cache.point(label, "riccati", key, RiccatiPoint, partial(_measure, runs, method, tol, label))
     return Question(tuple(points), tuple(riccati_slopes(points, reference.error)), reference)
 
 
-def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> RiccatiPoint:
+def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> list[RiccatiPoint]:
     """Gain error, true residual, counts and median seconds of one solver at one tolerance. Collective."""
     problem = runs.problem
     tight = runs.reference.judge_of(method).gain
@@ -215,16 +210,14 @@ def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> Ricca
         times = repeated(runs.layout.comm, once, repeats, REPEAT_SECONDS)
     except (SolverError, ResourceError) as error:
         lost = float("inf")
-        return RiccatiPoint(method, label, lost, lost, False, method=method, tolerance=tol,
-                            reason=str(error), residual=lost)  # fmt: skip
+        return [RiccatiPoint(method, label, lost, lost, False, method=method, tolerance=tol, reason=str(error),
+                             residual=lost)]  # fmt: skip
     (solution,) = solutions
-    counts = solution.counts
-    return RiccatiPoint(
+    counts = {name: solution.counts.get(name, 0) for name in ("newton_steps", "solves", "factorisations")}
+    return [RiccatiPoint(
         method, label, statistics.median(times), gain_error(problem, tight, solution.gain), method=method,
-        tolerance=tol, residual=solution.residual, repeats=len(times), rank=solution.rank,
-        newton_steps=counts.get("newton_steps", 0), solves=counts.get("solves", 0),
-        factorisations=counts.get("factorisations", 0),
-    )  # fmt: skip
+        tolerance=tol, residual=solution.residual, repeats=len(times), rank=solution.rank, **counts,
+    )]  # fmt: skip
 
 
 def above(error: float | None) -> float:
@@ -237,12 +230,10 @@ def riccati_slopes(points: Sequence[RiccatiPoint], reference_error: float | None
     slopes: list[Slope] = []
     for name, line in series_of([p for p in points if p.ok]).items():
         clear = [p for p in line if p.error > above(reference_error)]
-        tolerances, errors = [p.tolerance for p in clear], [p.error for p in clear]
-        slopes += slope("riccati", name, "gain error against tolerance", tolerances, errors)
+        slopes += slope(clear, "gain error against tolerance", "tolerance", "error")
         if name != "galerkin":  # which bounds the change of its gain
-            residuals = [p.residual for p in line]
-            slopes += slope("riccati", name, "residual against tolerance", [p.tolerance for p in line], residuals)
-            slopes += slope("riccati", name, "seconds against residual", residuals, [p.seconds for p in line])
+            slopes += slope(line, "residual against tolerance", "tolerance", "residual")
+            slopes += slope(line, "seconds against residual", "residual", "seconds")
     return slopes
 
 
@@ -258,13 +249,13 @@ def ask_reduced_riccati(runs: ControlRuns) -> Question:
     Raises:
         SolverError: the full equation cannot be solved.
     """
-    runs.guard.next("gain of reference")
-    reference = runs.cache.get("reduced_riccati", {"reference": True}, ReducedReference, lambda: [_reference(runs)])[0]
+    kind, once = "reduced_riccati", {"reference": True}
+    (reference,) = runs.cache.point("gain of reference", kind, once, ReducedReference, lambda: [_reference(runs)])
     points: list[ReducedRiccatiPoint] = []
     for name in BASES:
-        runs.guard.next(f"reduced Riccati equation, {BASIS_TITLES.get(name, name)}")
+        label = f"reduced Riccati equation, {BASIS_TITLES.get(name, name)}"
         key = {"basis": name, "N": list(runs.scene.control.N) if runs.scene.control else [], "repeats": runs.repeats}
-        points += runs.cache.get("reduced_riccati", key, ReducedRiccatiPoint, lambda name=name: _family(runs, name))  # type: ignore[misc]
+        points += runs.cache.point(label, kind, key, ReducedRiccatiPoint, partial(_family, runs, name))
     return Question(tuple(points), tuple(reduced_riccati_slopes(points, reference.error)), reference)
 
 
@@ -320,11 +311,10 @@ def reduced_riccati_slopes(points: Sequence[ReducedRiccatiPoint], reference_erro
     The cost is least at the optimal gain, so that its excess is of second order in the error of the gain.
     """
     clear = [p for p in points if p.ok and p.error > above(reference_error)]
-    question, slopes = "reduced_riccati", []
-    for name, line in series_of(clear).items():
+    slopes: list[Slope] = []
+    for line in series_of(clear).values():
         if len(line) > 2:
-            slopes += slope(question, name, "gain error against N", [p.N for p in line], [p.error for p in line])
+            slopes += slope(line, "gain error against N", "N", "error")
     near = [p for p in clear if p.error < 1]
-    excess = [p.cost_excess for p in near]
-    slopes += slope(question, "all", "excess cost against gain error", [p.error for p in near], excess)
-    return slopes + slope(question, "all", "seconds against N", [p.N for p in clear], [p.seconds for p in clear])
+    slopes += slope(near, "excess cost against gain error", "error", "cost_excess", "all")
+    return slopes + slope(clear, "seconds against N", "N", "seconds", "all")

@@ -104,9 +104,9 @@ def study_scene(
     names = request.questions
     model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
     guard = Guard(comm, progress)
-    store = Cache(cache, comm, scene)
-    runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store, guard)
-    control = ControlRuns(model, store, guard, request.names)
+    store = Cache(cache, comm, scene, guard)
+    runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store)
+    control = ControlRuns(model, store, request.names)
     refused = control.refused() if set(names) & set(CONTROL) else ""
     questions = {name: Question(skipped=refused) for name in names if name in CONTROL}
     truth: Truth | None = None

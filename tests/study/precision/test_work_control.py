@@ -24,7 +24,7 @@ from softgrasp.lqr.riccati import solve
 from softgrasp.study.precision import control_plots as work_control_plots
 from softgrasp.study.precision import loop as wp_loop
 from softgrasp.study.precision import riccati as wp_riccati
-from softgrasp.study.precision.cache import Cache, Guard
+from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.loop import step_counts
 from softgrasp.study.precision.points import CONTROL, LoopPoint, ReducedRiccatiPoint, Request, RiccatiPoint
 from softgrasp.study.precision.result import Question, RiccatiReference, WorkStudy
@@ -283,7 +283,7 @@ def test_large_scenes_are_asked_by_name_only(
 ) -> None:
     monkeypatch.setattr(wp_riccati, "LARGE", {2: 10, 3: 10})
     model, store = build(make_scene(SMALL), comm=comm), Cache(mpi_tmp_path, comm, make_scene(SMALL))
-    runs = [wp_riccati.ControlRuns(model, store, Guard(comm), names) for names in ((), ("riccati",))]
+    runs = [wp_riccati.ControlRuns(model, store, names) for names in ((), ("riccati",))]
     assert "--question" in runs[0].refused()
     assert runs[1].refused() == ""
     assert wp_riccati.tolerances_of("radi", runs[1].large) == wp_riccati.FEW_TOLERANCES
