@@ -25,30 +25,20 @@ class Slope:
     expected: float | None = None  # exponent of the theory, where there is one
 
 
-def seconds_of(point: WorkPoint) -> float:
-    """What a point costs [s]."""
-    return point.seconds
-
-
-def error_of(point: WorkPoint) -> float:
-    """What a point leaves."""
-    return point.error
-
-
 def usable[P: WorkPoint](points: Sequence[P]) -> list[P]:
     """Points that may be used and have a finite error and time."""
     return [p for p in points if p.ok and np.isfinite(p.error) and np.isfinite(p.seconds) and p.seconds > 0]
 
 
-def pareto[P: WorkPoint](
-    points: Sequence[P], x: Callable[[P], float] = seconds_of, y: Callable[[P], float] = error_of
-) -> list[P]:
-    """Points that no other beats in x and y at once, by x; less than :data:`GAIN` counts as none."""
+def pareto[P: WorkPoint](points: Sequence[P], x: str = "seconds", y: str = "error") -> list[P]:
+    """Points that no other beats in the attributes x and y at once, by x; less than :data:`GAIN` counts as none."""
     front: list[P] = []
-    good = (p for p in points if p.ok and np.isfinite(y(p)) and np.isfinite(x(p)) and x(p) > 0)
-    for p in sorted(good, key=lambda p: (x(p), y(p))):
-        if not front or y(p) < (1 - GAIN) * y(front[-1]):
-            front.append(p)
+    lowest = float("inf")
+    good = [(getattr(p, x), getattr(p, y), p) for p in points if p.ok]
+    good = [(a, b, p) for a, b, p in good if np.isfinite(a) and np.isfinite(b) and a > 0]
+    for _, value, p in sorted(good, key=lambda row: row[:2]):
+        if value < (1 - GAIN) * lowest:
+            front, lowest = [*front, p], value
     return front
 
 

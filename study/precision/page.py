@@ -12,8 +12,15 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.study.precision.answer import seconds_text
-from softgrasp.study.precision.control_plots import figure_loop, figure_reduced_riccati, figure_riccati
-from softgrasp.study.precision.plots import figure_budget, figure_forward, figure_reduced, figure_series
+from softgrasp.study.precision.plots import (
+    figure_budget,
+    figure_forward,
+    figure_loop,
+    figure_reduced,
+    figure_reduced_riccati,
+    figure_riccati,
+    figure_series,
+)
 from softgrasp.study.precision.points import (
     CONTROL,
     TITLES,

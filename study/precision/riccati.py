@@ -10,6 +10,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -213,7 +214,9 @@ def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> list[
         return [RiccatiPoint(method, label, lost, lost, False, method=method, tolerance=tol, reason=str(error),
                              residual=lost)]  # fmt: skip
     (solution,) = solutions
-    counts = {name: solution.counts.get(name, 0) for name in ("newton_steps", "solves", "factorisations")}
+    counts: dict[str, Any] = {
+        name: solution.counts.get(name, 0) for name in ("newton_steps", "solves", "factorisations")
+    }
     return [RiccatiPoint(
         method, label, statistics.median(times), gain_error(problem, tight, solution.gain), method=method,
         tolerance=tol, residual=solution.residual, repeats=len(times), rank=solution.rank, **counts,

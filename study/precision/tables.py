@@ -60,14 +60,9 @@ SERIES_TITLES: dict[str, dict[str, str]] = {
 }
 
 
-def error_outputs(point: ReducedPoint) -> float:
-    """Error against the full run on the same mesh and steps."""
-    return point.error_outputs_full
-
-
 def front_of(points: Sequence[WorkPoint]) -> list[WorkPoint]:
     """The Pareto front; of reduced models, that of the error against their own full run."""
-    return [*pareto([p for p in points if isinstance(p, ReducedPoint)], y=error_outputs)] or pareto(points)
+    return [*pareto([p for p in points if isinstance(p, ReducedPoint)], y="error_outputs_full")] or pareto(points)
 
 
 def question_table(name: str, points: Sequence[WorkPoint], front_only: bool = False) -> Table:

@@ -21,8 +21,8 @@ from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.lqr.riccati import solve
-from softgrasp.study.precision import control_plots as work_control_plots
 from softgrasp.study.precision import loop as wp_loop
+from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import riccati as wp_riccati
 from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.loop import step_counts
@@ -49,7 +49,7 @@ ALL = ",".join(CONTROL)
 def _rough() -> Iterator[None]:
     """No test looks at a time, or at more than the existence of a picture."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(work_control_plots, "save", rough_save)
+        patch.setattr(work_plots, "save", rough_save)
         patch.setattr(wp_loop, "SHARES", (8.0, 4.0, 2.0))
         patch.setattr(wp_loop, "BURST_SECONDS", 0.0)
         patch.setattr(wp_riccati, "REPEAT_SECONDS", 0.0)
