@@ -66,11 +66,7 @@ def seconds_text(value: float | None) -> str:
 
 
 def advice(shares: dict[str, float]) -> str:
-    """What to refine first: that which carries the largest share of an error.
-
-    Args:
-        shares: of space, time and maybe reduction.
-    """
+    """What to refine first: that of space, time and maybe reduction which carries the largest share of an error."""
     largest = max(shares, key=lambda name: shares[name])
     better = {
         "space": "a smaller tissue.refine.tolerance",

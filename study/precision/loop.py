@@ -77,13 +77,9 @@ class LoopSetting:
 
 
 def step_counts(shares: Sequence[float], steps: int, n_e: int = 1, most: float = np.inf) -> list[int]:
-    """Whole multiples and parts of the scene's steps that nest, most first.
+    """Whole multiples and parts of the scene's steps that nest, most first, as the shares are.
 
-    Args:
-        shares: multiples and parts, most first.
-        steps: of the scene.
-        n_e: unknowns.
-        most: unknowns times steps that a run may have; the scene's own and fewer steps always may.
+    Only the scene's own and fewer steps may have more unknowns n_e times steps than ``most``.
     """
     whole = [round(steps * s) for s in shares if float(steps * s).is_integer()]
     return [n for n in whole if n >= LEAST_STEPS and (n <= steps or n * n_e <= most)]
@@ -93,9 +89,6 @@ class LoopSweep:
     """Closed loops of one scene; gains and reference are made when the first point is not in the cache. Collective.
 
     Limits and delay of the scene's loop are left out: the law is linear.
-
-    Args:
-        runs: the control problem.
     """
 
     def __init__(self, runs: ControlRuns) -> None:

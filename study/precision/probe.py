@@ -84,12 +84,7 @@ def find_places(scene: Scene, model: Model) -> Places:
 
 
 class ProbedRun(Run):
-    """A run that records the places instead of the scene's nodes, and the seconds of every step.
-
-    Args:
-        model: the model.
-        probe: places on its mesh.
-    """
+    """A run that records places on its mesh instead of the scene's nodes, and the seconds of every step."""
 
     def __init__(self, model: Model, probe: Probe) -> None:
         self.probe: Probe | None = None

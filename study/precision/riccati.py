@@ -74,12 +74,9 @@ class Refusal:
 
 
 class ControlRuns:
-    """The control problem of a scene; solutions are made when the first point is not in the cache. Collective.
+    """The control problem on the scene's own mesh; solutions are made when the first point is not in the cache.
 
-    Args:
-        model: the scene's own mesh.
-        cache: of measured points.
-        named: questions of ``--question``, which are answered at any size.
+    Questions that are named are answered at any size. Collective.
     """
 
     def __init__(self, model: Model, cache: Cache, named: Sequence[str] = ()) -> None:

@@ -24,8 +24,8 @@ from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
-from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RiccatiPoint, RunPoint
-from softgrasp.study.precision.predict import Predictor, companion, error_budget
+from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
+from softgrasp.study.precision.predict import Predictor, error_budget
 from softgrasp.study.precision.probe import find_places
 from softgrasp.study.precision.reduced import ask_bases, ask_reduced
 from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
@@ -55,15 +55,8 @@ def run_study(
     Points are kept in ``out/cache``; the same command after an interruption goes on from there.
 
     Args:
-        path: scene file.
-        out: folder of the results.
-        overrides: arguments of ``--set``.
-        console: for the tables.
-        tolerance: relative error of the deformation to answer for, or None.
-        budget: seconds of a step to answer for, or None.
-        questions: arguments of ``--question``, see :class:`softgrasp.study.precision.points.Request`; None for all.
-        quiet: no progress bar.
-        empty: remove what an earlier run has left in the folder.
+        path, out, overrides, console, quiet, empty: see :class:`softgrasp.study.shell.session.Session`.
+        tolerance, budget, questions: see :class:`softgrasp.study.precision.points.Request`.
 
     Raises:
         SoftgraspError: with one sentence.
@@ -120,7 +113,7 @@ def study_scene(
             answers, measured = answer(scene, runs, truth, questions, request)
         if not refused:
             questions |= control_questions(control, names)
-    budgets = error_budgets(scene, runs, questions, answers, measured) if "forward" in questions else ()
+    budgets = error_budgets(scene, runs.dimension, questions, answers, measured) if "forward" in questions else ()
     return WorkStudy(
         scene=scene,
         truth=truth,
@@ -167,24 +160,18 @@ def answer(
 
 def error_budgets(
     scene: Scene,
-    runs: FullRuns,
+    dimension: int,
     questions: dict[str, Question],
     answers: Sequence[Answer],
     measured: Sequence[RunPoint],
 ) -> tuple[ErrorBudget, ...]:
     """Of the scene's own setting, and of the one that answers a tolerance."""
     points = [*measured, *(p for question in questions.values() for p in question.points)]
-    forward = [p for p in points if isinstance(p, ForwardPoint)]
-    reduced = [p for p in points if isinstance(p, ReducedPoint)]
-    riccati = [p for p in points if isinstance(p, RiccatiPoint)]
     skipped = {name: question.skipped for name, question in questions.items() if question.skipped}
-    predictor = Predictor(scene, forward, runs.dimension)
-    asked = [a.full.point.setting for a in answers if a.kind == "tolerance" and a.full is not None]
-    result = []
-    for setting in dict.fromkeys([own_setting(scene), *asked]):
-        model = companion(predictor.predict(setting).error, reduced)
-        result.append(error_budget(scene, predictor, setting, forward, model, reduced, riccati, skipped))
-    return tuple(result)
+    predictor = Predictor(scene, [p for p in points if isinstance(p, ForwardPoint)], dimension)
+    answered = [a.full.point.setting for a in answers if a.kind == "tolerance" and a.full is not None]
+    settings = dict.fromkeys([own_setting(scene), *answered])
+    return tuple(error_budget(predictor, setting, points, skipped) for setting in settings)
 
 
 def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Question]:

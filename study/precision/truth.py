@@ -67,13 +67,7 @@ def make_truth(scene: Scene, runs: FullRuns, tolerance: float | None = None) -> 
 
 
 def combine(scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half: TimedRun, fine: TimedRun) -> Truth:
-    """y* and its error estimate from the runs.
-
-    Args:
-        scene: the study's scene.
-        meshes: runs with few steps, coarse to fine.
-        middle: of them, the mesh of the other two.
-        half, fine: with twice and four times the scene's steps.
+    """y* and its error estimate: runs with few steps on meshes, coarse to fine, and two with more on the middle one.
 
     Raises:
         SceneError: the outputs move with the hand.
