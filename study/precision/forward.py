@@ -8,9 +8,8 @@ from dataclasses import replace
 from softgrasp.fem.mesh.singular import Ends, expected_order
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, series_of, slope
-from softgrasp.study.precision.full import FullRuns
+from softgrasp.study.precision.full import FullRuns, TimedRun, errors_of
 from softgrasp.study.precision.points import ForwardPoint
-from softgrasp.study.precision.probe import TimedRun, errors_of
 from softgrasp.study.precision.result import Question, Truth
 from softgrasp.study.precision.settings import (
     GOALS,

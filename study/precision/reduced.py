@@ -27,9 +27,8 @@ from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs
 from softgrasp.study.precision.fit import slopes
-from softgrasp.study.precision.full import FullRuns
+from softgrasp.study.precision.full import FullRuns, Series, TimedRun, errors_of
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
-from softgrasp.study.precision.probe import Series, TimedRun, errors_of
 from softgrasp.study.precision.result import Question, Truth
 from softgrasp.study.precision.settings import Setting, own_setting
 from softgrasp.study.reduce.result import Point

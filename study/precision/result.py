@@ -8,8 +8,8 @@ from typing import Any
 
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, pareto
+from softgrasp.study.precision.full import Series, TimedRun
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
-from softgrasp.study.precision.probe import Series, TimedRun
 from softgrasp.study.precision.settings import Setting
 from softgrasp.study.report.files import to_json
 

@@ -22,11 +22,10 @@ from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
 from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
-from softgrasp.study.precision.full import FullRuns
+from softgrasp.study.precision.full import FullRuns, find_places
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
 from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
 from softgrasp.study.precision.predict import Predictor, error_budget
-from softgrasp.study.precision.probe import find_places
 from softgrasp.study.precision.reduced import ask_bases, ask_reduced
 from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of

@@ -21,8 +21,7 @@ import numpy as np
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.full import FullRuns
-from softgrasp.study.precision.probe import Series, TimedRun, largest
+from softgrasp.study.precision.full import FullRuns, Series, TimedRun, largest
 from softgrasp.study.precision.result import Truth
 from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
+from softgrasp.fem.fields.full import make_probe
 
-from softgrasp.fem.fields.probe import make_probe
 from softgrasp.fem.model.build import Stopwatch, build
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
@@ -20,7 +20,7 @@ from softgrasp.lqr.design.feedback import design
 from softgrasp.reduction.replay import full_run
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.precision.probe import find_places
+from softgrasp.study.precision.full import find_places
 from softgrasp.study.reduce.sweep import sweep
 
 CHANGES = ["tissue.cells=[2,2]", "time.steps=40", "time.end=4.0", "reduction.N=[6]", "output.frames=2"]
