@@ -55,15 +55,10 @@ class GainReference:
     tolerances: dict[str, float]  # that they reached
     error: float  # relative difference of their gains; nan when only one method got through
 
-    def judge_of(self, method: str) -> RiccatiSolution:
+    def other_than(self, method: str) -> RiccatiSolution:
         """The solution that a method is compared with: of another method, where there is one."""
         others = [s for name, s in self.solutions.items() if name != method]
         return (others or list(self.solutions.values()))[0]
-
-    @property
-    def names(self) -> list[str]:
-        """Methods and tolerances in words."""
-        return [f"{TITLES[name]} to {tol:.0e}" for name, tol in self.tolerances.items()]
 
 
 @dataclass(frozen=True)
@@ -119,49 +114,44 @@ class ControlRuns:
 
     @cached_property
     def reference(self) -> GainReference:
-        """The tightest solutions of two methods.
+        """The tightest solutions of Newton-ADI and RADI; others stand in for one that fails.
 
         Raises:
             SolverError: no method reaches any of :data:`TIGHT`.
         """
-        return make_reference(self.problem)
+        problem = self.problem
+        solutions: dict[str, RiccatiSolution] = {}
+        tolerances: dict[str, float] = {}
+        for name in self.methods:
+            for tol in TIGHT:
+                try:
+                    solutions[name], tolerances[name] = solve(problem, name, tol), tol
+                    break
+                except (SolverError, ResourceError):  # rounding, or it does not converge here
+                    continue
+            if len(solutions) == 2:
+                break
+        if not solutions:
+            raise SolverError("no method solves the Riccati equation of this scene to 1e-8; add damping")
+        gains = [s.gain for s in solutions.values()]
+        error = gain_error(problem, gains[0], gains[1]) if len(gains) == 2 else float("nan")
+        return GainReference(solutions, tolerances, error)
+
+    @property
+    def methods(self) -> list[Method]:
+        """The dense one is left out of a large plant."""
+        return [m for m in METHODS if m != "dense" or self.layout.states <= DENSE_MOST]
 
     def reference_names(self) -> RiccatiReference:
         """Names and error of the reference, from the cache when they are there."""
 
         def measure() -> list[RiccatiReference]:
             tight = self.reference
-            residuals = tuple(s.residual for s in tight.solutions.values())
-            return [RiccatiReference(tuple(tight.names), tight.error, residuals)]
+            names = tuple(f"{TITLES[name]} to {tol:.0e}" for name, tol in tight.tolerances.items())
+            return [RiccatiReference(names, tight.error, tuple(s.residual for s in tight.solutions.values()))]
 
         key = {"reference": list(TIGHT)}
         return self.cache.point("Riccati reference", "riccati", key, RiccatiReference, measure)[0]
-
-
-def make_reference(problem: RiccatiProblem) -> GainReference:
-    """The tightest solutions of Newton-ADI and RADI; others stand in for one that fails. Collective.
-
-    Raises:
-        SolverError: no method reaches any tolerance.
-    """
-    solutions: dict[str, RiccatiSolution] = {}
-    tolerances: dict[str, float] = {}
-    for name in METHODS:
-        for tol in TIGHT:
-            if name == "dense" and problem.layout.states > DENSE_MOST:
-                break
-            try:
-                solutions[name], tolerances[name] = solve(problem, name, tol), tol
-                break
-            except (SolverError, ResourceError):  # rounding, or it does not converge here
-                continue
-        if len(solutions) == 2:
-            break
-    if not solutions:
-        raise SolverError("no method solves the Riccati equation of this scene to 1e-8; add damping")
-    gains = [s.gain for s in solutions.values()]
-    error = gain_error(problem, gains[0], gains[1]) if len(gains) == 2 else float("nan")
-    return GainReference(solutions, tolerances, error)
 
 
 def tolerances_of(method: str, large: bool) -> tuple[float, ...]:
@@ -173,8 +163,7 @@ def tolerances_of(method: str, large: bool) -> tuple[float, ...]:
 
 def settings_of(runs: ControlRuns) -> list[tuple[Method, float]]:
     """Methods with their tolerances."""
-    fit = [m for m in METHODS if m != "dense" or runs.layout.states <= DENSE_MOST]
-    return [(m, tol) for m in fit for tol in tolerances_of(m, runs.large)]
+    return [(m, tol) for m in runs.methods for tol in tolerances_of(m, runs.large)]
 
 
 def ask_riccati(runs: ControlRuns) -> Question:
@@ -197,7 +186,7 @@ def ask_riccati(runs: ControlRuns) -> Question:
 def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> list[RiccatiPoint]:
     """Gain error, true residual, counts and median seconds of one solver at one tolerance. Collective."""
     problem = runs.problem
-    tight = runs.reference.judge_of(method).gain
+    tight = runs.reference.other_than(method).gain
     solutions: list[RiccatiSolution] = []
     repeats = 1 if runs.large else runs.repeats
 
@@ -300,7 +289,7 @@ def _order(runs: ControlRuns, family: BasisFamily, N: int, time_basis: float, be
 def _reference(runs: ControlRuns) -> ReducedReference:
     """What the reduced gains are compared with, and its distance to the tightest solution of another method."""
     solution = runs.design.solution
-    other = runs.reference.judge_of(solution.method)
+    other = runs.reference.other_than(solution.method)
     gap = gain_error(runs.problem, other.gain, solution.gain)
     return ReducedReference(solution.summary, solution.residual, gap, runs.design.judge.optimal)
 
