@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.fit import usable
+from softgrasp.study.precision.fit import series_of, usable
 from softgrasp.study.precision.forward import to_point
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RunPoint
@@ -144,15 +144,12 @@ class Answers:
     def _models_on(self, setting: Setting, full: ForwardPoint, tolerance: float) -> list[Choice]:
         """Reduced models of the fastest basis on another mesh, or the second; N as the scene's own mesh predicts it."""
         room = tolerance - self.truth.error - full.error
-        expected: dict[str, ReducedPoint] = {}
-        for p in sorted(usable(self.reduced), key=lambda p: p.seconds):
-            if p.error_outputs_full <= SAFETY * room:
-                expected.setdefault(p.series, p)
+        fit = [p for p in usable(self.reduced) if p.error_outputs_full <= SAFETY * room]
         choices: list[Choice] = []
         reduced, run = ReducedRuns(self.scene, setting, self.runs, self.truth), self.runs.run(setting)
-        for name, own in list(expected.items())[:2]:
+        for own in _two_bases(fit, "seconds"):
             sizes = [n for n in sorted(self.scene.reduction.N) if n >= own.N][: MORE + 1]
-            points = reduced.points(name, sizes, run)
+            points = reduced.points(own.series, sizes, run)
             self.measured += points
             predicted = full.error + own.error_outputs_full, own.seconds
             choices += [self.choice(p, predicted) for p in points if self.meets(p, tolerance)]
@@ -166,11 +163,8 @@ class Answers:
         fit = [p for p in usable(self.reduced) if p.p99 <= budget]
         if full is None or not fit or full.error >= min(p.error for p in fit):
             return []
-        best: dict[str, ReducedPoint] = {}
-        for p in sorted(fit, key=lambda p: p.error_outputs_full):
-            best.setdefault(p.series, p)
         reduced, run = ReducedRuns(self.scene, full.setting, self.runs, self.truth), self.runs.run(full.setting)
-        points = [q for name, p in list(best.items())[:2] for q in reduced.points(name, [p.N], run)]
+        points = [q for p in _two_bases(fit, "error_outputs_full") for q in reduced.points(p.series, [p.N], run)]
         self.measured += points
         return points
 
@@ -297,6 +291,12 @@ class Answers:
 
 def _fits(full: ForwardPoint) -> bool:
     return 2 * full.n_e * full.steps <= SNAPSHOTS
+
+
+def _two_bases(points: Sequence[ReducedPoint], attribute: str) -> list[ReducedPoint]:
+    """The points with the least of an attribute, of the two bases where it is least."""
+    lines = series_of(sorted(points, key=lambda p: getattr(p, attribute)))
+    return [line[0] for line in lines.values()][:2]
 
 
 def _prediction(choice: Choice) -> str:
