@@ -22,8 +22,7 @@ def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve:
         needed: bytes that come on top, of this rank.
         reserve: bytes that must stay free besides, of all ranks.
 
-    Raises:
-        ResourceError: the room is too small.
+    Raises ResourceError: the room is too small.
     """
     total = comm.allreduce(needed) + MARGIN + reserve
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]

@@ -67,10 +67,7 @@ def agree(comm: MPI.Intracomm) -> Iterator[None]:
     The exception of the lowest failing rank is raised on every rank, so no rank waits in a collective call that
     the others never reach. The block itself must not communicate.
 
-    Collective.
-
-    Raises:
-        Exception: the exception of the lowest failing rank.
+    Collective. Raises Exception: the exception of the lowest failing rank.
     """
     caught: Exception | None = None
     try:

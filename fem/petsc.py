@@ -152,8 +152,7 @@ def led(
 ) -> Array:
     """What ``method(call)`` returns: it decides on rank 0 alone, and every rank takes part in its calls. Collective.
 
-    Raises:
-        Exception: of the method, or of ``call``, which must raise it on all ranks alike.
+    Raises Exception: of the method, or of ``call``, which must raise it on all ranks alike.
     """
 
     def lead() -> Array:

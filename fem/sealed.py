@@ -46,8 +46,7 @@ def digest(*parts: NDArray[Any] | None) -> str:
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> str:
     """Write arrays and return the SHA-256 of the file, of what was meant to be in it.
 
-    Raises:
-        OSError: the file cannot be written in full.
+    Raises OSError: the file cannot be written in full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
@@ -65,8 +64,7 @@ def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str
         sha256: what its manifest says; None if the manifest does not know it.
         advice: what to do about a damaged file.
 
-    Raises:
-        CheckpointError: the file is missing or not as it was written.
+    Raises CheckpointError: the file is missing or not as it was written.
     """
     try:
         with path.open("rb") as file:
@@ -82,8 +80,7 @@ def read_arrays(path: Path, sha256: str | None, advice: str = AGAIN) -> dict[str
 def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
     """Put a manifest in place of the old one, with its own SHA-256.
 
-    Raises:
-        OSError: it cannot be written; the old one stays.
+    Raises OSError: it cannot be written; the old one stays.
     """
     fresh = path.with_suffix(".new")
     with fresh.open("w") as file:

@@ -67,6 +67,11 @@ class Damping:
         """Whether any damping acts."""
         return self.alpha > 0 or self.beta > 0 or self.matrix is not None
 
+    @property
+    def drag(self) -> float:
+        """The part of alpha that drags the rigid motion [1/s]."""
+        return self.alpha if self.in_space else 0.0
+
 
 @dataclass(frozen=True)
 class BlockSystem:
@@ -91,6 +96,16 @@ class BlockSystem:
     two_way: bool = False  # the tissue acts on the hand
     graded: bool = False  # nodes crowd where cells shrink, so that Euclidean norms of node values mean little
     points: Points | None = None  # where finite strain evaluates its law; None: K_ee z is the whole force
+
+    @property
+    def fall(self) -> Array:
+        """Free fall in the hand's degrees of freedom, zero without gravity, (n_s,) [m/s^2]."""
+        return np.zeros(self.layout.n_s) if self.gravity is None else self.gravity
+
+    @property
+    def weight(self) -> Array:
+        """What gravity adds to the force on the hand, (n_s,) [N, N m]."""
+        return self.M_hand @ self.fall if self.hand_weight else np.zeros(self.layout.n_s)
 
     @property
     def M_es(self) -> Array:

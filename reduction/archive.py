@@ -20,7 +20,8 @@ from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
-from softgrasp.reduction.model import Lift, ModelError, Outputs, ReducedModel
+from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
+from softgrasp.reduction.operators import Lift
 
 if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel

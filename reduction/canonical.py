@@ -24,8 +24,6 @@ L_v = M_ee^-1 V_p [- M_ee^-1 G S_v in the absolute frame].
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
@@ -33,57 +31,35 @@ from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.galerkin import symmetric
-from softgrasp.reduction.operators import Operators, Parameters, Parts
+from softgrasp.reduction.operators import Lift, Operators, Parameters, Parts, layer_products, relative_rows, symmetric
 
 MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inherits it
 
 
-@dataclass(frozen=True)
-class CanonicalLift:
-    """Local rows that turn a reduced state into velocities: v_z = Y x / scale - W_G v_s."""
-
-    L_q: Array  # z = L_q x, (n_local, N)
-    Y: Array  # M_ee^-1 V_p at the densities of the projection, (n_local, N)
-    W_G: Array | None  # M_ee^-1 G, (n_local, n_s), or None in the relative frame
-
-
-def _rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array, Array]:
-    """S_q, rows of the hand's velocity or momentum, and L_q."""
-    S_q, S_p = basis.V_sq, basis.V_sv
-    if basis.fixed_solid:
-        n_s = system.layout.n_s
-        S_q, S_p = np.eye(n_s, basis.N), np.eye(n_s, basis.N, n_s)
-    absolute = basis.frame == "absolute"
-    L_q = np.asfortranarray(basis.V_q - system.T @ S_q) if absolute else basis.V_q
-    return S_q, S_p, L_q
-
-
-def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, CanonicalLift]:
-    """Small matrices at the densities of ``system``, and what lifts velocities. Collective.
+def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Lift]:
+    """Small matrices at the densities of ``system``, and the lift. Collective.
 
     Raises:
         SoftgraspError: the hand's own columns reach into the tissue.
         SolverError: the mass matrix cannot be factored.
     """
-    comm, absolute = system.layout.comm, basis.frame == "absolute"
-    k = 2 * system.layout.n_s if basis.fixed_solid else 0
+    comm, layout = system.layout.comm, system.layout
+    k = 2 * layout.n_s if basis.fixed_solid else 0
     # canonical models take the hand as their input
     if comm.allreduce(float(np.abs(basis.V_q[:, :k]).sum() + np.abs(basis.V_p[:, :k]).sum())) > 0:
         raise SoftgraspError(f"{basis.name}: the hand's own columns of a canonical basis must be zero in the tissue")
-    S_q, S_p, L_q = _rows(basis, system)
-    V_p, G, T = basis.V_p, system.G, system.T
-    both = solve_columns(system.M_ee, system.layout, np.hstack([V_p, G]), "the momentum of a basis vector", MASS_RTOL)
+    L_q, _ = relative_rows(basis, system)
+    V_p, G = basis.V_p, system.G
+    both = solve_columns(system.M_ee, layout, np.hstack([V_p, G]), "the momentum of a basis vector", MASS_RTOL)
     Y, W_G = np.split(both, [basis.N], axis=1)
     W = basis.V_q if basis.fixed_solid and not system.two_way else L_q
-    G_WG = total(comm, G.T @ W_G)
     parts: Parts = {
-        "S_q": S_q,
-        "S_p": S_p,
+        "S_q": basis.V_sq,
+        "S_p": basis.V_sv,
         "M_hand": system.M_hand,
         "M_rigid": system.M_rigid,
-        "GWG": symmetric(G_WG),
-        "TV": total(comm, T.T @ V_p),
+        "GWG": symmetric(total(comm, G.T @ W_G)),
+        "TV": total(comm, system.T.T @ V_p),
         "VY": symmetric(total(comm, V_p.T @ Y)),
         "VW_G": total(comm, Y.T @ G),
         "VL": total(comm, V_p.T @ L_q),
@@ -91,17 +67,13 @@ def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Canonical
         "WV": total(comm, W.T @ V_p),
         "WG": total(comm, W.T @ G),
     }
-    stacks: dict[str, list[Array]] = {}
-    for layer in system.layers:
-        for key, component in (("mu", layer.K_mu), ("lambda", layer.K_lambda)):
-            K_L = times_columns(component.ee, L_q)
-            stacks.setdefault(f"energy_{key}", []).append(symmetric(total(comm, L_q.T @ K_L)))
-            if W is not L_q:
-                stacks.setdefault(f"K_{key}", []).append(total(comm, W.T @ K_L))
-    parts.update({key: np.stack(value) for key, value in stacks.items()})
+    for key in ("mu", "lambda"):
+        energy, *stiffness = layer_products(system, f"K_{key}", L_q, *((L_q,) if W is L_q else (L_q, W)))
+        parts[f"energy_{key}"] = symmetric(energy)
+        parts |= {f"K_{key}": each for each in stiffness}
     if system.damping.alpha:
         parts["WM"] = total(comm, W.T @ times_columns(system.M_ee, L_q))
-    return parts, CanonicalLift(L_q, Y, W_G if absolute else None)
+    return parts, Lift(layout, L_q, Y, W_G if basis.frame == "absolute" else None)
 
 
 def hand_velocity(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Array:
@@ -114,37 +86,6 @@ def hand_velocity(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> A
     return np.linalg.solve(inertia, parts["S_p"] + parts["TV"] - parts["VW_G"].T)
 
 
-@dataclass(frozen=True)
-class Terms:
-    """Products at one parameter that the equations are put together from."""
-
-    S_q: Array  # S_q, S_v: readouts of the hand, (n_s, N)
-    S_v: Array
-    rigid: Array  # rigid, G_WG: inertia of the tissue moved rigidly, and G' M^-1 G, (n_s, n_s)
-    G_WG: Array
-    G_L: Array  # G_L, G_Lv: G' L_q and G' L_v, (n_s, N)
-    G_Lv: Array
-    W_tG: Array  # W_q' G, (N, n_s)
-    V_Lv: Array  # V_p' L_v, (N, N)
-    K: Array  # W_q' K L_q, (N, N)
-    energy: Array  # Hessian of the tissue's energy relative to the hand, (N, N)
-
-
-def _terms(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Terms:
-    c, V_W = p.scale, parts["VW_G"]
-    S_v = hand_velocity(parts, p, fixed, absolute)
-    G_WG = c * parts["GWG"]
-    # L_v loses M^-1 G S_v in the absolute frame
-    G_Lv = V_W.T - (G_WG @ S_v if absolute else 0.0)
-    V_Lv = parts["VY"] / c - (V_W @ S_v if absolute else 0.0)
-    K_energy = p.stiffness(parts["energy_mu"], parts["energy_lambda"])
-    K = p.stiffness(parts["K_mu"], parts["K_lambda"]) if "K_mu" in parts else K_energy
-    kinetic = V_Lv - (S_v.T @ G_Lv if absolute else 0.0)
-    energy = symmetric(K_energy + kinetic)
-    W_tG, G_L = c * parts["WG"], c * parts["GL"]
-    return Terms(parts["S_q"], S_v, c * parts["M_rigid"], G_WG, G_L, G_Lv, W_tG, V_Lv, K, energy)
-
-
 def canonical_operators(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Operators:
     """E, A, B, F and the energies at one parameter; online.
 
@@ -154,53 +95,49 @@ def canonical_operators(parts: Parts, p: Parameters, fixed: bool, absolute: bool
         fixed: the hand's displacement and velocity are the first 2 n_s coordinates.
         absolute: the tissue rows of the basis are absolute.
     """
-    t = _terms(parts, p, fixed, absolute)
-    M_hand, S_q, S_v = parts["M_hand"], t.S_q, t.S_v
-    inertia = M_hand + t.rigid if p.two_way else M_hand
-    coupled = S_v.T @ t.G_Lv if p.two_way else np.zeros_like(t.K)
-    hamiltonian = symmetric(t.energy + S_v.T @ inertia @ S_v + coupled + coupled.T)
+    c, M_hand, S_q, V_L, V_W = p.scale, parts["M_hand"], parts["S_q"], parts["VL"], parts["VW_G"]
+    S_v = hand_velocity(parts, p, fixed, absolute)
+    rigid, G_L, W_tG = c * parts["M_rigid"], c * parts["GL"], c * parts["WG"]
+    # G' L_v and V_p' L_v; L_v loses M^-1 G S_v in the absolute frame
+    G_Lv = V_W.T - (c * parts["GWG"] @ S_v if absolute else 0.0)
+    V_Lv = parts["VY"] / c - (V_W @ S_v if absolute else 0.0)
+    K_energy = p.stiffness(parts["energy_mu"], parts["energy_lambda"])
+    own = "K" if "K_mu" in parts else "energy"  # W_q' K L_q where W_q is another than L_q
+    K = K_energy if own == "energy" else p.stiffness(parts["K_mu"], parts["K_lambda"])
+    energy = symmetric(K_energy + (V_Lv - (S_v.T @ G_Lv if absolute else 0.0)))
+
+    inertia = M_hand + rigid if p.two_way else M_hand
+    coupled = S_v.T @ G_Lv if p.two_way else np.zeros_like(K)
+    hamiltonian = symmetric(energy + S_v.T @ inertia @ S_v + coupled + coupled.T)
     B, weight = -S_q.T, M_hand if p.hand_weight else np.zeros_like(M_hand)
-    F = -t.W_tG - S_q.T @ weight
+    F = -W_tG - S_q.T @ weight
     if p.two_way:
         # momenta M_s S_v + G' L_v of the hand and M L_v + G S_v of the tissue
-        X = (inertia @ S_v + t.G_Lv).T @ S_q + parts["VL"] + (0.0 if absolute else S_v.T @ t.G_L)
+        X = (inertia @ S_v + G_Lv).T @ S_q + V_L + (0.0 if absolute else S_v.T @ G_L)
         E, A = X - X.T, hamiltonian
-        F = F - S_q.T @ t.rigid
+        F = F - S_q.T @ rigid
     elif fixed:
-        E, A = _hand_as_input(parts, t, absolute)
+        # the hand as input; the tissue's own block is skew and symmetric to the bit
+        P_s = parts["S_p"] + (parts["TV"] if absolute else 0.0)
+        W_tP = parts["WV"] + (0.0 if absolute else W_tG @ S_v)
+        E = P_s.T @ S_q + V_L - W_tP - S_q.T @ M_hand @ S_v
+        A = P_s.T @ S_v + V_Lv + K
+        k = 2 * len(M_hand)
+        E[k:, k:] = (E[k:, k:] - E[k:, k:].T) / 2
+        A[k:, k:] = symmetric(A[k:, k:])
     else:
         # momenta M_hand S_v and M L_v; the tissue feels a_s = M_hand^-1 (u + weight)
-        X = (M_hand @ S_v).T @ S_q + parts["VL"] - (S_v.T @ t.G_L if absolute else 0.0)
+        X = (M_hand @ S_v).T @ S_q + V_L - (S_v.T @ G_L if absolute else 0.0)
         E, A = X - X.T, hamiltonian
-        pull = np.linalg.solve(M_hand, t.G_L).T
+        pull = np.linalg.solve(M_hand, G_L).T
         B, F = B + pull, F + pull @ weight
-    if p.damped:
-        E = E - _damping(parts, p, S_q)
-    return Operators(E, A, B, F, S_q, S_v, t.energy, hamiltonian)
-
-
-def _hand_as_input(parts: Parts, t: Terms, absolute: bool) -> tuple[Array, Array]:
-    """E and A of a one-way model with fixed solid modes; the tissue's own block is skew and symmetric to the bit."""
-    S_q, S_v, M_hand = t.S_q, t.S_v, parts["M_hand"]
-    P_s = parts["S_p"] + (parts["TV"] if absolute else 0.0)
-    W_tP = parts["WV"] + (0.0 if absolute else t.W_tG @ S_v)
-    E = P_s.T @ S_q + parts["VL"] - W_tP - S_q.T @ M_hand @ S_v
-    A = P_s.T @ S_v + t.V_Lv + t.K
-    k = 2 * len(M_hand)
-    E[k:, k:] = (E[k:, k:] - E[k:, k:].T) / 2
-    A[k:, k:] = symmetric(A[k:, k:])
-    return E, A
-
-
-def _damping(parts: Parts, p: Parameters, S_q: Array) -> Array:
-    """W' D L_q, plus the drag on the rigid motion when it acts in space."""
-    prefix = "K" if "K_mu" in parts else "energy"
-    D = p.viscosity(parts[f"{prefix}_mu"], parts[f"{prefix}_lambda"])
-    if p.alpha:
-        c = p.scale
-        D = D + p.alpha * c * parts["WM"]
-        if p.in_space:
+    if p.damped:  # W' D L_q, plus the drag on the rigid motion when it acts in space
+        D = p.viscosity(parts[f"{own}_mu"], parts[f"{own}_lambda"])
+        if p.alpha:
+            D = D + p.alpha * c * parts["WM"]
+        if p.alpha and p.in_space:
             D = D + p.alpha * c * (parts["WG"] @ S_q)
             if p.two_way:
                 D = D + p.alpha * c * S_q.T @ (parts["GL"] + parts["M_rigid"] @ S_q)
-    return D
+        E = E - D
+    return Operators(E, A, B, F, S_q, S_v, energy, hamiltonian)

@@ -13,20 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.system import BlockSystem, LayerMaterial, coupling
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.operators import Operators, Parameters, Parts
-
-
-def relative_rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array]:
-    """Displacement and second row block of every basis vector relative to the hand, local rows."""
-    if basis.frame == "relative":
-        return basis.V_q, basis.V_p
-    return (
-        np.asfortranarray(basis.V_q - system.T @ basis.V_sq),
-        np.asfortranarray(basis.V_p - system.T @ basis.V_sv),
-    )
+from softgrasp.reduction.operators import Lift, Operators, Parameters, Parts, layer_products, relative_rows, symmetric
 
 
 def unit_coupling(system: BlockSystem) -> tuple[list[Array], list[Array]]:
@@ -36,8 +26,8 @@ def unit_coupling(system: BlockSystem) -> tuple[list[Array], list[Array]]:
     return [g for g, _ in pairs], [r for _, r in pairs]
 
 
-def galerkin_parts(basis: Basis, system: BlockSystem) -> Parts:
-    """Small matrices from which every parameter is assembled. Collective.
+def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Lift]:
+    """Small matrices from which every parameter is assembled, and the lift. Collective.
 
     The rows of the tissue are tested with V_v itself (the paper), or with V_v - T V_sv where virtual work asks for it:
     two-way coupling, and bases of second order, whose models stay symmetric that way.
@@ -57,20 +47,12 @@ def galerkin_parts(basis: Basis, system: BlockSystem) -> Parts:
         "WG": np.stack([total(comm, W.T @ g) for g in G]),
         "ZG": np.stack([total(comm, Z_v.T @ g) for g in G]),
     }
-    stacks: dict[str, list[Array]] = {}
-    for layer in system.layers:
-        for key, component in (("mu", layer.K_mu), ("lambda", layer.K_lambda)):
-            K_Z = times_columns(component.ee, Z)
-            stacks.setdefault(f"K_{key}", []).append(total(comm, W.T @ K_Z))
-            stacks.setdefault(f"energy_{key}", []).append(total(comm, Z.T @ K_Z))
-            if system.damping.active:
-                K_Z = times_columns(component.ee, Z_v)
-                stacks.setdefault(f"D_{key}", []).append(total(comm, W.T @ K_Z))
-        M_Z = times_columns(layer.M_1.ee, Z_v)
-        stacks.setdefault("M", []).append(total(comm, W.T @ M_Z))
-        stacks.setdefault("energy_M", []).append(total(comm, Z_v.T @ M_Z))
-    parts.update({key: np.stack(value) for key, value in stacks.items()})
-    return parts
+    for key in ("mu", "lambda"):
+        parts[f"K_{key}"], parts[f"energy_{key}"] = layer_products(system, f"K_{key}", Z, W, Z)
+        if system.damping.active:
+            (parts[f"D_{key}"],) = layer_products(system, f"K_{key}", Z_v, W)
+    parts["M"], parts["energy_M"] = layer_products(system, "M_1", Z_v, W, Z_v)
+    return parts, Lift(system.layout, Z, Z_v)
 
 
 def galerkin_operators(parts: Parts, p: Parameters) -> Operators:
@@ -99,8 +81,3 @@ def galerkin_operators(parts: Parts, p: Parameters) -> Operators:
         energy=energy,
         total=symmetric(energy + S_v.T @ hand @ S_v + ((cross + cross.T) if p.two_way else 0.0)),
     )
-
-
-def symmetric(X: Array) -> Array:
-    """(X + X') / 2."""
-    return np.asarray((X + X.T) / 2)

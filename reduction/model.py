@@ -8,14 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
 from softgrasp.reduction.lti import LTI, make_lti
-from softgrasp.reduction.operators import Operators, Parameters, Parts
+from softgrasp.reduction.operators import Lift, Operators, Parameters, Parts
 from softgrasp.reduction.spectrum import Spectrum, spectrum
 
 
@@ -33,17 +32,6 @@ def singular(X: Array) -> bool:
     rows, columns = (np.sqrt(np.where(m > 0, m, 1.0)) for m in (sizes.max(axis=1), sizes.max(axis=0)))
     values = np.linalg.svd(X / np.outer(rows, columns), compute_uv=False)
     return bool(values[-1] <= 4 * len(X) * np.finfo(float).eps * values[0])
-
-
-@dataclass(frozen=True)
-class Lift:
-    """Rows that turn reduced states into tissue states relative to the hand; the only distributed part of a model."""
-
-    layout: BlockLayout  # sizes and ownership
-    L_q: Array  # z = L_q x, local rows (n_local, N)
-    L_v: Array  # v_z = L_v x / scale [- W_G v_s], local rows (n_local, N)
-    # M_ee^-1 G, local rows (n_local, n_s), in canonical coordinates of the absolute frame; else None
-    W_G: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.model import ModelError, SmallModel, UnstableModelError
-from softgrasp.reduction.propagator import Propagator, march, propagator
+from softgrasp.reduction.propagator import Propagator, march, march_together, propagator
 
 # byte of the matrices of a batch up to which all models step together; somewhere between 4 and 11 MB they leave the
 # cache, and one model after the other is faster (softgrasp.study.bench.switches)
@@ -71,7 +71,7 @@ def run(
     if hand is None and (inputs.ndim != 2 or inputs.shape[1] != model.n_s or len(inputs) < 1):
         raise ModelError(f"the force has the shape {inputs.shape}; it must be (steps, {model.n_s})")
     start = np.zeros(model.N) if x0 is None else np.asarray(x0, dtype=float)
-    w = march(step, inputs, step.X_inverse @ start[model.N - step.size :])
+    w = march(step, inputs, step.at.X_inverse @ start[model.N - step.size :])
     return trajectory(step, w, hand)
 
 
@@ -111,7 +111,7 @@ def hand_inputs(model: SmallModel, hand: tuple[Array, Array], dt: float) -> Arra
 
 def trajectory(step: Propagator, w: Array, hand: tuple[Array, Array] | None) -> ReducedTrajectory:
     """Bundle states w (steps + 1, k) with the hand, prescribed or of the states, and the outputs."""
-    model, op, x = step.model, step.model.operators, w @ step.X.T
+    model, op, x = step.model, step.model.operators, w @ step.at.X.T
     if hand is None:
         q, v = x @ op.S_q.T, x @ op.S_v.T
     else:
@@ -142,7 +142,7 @@ class Stepper:
         k, op = self.step.size, model.operators
         C = model.outputs.C_z + model.outputs.C_s @ op.S_q
         # new state, and outputs of the new state, in one product
-        self._matrix = np.ascontiguousarray(np.vstack([self.step.matrix, C @ self.step.X @ self.step.matrix]))
+        self._matrix = np.ascontiguousarray(np.vstack([self.step.matrix, C @ self.step.at.X @ self.step.matrix]))
         self._row = np.zeros(self._matrix.shape[1])
         self._row[-1] = 1.0
         self._new = np.zeros(len(self._matrix))
@@ -150,8 +150,8 @@ class Stepper:
         self._w_new, self.outputs = self._new[:k], self._new[k:]
         self._dot = np.dot
         if x0 is not None:
-            self._w[:] = self.step.X_inverse @ x0
-        self.outputs[:] = C @ (self.step.X @ self._w)
+            self._w[:] = self.step.at.X_inverse @ x0
+        self.outputs[:] = C @ (self.step.at.X @ self._w)
 
     def __call__(self, u: Array) -> Array:
         """Advance by dt under the force u (n_s,); returns the outputs, overwritten by the next call."""
@@ -163,7 +163,7 @@ class Stepper:
     @property
     def state(self) -> Array:
         """Reduced state x now, (N,)."""
-        return np.asarray(self.step.X @ self._w)
+        return np.asarray(self.step.at.X @ self._w)
 
 
 def run_batch(
@@ -209,25 +209,9 @@ def run_batch(
     own = [None if hands is None else (tables[0][i], tables[1][i]) for i in range(shape[0])]
     u = tables[0] if hands is None else np.stack([hand_inputs(steps[0].model, h, dt) for h in own if h is not None])
     many = len(steps) > 1
-    return [trajectory(steps[i if many else 0], w, own[i]) for i, w in enumerate(_states(steps, u))]
-
-
-def _states(steps: Sequence[Propagator], u: Array) -> Array:
-    """States w from rest, (runs, steps + 1, k)."""
-    alone = all(s.modal is not None for s in steps) or sum(s.block.nbytes for s in steps) > TOGETHER
-    if len(steps) > 1 and alone:
-        return np.stack([march(s, own, np.zeros(s.size)) for s, own in zip(steps, u, strict=True)])
-    (runs, number, m), k, b = u.shape, steps[0].size, steps[0].steps
-    count = -(-number // b)
-    padded = np.zeros((runs, count * b, m))
-    padded[:, :number] = u
-    rows = np.zeros((count + 1, runs, b * k + b * m + 1))
-    rows[:-1, :, b * k : -1] = padded.reshape(runs, count, b * m).transpose(1, 0, 2)
-    rows[:, :, -1] = 1.0
-    stack = np.stack([s.block for s in steps])
-    one = np.ascontiguousarray(steps[0].block.T)
-    for old, new in zip(rows[:-1, :, (b - 1) * k :], rows[1:, :, : b * k], strict=True):
-        new[:] = old @ one if len(steps) == 1 else np.matmul(stack, old[:, :, None])[:, :, 0]
-    states = np.zeros((runs, number + 1, k))
-    states[:, 1:] = rows[1:, :, : b * k].transpose(1, 0, 2).reshape(runs, count * b, k)[:, :number]
-    return states
+    rest, alone = np.zeros(steps[0].size), all(s.modal is not None for s in steps)
+    if many and (alone or sum(s.block.nbytes for s in steps) > TOGETHER):
+        states: Iterable[Array] = (march(s, inputs, rest) for s, inputs in zip(steps, u, strict=True))
+    else:
+        states = march_together(steps, u, rest)
+    return [trajectory(steps[i if many else 0], w, own[i]) for i, w in enumerate(states)]

@@ -1,4 +1,4 @@
-"""Parameters and operators of a small model: what online assembly takes and what it gives."""
+"""What projections share: products with every layer, the lift, and what online assembly takes and gives."""
 
 from __future__ import annotations
 
@@ -6,11 +6,51 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgrasp.fem.petsc import Array
-from softgrasp.fem.system import LayerMaterial
+from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.system import BlockSystem, LayerMaterial
+from softgrasp.reduction.bases.basis import Basis
 
 Parts = dict[str, Array]
 """Named small matrices; those with a leading axis hold one matrix a layer."""
+
+
+@dataclass(frozen=True)
+class Lift:
+    """Rows that turn reduced states into tissue states relative to the hand; the only distributed part of a model."""
+
+    layout: BlockLayout  # sizes and ownership
+    L_q: Array  # z = L_q x, local rows (n_local, N)
+    L_v: Array  # v_z = L_v x / scale [- W_G v_s], local rows (n_local, N)
+    # M_ee^-1 G, local rows (n_local, n_s), in canonical coordinates of the absolute frame; else None
+    W_G: Array | None = None
+
+
+def relative_rows(basis: Basis, system: BlockSystem) -> tuple[Array, Array]:
+    """Displacement and second row block of every basis vector relative to the hand, local rows."""
+    if basis.frame == "relative":
+        return basis.V_q, basis.V_p
+    return (
+        np.asfortranarray(basis.V_q - system.T @ basis.V_sq),
+        np.asfortranarray(basis.V_p - system.T @ basis.V_sv),
+    )
+
+
+def layer_products(system: BlockSystem, component: str, Y: Array, *tests: Array) -> list[Array]:
+    """X' A_l Y stacked over the layers l, (layers, .., ..), for each X of ``tests``. Collective.
+
+    ``component``: "K_mu", "K_lambda" or "M_1" of :class:`softgrasp.fem.system.LayerBlocks`.
+    """
+    products: list[list[Array]] = []
+    for layer in system.layers:
+        A_Y = times_columns(getattr(layer, component).ee, Y)
+        products.append([total(system.layout.comm, X.T @ A_Y) for X in tests])
+    return [np.stack(each) for each in zip(*products, strict=True)]
+
+
+def symmetric(X: Array) -> Array:
+    """(X + X') / 2, of every matrix of a stack."""
+    return np.asarray((X + X.swapaxes(-1, -2)) / 2)
 
 
 @dataclass(frozen=True)

@@ -13,30 +13,22 @@ from softgrasp.fem.petsc import total
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.canonical import canonical_parts
-from softgrasp.reduction.galerkin import galerkin_parts, relative_rows
-from softgrasp.reduction.model import Lift, Outputs, ReducedModel
+from softgrasp.reduction.galerkin import galerkin_parts
+from softgrasp.reduction.model import Outputs, ReducedModel
+from softgrasp.reduction.operators import Lift
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.outputs import Output
 
 
-def project(
-    basis: Basis,
-    system: BlockSystem,
-    outputs: Sequence[Output] = (),
-    scene_hash: str = "",
-) -> ReducedModel:
+def project(basis: Basis, system: BlockSystem, outputs: Sequence[Output] = (), scene_hash: str = "") -> ReducedModel:
     """Reduced model E x' = A x + B u + F g, y = C_z x + C_s q_s of a basis V of shape (2n, N). Collective.
 
     A basis in (q, v) gives the paper's Galerkin model with W = V [SBRH21] (`reduction.galerkin`), one in (q, p) a
     canonical model that is Hamiltonian, or dissipative with damping [AH19] (`reduction.canonical`).
 
-    Costs a product with every component for each basis vector; a canonical model also one factorisation of M_ee and a
-    solve for each vector with a momentum.
-
-    Args:
-        basis: V in the blocks of hand and tissue.
-        system: operators; a canonical model is affine around their densities.
+    A canonical model is affine around the densities of ``system``. Costs a product with every component for each basis
+    vector; a canonical model also one factorisation of M_ee and a solve for each vector with a momentum.
 
     Raises:
         SolverError: the mass matrix cannot be factored.
@@ -45,13 +37,7 @@ def project(
     layout = system.layout
     layout.comm.Barrier()
     begin = time.perf_counter()
-    if basis.coordinates == "qv":
-        parts = galerkin_parts(basis, system)
-        L_q, L_v = relative_rows(basis, system)
-        lift = Lift(layout, L_q, L_v)
-    else:
-        parts, velocity = canonical_parts(basis, system)
-        lift = Lift(layout, velocity.L_q, velocity.Y, velocity.W_G)
+    parts, lift = (galerkin_parts if basis.coordinates == "qv" else canonical_parts)(basis, system)
     # sums over ranks may differ in the last bit from rank to rank
     parts = layout.comm.bcast(parts)
     damping = system.damping

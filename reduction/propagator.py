@@ -9,7 +9,7 @@ over any number of steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -41,16 +41,6 @@ class Propagator:
     modal: Modal | None = None  # the same mode by mode, for conservative models
 
     @property
-    def X(self) -> Array:
-        """Columns X of x = X w, (N or the tissue's own coordinates, k)."""
-        return self.at.X
-
-    @property
-    def X_inverse(self) -> Array:
-        """Rows of w = X_inverse x."""
-        return self.at.X_inverse
-
-    @property
     def size(self) -> int:
         """Length k of w."""
         return len(self.at.X)
@@ -68,7 +58,7 @@ class Propagator:
     @cached_property
     def matrix(self) -> Array:
         """One step, (k, k + m + 1) for m inputs, C order. Raises ModelError: E - dt/2 A is singular."""
-        dt, X = self.dt, self.X
+        dt, X = self.dt, self.at.X
         try:
             implicit = (self.E - dt / 2 * self.A) @ X
             matrix = np.linalg.solve(implicit, np.hstack([(self.E + dt / 2 * self.A) @ X, dt * self.loads]))
@@ -81,7 +71,18 @@ class Propagator:
     @cached_property
     def block(self) -> Array:
         """[w_{n+1}; ...; w_{n+b}] = block [w_n; u_n; ...; u_{n+b-1}; 1], (b k, k + b m + 1), C order."""
-        return several(self.matrix, self.steps, self._exact)
+        k, b, m = self.size, self.steps, self.loads.shape[1] - 1
+        P, Q, f = self.matrix[:, :k], self.matrix[:, k:-1], self.matrix[:, -1]
+        powers = [np.eye(k)]
+        for i in range(1, b + 1):
+            powers.append(self._exact(P @ powers[-1], i))
+        block = np.zeros((b, k, k + b * m + 1))
+        for i in range(b):
+            block[i, :, :k] = powers[i + 1]
+            block[i, :, -1] = sum(powers[: i + 1]) @ f
+            for j in range(i + 1):
+                block[i, :, k + j * m : k + (j + 1) * m] = powers[i - j] @ Q
+        return block.reshape(b * k, -1)
 
     def _exact(self, P: Array, steps: int) -> Array:
         """Entries of P^steps that are known: rotations, and the free hand."""
@@ -178,42 +179,43 @@ def propagator(model: SmallModel, dt: float, driven: bool = False) -> Propagator
     return step
 
 
-def several(matrix: Array, steps: int, exact: Callable[[Array, int], Array]) -> Array:
-    """Matrix of several steps from that of one, [P Q f]; ``exact`` corrects the powers of P."""
-    k, m = len(matrix), matrix.shape[1] - len(matrix) - 1
-    P, Q, f = matrix[:, :k], matrix[:, k:-1], matrix[:, -1]
-    powers = [np.eye(k)]
-    for i in range(1, steps + 1):
-        powers.append(exact(P @ powers[-1], i))
-    block = np.zeros((steps, k, k + steps * m + 1))
-    for i in range(steps):
-        block[i, :, :k] = powers[i + 1]
-        block[i, :, -1] = sum(powers[: i + 1]) @ f
-        for j in range(i + 1):
-            block[i, :, k + j * m : k + (j + 1) * m] = powers[i - j] @ Q
-    return block.reshape(steps * k, -1)
-
-
 def march(step: Propagator, inputs: Array, start: Array) -> Array:
-    """States w of all steps, (steps + 1, k), for inputs (steps, m) and a start (k,): one small product a block.
-
-    A row of the table is [w of the block; inputs of the next block; 1], so that neither inputs nor results are copied
-    in the loop.
-    """
+    """States w of all steps, (steps + 1, k), for inputs (steps, m) and a start (k,)."""
     if step.modal is not None:
         return step.modal.march(inputs, start)
-    k, b, (steps, m) = step.size, step.steps, inputs.shape
-    blocks = -(-steps // b)
-    rows = np.zeros((blocks + 1, b * k + b * m + 1))
-    padded = np.zeros((blocks * b, m))
-    padded[:steps] = inputs
-    rows[:-1, b * k : -1] = padded.reshape(blocks, b * m)
-    rows[:, -1] = 1.0
-    rows[0, (b - 1) * k : b * k] = start
-    product, block = np.dot, step.block
-    for old, new in zip(list(rows[:-1, (b - 1) * k :]), list(rows[1:, : b * k]), strict=True):
-        product(block, old, new)
-    states = np.empty((steps + 1, k))
-    states[0] = start
-    states[1:] = rows[1:, : b * k].reshape(-1, k)[:steps]
+    return np.asarray(march_together([step], inputs[None], start)[0])
+
+
+def march_together(steps: Sequence[Propagator], inputs: Array, start: Array) -> Array:
+    """States (runs, steps + 1, k) for inputs (runs, steps, m) and one start (k,): one product for all runs a block.
+
+    A row of the table is [w of the block; inputs of the next block; 1], so that a single run copies neither inputs nor
+    results in the loop.
+
+    ``steps``: one propagator for all runs, or one for each.
+    """
+    (runs, number, m), k, b = inputs.shape, steps[0].size, steps[0].steps
+    blocks = -(-number // b)
+    rows = np.zeros((blocks + 1, runs, b * k + b * m + 1))
+    padded = np.zeros((runs, blocks * b, m))
+    padded[:, :number] = inputs
+    rows[:-1, :, b * k : -1] = padded.reshape(runs, blocks, b * m).swapaxes(0, 1)
+    rows[:, :, -1] = 1.0
+    rows[0, :, (b - 1) * k : b * k] = start
+    before, after = rows[:-1, :, (b - 1) * k :], rows[1:, :, : b * k]
+    if runs == 1:
+        product, block = np.dot, steps[0].block
+        for old, new in zip(list(before[:, 0]), list(after[:, 0]), strict=True):
+            product(block, old, new)
+    elif len(steps) == 1:
+        right = np.ascontiguousarray(steps[0].block.T)
+        for old, new in zip(before, after, strict=True):
+            new[:] = old @ right
+    else:
+        stack = np.stack([s.block for s in steps])
+        for old, new in zip(before, after, strict=True):
+            new[:] = np.matmul(stack, old[:, :, None])[:, :, 0]
+    states: Array = np.empty((runs, number + 1, k))
+    states[:, 0] = start
+    states[:, 1:] = after.swapaxes(0, 1).reshape(runs, blocks * b, k)[:, :number]
     return states

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.estimate import estimate, next_order
-from softgrasp.fem.accuracy.marking import marked_cells
+from softgrasp.fem.accuracy.estimate import estimate, marked_cells, next_order
 from softgrasp.fem.accuracy.small import Small, reduced
 from softgrasp.fem.errors import SceneError, agree
-from softgrasp.fem.mesh.bisect import bisect, distribute
+from softgrasp.fem.mesh.grading import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
 from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.refined import by_lines, refined_mesh, unknowns
@@ -90,8 +89,7 @@ def _effectivity(old: Array, error: Array, new: Array) -> float:
 def judged(model: Model) -> MeshEstimate:
     """The estimate of a model that was built without one, against the tolerance of its scene if it has one. Collective.
 
-    Raises:
-        SolverError, SceneError, MeshError: see :func:`softgrasp.fem.accuracy.estimate.estimate`.
+    Raises SolverError, SceneError, MeshError: see :func:`softgrasp.fem.accuracy.estimate.estimate`.
     """
     result, refine = estimate(model), model.scene.tissue.refine
     if refine is None or refine.tolerance is None:
@@ -125,7 +123,7 @@ def _finer(small: Small, finer: Small, refine: Refine, aim: float, factor: float
                 whole = None
     if not comm.bcast(whole is not None):
         return None
-    return distribute(comm, whole, model.space.mesh.dimension)
+    return distribute(comm, whole)
 
 
 def _more_lines(model: Model, aim: float) -> TissueMesh | None:

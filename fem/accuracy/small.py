@@ -21,7 +21,7 @@ import scipy.linalg
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array, times_columns, total
-from softgrasp.fem.run.motion import HandTable, driven_table, force_values, motion_table
+from softgrasp.fem.run.motion import force_values, free_table
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 
 if TYPE_CHECKING:
@@ -79,21 +79,10 @@ def static_solves(model: Model) -> Iterator[Solve]:
     system, time = model.system, model.scene.time
     name, _ = choose_solver(system.layout, "auto", few=True)
     solver = make_solver(system.K_ee.copy(), name, system.layout, PREFIX, min(time.rtol, 1e-10), reproducible=False)
-    r, w = system.K_ee.createVecs()
-
-    def solve(F: Array) -> Array:
-        X = np.empty(F.shape, order="F")
-        for j in range(F.shape[1]):
-            r.array_w[:] = F[:, j]
-            solver.solve(r, w)
-            X[:, j] = w.array_r
-        return X
-
     try:
-        yield solve
+        yield solver.columns
     finally:
-        for used in (solver, r, w):
-            used.destroy()
+        solver.destroy()
 
 
 def reduced(model: Model) -> Small:
@@ -142,20 +131,17 @@ class SmallRun:
 def run_small(small: Small, steps: int | None = None) -> SmallRun:
     """Run the scene's motion or force with the midpoint rule, as the full model does.
 
-    Raises:
-        SceneError: a CSV file of the motion does not fit.
+    Raises SceneError: a CSV file of the motion does not fit.
     """
     system, scene = small.model.system, small.model.scene
     n = steps or scene.time.steps
     scene = scene.model_copy(update={"time": scene.time.model_copy(update={"steps": n})})
-    dt, n_s = scene.time_end / n, system.layout.n_s
-    g = np.zeros(n_s) if system.gravity is None else system.gravity
-    z = small.G @ g if scene.time.start == "equilibrium" else np.zeros(len(small.M))  # V' K V = 1
+    dt = scene.time_end / n
+    z = small.G @ system.fall if scene.time.start == "equilibrium" else np.zeros(len(small.M))  # V' K V = 1
     if scene.motion.drive == "force" and system.two_way:
         return _driven(small, scene, z, dt)
-    table = _table(small, scene, dt)
-    alpha = system.damping.alpha if system.damping.in_space else 0.0
-    loads = g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
+    table, _ = free_table(system, scene, dt)
+    loads = system.fall - table.a - system.damping.drag * (table.v[1:] + table.v[:-1]) / 2
     s = 2 / dt
     inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
     half = np.hstack([-inverse, s * s * inverse @ small.M])  # w = z_mid - z_n from z_n and u_n = v_n / s
@@ -169,24 +155,11 @@ def run_small(small: Small, steps: int | None = None) -> SmallRun:
     return SmallRun(Y[:, : len(z)] @ small.C.T, table.q @ small.C_s.T, loads, s * s * np.diff(u, axis=0) / 2)
 
 
-def _table(small: Small, scene: Scene, dt: float) -> HandTable:
-    """The hand's motion where it does not feel the tissue."""
-    system = small.model.system
-    n_s = system.layout.n_s
-    if scene.motion.drive == "motion":
-        return motion_table(scene, n_s)
-    zero = np.zeros(n_s)
-    weight = system.M_hand @ system.gravity if system.hand_weight and system.gravity is not None else zero
-    return driven_table(system.M_hand, force_values(scene, n_s, system.M_hand) + weight, dt, zero, zero)
-
-
 def _driven(small: Small, scene: Scene, z: Array, dt: float) -> SmallRun:
     """Hand and tissue together, as in :class:`softgrasp.fem.run.motion.ForceDrive`."""
     system, s, n_s = small.model.system, 2 / dt, small.G.shape[1]
-    u = force_values(scene, n_s, system.M_hand)
-    g = np.zeros(n_s) if system.gravity is None else system.gravity
-    u = u + (system.M_hand @ g if system.hand_weight else 0.0)
-    alpha = system.damping.alpha if system.damping.in_space else 0.0
+    u = force_values(scene, n_s, system.M_hand) + system.weight
+    g, alpha = system.fall, system.damping.drag
     kappa, theta = 1 + alpha * dt / 2, s * s + alpha * s
     inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
     Y = inverse @ small.G

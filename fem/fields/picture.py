@@ -54,7 +54,7 @@ def gather_picture(model: Model) -> PictureMesh | None:
     def facet_nodes(facets: npt.NDArray[np.int32]) -> Integers:
         return _numbered(nodes, _outward(mesh, d, facets))
 
-    cells = np.asarray(cell_nodes(mesh)[: mesh.topology.index_map(d).size_local])
+    cells = np.asarray(cell_nodes(mesh)[: tissue.owned])
     names, layers = layer_numbers(tissue, model.scene)
     outer = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     held = contact_facets(tissue, model.scene.contact)

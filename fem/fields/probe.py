@@ -91,7 +91,7 @@ def locate(space: Discretisation, points: Array) -> tuple[np.ndarray, Array, Arr
 def _nearest_cells(space: Discretisation, points: Array) -> np.ndarray:
     """Nearest owned cell of each point (k, 3), -1 on a rank without cells."""
     mesh, d = space.mesh.mesh, space.mesh.dimension
-    owned = np.arange(mesh.topology.index_map(d).size_local, dtype=np.int32)
+    owned = np.arange(space.mesh.owned, dtype=np.int32)
     if not len(owned):
         return np.full(len(points), -1, dtype=np.int32)
     boxes = dolfinx.geometry.bb_tree(mesh, d, padding=1e-12 * space.layout.extent, entities=owned)

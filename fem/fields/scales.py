@@ -8,7 +8,6 @@ from softgrasp.fem.effects.catalog import EARTH, acceleration, ratios
 from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns, total
@@ -24,11 +23,9 @@ SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to cou
 def gradient(model: Model, z: Array) -> Gradient:
     """Gradient of a displacement z against the hand, local rows (n_local,) [m]. Collective."""
     space, d = model.space, model.space.mesh.dimension
-    mesh, comm = space.mesh.mesh, space.layout.comm
-    cells = mesh.topology.index_map(d).size_local
+    comm, x = space.layout.comm, space.mesh.vertices
     nodal = FullField(model).fill(z, np.zeros(space.layout.n_s)).x.array.reshape(-1, d)
-    u = nodal[space.V.dofmap.list[:cells, : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
-    x = mesh.geometry.x[cell_nodes(mesh)[:cells], :d]
+    u = nodal[space.V.dofmap.list[: len(x), : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
     edges = x[:, 1:] - x[:, :1]
     size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))
     volume = np.abs(np.linalg.det(edges))
@@ -84,8 +81,7 @@ def measure_sag(model: Model, a: Array) -> tuple[Sag, Gradient]:
     Args:
         a: largest acceleration of the hand, (n_s,).
 
-    Raises:
-        SolverError: the solve failed or missed its tolerance.
+    Raises SolverError: the solve failed or missed its tolerance.
     """
     scene, system = model.scene, model.system
     layout, d = system.layout, system.layout.dimension
@@ -110,8 +106,7 @@ def measure(model: Model, omega: Array, Phi: Array, a: Array) -> Problem:
         Phi: their M-orthonormal modes, local rows (n_local, k).
         a: largest acceleration of the hand, (n_s,).
 
-    Raises:
-        SolverError: the static problem cannot be solved.
+    Raises SolverError: the static problem cannot be solved.
     """
     mesh, system = model.space.mesh, model.system
     low, high = bounding_box(mesh.mesh.comm, mesh.mesh.geometry.x[:, : mesh.dimension])
@@ -138,10 +133,9 @@ def rigid_inertia(model: Model) -> tuple[float, tuple[float, ...]]:
     Collective.
     """
     mesh, scene, layout = model.space.mesh, model.scene, model.system.layout
-    d, geometry = mesh.dimension, mesh.mesh.geometry
-    owned = mesh.mesh.topology.index_map(d).size_local
+    d = mesh.dimension
     density = np.array([m.rho for m in model.system.materials])[layer_numbers(mesh, scene)[1]]
-    x = geometry.x[cell_nodes(mesh.mesh)[:owned], :d] - layout.reference
+    x = mesh.vertices - layout.reference
     edges = x[:, 1:] - x[:, :1]
     weight = density * np.abs(np.linalg.det(edges)) / (2 if d == 2 else 6) * scene.tissue.thickness
     sums = x.sum(axis=1)

@@ -13,7 +13,6 @@ import numpy as np
 from softgrasp.fem.disk import check_room
 from softgrasp.fem.errors import agree
 from softgrasp.fem.fields.vtu import Collection, Field, Grid, write_vtu
-from softgrasp.fem.mesh.tissue_mesh import cell_nodes
 from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
@@ -33,14 +32,12 @@ class CellStress:
 
     def __init__(self, model: Model) -> None:
         space, d = model.space, model.space.mesh.dimension
-        mesh = space.mesh.mesh
-        owned = mesh.topology.index_map(d).size_local
         element = space.V.element.basix_element
         middle = np.full((1, d), 1 / (d + 1))
         slopes = element.tabulate(1, middle)[1:, 0, :, 0]  # of the shape functions on the reference cell, (d, k)
-        x = mesh.geometry.x[cell_nodes(mesh)[:owned], :d]
+        x = space.mesh.vertices
         self.gradients = np.linalg.solve(x[:, 1:] - x[:, :1], slopes)  # (m, d, k)
-        self.dofs = space.V.dofmap.list[:owned]
+        self.dofs = space.V.dofmap.list[: len(x)]
         self.layer = layer_numbers(space.mesh, model.scene)[1].astype(np.int32)
         finite = model.scene.effects.finite_strain
         self.law = None if finite is None else LAWS[finite.law]
@@ -107,10 +104,7 @@ class SeriesWriter:
     in the cells ``strain`` [1], ``stress`` and ``von_mises`` [Pa] and ``layer``; and ``hand`` [m, rad], the hand's
     displacement. Cells keep the order of the elements.
 
-    Collective.
-
-    Raises:
-        OSError: the directory cannot be made.
+    Collective. Raises OSError: the directory cannot be made.
     """
 
     def __init__(self, model: Model, directory: str | Path, name: str = "fields") -> None:

@@ -75,8 +75,7 @@ def write_vtu(
         points, cells: fields of this rank, one row a point or a cell.
         whole: fields of the whole file, the same on every rank.
 
-    Raises:
-        OSError: the file cannot be written.
+    Raises OSError: the file cannot be written.
     """
     parts = grid.fields() | {"PointData": points, "CellData": cells}
     own = b"".join(field.block() for fields in parts.values() for field in fields)

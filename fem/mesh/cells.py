@@ -157,12 +157,9 @@ def simplices(cells: Integers, shape: str, turn: int = 0) -> tuple[Integers, Int
 def cut_cells(points: Floats, cells: Integers, shape: str, name: str) -> tuple[Integers, Integers]:
     """`simplices` of the cells of a mesh, whose volumes must have one sign within each cell.
 
-    A quadrilateral that its smallest node cuts badly (a concave one) is cut by its other diagonal. Wedges are
-    turned as needed, since formats disagree on their orientation. The volume of a cell with flat faces is kept;
-    warped faces are replaced by two triangles.
-
-    Raises:
-        MeshError: a cell is so distorted that its parts overlap.
+    A quadrilateral that its smallest node cuts badly (a concave one) is cut by its other diagonal. Wedges are turned as
+    needed, since formats disagree on their orientation. The volume of a cell with flat faces is kept; warped faces are
+    replaced by two triangles. Raises MeshError: a cell is so distorted that its parts overlap.
     """
     cut, parents = simplices(cells, shape)
     if cells.shape[1] == cut.shape[1]:
@@ -198,8 +195,7 @@ def check_interfaces(points: Floats, blocks: list[tuple[Integers, str]], name: s
     Args:
         blocks: corner nodes and shape of the cells of each type.
 
-    Raises:
-        MeshError: there are such faces; the body would be open there.
+    Raises MeshError: there are such faces; the body would be open there.
     """
     faces = [cells[:, face] for cells, shape in blocks if _DIMENSIONS[shape] == 3 for face in _FACES[shape]]
     quads = [face for face in faces if face.shape[1] == 4]

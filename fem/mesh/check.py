@@ -42,11 +42,8 @@ def longest_edges(points: Floats, cells: Integers) -> Floats:
 def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Integers:
     """Return cells of positive volume, or refuse the mesh.
 
-    Flat cells are refused always; inverted cells (also if all of them are) unless ``repair`` turns them round
-    by swapping their last two nodes.
-
-    Raises:
-        MeshError: a coordinate is not finite, or a cell is flat or inverted.
+    Flat cells are refused always; inverted cells (also if all of them are) unless ``repair`` turns them round by
+    swapping their last two nodes. Raises MeshError: a coordinate is not finite, or a cell is flat or inverted.
     """
     bad_points = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad_points.size:
@@ -234,8 +231,7 @@ def find_parts(
 ) -> tuple[npt.NDArray[np.int32], Parts] | None:
     """Label the cells of each facet-connected part from 0; None if the mesh is one part.
 
-    Raises:
-        MeshError: a facet has more than two cells.
+    Raises MeshError: a facet has more than two cells.
     """
     n = len(cells)
     if (crowded := facets.same[1:] & facets.same[:-1]).any():

@@ -32,13 +32,12 @@ from softgrasp.fem.mesh.check import (
     sort_facets,
 )
 from softgrasp.fem.mesh.foreign import read_foreign
-from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, spread
+from softgrasp.fem.mesh.tissue_mesh import Marks, Sets, TissueMesh, spread
 from softgrasp.fem.sealed import digest
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Tags = npt.NDArray[np.int32]
-Sets = dict[int | str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,6 @@ def _text(sets: Sets) -> str:
     return repr(sorted((repr(name), tuple(int(mark) for mark in marks)) for name, marks in sets.items()))
 
 
-_MARKS = ("facets", "cells", "parts")
 _TAG_NAMES = ("gmsh:physical", "medit:ref", "CellEntityIds")  # preferred names of integer cell data
 _NOT_TAGS = ("gmsh:geometrical",)  # numbers of CAD entities, not marks of the user
 
@@ -94,39 +92,27 @@ def read_mesh(
         seam: boundary nodes closer than this share of the shortest edge there count as doubled [1].
         limit: longest processor time for a file that meshio may never end [s]; by its size if None.
 
-    Raises:
-        MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or curved
-            cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
+    Raises MeshError: the file is missing or unreadable, takes longer than the limit, holds polygons, polyhedra or
+    curved cells, a mesh of surfaces only is not in the plane z = 0, or a cell is flat, inverted or too distorted.
     """
     arrays: MeshArrays | None = None
     with agree(comm):
         if comm.rank == 0:
             arrays = load_arrays(path, scale, repair, seam, limit)
-    facts, body = None, None
-    marks: Marks = {}
-    if arrays is not None:
-        d, body = arrays.points.shape[1], (arrays.points, arrays.cells)
-        tagged = (
-            (d - 1, arrays.facets, arrays.facet_tags),
-            (d, arrays.cells, arrays.cell_tags),
-            (d, arrays.cells, arrays.part_tags),
-        )
-        marks = {
-            name: (k, nodes, tags) for name, (k, nodes, tags) in zip(_MARKS, tagged, strict=True) if tags is not None
-        }
-        facts = (d, arrays.parts, arrays.facet_sets, arrays.cell_sets, arrays.notes, arrays.digest())
-    dimension, *known = comm.bcast(facts)
-    mesh, found = spread(comm, dimension, body, marks)
-    facet_tags, cell_tags, part_tags = (found.get(name) for name in _MARKS)
-    return TissueMesh(mesh, dimension, facet_tags, cell_tags, path.name, part_tags, *known)
+    if arrays is None:
+        return spread(comm, None, {}, {})
+    d, cells = arrays.points.shape[1], arrays.cells
+    entities = {"facet_tags": (d - 1, arrays.facets), "cell_tags": (d, cells), "part_tags": (d, cells)}
+    marks: Marks = {
+        name: (*where, tags) for name, where in entities.items() if (tags := getattr(arrays, name)) is not None
+    }
+    known = {name: getattr(arrays, name) for name in ("parts", "facet_sets", "cell_sets", "notes")}
+    known |= {"source": path.name, "digest": arrays.digest()}
+    return spread(comm, (arrays.points, cells), marks, known)
 
 
 def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
-    """Read and check a mesh file.
-
-    Raises:
-        MeshError: see `read_mesh`.
-    """
+    """Read and check a mesh file. Raises MeshError: see `read_mesh`."""
     raw = _read(path, limit)
     kinds = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]

@@ -1,26 +1,99 @@
-"""Cell sizes that fall towards singular ends, and boxes whose lines meet and follow the ends."""
+"""Graded meshes: cell sizes that fall towards singular ends, bisection down to them, boxes whose lines meet the ends.
+
+DOLFINx bisects distributed meshes too, but passes tags on only where no cell is shared by ranks, and keeps children on
+the rank of their parent. On rank 0 the mesh is the same for every rank count and is spread evenly; contact zone, tags
+and layers pass to the children.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import MeshError, SceneError
+from softgrasp.fem.mesh.check import FLAT, counted, find_parts, longest_edges, place_text, signed_volumes, sort_facets
 from softgrasp.fem.mesh.make import structured_mesh
 from softgrasp.fem.mesh.singular import Ends
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
 
 
 Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
+
+MOST_LEVELS = 60  # each halves the longest edge at most; 2^-30 of a body is below any useful cell
+
+
+def bisect(whole: Whole, marked: Ints) -> Whole:
+    """Split the marked cells, and others until no node hangs, through their longest edges [PC00].
+
+    Args:
+        marked: numbers of the cells to split, in the order of ``whole.simplices``.
+
+    Raises MeshError: a child would be flat to rounding.
+    """
+    mesh, d = whole.mesh, whole.dimension
+    for a, b in ((d, 1), (1, d), (d - 1, d), (d, d - 1)):
+        mesh.topology.create_connectivity(a, b)
+    edges = dolfinx.mesh.compute_incident_entities(mesh.topology, np.sort(marked).astype(np.int32), d, 1)
+    option = dolfinx.mesh.RefinementOption.parent_cell_and_facet
+    fine, parent, parent_facet = dolfinx.mesh.refine(mesh, edges, option=option)
+    for a, b in ((d - 1, d), (d, d - 1)):
+        fine.topology.create_connectivity(a, b)
+    facets = {
+        name: dolfinx.mesh.transfer_meshtag(tags, fine, parent, parent_facet) for name, tags in whole.facets.items()
+    }
+    above = parent[fine.topology.original_cell_index]  # DOLFINx numbers parents in the order before its own reordering
+    result = replace(whole, mesh=fine, cells={k: v[above] for k, v in whole.cells.items()}, facets=facets)
+    points, cells = result.points, result.simplices
+    quality = np.abs(signed_volumes(points, cells)) / longest_edges(points, cells) ** d
+    if (flat := quality <= FLAT).any():
+        place = place_text(points[cells[int(np.argmin(quality))]].mean(axis=0))
+        raise MeshError(
+            f"{whole.source} cannot be bisected further: {counted(int(flat.sum()), 'cell')} would be flat, the worst "
+            f"around {place}; remesh the body there or take a larger tissue.refine.tolerance."
+        )
+    return result
+
+
+def bisect_to(whole: Whole, size: Callable[[Floats], Floats], slack: float, most: int) -> Whole:
+    """Bisect until no cell is larger than ``slack`` times its size(points (n, d)) [m], or there are more than ``most``.
+
+    Raises MeshError: see :func:`bisect`.
+    """
+    for _ in range(MOST_LEVELS):
+        points, cells = whole.points, whole.simplices
+        large = longest_edges(points, cells) > slack * size(points[cells].mean(axis=1))
+        if not large.any() or len(cells) > most:
+            break
+        whole = bisect(whole, np.flatnonzero(large).astype(np.int32))
+    return whole
+
+
+def distribute(comm: MPI.Intracomm, whole: Whole | None) -> TissueMesh:
+    """Spread a mesh from rank 0 over the ranks (None on the others), with all it carries. Collective.
+
+    ``mesh.topology.original_cell_index`` of the result counts the cells as ``whole.simplices`` does.
+    """
+    if whole is None:
+        return spread(comm, None, {}, {})
+    points, cells, d = whole.points, whole.simplices, whole.dimension
+    marks: Marks = {name: (d, cells, values) for name, values in whole.cells.items()}
+    marks |= {name: (d - 1, whole.facet_nodes(name), tags.values) for name, tags in whole.facets.items()}
+    known: dict[str, Any] = {name: getattr(whole, name) for name in ("source", "facet_sets", "cell_sets")}
+    if (parts := find_parts(points, cells, sort_facets(cells), whole.source)) is not None:
+        marks["part_tags"], known["parts"] = (d, cells, parts[0]), parts[1]
+    return replace(spread(comm, (points, cells), marks, known), whole=whole)
+
 
 # mu < alpha / p with alpha about 1/2 gives elements of order p their full order; below it the cells next to the end
 # shrink so fast that the floor, not mu, decides where they stop.
@@ -111,10 +184,7 @@ def box_axes(scene: Scene) -> tuple[Axis, ...]:
     """What the lines of a structured box must meet.
 
     Lines meet the box of the contact zone, the boxes of layers and the points of outputs, and the zone ends at its
-    sides and at its box.
-
-    Raises:
-        SceneError: the scene has no structured box.
+    sides and at its box. Raises SceneError: the scene has no structured box.
     """
     tissue, contact = scene.tissue, scene.contact
     if tissue.size is None:

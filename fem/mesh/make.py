@@ -53,8 +53,7 @@ def structured_mesh(
         size: side lengths, 2 or 3 positive numbers [m].
         origin: lower corner [m]; zero if None or empty.
 
-    Raises:
-        SceneError: the lengths of ``size``, ``cells`` and ``origin`` differ or are not positive.
+    Raises SceneError: the lengths of ``size``, ``cells`` and ``origin`` differ or are not positive.
     """
     dimension = len(size)
     low = np.asarray(origin if origin is not None and len(origin) else np.zeros(dimension), dtype=np.float64)
@@ -70,4 +69,4 @@ def structured_mesh(
         mesh = dolfinx.mesh.create_rectangle(comm, corners, list(cells))
     else:
         mesh = dolfinx.mesh.create_box(comm, corners, list(cells))
-    return TissueMesh(mesh, dimension, None, None, "structured")
+    return TissueMesh(mesh, dimension, "structured")

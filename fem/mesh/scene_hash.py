@@ -13,11 +13,9 @@ from softgrasp.fem.scene.scene import Scene
 def scene_hash(scene: Scene, without: Iterable[str] = ("name", "description")) -> str:
     """SHA-256 of the resolved scene, of what its mesh file holds and of the bytes of its csv file, 64 hex digits.
 
-    Top-level keys in `without` do not count; nor do folder, name and format of the files. The mesh is the one that
-    the model of this scene was built with; without a model it is read.
-
-    Raises:
-        SceneError, MeshError: a file that the scene names cannot be read.
+    Top-level keys in `without` do not count; nor do folder, name and format of the files. The mesh is the one that the
+    model of this scene was built with; without a model it is read. Raises SceneError, MeshError: a file that the scene
+    names cannot be read.
     """
     data = scene.model_dump(mode="json", by_alias=True, exclude=set(without))
     tissue, motion = data.get("tissue", {}), data.get("motion", {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import basix.ufl
 import dolfinx.io
@@ -15,6 +16,11 @@ from mpi4py import MPI
 
 from softgrasp.fem.mesh.check import Parts
 
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Sets = dict[int | str, tuple[int, ...]]  # marks of each tag number and named set of a file
+Marks = dict[str, tuple[int, Integers, npt.NDArray[np.int32]]]  # dimension of entities, their nodes, one value each
+
 
 @dataclass(frozen=True)
 class Whole:
@@ -22,11 +28,10 @@ class Whole:
 
     mesh: dolfinx.mesh.Mesh  # on MPI.COMM_SELF
     source: str  # its name, for messages
-    cells: dict[str, npt.NDArray[np.int32]]  # marks by name, one a cell: "tags", "layers"
-    facets: dict[str, dolfinx.mesh.MeshTags]  # marks by name: "tags", "contact"
-    # facet_sets, cell_sets: see TissueMesh
-    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
-    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    cells: dict[str, npt.NDArray[np.int32]]  # one mark a cell by field of TissueMesh: cell_tags, layers
+    facets: dict[str, dolfinx.mesh.MeshTags]  # marks likewise: facet_tags, contact
+    facet_sets: Sets = field(default_factory=dict)  # see TissueMesh
+    cell_sets: Sets = field(default_factory=dict)
 
     @property
     def dimension(self) -> int:
@@ -57,16 +62,14 @@ class TissueMesh:
 
     mesh: dolfinx.mesh.Mesh  # distributed mesh; the topological dimension equals the geometric one
     dimension: int  # 2 or 3
-    facet_tags: dolfinx.mesh.MeshTags | None  # integer marks of boundary facets, or None
-    cell_tags: dolfinx.mesh.MeshTags | None  # integer marks of cells (layers), or None
     source: str  # "structured" or the name of the mesh file, for messages
+    facet_tags: dolfinx.mesh.MeshTags | None = None  # integer marks of boundary facets
+    cell_tags: dolfinx.mesh.MeshTags | None = None  # integer marks of cells (layers)
     # number of the part of each cell, parts hanging together through facets; None if it is one
     part_tags: dolfinx.mesh.MeshTags | None = None
     parts: Parts | None = None  # what is known of these parts, or None
-    # marks in ``facet_tags`` of each tag number and named set of the file, on all ranks
-    facet_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
-    # marks in ``cell_tags`` of each tag number and named set of the file, on all ranks
-    cell_sets: dict[int | str, tuple[int, ...]] = field(default_factory=dict)
+    facet_sets: Sets = field(default_factory=dict)  # marks in ``facet_tags``, on all ranks
+    cell_sets: Sets = field(default_factory=dict)  # marks in ``cell_tags``, on all ranks
     notes: tuple[str, ...] = ()  # warnings about the file, one sentence each, on all ranks
     digest: str = ""  # SHA-256 of what was read from the file, on all ranks; empty without one
     # facets of the contact zone that a refined mesh inherits; None: they are selected on this mesh
@@ -74,6 +77,16 @@ class TissueMesh:
     # number of the layer of each cell that a refined mesh inherits, -1 for none; None likewise
     layers: dolfinx.mesh.MeshTags | None = None
     whole: Whole | None = None  # a bisected mesh on rank 0, to bisect it further; None elsewhere and on other meshes
+
+    @property
+    def owned(self) -> int:
+        """Number of the cells that this rank owns; they come first."""
+        return int(self.mesh.topology.index_map(self.dimension).size_local)
+
+    @property
+    def vertices(self) -> Floats:
+        """Coordinates of the vertices of the owned cells, (owned, d + 1, d) [m]."""
+        return np.asarray(self.mesh.geometry.x[cell_nodes(self.mesh)[: self.owned], : self.dimension])
 
 
 def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
@@ -83,26 +96,24 @@ def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
     return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)
 
 
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-Marks = dict[str, tuple[int, Integers, npt.NDArray[np.int32]]]  # dimension of entities, their nodes, one value each
-
-
 def spread(
-    comm: MPI.Intracomm, d: int, body: tuple[Floats, Integers] | None, marks: Marks
-) -> tuple[dolfinx.mesh.Mesh, dict[str, dolfinx.mesh.MeshTags]]:
-    """Distribute points and simplices, and mesh tags by name. Collective.
+    comm: MPI.Intracomm, body: tuple[Floats, Integers] | None, marks: Marks, known: dict[str, Any]
+) -> TissueMesh:
+    """Distribute points and simplices from rank 0. Collective.
 
     Args:
         body: points (n_points, d) [m] and cells (n_cells, d + 1) on rank 0, None elsewhere.
-        marks: on rank 0, empty elsewhere.
+        marks: mesh tags by field of the result; empty elsewhere.
+        known: its other fields; empty elsewhere.
     """
+    facts = 0 if body is None else body[0].shape[1], {name: mark[0] for name, mark in marks.items()}, known
+    d, dimensions, known = comm.bcast(facts)
     points, cells = body or (np.zeros((0, d)), np.zeros((0, d + 1), dtype=np.int64))
     shape = {2: "triangle", 3: "tetrahedron"}[d]
     domain = ufl.Mesh(basix.ufl.element("Lagrange", shape, 1, shape=(d,)))
     mesh = dolfinx.mesh.create_mesh(comm, cells, domain, points.copy())
     tags = {}
-    for name, dimension in comm.bcast({name: mark[0] for name, mark in marks.items()}).items():
+    for name, dimension in dimensions.items():
         for a, b in ((dimension, 0), (dimension, d)):
             mesh.topology.create_entities(a)
             mesh.topology.create_connectivity(a, b)
@@ -113,4 +124,4 @@ def spread(
         )
         entities = adjacencylist(np.ascontiguousarray(local, dtype=np.int32))
         tags[name] = dolfinx.mesh.meshtags_from_entities(mesh, dimension, entities, here.astype(np.int32))
-    return mesh, tags
+    return TissueMesh(mesh=mesh, dimension=d, **known, **tags)

@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import BlockLayout, bounding_box
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, cell_nodes
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.contact import cells_in, contact_blocks, contact_facets, held_check, rigid_modes
 from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.scene.scene import FiniteStrain, Scene
@@ -44,6 +44,14 @@ class Discretisation:
     is_e: PETSc.IS  # PETSc index set of the free dofs (blocked)
     R: Array  # rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s)
     layout: BlockLayout
+
+    def nodal(self, free: Array, held: float = 0.0) -> Any:
+        """The function with these values (n_local,) on the free dofs and one on the others. Collective."""
+        result = dolfinx.fem.Function(self.V)
+        result.x.array[:] = held
+        result.x.array.reshape(-1, self.layout.dimension)[self.free] = free.reshape(-1, self.layout.dimension)
+        result.x.scatter_forward()
+        return result
 
 
 def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
@@ -131,10 +139,8 @@ def _component(space: Discretisation, A: PETSc.Mat, thickness: float) -> Compone
 def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple[LayerBlocks, ...]:
     """Assemble K_mu, K_lambda and M_1, once per layer; a uniform body is one layer. Collective.
 
-    One form is compiled for each component: layers share it and differ in their cells only.
-
-    Raises:
-        SceneError: a layer has no cells, or some cells belong to no layer.
+    One form is compiled for each component: layers share it and differ in their cells only. Raises SceneError: a layer
+    has no cells, or some cells belong to no layer.
     """
     domain = space.mesh.mesh
     layers = cells_of_layers(space.mesh, scene) if scene.tissue.layers else {"tissue": None}
@@ -143,7 +149,7 @@ def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple
     csr = None  # one pattern for all
     if len(layers) > 1:
         # DOLFINx gives a layer the pattern of its own cells, and sums of layers need one pattern for all
-        owned = np.arange(domain.topology.index_map(space.mesh.dimension).size_local, dtype=np.int32)
+        owned = np.arange(space.mesh.owned, dtype=np.int32)
         whole = ufl.Measure("dx", domain=domain, subdomain_data=[(1, owned)])(1)
         csr = dolfinx.fem.create_matrix(dolfinx.fem.form(forms["M_1"](whole)))
     result = []
@@ -183,14 +189,12 @@ def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
 def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
     """Owned cells of each layer; later layers win where boxes overlap, the rest is ``tissue``. Collective.
 
-    Raises:
-        SceneError: a layer holds no cell.
+    Raises SceneError: a layer holds no cell.
     """
-    owned = mesh.mesh.topology.index_map(mesh.dimension).size_local
-    label = np.full(owned, -1)
+    label = np.full(mesh.owned, -1)
     names = list(scene.tissue.layers)
     if mesh.layers is not None:
-        here = mesh.layers.indices < owned
+        here = mesh.layers.indices < mesh.owned
         label[mesh.layers.indices[here]] = mesh.layers.values[here]
     else:
         for i, name in enumerate(names):
@@ -208,7 +212,7 @@ def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
 def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.ndarray]:
     """Names of the layers in the order of their blocks, and the number of the layer of each owned cell. Collective."""
     cells = cells_of_layers(mesh, scene)
-    numbers = np.zeros(mesh.mesh.topology.index_map(mesh.dimension).size_local, dtype=np.intp)
+    numbers = np.zeros(mesh.owned, dtype=np.intp)
     for i, members in enumerate(cells.values()):
         numbers[members] = i
     return tuple(cells), numbers
@@ -219,20 +223,18 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
     from softgrasp.fem.strain.points import Points, make_gradient  # only scenes with finite strain pay for it
 
     d, V, order = space.mesh.dimension, space.V, scene.tissue.order
-    mesh = space.mesh.mesh
-    cells = mesh.topology.index_map(d).size_local
+    x, cells = space.mesh.vertices, space.mesh.owned
     shape = basix.CellType.triangle if d == 2 else basix.CellType.tetrahedron
     element = basix.create_element(basix.ElementFamily.P, shape, order, basix.LagrangeVariant.gll_warped)
     # exact for K(0), all weights positive
     at, weights = basix.make_quadrature(shape, 1 if order == 1 else 2 * order)
     table = element.tabulate(1, at)[1:, :, :, 0]  # (d, points, nodes)
-    x = mesh.geometry.x[cell_nodes(mesh)[:cells], :d]
     edges = x[:, 1:] - x[:, :1]  # rows are the columns of dX/dxi
     gradients = np.einsum("kqa,cjk->cqaj", table, np.linalg.inv(edges))
     volume = np.abs(np.linalg.det(edges)) * scene.tissue.thickness
     vol = (volume[:, None] * weights).ravel()
     layer = layer_numbers(space.mesh, scene)[1]
-    first = mesh.topology.index_map(d).local_range[0]
+    first = space.mesh.mesh.topology.index_map(d).local_range[0]
     layout, each = space.layout, len(weights)
     B = make_gradient(layout.comm, gradients, _free_nodes(space)[V.dofmap.list[:cells]], (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
@@ -243,9 +245,5 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
 def _free_nodes(space: Discretisation) -> np.ndarray:
     """Number among all free nodes of each local node, ghosts included; -1 where it follows the hand. Collective."""
     d, layout = space.layout.dimension, space.layout
-    numbers = dolfinx.fem.Function(space.V)
-    at = numbers.x.array.reshape(-1, d)
-    at[:] = -1.0
-    at[space.free] = layout.start // d + np.arange(len(space.free))[:, None]
-    numbers.x.scatter_forward()
-    return np.asarray(np.rint(numbers.x.array.reshape(-1, d)[:, 0]), dtype=np.intp)
+    numbers = np.repeat(layout.start // d + np.arange(len(space.free), dtype=float), d)
+    return np.asarray(np.rint(space.nodal(numbers, -1.0).x.array.reshape(-1, d)[:, 0]), dtype=np.intp)

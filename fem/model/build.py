@@ -107,8 +107,7 @@ class Model:
             lam, mu: Lame parameters [Pa]; None keeps those of each layer.
             rho: density [kg/m^d]; None keeps it.
 
-        Raises:
-            SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
+        Raises SceneError: a number is not positive (lam: not above -2 mu / d), or not finite.
         """
         changes = {key: value for key, value in (("lam", lam), ("mu", mu), ("rho", rho)) if value is not None}
         d = self.system.layout.dimension

@@ -30,10 +30,7 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
     and inside ``contact.box``; or if it carries ``contact.facet_tag``. What is not given does not restrict. A bisected
     mesh has inherited its zone.
 
-    Collective.
-
-    Raises:
-        SceneError: a side is unknown, the tag is absent, or no facet is in the zone.
+    Collective. Raises SceneError: a side is unknown, the tag is absent, or no facet is in the zone.
     """
     mesh, fdim = tissue.mesh, tissue.dimension - 1
     mesh.topology.create_connectivity(fdim, fdim + 1)
@@ -72,11 +69,8 @@ def contact_facets(tissue: TissueMesh, contact: Contact) -> Ints:
 def held_check(tissue: TissueMesh, facets: Ints) -> None:
     """Refuse a mesh of which a part could move freely, alone or about the nodes by which it hangs on the rest.
 
-    Collective.
-
-    Raises:
-        MeshError: parts that share no node with the rest have no contact facet, or parts are joined to the rest
-            by so few nodes that they can turn.
+    Collective. Raises MeshError: parts that share no node with the rest have no contact facet, or parts are joined to
+    the rest by so few nodes that they can turn.
     """
     tags, parts = tissue.part_tags, tissue.parts
     if tags is None or parts is None:
@@ -84,7 +78,7 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
     mesh, dimension = tissue.mesh, tissue.dimension
     mesh.topology.create_connectivity(dimension - 1, dimension)
     facet_cells = mesh.topology.connectivity(dimension - 1, dimension)
-    labels = np.zeros(mesh.topology.index_map(dimension).size_local, dtype=np.int64)
+    labels = np.zeros(tissue.owned, dtype=np.int64)
     owned = tags.indices < len(labels)
     labels[tags.indices[owned]] = tags.values[owned]
     # An owned exterior facet has one cell, and that cell is owned too.
@@ -107,8 +101,7 @@ def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
     Args:
         held: whether a part has a contact facet, shape (n_parts,).
 
-    Raises:
-        MeshError: see `held_check`.
+    Raises MeshError: see `held_check`.
     """
     groups = int(parts.groups.max()) + 1
     loose = np.setdiff1d(np.arange(groups), parts.groups[held])
@@ -211,10 +204,9 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
 def cells_in(tissue: TissueMesh, layer: Any) -> Ints:
     """Owned cells with the layer's ``tag``, or with their midpoint in its ``box``; sorted, maybe empty here.
 
-    Raises:
-        SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
+    Raises SceneError: the layer has a tag that the mesh does not have, or it has neither tag nor box.
     """
-    owned = np.arange(tissue.mesh.topology.index_map(tissue.dimension).size_local, dtype=np.int32)
+    owned = np.arange(tissue.owned, dtype=np.int32)
     midpoints = dolfinx.mesh.compute_midpoints(tissue.mesh, tissue.dimension, owned)[:, : tissue.dimension]
     if layer.tag is not None:
         if tissue.cell_tags is None:

@@ -99,8 +99,7 @@ def free_bytes(scene: Scene) -> float:
 def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int) -> None:
     """Refuse a model or run that the memory of some node cannot hold. Collective.
 
-    Raises:
-        ResourceError: on all ranks, with the key, the estimate, what the node has, and what would fit.
+    Raises ResourceError: on all ranks, with the key, the estimate, what the node has, and what would fit.
     """
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
     ranks, free = node.size, node.bcast(free_bytes(scene))

@@ -42,8 +42,7 @@ class Output:
 def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     """Outputs of the scene; without any, the free node farthest from the hand. Collective.
 
-    Raises:
-        SceneError: a node lies outside the body or a region holds no node.
+    Raises SceneError: a node lies outside the body or a region holds no node.
     """
     entries = scene.control.outputs if scene.control is not None else []
     if not entries:

@@ -16,9 +16,18 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SceneError, agree
-from softgrasp.fem.mesh.bisect import bisect_to, distribute
 from softgrasp.fem.mesh.check import longest_edges, sort_facets
-from softgrasp.fem.mesh.grading import BISECTION, LINES, SLACK, SizeField, box_axes, box_of_lines, even_cells
+from softgrasp.fem.mesh.grading import (
+    BISECTION,
+    LINES,
+    SLACK,
+    SizeField,
+    bisect_to,
+    box_axes,
+    box_of_lines,
+    distribute,
+    even_cells,
+)
 from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
@@ -73,7 +82,7 @@ def refined_mesh(comm: MPI.Intracomm, scene: Scene, tolerance: float | None = No
     with agree(comm):
         if comm.rank == 0:
             whole = _bisected(scene, refine, goal)
-    return distribute(comm, whole, comm.bcast(None if whole is None else whole.dimension))
+    return distribute(comm, whole)
 
 
 def _lined(comm: MPI.Intracomm, scene: Scene, refine: Refine, goal: float | None) -> TissueMesh:
@@ -110,8 +119,8 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
         aim *= SHRINK
     if refine.contact == "inherit":
         return whole
-    kept, tags = ({k: v for k, v in marks.items() if k == "tags"} for marks in (whole.cells, whole.facets))
-    return replace(whole, cells=kept, facets=tags)  # zone and layers are selected again
+    tags, marks = ({k: v for k, v in marks.items() if k.endswith("_tags")} for marks in (whole.cells, whole.facets))
+    return replace(whole, cells=tags, facets=marks)  # zone and layers are selected again
 
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
@@ -126,7 +135,7 @@ def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
 def marked(tissue: TissueMesh, scene: Scene) -> Whole:
     """A mesh on one rank with its contact zone, layers and tags as marks."""
     facets = contact_facets(tissue, scene.contact)
-    n = tissue.mesh.topology.index_map(tissue.dimension).size_local
+    n = tissue.owned
     layers = np.full(n, -1, dtype=np.int32)
     if scene.tissue.layers:
         names = list(scene.tissue.layers)
@@ -136,13 +145,13 @@ def marked(tissue: TissueMesh, scene: Scene) -> Whole:
     if tissue.cell_tags is not None:
         tags = np.zeros(n, dtype=np.int32)
         tags[tissue.cell_tags.indices] = tissue.cell_tags.values
-        on_cells["tags"] = tags
+        on_cells["cell_tags"] = tags
     contact = dolfinx.mesh.meshtags(
         tissue.mesh, tissue.dimension - 1, np.sort(facets), np.ones(len(facets), dtype=np.int32)
     )
     on_facets = {"contact": contact}
     if tissue.facet_tags is not None:
-        on_facets["tags"] = tissue.facet_tags
+        on_facets["facet_tags"] = tissue.facet_tags
     return Whole(tissue.mesh, tissue.source, on_cells, on_facets, tissue.facet_sets, tissue.cell_sets)
 
 
@@ -199,8 +208,7 @@ def _too_large(refine: Refine, count: int) -> SceneError:
 def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
     """Singular ends of a scene's body, on all ranks; rank 0 looks at the whole mesh. Collective.
 
-    Raises:
-        MeshError: the mesh file cannot be read again.
+    Raises MeshError: the mesh file cannot be read again.
     """
     ends: Ends | None = None
     with agree(comm):

@@ -64,8 +64,7 @@ def write_checkpoint(state: RestartState, scene: Scene, layout: BlockLayout, dir
     Returns:
         The manifest file.
 
-    Raises:
-        CheckpointError: the folder cannot be written.
+    Raises CheckpointError: the folder cannot be written.
     """
     comm = layout.comm
     manifest = directory / "checkpoint.json"
@@ -127,8 +126,7 @@ def read_checkpoint(scene: Scene, layout: BlockLayout, directory: Path) -> Resta
 def _fitting(scene: Scene, ranks: int, manifest: Path, entry: dict[str, Any]) -> dict[str, Any]:
     """The manifest's entry if it is of this scene and rank count.
 
-    Raises:
-        CheckpointError: it is not; the message names the key.
+    Raises CheckpointError: it is not; the message names the key.
     """
     before, now = {"ranks": entry["ranks"]}, {"ranks": ranks}
     same = entry["scene_hash"] == _numbers_hash(scene)

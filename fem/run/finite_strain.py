@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import SAME, Array, PETSc, led, total
+from softgrasp.fem.petsc import SAME, Array, PETSc, combine, led, total
 from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState, viscosity
 from softgrasp.fem.strain.body import Body
 from softgrasp.fem.strain.newton import Counts, NewtonFigures, Pairs, QuasiNewton, Root
@@ -42,8 +42,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     """
 
     def _parts(self) -> tuple[PETSc.Mat, ...]:
-        inertia = self.system.M_ee.copy()
-        inertia.scale(self.s * self.s)
+        inertia = combine([(self.s * self.s, self.system.M_ee)])
         return (inertia, viscosity(self.system, self.s)) if self.system.damping.active else (inertia,)
 
     def _prepare(self) -> None:
@@ -281,8 +280,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
     def _divided(self, c: Array) -> Root:
         """The step in 2 to 16 parts under one load, ``self.c``; sets ``jump``, ``rate`` and ``sensed``. Collective.
 
-        Raises:
-            SolverError: no number of parts converges.
+        Raises SolverError: no number of parts converges.
         """
         feedback, self.feedback, at = self.feedback, None, self.at
         begin = at, self.r_array.copy(), self.held.gather(self.now.v.array_r) / self.s, self.dissipated

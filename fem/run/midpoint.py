@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, PETSc, total
-from softgrasp.fem.solve.order import held_operators
+from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
+from softgrasp.fem.solve.cholesky import held_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from softgrasp.fem.system import BlockSystem
 
@@ -47,25 +47,15 @@ def make_midpoint(
 def midpoint_matrix(system: BlockSystem, dt: float) -> PETSc.Mat:
     """S = K + s D + s^2 M with s = 2/dt. Collective."""
     s, damping = 2 / dt, system.damping
-    S = system.K_ee.copy()
-    if damping.beta:
-        S.scale(1 + s * damping.beta)
-    S.axpy(s * s + s * damping.alpha, system.M_ee, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-    if damping.matrix is not None:
-        S.axpy(s, damping.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-    return S
+    layers = [] if damping.matrix is None else [(s, damping.matrix)]
+    return combine([(1 + s * damping.beta, system.K_ee), (s * s + s * damping.alpha, system.M_ee), *layers])
 
 
 def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:
     """S D with D = alpha M + beta K [+ layers], with the pattern of M. Collective."""
     damping = system.damping
-    result = system.M_ee.copy()
-    result.scale(s * damping.alpha)
-    if damping.beta:
-        result.axpy(s * damping.beta, system.K_ee, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-    if damping.matrix is not None:
-        result.axpy(s, damping.matrix, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-    return result
+    layers = [] if damping.matrix is None else [(s, damping.matrix)]
+    return combine([(s * damping.alpha, system.M_ee), (s * damping.beta, system.K_ee), *layers])
 
 
 @dataclass
@@ -204,7 +194,7 @@ class TissueMidpoint:
         if self.held.D is None or self.held.M is None:
             raise SolverError("a damping matrix is missing")
         self.M, self.D = self.held.M, self.held.D.copy()
-        self.D.axpy(self.alpha, self.M, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self.D.axpy(self.alpha, self.M, SAME)
         self._propagate = self._general
 
     def start(self, state: TissueState) -> None:
@@ -256,10 +246,8 @@ class TissueMidpoint:
     def make_responses(self) -> Array:
         """Set Y = S^{-1} G for :meth:`accelerate`; its owned rows (n_local, n_s). Collective.
 
-        Call it before :meth:`start`: r is scratch here, and a run in progress would be lost.
-
-        Raises:
-            SolverError: a solve missed its tolerance.
+        Call it before :meth:`start`: r is scratch here, and a run in progress would be lost. Raises SolverError: a
+        solve missed its tolerance.
         """
         self.Y = np.empty(self.G.shape, order="F")
         with self.held.agree():

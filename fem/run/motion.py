@@ -47,8 +47,7 @@ def read_csv(path: Path, columns: int, end: float | None = None, key: str = "mot
         end: of the run [s]; None takes the file as long as it is, from 0 on.
         key: who names the file, for the messages.
 
-    Raises:
-        SceneError: the file is missing, not numeric, not increasing in time or does not cover [0, end].
+    Raises SceneError: the file is missing, not numeric, not increasing in time or does not cover [0, end].
     """
     try:
         table = np.array(read_table(path, columns + 1))
@@ -75,10 +74,7 @@ def _target(scene: Scene, n_s: int) -> Array:
 def motion_table(scene: Scene, n_s: int) -> HandTable:
     """Positions of the prescribed motion (drive = "motion") on the time grid.
 
-    A CSV table is joined by a cubic spline, at rest at both ends.
-
-    Raises:
-        SceneError: a CSV file does not fit.
+    A CSV table is joined by a cubic spline, at rest at both ends. Raises SceneError: a CSV file does not fit.
     """
     steps, end = scene.time.steps, scene.time_end
     t = end * np.arange(steps + 1) / steps
@@ -105,10 +101,8 @@ def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
 
     A CSV table is joined by straight lines.
 
-    With the quintic profile it is the feed-forward M_hand a(t) that would carry the bare hand to the target.
-
-    Raises:
-        SceneError: a CSV file does not fit.
+    With the quintic profile it is the feed-forward M_hand a(t) that would carry the bare hand to the target. Raises
+    SceneError: a CSV file does not fit.
     """
     steps, end = scene.time.steps, scene.time_end
     t = end * (np.arange(steps) + 0.5) / steps
@@ -125,8 +119,7 @@ def force_values(scene: Scene, n_s: int, M_hand: Array) -> Array:
 def largest_acceleration(scene: Scene, n_s: int, M_hand: Array) -> Array:
     """The largest acceleration that a motion, or a force on the bare hand, gives the hand [m/s^2, rad/s^2], (n_s,).
 
-    Raises:
-        SceneError: a CSV file does not fit.
+    Raises SceneError: a CSV file does not fit.
     """
     if scene.motion.profile == "quintic":
         return np.asarray(10 / np.sqrt(3) / scene.motion.duration**2 * _target(scene, n_s))
@@ -135,6 +128,18 @@ def largest_acceleration(scene: Scene, n_s: int, M_hand: Array) -> Array:
     else:
         a = np.linalg.solve(M_hand, force_values(scene, n_s, M_hand).T).T
     return np.asarray(a[int(np.argmax(np.abs(a).max(axis=1)))])
+
+
+def free_table(system: BlockSystem, scene: Scene, dt: float) -> tuple[HandTable, Array | None]:
+    """Motion of a hand that does not feel the tissue, and the force (steps, n_s) behind it; None where prescribed.
+
+    Raises SceneError: a CSV file does not fit.
+    """
+    n_s = system.layout.n_s
+    if scene.motion.drive == "motion":
+        return motion_table(scene, n_s), None
+    force, zero = force_values(scene, n_s, system.M_hand), np.zeros(n_s)
+    return driven_table(system.M_hand, force + system.weight, dt, zero, zero), force
 
 
 def driven_table(M_hand: Array, force: Array, dt: float, q0: Array, v0: Array) -> HandTable:
@@ -214,9 +219,7 @@ class ForceDrive:
         self.q, self.v, self.c = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
         self.u = np.zeros((steps, n_s))
         self.q[0], self.v[0] = q0, v0
-        self.g = np.zeros(n_s) if system.gravity is None else system.gravity
-        self.weight = system.M_hand @ self.g if system.hand_weight else np.zeros(n_s)
-        self.alpha = system.damping.alpha if system.damping.in_space else 0.0
+        self.g, self.weight, self.alpha = system.fall, system.weight, system.damping.drag
         self.kappa = 1 + self.alpha * self.dt / 2
         s = midpoint.s
         self.theta = s * s + self.alpha * s
@@ -253,8 +256,7 @@ class ForceDrive:
     def check(self, begin: int, end: int) -> None:
         """Look at the forces taken in these steps, once a segment: a step spends nothing on it.
 
-        Raises:
-            SolverError: a force is not finite; the message names the first.
+        Raises SolverError: a force is not finite; the message names the first.
         """
         for i, j in np.argwhere(~np.isfinite(self.u[begin:end]))[:1]:
             layout = self.system.layout
@@ -324,9 +326,5 @@ def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float
     rates, n_s = np.zeros_like(v), v.shape[1]
     work, speed = pulls[:, :n_s], pulls[:, -n_s:]
     rates[1:] = -turn[1:] * np.cumsum(turn[:-1] * (2 * s * speed), axis=0)
-    alpha = system.damping.alpha if system.damping.in_space else 0.0
-    tissue = s * (s * speed - rates[:-1]) + alpha * s * work
-    u = np.diff(v, axis=0) / dt @ system.M_hand.T - c @ system.M_rigid.T + tissue
-    if system.hand_weight and system.gravity is not None:
-        u -= system.M_hand @ system.gravity
-    return np.asarray(u)
+    tissue = s * (s * speed - rates[:-1]) + system.damping.drag * s * work
+    return np.asarray(np.diff(v, axis=0) / dt @ system.M_hand.T - c @ system.M_rigid.T + tissue - system.weight)

@@ -19,16 +19,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.midpoint import make_midpoint
-from softgrasp.fem.run.motion import (
-    Drive,
-    Force,
-    ForceDrive,
-    TableDrive,
-    driven_table,
-    force_taken,
-    force_values,
-    motion_table,
-)
+from softgrasp.fem.run.motion import Drive, Force, ForceDrive, TableDrive, force_taken, force_values, free_table
 from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
@@ -103,17 +94,14 @@ class Run(Stepped):
         return points, regions
 
     def _make_drive(self, force: Force | None) -> Drive:
-        scene, system, n_s = self.model.scene, self.model.system, self.model.system.layout.n_s
-        zero = np.zeros(n_s)
+        scene, system = self.model.scene, self.model.system
+        if force is None and (scene.motion.drive == "motion" or not system.two_way):
+            return TableDrive(system, *free_table(system, scene, self.dt))
+        zero = np.zeros(system.layout.n_s)
         if force is not None:
             return ForceDrive(system, force, self.midpoint, self.steps, zero, zero)
-        if scene.motion.drive == "motion":
-            return TableDrive(system, motion_table(scene, n_s))
-        u = force_values(scene, n_s, system.M_hand)
-        if system.two_way:
-            return ForceDrive(system, lambda n, t, q, v: u[n], self.midpoint, self.steps, zero, zero)
-        weight = system.M_hand @ system.gravity if system.hand_weight and system.gravity is not None else zero
-        return TableDrive(system, driven_table(system.M_hand, u + weight, self.dt, zero, zero), u)
+        u = force_values(scene, len(zero), system.M_hand)
+        return ForceDrive(system, lambda n, t, q, v: u[n], self.midpoint, self.steps, zero, zero)
 
     def solve_step(self, n: int) -> None:
         """Load of the hand's motion, or its force, and one solve. Collective."""
@@ -143,8 +131,7 @@ class Run(Stepped):
     def take(self, ts: Any, step: int, check: bool = False) -> None:
         """Step up to a number, and see that the forces on the way were finite. Collective.
 
-        Raises:
-            SolverError: a solve failed or missed its tolerance, or a force is not finite.
+        Raises SolverError: a solve failed or missed its tolerance, or a force is not finite.
         """
         before = self.reached
         try:
@@ -217,8 +204,7 @@ class Run(Stepped):
     def restore(self, saved: RestartState) -> None:
         """Go back to where a run was stopped. Collective.
 
-        Raises:
-            CheckpointError: the state is of another mesh numbering, or the streamed snapshots do not fit to it.
+        Raises CheckpointError: the state is of another mesh numbering, or the streamed snapshots do not fit to it.
         """
         n, midpoint = saved.step, self.midpoint
         with agree(self.layout.comm):

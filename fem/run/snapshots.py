@@ -75,8 +75,7 @@ class NoStore:
 class MemoryStore(NoStore):
     """Every k-th state is a column of one local array; the step writes straight into it.
 
-    Raises:
-        ResourceError: the columns of all ranks would not fit in the memory that is free now.
+    Raises ResourceError: the columns of all ranks would not fit in the memory that is free now.
     """
 
     def __init__(self, system: BlockSystem, steps: int, every: int) -> None:
@@ -117,10 +116,8 @@ class MemoryStore(NoStore):
 class Hdf5Store(NoStore):
     """Columns go through a buffer to one HDF5 file a rank; ``snapshots.h5`` shows them as one.
 
-    Datasets of ``snapshots.h5``: z, v (m, n_e), nodes (n_e / d, d), times, steps (m,), q_s, v_s (m, n_s).
-
-    Raises:
-        ResourceError: the files of all ranks would not fit on the disk.
+    Datasets of ``snapshots.h5``: z, v (m, n_e), nodes (n_e / d, d), times, steps (m,), q_s, v_s (m, n_s). Raises
+    ResourceError: the files of all ranks would not fit on the disk.
     """
 
     def __init__(self, system: BlockSystem, steps: int, every: int, directory: Path, run: str | None) -> None:
@@ -198,8 +195,7 @@ class Hdf5Store(NoStore):
     def restore(self, columns: Array, step: int, run: str) -> None:
         """Go on behind what is already in the file, which is read once to see that it is whole.
 
-        Raises:
-            CheckpointError: the file is of another run, is damaged or holds less.
+        Raises CheckpointError: the file is of another run, is damaged or holds less.
         """
         self.written, path = int(np.searchsorted(self.steps, step, side="right")), self.path
         if self.owner != run:

@@ -71,8 +71,7 @@ class Stepped(ABC):
     def advance_to(self, ts: Any, step: int) -> None:
         """Let TS run up to a step number; its own time is set at the end. Collective.
 
-        Raises:
-            SolverError: a solve failed; the message names solver, step and reason.
+        Raises SolverError: a solve failed; the message names solver, step and reason.
         """
         if step <= self.reached:
             return
@@ -103,9 +102,7 @@ class Stepped(ABC):
 
         The residual needs the right-hand side, which the end of the step overwrites; so the check is part of the step,
         but not of its time. A step that is behind already is not checked again: the residual is that of the last check.
-
-        Raises:
-            SolverError: a solve failed or missed its tolerance.
+        Raises SolverError: a solve failed or missed its tolerance.
         """
         self.check_at = step - 1
         self.advance_to(ts, step)

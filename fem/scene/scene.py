@@ -239,8 +239,7 @@ def _check_vectors(scene: Scene, d: int) -> None:
 def check_dimension(scene: Scene, d: int) -> None:
     """Check every vector of the scene against the dimension d of its mesh.
 
-    Raises:
-        SceneError: the first vector, side or value that does not fit.
+    Raises SceneError: the first vector, side or value that does not fit.
     """
     from softgrasp.fem.errors import SceneError  # imports MPI, which the models do without
 

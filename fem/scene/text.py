@@ -62,10 +62,8 @@ def parse_toml(text: str) -> dict[str, Any]:
 def check_values(data: dict[str, Any]) -> None:
     """Bound the values of a parsed scene: depth, keys, texts and numbers.
 
-    Infinite numbers and NaN pass: the types of the scene refuse them by key.
-
-    Raises:
-        ValueError: the first key whose value is beyond all use, with what would be right.
+    Infinite numbers and NaN pass: the types of the scene refuse them by key. Raises ValueError: the first key whose
+    value is beyond all use, with what would be right.
     """
     todo: list[tuple[tuple[str, ...], Any]] = [((), data)]
     while todo:

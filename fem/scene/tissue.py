@@ -264,8 +264,7 @@ class Contact(Section):
     def axes(self, dimension: int) -> list[tuple[int, int]]:
         """(axis, -1 or +1) of each named side; bottom and top are y in 2D and z in 3D.
 
-        Raises:
-            ValueError: a side does not exist in this dimension.
+        Raises ValueError: a side does not exist in this dimension.
         """
         names = {"left": "x-", "right": "x+", "bottom": "y-", "top": "y+"}
         if dimension == 3:

@@ -30,8 +30,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     Returns:
         omega [1/s], ascending, (k,), on every rank; Phi, local rows (n_local, k), no ghosts.
 
-    Raises:
-        SolverError: k is out of range, the factorisation fails, or a mode does not converge.
+    Raises SolverError: k is out of range, the factorisation fails, or a mode does not converge.
     """
     n_e = system.layout.n_e
     if not 1 <= k <= n_e:

@@ -8,7 +8,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.petsc import Array, PETSc, total
+from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.scene.scene import Time
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, choose_solver, make_solver
 from softgrasp.fem.system import BlockSystem
@@ -55,24 +55,14 @@ def solve_columns(
     Args:
         rtol: of cg, where no direct solver fits.
 
-    Raises:
-        SolverError: the factorisation fails, or the solution has a large residual.
+    Raises SolverError: the factorisation fails, or the solution has a large residual.
     """
     name = solver or choose_solver(layout, few=True)[0]
     static = make_solver(A.copy(), name, layout, "softgrasp_static_", rtol, reproducible)
-    b, x = A.createVecs()
-    result = np.zeros(X.shape, order="F")
     try:
-        for j in np.flatnonzero(total(layout.comm, np.abs(X).sum(axis=0)) != 0):
-            b.array_w[:] = X[:, j]
-            static.solve(b, x)
-            static.check(b, x, where)
-            result[:, j] = x.array_r
+        return static.columns(X, where)
     finally:
         static.destroy()
-        b.destroy()
-        x.destroy()
-    return result
 
 
 SMALLEST = 2.0**-10  # step of the load, and part of a correction
@@ -84,9 +74,8 @@ def finite_equilibrium(system: BlockSystem, solver: SolverName | None = None) ->
     """Z with f(z) = G g, stable under small motions of the load; local rows (n_local,) [m]. Collective.
 
     The load t G g grows from 0 to 1 by steps that are halved where Newton's method fails and doubled where it does not.
-
-    Raises:
-        SolverError: no step of the load converges; the message names its share t, the cell with the smallest J, and J.
+    Raises SolverError: no step of the load converges; the message names its share t, the cell with the smallest J, and
+    J.
     """
     from softgrasp.fem.strain.body import Body  # only scenes with finite strain pay for it
 

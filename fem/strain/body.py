@@ -152,8 +152,7 @@ class Body:
         Args:
             comm: ranks that share the points; None where each has them all.
 
-        Raises:
-            SolverError: the message names law, cell, J and stretch.
+        Raises SolverError: the message names law, cell, J and stretch.
         """
         J, place = self.lowest(1 + start.j, comm)
         least, where = self._least_stretch(start, comm) if self.law.least_stretch else (1.0, place)

@@ -90,12 +90,7 @@ def feedback_inputs(law: Responses) -> Array:
 
 
 def responses(
-    problem: RiccatiProblem,
-    W: Block,
-    start: Block,
-    dt: float,
-    steps: int,
-    notify: Notify | None = None,
+    problem: RiccatiProblem, W: Block, start: Block, dt: float, steps: int, notify: Notify | None = None
 ) -> Responses:
     """One factor and n_s runs of the full plant, one more where the start moves by itself. Collective.
 
@@ -104,14 +99,13 @@ def responses(
         start: x(0) as a difference to a state of rest, one column.
         notify: called with the number of steps done and in all.
 
-    Raises:
-        SolverError: a solve failed.
+    Raises SolverError: a solve failed.
     """
     n_s, n = problem.layout.n_s, problem.layout.n_local
     # differences of two states feel no gravity
     problem = replace(problem, system=replace(problem.system, gravity=None, hand_weight=False))
     rest = PlantState(np.zeros(n_s), np.zeros(n_s), np.zeros(n), np.zeros(n))
-    begin = PlantState(start.hand[:n_s, 0], start.hand[n_s:, 0], start.tall[:n, 0], start.tall[n:, 0])
+    begin = PlantState(*(part[:, 0] for part in start.parts))
     inputs = np.zeros((n_s + 1, steps, n_s))
     inputs[range(n_s), 0, range(n_s)] = 1.0
     runs = [(rest, u) for u in inputs[:n_s]]
@@ -208,8 +202,7 @@ def duality_gaps(
         factor: Z; None takes the cost up to the end alone.
         notify: called with the number of steps done and in all.
 
-    Raises:
-        SolverError: a solve failed.
+    Raises SolverError: a solve failed.
     """
     p, n_s, n = len(problem.Q), problem.layout.n_s, problem.layout.n_local
     hand, tall = np.zeros((2 * n_s, p)), np.zeros((2 * n, p))

@@ -62,9 +62,7 @@ def residual_weight(plant: Plant, Z: Block) -> Array:
 
 def _tissue_products(plant: Plant, Z: Block) -> tuple[Array, Array, Array, Array]:
     """[a, b], K_ee [a, b], M_ee b and v = K_ee a - D_ee b for tissue rows a, b of Z. Collective."""
-    n, c = plant.n_local, Z.columns
-    both = np.empty((n, 2 * c))
-    both[:, :c], both[:, c:] = Z.tall[:n], Z.tall[n:]
+    c, both = Z.columns, np.hstack(Z.parts[2:])
     b, K_both = both[:, c:], plant.stiff(both)
     M_b = plant.mass(b)
     return both, K_both, M_b, K_both[:, :c] - damp(plant.system, b, M_b, K_both[:, c:])

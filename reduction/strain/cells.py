@@ -56,16 +56,6 @@ class Cells:
         return replace(self, B=np.ascontiguousarray(self.B[:k]))
 
 
-@dataclass(frozen=True)
-class Packed:
-    """What `stepper.c` takes: B (p / LANES, k, d d, LANES), weight, lam, mu (p,); what fills up p weighs nothing."""
-
-    law: int
-    d: int
-    p: int
-    arrays: tuple[Array, Array, Array, Array]
-
-
 class Potential:
     """W_r and its derivatives at one set of materials.
 
@@ -138,8 +128,8 @@ class Potential:
         return self._sum(self._rows @ (self.cells.weight * P).ravel()), -1
 
     @cached_property
-    def packed(self) -> Packed:
-        """Arrays for the compiled stepper."""
+    def packed(self) -> tuple[Array, Array, Array, Array]:
+        """B (p / LANES, k, d d, LANES), weight, lam, mu (p,) for `stepper.c`; what fills up p weighs nothing."""
         q = len(self.cells.weight)
         p = -(-q // LANES) * LANES
 
@@ -148,5 +138,4 @@ class Potential:
 
         B = padded(self.cells.B.reshape(self.k, self.d**2, q)).reshape(self.k, self.d**2, -1, LANES)
         B = np.ascontiguousarray(B.transpose(2, 0, 1, 3))
-        arrays = (B, padded(self.cells.weight), padded(self.lam), padded(self.mu))
-        return Packed(list(LAWS).index(self.cells.law), self.d, p, arrays)
+        return B, padded(self.cells.weight), padded(self.lam), padded(self.mu)

@@ -20,6 +20,7 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.strain.compiled import library
+from softgrasp.fem.strain.laws import LAWS
 from softgrasp.reduction.strain.cells import Potential
 
 SOURCE = Path(__file__).with_name("stepper.c")
@@ -99,17 +100,18 @@ def _sentence(problem: StrainProblem, step: int, point: int) -> str:
 
 def _march_c(library: Any, problem: StrainProblem, load: Array, tol: float, J: Array, A: Array, V: Array) -> Any:
     ffi, lib = library
-    packed = problem.potential.packed
+    potential = problem.potential
     counts = ffi.new("long[3]")
 
     def pointer(x: Array) -> Any:
         return ffi.cast("double *", x.ctypes.data)
 
-    arrays = [*packed.arrays, np.ascontiguousarray(problem.S)]
+    arrays = [*potential.packed, np.ascontiguousarray(problem.S)]
     load = np.ascontiguousarray(load)
     failed = lib.softgrasp_march(
-        packed.law, packed.d, load.shape[1], packed.p, *map(pointer, arrays), 2 / problem.dt, pointer(load), len(load),
-        tol, problem.potential.rounding, pointer(J), pointer(A), pointer(V), counts,
+        list(LAWS).index(potential.cells.law), potential.d, load.shape[1], len(potential.packed[1]),
+        *map(pointer, arrays), 2 / problem.dt, pointer(load), len(load), tol, potential.rounding, pointer(J),
+        pointer(A), pointer(V), counts,
     )  # fmt: skip
     if failed < 0:
         raise MemoryError("the reduced run does not fit into memory")

@@ -31,9 +31,9 @@ from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.inner import Rows, Weight
 from softgrasp.reduction.bases.pod import pod_part
 from softgrasp.reduction.bases.states import BasisError
-from softgrasp.reduction.galerkin import symmetric
-from softgrasp.reduction.model import Lift, ModelError
+from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.operators import Lift, layer_products, symmetric
 from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun
@@ -67,10 +67,7 @@ class Training:
         """The largest model on the cells of this rank, every weight 1. Collective."""
         system, Phi = self.model.system, self.Phi
         comm, layout = system.layout.comm, system.layout
-        K_mu, K_lambda = (
-            np.stack([symmetric(total(comm, Phi.T @ times_columns(A, Phi))) for A in matrices])
-            for matrices in ([x.K_mu.ee for x in system.layers], [x.K_lambda.ee for x in system.layers])
-        )
+        K_mu, K_lambda = (symmetric(layer_products(system, key, Phi, Phi)[0]) for key in ("K_mu", "K_lambda"))
         outputs = project_outputs(make_outputs(self.model.scene, system), Lift(layout, Phi, Phi))
         G, K_mu, K_lambda = comm.bcast((total(comm, Phi.T @ system.G), K_mu, K_lambda))
         count = comm.allreduce(int(self.cells.cell.max(initial=-1)) + 1)

@@ -12,7 +12,7 @@ from softgrasp.fem.columns import hand_columns
 from softgrasp.lqr.design.feedback import Design
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.margins import LoopMargins
-from softgrasp.lqr.plant.identities import rigid_gains
+from softgrasp.lqr.plant.problem import rigid_gains
 from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header

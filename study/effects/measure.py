@@ -25,7 +25,8 @@ from softgrasp.fem.run.simulate import Run, RunOptions
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import digest
-from softgrasp.study.effects.switch import changed
+from softgrasp.study.effects.result import Cost, OffProof
+from softgrasp.study.effects.switch import changed, neutral
 from softgrasp.study.shell.timing import interleave, medians, rotated
 
 BURSTS = 7  # short ones make a sample by their median, so that a busy moment of the machine falls out
@@ -38,7 +39,7 @@ SCENE, AGAIN = "scene", "scene again"  # cases: as it is, before and after its e
 
 
 @dataclass
-class Case:
+class MeasuredScene:
     """One scene under measurement."""
 
     model: Model  # the last one built
@@ -52,7 +53,7 @@ class Case:
     objects_in_steps: dict[str, int] = field(default_factory=dict)  # the same of the next steps
 
 
-class Stepper:
+class TimedRun:
     """A run that can be taken back to its start, to time its steps any number of times. Collective."""
 
     def __init__(self, model: Model) -> None:
@@ -176,9 +177,9 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
 
 def measure_builds(
     comm: MPI.Intracomm, scenes: dict[str, Scene], repeats: int, tick: Callable[[], None]
-) -> dict[str, Case]:
+) -> dict[str, MeasuredScene]:
     """Build and factor every scene in rotated order, ``repeats`` times or for `BUILD_SECONDS`. Collective."""
-    cases: dict[str, Case] = {}
+    cases: dict[str, MeasuredScene] = {}
     spent = 0.0
 
     def once(name: str) -> None:
@@ -186,7 +187,7 @@ def measure_builds(
         model = build(scenes[name], comm=comm)
         with model.watch.stage("setup"):
             run = Run(model, RunOptions())
-        case = cases.setdefault(name, Case(model))
+        case = cases.setdefault(name, MeasuredScene(model))
         for stage in ("mesh", "assembly", "setup"):
             case.seconds.setdefault(stage, []).append(model.watch.seconds[stage])
             spent += model.watch.seconds[stage]
@@ -202,9 +203,9 @@ def measure_builds(
     return cases
 
 
-def measure_steps(comm: MPI.Intracomm, cases: dict[str, Case], repeats: int, tick: Callable[[], None]) -> None:
+def measure_steps(comm: MPI.Intracomm, cases: dict[str, MeasuredScene], repeats: int, tick: Callable[[], None]) -> None:
     """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective."""
-    steppers = {name: Stepper(case.model) for name, case in cases.items()}
+    steppers = {name: TimedRun(case.model) for name, case in cases.items()}
     try:
         pace = next(iter(steppers.values())).seconds_per_step(5)
         for stepper in steppers.values():
@@ -267,9 +268,72 @@ def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[
     Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
     """
     with counting(comm) as at_first:
-        stepper = Stepper(build(scene, comm=comm))
+        stepper = TimedRun(build(scene, comm=comm))
         stepper.run.advance_to(stepper.ts, min(1, stepper.run.steps))
     with counting(comm) as in_steps:
         stepper.run.advance_to(stepper.ts, min(1 + STEPS, stepper.run.steps))
     stepper.destroy()
     return at_first, in_steps
+
+
+# --- what an effect adds, and that one that is off adds nothing
+
+
+def ends(samples: Array, share: float = 0.0) -> tuple[float, float]:
+    """Smallest and largest sample, or the two with a share of the samples beyond."""
+    low, high = np.quantile(samples, [share, 1 - share])
+    return float(low), float(high)
+
+
+def cost_of(with_: MeasuredScene, without: MeasuredScene, noise: float) -> Cost:
+    """The differences of two cases; ``noise`` is what a step of one scene differs from itself by."""
+
+    def added(stage: str) -> Array:
+        return np.asarray(np.array(with_.seconds[stage]) - np.array(without.seconds[stage]))
+
+    assembly, setup, step = added("assembly"), added("setup"), added("step")
+    shares = step / np.array(without.seconds["step"])
+    more, less = sum(with_.bytes.values()), sum(without.bytes.values())
+    low, high = ends(shares)
+    return Cost(
+        assembly=float(np.median(assembly)),
+        setup=float(np.median(setup)),
+        assembly_range=ends(assembly),
+        setup_range=ends(setup),
+        step=float(np.median(step)),
+        step_relative=float(np.median(shares)),
+        step_low=low,
+        step_high=high,
+        step_noise=noise,
+        step_quartiles=ends(shares, 0.25),
+        flops=with_.flops - without.flops,
+        flops_relative=with_.flops / without.flops - 1 if without.flops else 0.0,
+        memory=more - less,
+        memory_relative=more / less - 1,
+        holds=tuple(sorted(set(with_.bytes) - set(without.bytes))),
+        objects=difference(with_.objects, without.objects),
+    )
+
+
+def difference(more: dict[str, int], less: dict[str, int]) -> dict[str, int]:
+    """What the one has more, or less, of each class than the other."""
+    return {name: d for name in sorted({*more, *less}) if (d := more.get(name, 0) - less.get(name, 0))}
+
+
+def prove_off(name: str, before: MeasuredScene, again: MeasuredScene) -> OffProof:
+    """Compare the scene before and after the effect was on in this process. Collective."""
+    layout = before.model.system.layout
+    prints, counts = [again.prints], [(again.objects, again.objects_in_steps)]
+    with_zero = neutral(before.model.scene, name, layout.dimension)
+    if with_zero is not None:
+        model = build(with_zero, comm=layout.comm)
+        run = Run(model, RunOptions())
+        prints.append(fingerprint(model, run))
+        run.midpoint.destroy()
+        if before.objects:
+            counts.append(objects_of(layout.comm, with_zero))
+    return OffProof(
+        same_operators=all(p == before.prints for p in prints),
+        same_objects=not before.objects_in_steps and all(c == (before.objects, {}) for c in counts),
+        same_work=again.flops == before.flops,
+    )

@@ -96,7 +96,7 @@ class Elements:
 
 
 @dataclass(frozen=True)
-class Finding:
+class EffectResult:
     """One effect."""
 
     name: str  # the effect
@@ -137,7 +137,7 @@ class Finding:
 class EffectsStudy:
     """All findings of a scene."""
 
-    findings: tuple[Finding, ...]  # in the order of `fem.effects.EFFECTS`
+    findings: tuple[EffectResult, ...]  # in the order of `fem.effects.EFFECTS`
     advised: tuple[str, ...]  # effects that are on when every advice is followed, for control alone included
     explanation: Explanation  # of the scene as it is; its warnings are repeated in the report
     tolerance: float  # relative change that counts [1]

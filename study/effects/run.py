@@ -18,12 +18,19 @@ from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.effects.change import Changes, Experiments, judge_together
-from softgrasp.study.effects.judge import ends, find, judge_elements, shows
-from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, measure_builds, measure_steps, objects_of
+from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
 from softgrasp.study.effects.page import compose, show
-from softgrasp.study.effects.result import Change, Company, EffectsStudy
+from softgrasp.study.effects.result import EffectsStudy
 from softgrasp.study.effects.switch import Scales, Switch, switches
+from softgrasp.study.effects.verdict import (
+    Changes,
+    Experiments,
+    advised_together,
+    check_elements,
+    find,
+    finite_strain_beside,
+    shows,
+)
 from softgrasp.study.forward.explain import Explanation, explain_model
 from softgrasp.study.report.origin import origin, peak_memory_mb
 from softgrasp.study.shell.session import Session, list_files
@@ -73,13 +80,13 @@ def study_effects(
     # with other effects on trial a run of finite strain is dear and may leave its law: no pairs with it
     apart = {s.name for s in tried if s.name == "finite_strain" and not s.on}
     joint = tuple(name for name in changes if name not in apart)
-    together = judge_together(runs, joint, needed - apart, scene.study.tolerance)
+    together = advised_together(runs, joint, needed - apart, scene.study.tolerance)
     for name in apart:
-        company = _beside(runs, name, changes[name], frozenset(together.on))
+        company = finite_strain_beside(runs, name, changes[name], frozenset(together.on))
         together.company[name] = company
         if name in needed or company.partners:
             together = replace(together, on=(*together.on, name))
-    elements = judge_elements(runs.models[on], runs.first, scene.study.tolerance)
+    elements = check_elements(runs.models[on], runs.first, scene.study.tolerance)
     done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
     for name, case in cases.items():
@@ -114,19 +121,6 @@ def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
     except SolverError as error:
         return replace(s, other=None, reason=f"the run with it fails ({error})")
     return s
-
-
-def _beside(runs: Experiments, name: str, alone: tuple[Change, float | None], on: frozenset[str]) -> Company:
-    """Finite strain on trial beside all advised effects, one run more; alone where it fails there. Collective."""
-    if on == runs.on or "rotation" in on:
-        return Company(*alone)
-    try:
-        change = runs.change(on, on | {name})
-    except SolverError:
-        return Company(*alone)
-    if alone[0].outputs <= runs.scene.study.tolerance < change.outputs:
-        return Company(change, alone[1], tuple(sorted(on ^ runs.on)), False, change.outputs)
-    return Company(change, alone[1])
 
 
 def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:

@@ -1,4 +1,4 @@
-"""Hard cases of the time loop: any step, many steps, any damping, any hand, interrupted and gone on."""
+"""Hard cases of the time loop, linear and of finite strain: any step, damping and hand, compression, restarts."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse.linalg
 
 from softgrasp.fem.errors import Interrupted
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, to_scipy
-from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
+from softgrasp.fem.run.midpoint import make_midpoint, midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.solve.modes import lowest_modes
+from softgrasp.fem.solve.statics import equilibrium
+from softgrasp.fem.strain.body import Body
 from softgrasp.fem.system import BlockSystem, Damping
 from softgrasp.study.hardcases.cases import EPS, Family, HardCase, here, make, scaled_condition, textbook, thin
 from softgrasp.study.hardcases.textbook import implicit_and_explicit, in_turn, textbook_midpoint
@@ -27,12 +30,16 @@ from softgrasp.study.hardcases.textbook import implicit_and_explicit, in_turn, t
 SMALL = ("tissue.cells=[3, 6]", "control=false")
 
 
+def period(system: BlockSystem) -> float:
+    """First period 2 pi / omega_1 [s] at small strain."""
+    return float(2 * math.pi / lowest_modes(replace(system, points=None), 1)[0][0])
+
+
 def free_body() -> tuple[BlockSystem, Array, float, Any, Any]:
-    """A held body, a displacement in which every mode takes part, T_1 = 2 pi / omega_1 [s], and M, K in SciPy."""
+    """A held body, a displacement in which every mode takes part, its first period [s], and M, K in SciPy."""
     system = make("paper_forward", *SMALL, "motion={profile='hold'}").system
     z = 0.05 * np.random.default_rng(3).standard_normal(system.layout.n_e)
-    period = float(2 * math.pi / lowest_modes(system, 1)[0][0])
-    return system, z, period, to_scipy(system.M_ee), to_scipy(system.K_ee)
+    return system, z, period(system), to_scipy(system.M_ee), to_scipy(system.K_ee)
 
 
 def let_go(system: BlockSystem, z: Array, dt: float, steps: int, peaks: bool = False) -> float:
@@ -40,22 +47,23 @@ def let_go(system: BlockSystem, z: Array, dt: float, steps: int, peaks: bool = F
 
     With ``peaks`` at least what the energy exceeds the first one by, which is as wrong.
     """
-    midpoint = TissueMidpoint(system, dt, "cholesky")
-    state = state_on(np.concatenate([z, np.zeros_like(z)]), system)
-    midpoint.start(state)
-    start, highest = midpoint.energy(state), 1.0
-    nothing = np.zeros(system.layout.n_s)
-    for n in range(steps):
-        midpoint.solve_midpoint(nothing)
-        if n == steps - 1:
-            midpoint.residual()
-        midpoint.advance(state, state)
-        if n % 50 == 0:
-            highest = max(highest, midpoint.energy(state) / start)
-    lost = midpoint.over_ranks(midpoint.dissipated)
-    midpoint.start(state)  # so that the last energy comes from M v and K z, as the first one did
-    end = midpoint.energy(state)
-    midpoint.destroy()
+    midpoint = make_midpoint(system, dt, "cholesky")
+    state, nothing = state_on(np.concatenate([z, np.zeros_like(z)]), system), np.zeros(system.layout.n_s)
+    try:
+        midpoint.start(state)
+        start, highest = midpoint.energy(state), 1.0
+        for n in range(steps):
+            midpoint.solve_midpoint(nothing)
+            if n == steps - 1:
+                midpoint.residual()
+            midpoint.advance(state, state)
+            if n % 50 == 0:
+                highest = max(highest, midpoint.energy(state) / start)
+        lost = midpoint.over_ranks(midpoint.dissipated)
+        midpoint.start(state)  # so that the last energy comes from M v and K z, as the first one did
+        end = midpoint.energy(state)
+    finally:
+        midpoint.destroy()
     defect, excess = abs(end + lost - start) / start, max(highest, end / start) - 1
     return max(defect, excess) if peaks else defect
 
@@ -85,9 +93,9 @@ def drift_bound(system: BlockSystem, ratio: float, dt: float, steps: int) -> tup
 
 def step_rows(quick: bool) -> Iterator[HardCase]:
     """Energy of a free vibration for steps from a thousandth to a thousand first periods."""
-    (system, z, period, M, K), steps = free_body(), 400 if quick else 2000
+    (system, z, first, M, K), steps = free_body(), 400 if quick else 2000
     for ratio in thin([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e3], quick):
-        dt = ratio * period
+        dt = ratio * first
         drift = here(let_go, system, z, dt, steps)
         newmark = textbook(implicit_and_explicit, M, K, 0 * K, z, dt, steps)
         bound = drift_bound(system, ratio, dt, steps)
@@ -96,9 +104,9 @@ def step_rows(quick: bool) -> Iterator[HardCase]:
 
 def long_rows(quick: bool) -> Iterator[HardCase]:
     """Energy after 1e5 steps of free vibration."""
-    (system, z, period, M, K), steps = free_body(), 3000 if quick else 100_000
+    (system, z, first, M, K), steps = free_body(), 3000 if quick else 100_000
     for ratio in [1e-3] if quick else [1e-3, 1e-2, 1.0, 100.0]:
-        dt = ratio * period
+        dt = ratio * first
         drift = here(let_go, system, z, dt, steps)
         loop = textbook(textbook_midpoint, M, K, z, dt, steps)
         yield HardCase(f"{steps} steps of {ratio:g} T1", ratio, drift, loop, *drift_bound(system, ratio, dt, steps))
@@ -106,8 +114,8 @@ def long_rows(quick: bool) -> Iterator[HardCase]:
 
 def damping_rows(quick: bool) -> Iterator[HardCase]:
     """Energy balance of a let-go body for damping from none to a million times critical."""
-    (system, z, period, M, K), steps = free_body(), 200 if quick else 1000
-    omega, dt = 2 * math.pi / period, period / 500
+    (system, z, first, M, K), steps = free_body(), 200 if quick else 1000
+    omega, dt = 2 * math.pi / first, first / 500
     for zeta in thin([0.0, 1e-14, 1e-8, 1e-2, 1.0, 1e3, 1e6], quick):
         beta = 2 * zeta / omega
         damped = replace(system, damping=Damping(beta=beta))
@@ -154,30 +162,35 @@ RESTARTS = {
 }  # fmt: skip
 
 
+def different_bits(a: Array, b: Array) -> int:
+    """Number of doubles whose bits differ."""
+    return int((a.view(np.int64) != b.view(np.int64)).sum())
+
+
 def differing(a: Trajectory, b: Trajectory) -> int:
     """Number of doubles whose bits differ between two runs."""
     pairs = [(a.q_s, b.q_s), (a.v_s, b.v_s), (a.outputs, b.outputs), (a.final, b.final)]
     pairs.append((np.array([a.energy_drift]), np.array([b.energy_drift])))
     if a.snapshots is not None and b.snapshots is not None:
         pairs.append((a.snapshots.Z, b.snapshots.Z))
-    return sum(int((x.view(np.int64) != y.view(np.int64)).sum()) for x, y in pairs)
+    return sum(different_bits(x, y) for x, y in pairs)
 
 
-def _interrupted(model: Model, stop: int) -> float:
-    """Doubles that differ between an unbroken run and one that was stopped and resumed."""
+def interrupted(model: Model, stop: int) -> tuple[Trajectory, Trajectory]:
+    """An unbroken run, and one that was stopped and resumed."""
     with tempfile.TemporaryDirectory() as name:
         whole, part = Path(name) / "whole", Path(name) / "part"
         unbroken = simulate(model, RunOptions(whole))
         with suppress(Interrupted):
             simulate(model, RunOptions(part, until=stop))
-        return float(differing(unbroken, simulate(model, RunOptions(part, resume=True))))
+        return unbroken, simulate(model, RunOptions(part, resume=True))
 
 
-def _from_state_only(model: Model, stop: int) -> float:
-    """Go on from the exact q_s, v_s, z, v of a step but without the carried vectors; doubles that differ at the end."""
+def from_state_only(model: Model, stop: int) -> tuple[Array, Array]:
+    """Last states of an unbroken run, and of one that goes on from the exact q_s, v_s, z, v of a step alone."""
     with tempfile.TemporaryDirectory() as name:
-        whole = simulate(model, RunOptions(Path(name) / "whole"))
         folder = Path(name)
+        whole = simulate(model, RunOptions(folder / "whole"))
         first = Run(model, RunOptions(folder / "a"))
         ts = make_ts(first)
         first.start()
@@ -195,16 +208,127 @@ def _from_state_only(model: Model, stop: int) -> float:
         ts.setStepNumber(stop)
         second.advance_to(ts, second.steps)
         ts.destroy()
-        final = second.state.array
-    return float((final.view(np.int64) != whole.final.view(np.int64)).sum())
+    return whole.final, second.state.array
 
 
 def restart_rows(quick: bool) -> Iterator[HardCase]:
     """Stop in the middle, go on from the restart file, and count the doubles that differ from an unbroken run."""
     for i, name in enumerate(list(RESTARTS)[: 2 if quick else None]):
         model = make("paper_forward", "tissue.cells=[4, 8]", "time.steps=60", *RESTARTS[name])
-        resumed, lost = here(_interrupted, model, 23), textbook(_from_state_only, model, 23)
+        resumed = here(lambda: differing(*interrupted(model, 23)))  # noqa: B023  (at once)
+        lost = textbook(lambda: different_bits(*from_state_only(model, 23)))  # noqa: B023  (at once)
         yield HardCase(name, i + 1, resumed, lost, 0.0, "the same bits, not nearly the same")
+
+
+# --- finite strain
+
+LAW = "effects.finite_strain.law='neo-hooke'"
+STRIP = (
+    LAW, "control=false", "tissue.size=[0.4, 2.0]", "tissue.cells=[2, 10]", "contact.sides=['top']",
+    "contact.box=[[0.0, 0.0], [0.4, 2.0]]", "motion={profile='hold'}",
+)  # fmt: skip
+SMALL_STRAIN = (LAW, *SMALL)
+STRAIN_STEPS = 60
+
+
+def squeezed(model: Model, J: float) -> Array:
+    """The strip pressed evenly against the hand, det F = J in every cell but those that the hand bends."""
+    y = model.system.layout.nodes[:, 1]
+    return np.column_stack([0 * y, (1 - J) * (2.0 - y)]).ravel()
+
+
+def newton_midpoint(system: BlockSystem, z: Array, dt: float) -> float:
+    """The same by the midpoint rule, s^2 M w + f(z + w) = s M v, with Newton's method from w = 0 as it comes."""
+    assert system.points is not None
+    body, M, s = Body(system.points, system.materials), to_scipy(system.M_ee), 2 / dt
+    x, f = system.K_ee.createVecs()
+
+    def at(u: Array) -> tuple[Array, float]:
+        x.array_w[:] = u
+        body.force(x, f)
+        return f.array_r.copy(), body.energy(x)
+
+    v = np.zeros_like(z)
+    first = at(z)[1]
+    for _ in range(STRAIN_STEPS):
+        w = np.zeros_like(z)
+        for _ in range(12):
+            R = s * s * (M @ w) + at(z + w)[0] - s * (M @ v)
+            x.array_w[:] = z + w
+            K = to_scipy(body.tangent(x))
+            w = w - scipy.sparse.linalg.spsolve((K + s * s * M).tocsc(), R)
+            if np.linalg.norm(R) <= 1e-9 * np.linalg.norm(s * (M @ v) + at(z)[0]):
+                break
+        z, v = z + 2 * w, 2 * s * w - v
+    return float(abs(at(z)[1] + v @ (M @ v) / 2 - first) / first)
+
+
+def released(case: str, x: float, model: Model, z: Array, dt: float, group: str) -> HardCase:
+    """One body let go: energy kept to the rounding of what the steps add up; cells that start inverted have none."""
+    ways = here(let_go, model.system, z, dt, STRAIN_STEPS), textbook(newton_midpoint, model.system, z, dt)
+    if group == "start":
+        return HardCase(case, x, *ways, None, "the law has no energy there", group=group)
+    reason = f"the asked defect of {STRAIN_STEPS} steps, 1e-9, at the default tolerance"
+    return HardCase(case, x, *ways, 1e-9, reason, group=group)
+
+
+def strain_rows(quick: bool) -> Iterator[HardCase]:
+    """Bodies let go from far outside the range of linear elasticity."""
+    strip = make("paper_forward", *STRIP)
+    T = period(strip.system)
+    for J in thin((0.5, 0.3, 0.1), quick):
+        yield released(f"squeezed to det F = {J:g}", J, strip, squeezed(strip, J), T / 200, "compression")
+    for name, overrides in (
+        ("nu = 0.499, P2", (
+            "tissue.cells=[1, 5]", "tissue.order=2", "tissue.material={young=130.0, poisson=0.499, rho=1.0}")),
+        ("layers 1 : 1e4", (
+            "tissue.layers={low={box=[[0.0, 0.0], [0.4, 1.0]], material={lambda=5e5, mu=5e5, rho=1.0}}}",)),
+    ):  # fmt: skip
+        model = make("paper_forward", *STRIP, *overrides)
+        y = model.system.layout.nodes[:, 1]
+        sheared = np.column_stack([0.4 * np.minimum(2.0 - y, 1.0), 0 * y]).ravel()  # the lower half as it is
+        yield released(name, 0.3 if "nu" in name else 0.4, model, sheared, period(model.system) / 100, "material")
+    small = make("paper_forward", *SMALL_STRAIN)
+    T, z = period(small.system), 0.03 * np.sin(np.arange(small.system.layout.n_e))
+    for share in thin((1e-3, 1e-2, 0.1, 1.0, 10.0), quick):
+        yield released(f"dt = {share:g} of the first period", share, small, z, share * T, "time step")
+    yield released("start with inverted cells", -0.2, strip, squeezed(strip, -0.2), T / 200, "start")
+
+
+def sag_error(model: Model, newton: bool) -> float:
+    """|f(z) - G g| / |G g| of the equilibrium, and that it sags by more than its length.
+
+    ``newton``: by Newton's method from rest under the whole load instead, wherever it ends.
+    """
+    system = model.system
+    assert system.points is not None
+    assert system.gravity is not None
+    body, load = Body(system.points, system.materials), system.G @ system.gravity
+    z, f = system.K_ee.createVecs()
+    if not newton:
+        z.array_w[:] = equilibrium(system)
+    for _ in range(12 if newton else 0):
+        body.force(z, f)
+        z.array_w[:] = z.array_r - scipy.sparse.linalg.spsolve(to_scipy(body.tangent(z)).tocsc(), f.array_r - load)
+    body.force(z, f)
+    right = newton or np.abs(z.array_r).max() > 2.0
+    return float(np.linalg.norm(f.array_r - load) / np.linalg.norm(load)) if right else np.inf
+
+
+def strain_state_rows(quick: bool) -> Iterator[HardCase]:
+    """A strip that sags by more than its length, and a run that is stopped."""
+    for g in thin((50.0, 150.0, 250.0), quick)[1:]:
+        model = make("paper_forward", *STRIP, f"effects.gravity.g=[0.0, {-g}]", "time.start='equilibrium'")
+        ways = here(sag_error, model, False), textbook(sag_error, model, True)
+        yield HardCase(f"strip under {g:g} m/s2", g, *ways, 1e-10, "ten times the tolerance of the equilibrium")
+    model = make("paper_forward", *SMALL_STRAIN, "time.steps=60")
+
+    def difference(whole: Array, end: Array) -> float:
+        return float(np.abs(end - whole).max())
+
+    resumed = here(lambda: difference(*(run.final for run in interrupted(model, 30))))
+    ways = resumed, textbook(lambda: difference(*from_state_only(model, 30)))
+    yield HardCase("stopped at half and gone on", 1.0, *ways, 0.0, "the same bits")
 
 
 FAMILIES = (
@@ -229,4 +353,14 @@ FAMILIES = (
            mass_rows),
     Family("restart", "Stopped and gone on", "case", "doubles that differ", "restart from displacement and velocity",
            "Displacement and velocity alone lose the last bits of the carried momentum.", restart_rows, axis="listed"),
+    Family("finite_strain", "Finite strain", "det F, share of a period, or measure of the material",
+           "relative defect of the energy", "midpoint rule and Newton's method without safeguards",
+           "The discrete gradient keeps the energy whatever the step and however strong the compression, and inverted "
+           "cells are refused; Newton's method as it comes leaves the energy to chance or stops with no number.",
+           strain_rows, axis="listed"),
+    Family("finite_state", "Equilibrium and restart of finite strain", "gravity [m/s2]",
+           "residual of the equilibrium, difference after a restart", "one load step; restart from z and v",
+           "Load steps reach an equilibrium several times the body's length away, and a restart keeps every bit, "
+           "because tangent, pairs and last steps are stored.",
+           strain_state_rows, axis="listed"),
 )  # fmt: skip

@@ -11,14 +11,13 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.study.hardcases import carex, certified, motion, numbers, ranks, reduction, riccati, statics, strain
-from softgrasp.study.hardcases.cases import Family
+from softgrasp.study.hardcases import certified, faults, motion, reduction, riccati, statics
+from softgrasp.study.hardcases.cases import Family, FamilyResult, HardCaseResult
 from softgrasp.study.hardcases.page import show, write_files
-from softgrasp.study.hardcases.result import FamilyResult, HardCaseResult
 from softgrasp.study.shell.folder import claim
 from softgrasp.study.shell.session import list_files, progress_bar
 
-MODULES: Any = (statics, motion, strain, reduction, certified, carex, riccati, numbers, ranks)
+MODULES: Any = (statics, motion, reduction, certified, riccati, faults)
 FAMILIES: dict[str, Family] = {family.name: family for module in MODULES for family in module.FAMILIES}
 
 

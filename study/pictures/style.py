@@ -95,10 +95,7 @@ def log_axis(ax: Any, top: float | None) -> None:
 def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: float = 7.0) -> None:
     """Names of curves right of the axes, each beside the end of its own, moved apart where they would touch.
 
-    Args:
-        ax: axes with their final limits and scales.
-        ends: x and y of the last point, name and colour of each curve.
-        size: of the font [pt].
+    The axes have their final limits and scales; ``ends`` are x and y of the last point, name and colour of each curve.
     """
     inverse, inch = ax.transAxes.inverted(), ax.get_position().height * ax.figure.get_figheight()
     gap = 1.25 * size / 72 / inch

@@ -60,7 +60,7 @@ def test_modes_follow_the_plain_rule(comm: MPI.Intracomm, kind: tuple[Any, ...],
     if not kind[2] or two_way:
         step, u = propagator(small, dt), wiggle(steps, dt)
         assert step.modal is not None
-        start = step.X_inverse @ x0
+        start = step.at.X_inverse @ x0
         blocks = march(replace(step, modal=None), u, start)
         assert close(march(step, u, start), blocks) < 1e-10  # as above
 

@@ -12,8 +12,7 @@ import skfem
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.adapt import build_to_tolerance, judged
-from softgrasp.fem.accuracy.estimate import difference, estimate, next_order
-from softgrasp.fem.accuracy.marking import cell_products, indicators, prolong
+from softgrasp.fem.accuracy.estimate import cell_products, difference, estimate, indicators, next_order, prolong
 from softgrasp.fem.accuracy.small import reduced
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build

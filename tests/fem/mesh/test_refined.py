@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.bisect import bisect, distribute
+from softgrasp.fem.mesh.grading import bisect, distribute
 from softgrasp.fem.mesh.make import make_mesh, structured_mesh
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, spread
 from softgrasp.fem.model.assembly import cells_of_layers
@@ -122,12 +122,14 @@ def test_tags_survive_four_bisections(comm: MPI.Intracomm, dimension: int) -> No
         tags = dolfinx.mesh.meshtags(mesh, d - 1, np.sort(side), np.full(len(side), 7, np.int32))
         n = mesh.topology.index_map(d).size_local
         middle = dolfinx.mesh.compute_midpoints(mesh, d, np.arange(n, dtype=np.int32))
-        whole = Whole(mesh, "box", {"tags": (middle[:, 1] > 1).astype(np.int32)}, {"tags": tags}, {7: (7,)}, {1: (1,)})
+        whole = Whole(
+            mesh, "box", {"cell_tags": (middle[:, 1] > 1).astype(np.int32)}, {"facet_tags": tags}, {7: (7,)}, {1: (1,)}
+        )
         for level in range(4):
             x = whole.points[whole.simplices].mean(axis=1)
             r = np.linalg.norm(x - np.array([0.0, 2.0, 0.0])[:d], axis=1)
             whole = bisect(whole, np.flatnonzero(r < 0.8 / 2**level).astype(np.int32))
-    result = distribute(comm, whole, dimension)
+    result = distribute(comm, whole)
     assert result.facet_tags is not None
     assert result.cell_tags is not None
     result.mesh.topology.create_connectivity(dimension - 1, dimension)
@@ -146,7 +148,7 @@ def test_tags_survive_four_bisections(comm: MPI.Intracomm, dimension: int) -> No
 def test_cells_that_cannot_be_bisected_are_named() -> None:
     """A needle with a short side beside a cell that is split: half of it keeps its length and has half its area."""
     points, cells = np.array([[0.0, 0.0], [1.0, 0.0], [0.99, 3e-12], [0.0, -1.0]]), np.array([[0, 1, 2], [0, 3, 1]])
-    mesh, _ = spread(MPI.COMM_SELF, 2, (points, cells), {})
+    mesh = spread(MPI.COMM_SELF, (points, cells), {}, {"source": "needle.msh"}).mesh
     mesh.topology.create_connectivity(1, 2)
     whole = Whole(mesh, "needle.msh", {}, {})
     beside = int(np.argmin(whole.points[whole.simplices].mean(axis=1)[:, 1]))

@@ -17,8 +17,7 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import whole_copy
 from softgrasp.fem.run.midpoint import TissueMidpoint, midpoint_matrix, state_on
 from softgrasp.fem.run.simulate import RunOptions, simulate
-from softgrasp.fem.solve.cholesky import BACKWARD_ERROR, backward_error, factor_blocks, make_ksp
-from softgrasp.fem.solve.order import dissect
+from softgrasp.fem.solve.cholesky import BACKWARD_ERROR, backward_error, dissect, factor_blocks, make_ksp
 from softgrasp.fem.solve.solvers import FEW_LIMIT, choose_solver, make_solver
 from tests.helpers.models import CUBE, close, gather_matrix, gather_rows, local_rows, make_scene
 

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.errors import Interrupted, MeshError, SceneError
-from softgrasp.fem.mesh.bisect import bisect
+from softgrasp.fem.mesh.grading import bisect
 from softgrasp.fem.mesh.make import structured_mesh
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.refined import marked

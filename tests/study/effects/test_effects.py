@@ -22,21 +22,32 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.effects import measure as effects_measure
-from softgrasp.study.effects.change import Experiments, Names, Shown, compare, judge_together, shown
-from softgrasp.study.effects.judge import difference, judge, prove_off
 from softgrasp.study.effects.measure import (
-    Case,
-    Stepper,
+    MeasuredScene,
+    TimedRun,
     bare_output,
     counting,
+    difference,
     fingerprint,
     holdings,
     objects_of,
+    prove_off,
     read_table,
 )
-from softgrasp.study.effects.result import Change, EffectsStudy, Finding
-from softgrasp.study.effects.run import _beside, run_effects, show, study_effects
+from softgrasp.study.effects.page import show
+from softgrasp.study.effects.result import Change, EffectResult, EffectsStudy
+from softgrasp.study.effects.run import run_effects, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
+from softgrasp.study.effects.verdict import (
+    Experiments,
+    Names,
+    Shown,
+    advised_together,
+    compare,
+    finite_strain_beside,
+    shown,
+    verdict_of,
+)
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
 
@@ -59,14 +70,16 @@ def _short_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(effects_measure, "BURSTS", 1)
 
 
-def found(comm: MPI.Intracomm, *changes: dict[str, Any], **tables: Any) -> tuple[EffectsStudy, dict[str, Finding]]:
+def found(comm: MPI.Intracomm, *changes: dict[str, Any], **tables: Any) -> tuple[EffectsStudy, dict[str, EffectResult]]:
     study = study_effects(make_scene(QUICK, *changes, **tables), comm)
     return study, {f.name: f for f in study.findings}
 
 
-def measured(model: Any) -> Case:
-    stepper = Stepper(model)
-    case = Case(model, {"step": [1.0]}, fingerprint(model, stepper.run), holdings(model, stepper.run), stepper.flops())
+def measured(model: Any) -> MeasuredScene:
+    stepper = TimedRun(model)
+    case = MeasuredScene(
+        model, {"step": [1.0]}, fingerprint(model, stepper.run), holdings(model, stepper.run), stepper.flops()
+    )
     stepper.destroy()
     case.objects, case.objects_in_steps = objects_of(model.system.layout.comm, model.scene)
     return case
@@ -179,11 +192,11 @@ class Trial:
 @pytest.mark.parametrize(("size", "expected"), [(0.5, ("gravity",)), (1e-9, ()), (None, ())])
 def test_finite_strain_is_judged_beside_the_advised_effects_in_one_run(size: float | None, expected: Any) -> None:
     alone, name, runs = (Change(1e-6, 1e-6, 1e-6), None), "finite_strain", Trial(size)
-    found = _beside(runs, name, alone, frozenset({"gravity"}))  # type: ignore[arg-type]
+    found = finite_strain_beside(runs, name, alone, frozenset({"gravity"}))  # type: ignore[arg-type]
     assert runs.asked[1:] == [frozenset({"gravity", name})]
     assert found.partners == expected
     assert found.change.outputs == (1e-6 if size is None else size)
-    assert _beside(runs, name, alone, frozenset({"rotation"})).change is alone[0]  # type: ignore[arg-type]
+    assert finite_strain_beside(runs, name, alone, frozenset({"rotation"})).change is alone[0]  # type: ignore[arg-type]
     assert len(runs.asked) == 2
 
 
@@ -233,16 +246,16 @@ def test_pairs_that_hide_below_the_tolerance_one_by_one() -> None:
     def y(on: Names) -> float:
         return 1 + sum(1e-3 * sizes[name] for name in on)
 
-    off = judge_together(Table(set(), y, None), tried, frozenset(), 1e-3)
+    off = advised_together(Table(set(), y, None), tried, frozenset(), 1e-3)
     assert off.on == ("gravity", "damping")
     assert off.company["gravity"].partners == ("damping",)
     assert off.company["gravity"].together == pytest.approx(1.2e-3, rel=2e-3)  # relative to 1 + 1.2e-3
     assert off.company["reaction"].partners == ()
-    on = judge_together(Table(set(tried), y, None), tried, frozenset(), 1e-3)
+    on = advised_together(Table(set(tried), y, None), tried, frozenset(), 1e-3)
     assert on.on == ("gravity",)  # one of both is enough
     assert on.company["gravity"].either
     assert on.company["damping"].partners == ()
-    assert judge_together(Table(set(), lambda on: y(on) - 1 + 1e3, None), tried, frozenset(), 1e-3).on == ()
+    assert advised_together(Table(set(), lambda on: y(on) - 1 + 1e3, None), tried, frozenset(), 1e-3).on == ()
 
 
 def test_an_effect_may_need_two_partners_and_a_force() -> None:
@@ -255,14 +268,14 @@ def test_an_effect_may_need_two_partners_and_a_force() -> None:
         return still(on) + 0.5 * ({"gravity", "reaction", "rotation"} <= on)
 
     needed = frozenset({"gravity", "reaction"})
-    found = judge_together(Table(set(), still, forced), tried, needed, 1e-2)
+    found = advised_together(Table(set(), still, forced), tried, needed, 1e-2)
     assert found.on == ("gravity", "reaction", "rotation")
     assert found.company["rotation"].partners == ("gravity", "reaction")
     assert found.company["rotation"].forced
     assert found.company["rotation"].together == pytest.approx(0.5 / 1.7)
     assert found.company["rotation"].change.outputs == 0
-    assert not judge_together(Table(set(), still, None), tried, needed, 1e-2).company["rotation"].forced
-    assert judge_together(Table(set(), still, None), tried, needed, 1e-2).on == ("gravity", "reaction")
+    assert not advised_together(Table(set(), still, None), tried, needed, 1e-2).company["rotation"].forced
+    assert advised_together(Table(set(), still, None), tried, needed, 1e-2).on == ("gravity", "reaction")
 
 
 # --- numbers against independent ones
@@ -313,7 +326,7 @@ def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None
 def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:
     """A run taken back to its start gives the state of a fresh one."""
     model = build(make_scene(effects=ALL_ON, motion={"drive": "force"}), comm=comm)
-    stepper = Stepper(model)
+    stepper = TimedRun(model)
     stepper.seconds_per_step(2 * 60 + 17)
     stepper.rewind()
     stepper.run.advance_to(stepper.ts, 60)
@@ -339,12 +352,12 @@ def test_memory_counts_what_each_effect_holds(comm: MPI.Intracomm) -> None:
     assert bare.bytes["G"] == 16 * n_e
 
 
-def test_judge() -> None:
-    assert judge(2e-3, False, False, 1e-3) == "needed"
-    assert judge(2e-3, True, True, 1e-3) == "needed"
-    assert judge(1e-3, False, True, 1e-3) == "wasted"
-    assert judge(0.0, True, True, 1e-3) == "optional"
-    assert judge(0.0, False, False, 1e-3) == "optional"
+def test_verdict() -> None:
+    assert verdict_of(2e-3, False, False, 1e-3) == "needed"
+    assert verdict_of(2e-3, True, True, 1e-3) == "needed"
+    assert verdict_of(1e-3, False, True, 1e-3) == "wasted"
+    assert verdict_of(0.0, True, True, 1e-3) == "optional"
+    assert verdict_of(0.0, False, False, 1e-3) == "optional"
 
 
 # --- off is free, and the proof can fail

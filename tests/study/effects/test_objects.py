@@ -8,8 +8,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.study.effects.judge import difference
-from softgrasp.study.effects.measure import counting
+from softgrasp.study.effects.measure import counting, difference
 from tests.helpers.effects import GRAVITY, NEUTRAL, RAYLEIGH, VISCOUS, WEIGHT
 from tests.helpers.models import LAYERS, make_scene
 

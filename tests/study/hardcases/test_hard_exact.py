@@ -16,8 +16,7 @@ from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.study.hardcases import riccati as hard_riccati
 from softgrasp.study.hardcases.cases import HardCase
-from softgrasp.study.hardcases.exact import exact_gain, worst_part_error
-from softgrasp.study.hardcases.riccati import problem_of
+from softgrasp.study.hardcases.riccati import exact_gain, problem_of, worst_part_error
 
 pytestmark = pytest.mark.serial
 

@@ -17,9 +17,8 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.hardcases import carex as hard_carex
-from softgrasp.study.hardcases import numbers as hard_numbers
-from softgrasp.study.hardcases import ranks as hard_rank
+from softgrasp.study.hardcases import faults
+from softgrasp.study.hardcases import riccati as hard_riccati
 from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, textbook
 from softgrasp.study.hardcases.run import FAMILIES, choose, run_hardcases
 from softgrasp.study.hardcases.textbook import leapfrog, newmark, solve_twice, staggered_hand, textbook_midpoint
@@ -158,17 +157,17 @@ def leaves(annotation: Any) -> int:
 
 def test_no_numeric_key_is_missed() -> None:
     """Each material can also be written by young and poisson, which no annotation knows."""
-    assert len(hard_numbers.numeric_keys()) == leaves(Scene) + 4
+    assert len(faults.numeric_keys()) == leaves(Scene) + 4
 
 
 def test_a_key_that_takes_nan_would_be_seen(tmp_path: Path) -> None:
     """A name is no number: the loader takes it, and the count says so."""
     file = tmp_path / "scene.toml"
-    file.write_text(hard_numbers.SCENE)
-    assert hard_numbers.accepted(file, "name", "'%s'") == ["name = nan", "name = inf", "name = -inf"]
+    file.write_text(faults.SCENE)
+    assert faults.accepted(file, "name", "'%s'") == ["name = nan", "name = inf", "name = -inf"]
 
 
-@pytest.mark.parametrize("example", [pytest.param((n, f, p), id=n) for n, f, p in hard_carex.EXAMPLES])
+@pytest.mark.parametrize("example", [pytest.param((n, f, p), id=n) for n, f, p in hard_riccati.EXAMPLES])
 def test_known_solutions_solve_their_equations(example: tuple[str, Any, tuple[float, ...]]) -> None:
     _, make, parameters = example
     x = make(parameters[0])
@@ -226,18 +225,18 @@ def test_a_loaded_machine_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None
             return None, "", limit  # the bare script hangs
         return (1, "cannot be written", 180.0) if "disk" in command else (0, "", 200.0)
 
-    monkeypatch.setattr(hard_rank, "job", job)
-    for variable in hard_rank.IN_MPI_JOB:
+    monkeypatch.setattr(faults, "job", job)
+    for variable in faults.IN_MPI_JOB:
         monkeypatch.delenv(variable, raising=False)
-    (row,) = hard_rank.rank_rows(True)
+    (row,) = faults.rank_rows(True)
     assert row.ok
     assert row.here.value == pytest.approx(0.9)
     assert row.textbook.value == math.inf
-    assert limits[1:] == [200.0 * hard_rank.PATIENCE, 200.0 * hard_rank.BARE_PATIENCE]
+    assert limits[1:] == [200.0 * faults.PATIENCE, 200.0 * faults.BARE_PATIENCE]
 
 
 def test_a_rank_that_waits_for_ever_fails() -> None:
-    command = ["-c", hard_rank.BARE.format(fault="raise OSError")]
-    outcome = hard_rank.judge(command, 1.0, 0.5, "")  # half a second; the bare script never ends
+    command = ["-c", faults.BARE.format(fault="raise OSError")]
+    outcome = faults.ending(command, 1.0, 0.5, "")  # half a second; the bare script never ends
     assert outcome.value == math.inf
-    assert not number(outcome.value, hard_rank.PATIENCE).ok
+    assert not number(outcome.value, faults.PATIENCE).ok

@@ -1,8 +1,11 @@
-"""Hard case: NaN and infinity in every number that a user can write, found by walking the JSON schema."""
+"""Hard cases of what goes wrong around a run: NaN in every number a user can write, one of two ranks."""
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
+import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -13,39 +16,32 @@ import numpy as np
 from mpi4py import MPI
 from pydantic import TypeAdapter, ValidationError
 
-from softgrasp.fem.errors import SceneError
+from softgrasp.fem.errors import SceneError, SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import to_scipy
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import scene_schema
-from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, make, textbook
+from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, make, short, textbook
 from softgrasp.study.hardcases.textbook import textbook_midpoint
+from softgrasp.study.shell.processes import IN_MPI_JOB, child_environment, find_mpiexec, run_limited
 
 BAD = ("nan", "inf", "-inf")
 SCENE = """
 name = "every key"
+contact = { sides = ["left", "right"], box = [[0.0, 1.5], [1.0, 2.0]] }
+hand = { mass = 20.0 }
+motion = { target = [5.0, 3.0] }
+time = { steps = 5 }
+control = { outputs = [{ kind = "node", point = [0.5, 0.0] }] }
+[effects]
+gravity = { g = [0.0, -9.0] }
+damping = { kind = "rayleigh", beta = 0.01, alpha = 0.4 }
 [tissue]
 size = [1.0, 2.0]
 cells = [2, 4]
 material = { lambda = 50.0, mu = 50.0, rho = 1.0 }
-[tissue.layers.low]
-box = [[0.0, 0.0], [1.0, 0.5]]
-material = { lambda = 90.0, mu = 20.0, rho = 2.5 }
-[contact]
-sides = ["left", "right"]
-box = [[0.0, 1.5], [1.0, 2.0]]
-[hand]
-mass = 20.0
-[effects]
-gravity = { g = [0.0, -9.0] }
-damping = { kind = "rayleigh", beta = 0.01, alpha = 0.4 }
-[motion]
-target = [5.0, 3.0]
-[time]
-steps = 5
-[control]
-outputs = [{ kind = "node", point = [0.5, 0.0] }]
+layers.low = { box = [[0.0, 0.0], [1.0, 0.5]], material = { lambda = 90.0, mu = 20.0, rho = 2.5 } }
 """
 
 
@@ -137,17 +133,14 @@ def _file_rows(folder: Path, scene: Path, at: int) -> Iterator[HardCase]:
     mesh = ["tissue={mesh='body.mesh', material={lambda=1.0, mu=1.0, rho=1.0}}", "contact={sides=['left']}"]
 
     def run(changes: list[str]) -> float:
-        simulate(build(load_scene(scene, changes), comm=MPI.COMM_SELF))
-        return 1.0
+        return simulate(build(load_scene(scene, changes), comm=MPI.COMM_SELF)).energy_drift
 
-    def read() -> float:
-        return float(np.isnan(np.genfromtxt(folder / "hand.csv", delimiter=",")).sum())
-
+    read = textbook(lambda: float(np.isnan(np.genfromtxt(folder / "hand.csv", delimiter=",")).sum()))
     reason = "a file must be refused before the first step"
     lines = (folder / "body.mesh").read_text().split()
     taken = Outcome(float(sum(not np.isfinite(float(x)) for x in lines if x[0].isdigit() or x == "nan")))
-    yield HardCase("NaN in a trajectory file", at, here(lambda: run(motion)), textbook(read), None, reason)
-    yield HardCase("NaN in a mesh file", at + 1, here(lambda: run(mesh)), taken, None, reason)
+    yield HardCase("NaN in a trajectory file", at, here(run, motion), read, None, reason)
+    yield HardCase("NaN in a mesh file", at + 1, here(run, mesh), taken, None, reason)
 
 
 def _force_row(at: int) -> HardCase:
@@ -155,8 +148,7 @@ def _force_row(at: int) -> HardCase:
     model = make("paper_forward", "tissue.cells=[2, 4]", "time.steps=60")
 
     def run() -> float:
-        simulate(model, force=lambda n, t, q, v: np.full(2, np.nan if n == 30 else 1.0))
-        return 1.0
+        return simulate(model, force=lambda n, t, q, v: np.full(2, np.nan if n == 30 else 1.0)).energy_drift
 
     def loop() -> float:
         z = np.full(model.system.layout.n_e, np.nan)
@@ -166,8 +158,85 @@ def _force_row(at: int) -> HardCase:
     return HardCase("feedback that turns NaN at step 30", at, here(run), textbook(loop), None, reason)
 
 
+# --- a rank that fails alone
+
+# what happens, what must be said, and the same in a bare script
+FAULTS: dict[str, tuple[str, str, str]] = {
+    "disk": ("rank 1 cannot write its restart file", "cannot be written", 'raise OSError("disk full")'),
+    "bug": ("a bug raises on rank 1 in the middle of the run", "RuntimeError", 'raise RuntimeError("a bug")'),
+    "nan": ("the state of rank 1 turns NaN", "not finite", 'x = float("nan")'),
+    "killed": ("rank 1 is killed by the system", "", "os.kill(os.getpid(), signal.SIGKILL)"),
+}
+HEALTHY_LIMIT = 600.0  # [s] for the run without a fault
+# Times of a run without a fault on the same machine, measured just before, so that no bound judges the machine. A job
+# that ends early needs less than one; the rest is for other work that comes in between. One that hangs never ends.
+PATIENCE = 20.0
+BARE_PATIENCE = 1.0  # the bare script only starts, which is a part of the run
+BARE = """
+import os, signal
+from mpi4py import MPI
+x = 1.0
+if MPI.COMM_WORLD.rank == 1:
+    {fault}
+print(MPI.COMM_WORLD.allreduce(x))
+"""
+FAULTY = ["-m", "softgrasp.study.hardcases.faulty"]  # then fault and folder
+
+
+def healthy_seconds() -> float:
+    """Seconds of the command on two ranks without a fault: what this machine needs, loaded as it is."""
+    with tempfile.TemporaryDirectory() as folder:
+        status, output, seconds = job([*FAULTY, "", folder], HEALTHY_LIMIT)
+    if status != 0:
+        said = output.strip().splitlines()[-1:] or ["it says nothing"]
+        raise SoftgraspError(f"a run on two ranks without a fault fails, status {status}: {said[0]}")
+    return seconds
+
+
+def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
+    """Run two ranks for at most ``limit`` [s]; status, None when that was not enough, output and seconds."""
+    mpiexec = find_mpiexec()
+    if mpiexec is None:
+        raise SoftgraspError("no mpiexec found; `softgrasp doctor` says what to do")
+    begin = time.perf_counter()
+    status, output = run_limited([mpiexec, "-n", "2", sys.executable, *command], limit, child_environment())
+    return status, output, time.perf_counter() - begin
+
+
+def ending(command: list[str], patience: float, healthy: float, sentence: str) -> Outcome:
+    """Time until both ranks have ended over that of a healthy run, or why that is no good end."""
+    status, output, seconds = job(command, patience * healthy)
+    if status is None:
+        return Outcome(float("inf"), f"hangs, still waiting after {patience:g} times a healthy run")
+    if status == 0:
+        return Outcome(None, "status 0, the fault goes unnoticed")
+    if sentence not in output:
+        return Outcome(None, f"ended without saying '{sentence}'")
+    said = next((line.strip() for line in output.splitlines() if sentence and sentence in line), f"status {status}")
+    return Outcome(seconds / healthy, short(said))
+
+
+def rank_rows(quick: bool) -> Iterator[HardCase]:
+    """Two ranks, one of them fails; all must end, with a status and a sentence."""
+    if any(variable in os.environ for variable in IN_MPI_JOB):
+        return  # an MPI job cannot start another one
+    healthy = healthy_seconds()
+    reason = "all ranks must end sooner than a healthy run, times what other work may slow it down"
+    for i, fault in enumerate(["disk"] if quick else list(FAULTS)):
+        text, sentence, same = FAULTS[fault]
+        with tempfile.TemporaryDirectory() as folder:
+            outcome = ending([*FAULTY, fault, folder], PATIENCE, healthy, sentence)
+        bare = textbook(ending, ["-c", BARE.format(fault=same)], BARE_PATIENCE, healthy, "")
+        yield HardCase(text, i + 1, outcome, bare, PATIENCE, reason)
+
+
 FAMILIES = (
     Family("numbers", "NaN and infinity in every numeric key", "section", "bad values taken", "type check alone",
            "NaN is a float to TOML and to every type check; each key has to ask for a finite number.", number_rows,
            axis="listed"),
+    Family("rank", "A rank that fails alone", "fault", "time until all ranks have ended / time of a healthy run",
+           "bare mpi4py script",
+           "In a bare script the healthy rank waits for ever, or goes on with the NaN of the other; here all ranks "
+           "agree on the failure or are ended.",
+           rank_rows, axis="listed"),
 )  # fmt: skip
