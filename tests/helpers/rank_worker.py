@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
-from softgrasp.fem.fields.full import make_probe
 
+from softgrasp.fem.fields.probe import make_probe
 from softgrasp.fem.model.build import Stopwatch, build
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.scene.file import load_scene, shipped_scenes

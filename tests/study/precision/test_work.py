@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from rich.console import Console
-from softgrasp.fem.fields.full import make_probe
 
 from softgrasp.fem.errors import Interrupted, SceneError
+from softgrasp.fem.fields.probe import make_probe
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene_collective

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from softgrasp.fem.fields.full import make_probe
 
+from softgrasp.fem.fields.probe import make_probe
 from softgrasp.fem.model.build import build
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
