@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import series_of, usable
 from softgrasp.study.precision.forward import to_point
 from softgrasp.study.precision.full import FullRuns
@@ -81,16 +80,11 @@ class Answers:
     """Answers for one study; ``measured`` are the points that were made for them. Its methods are collective."""
 
     def __init__(
-        self,
-        scene: Scene,
-        runs: FullRuns,
-        truth: Truth,
-        forward: Sequence[ForwardPoint],
-        reduced: Sequence[ReducedPoint],
+        self, runs: FullRuns, truth: Truth, forward: Sequence[ForwardPoint], reduced: Sequence[ReducedPoint]
     ) -> None:
-        self.scene, self.runs, self.truth = scene, runs, truth
+        self.scene, self.runs, self.truth = runs.scene, runs, truth
         self.forward, self.reduced = forward, reduced
-        self.predictor = Predictor(scene, forward, runs.dimension)
+        self.predictor = Predictor(runs.scene, forward, runs.dimension)
         self.measured: list[RunPoint] = []
 
     def meets(self, point: RunPoint, tolerance: float) -> bool:
@@ -146,10 +140,10 @@ class Answers:
         room = tolerance - self.truth.error - full.error
         fit = [p for p in usable(self.reduced) if p.error_outputs_full <= SAFETY * room]
         choices: list[Choice] = []
-        reduced, run = ReducedRuns(self.scene, setting, self.runs, self.truth), self.runs.run(setting)
+        reduced = ReducedRuns(setting, self.runs, self.truth)
         for own in _two_bases(fit, "seconds"):
             sizes = [n for n in sorted(self.scene.reduction.N) if n >= own.N][: MORE + 1]
-            points = reduced.points(own.series, sizes, run)
+            points = reduced.points(own.series, sizes)
             self.measured += points
             predicted = full.error + own.error_outputs_full, own.seconds
             choices += [self.choice(p, predicted) for p in points if self.meets(p, tolerance)]
@@ -163,8 +157,8 @@ class Answers:
         fit = [p for p in usable(self.reduced) if p.p99 <= budget]
         if full is None or not fit or full.error >= min(p.error for p in fit):
             return []
-        reduced, run = ReducedRuns(self.scene, full.setting, self.runs, self.truth), self.runs.run(full.setting)
-        points = [q for p in _two_bases(fit, "error_outputs_full") for q in reduced.points(p.series, [p.N], run)]
+        reduced = ReducedRuns(full.setting, self.runs, self.truth)
+        points = [q for p in _two_bases(fit, "error_outputs_full") for q in reduced.points(p.series, [p.N])]
         self.measured += points
         return points
 

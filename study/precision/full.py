@@ -288,19 +288,10 @@ class FullRuns:
         layout = model.system.layout
         factor = statistics.median(r.factor for r in runs)
         per_step = statistics.median(float(s.mean()) for s in later)
+        p50, p99, most = (float(np.quantile(steps, q)) for q in (0.5, 0.99, 1.0))
         return TimedRun(
-            **built,
-            n_e=layout.n_e,
-            states=layout.states,
-            dimension=layout.dimension,
-            steps=setting.steps,
-            dt=self.scene.time_end / setting.steps,
-            factor=factor,
-            per_step=per_step,
-            p50=float(np.quantile(steps, 0.5)),
-            p99=float(np.quantile(steps, 0.99)),
-            max=float(steps.max()),
+            **built, n_e=layout.n_e, states=layout.states, dimension=layout.dimension, steps=setting.steps,
+            dt=self.scene.time_end / setting.steps, factor=factor, per_step=per_step, p50=p50, p99=p99, max=most,
             seconds=built["mesh"] + built["assembly"] + factor + setting.steps * per_step,
-            times=first.times,
-            values=np.hstack([first.own, first.y]),
-        )
+            times=first.times, values=np.hstack([first.own, first.y]),
+        )  # fmt: skip

@@ -26,7 +26,7 @@ from softgrasp.study.precision.full import FullRuns, find_places
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
 from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
 from softgrasp.study.precision.predict import Predictor, error_budget
-from softgrasp.study.precision.reduced import ask_bases, ask_reduced
+from softgrasp.study.precision.reduced import ReducedRuns, ask_bases, ask_reduced
 from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of
 from softgrasp.study.precision.settings import own_setting, variant
@@ -107,9 +107,9 @@ def study_scene(
     with interruptible(False) as guard.stop:
         guard.count = count_points(scene, control, [name for name in names if not (refused and name in CONTROL)])
         if set(names) - set(CONTROL):
-            truth = make_truth(scene, runs, request.tolerance)
+            truth = make_truth(runs, request.tolerance)
             questions |= forward_questions(model, runs, truth, names)
-            answers, measured = answer(scene, runs, truth, questions, request)
+            answers, measured = answer(runs, truth, questions, request)
         if not refused:
             questions |= control_questions(control, names)
     budgets = error_budgets(scene, runs.dimension, questions, answers, measured) if "forward" in questions else ()
@@ -127,31 +127,31 @@ def study_scene(
 
 def forward_questions(model: Model, runs: FullRuns, truth: Truth, names: Sequence[str]) -> dict[str, Question]:
     """Full model, reduced models, and bases. Collective."""
-    questions, scene = {}, runs.scene
+    questions = {}
     if "forward" in names:
         questions["forward"] = ask_forward(runs, truth, scene_ends(runs.cache.comm, model.space.mesh, model.scene))
     asks = {"reduced": ask_reduced, "bases": ask_bases}
     if not set(names) & set(asks):
         return questions
-    full = runs.run(own_setting(scene))
+    reduced = ReducedRuns(own_setting(runs.scene), runs, truth)
     reason = "the snapshots of the scene's own run would not fit in memory"
-    fits = 2.0 * full.n_e * full.steps <= FULL_SNAPSHOTS
+    fits = 2.0 * reduced.timed.n_e * reduced.timed.steps <= FULL_SNAPSHOTS
     return questions | {
-        name: ask(scene, runs, truth, full) if fits else Question(reference=full, skipped=reason)
+        name: ask(reduced) if fits else Question(reference=reduced.timed, skipped=reason)
         for name, ask in asks.items()
         if name in names
     }
 
 
 def answer(
-    scene: Scene, runs: FullRuns, truth: Truth, questions: dict[str, Question], request: Request
+    runs: FullRuns, truth: Truth, questions: dict[str, Question], request: Request
 ) -> tuple[list[Answer], list[RunPoint]]:
     """Answers to the tolerance and the budget, and the points that were measured for them. Collective."""
     if request.tolerance is None and request.budget is None:
         return [], []
     points = [p for name in ("forward", "reduced") for p in questions[name].points]
     forward = [p for p in points if isinstance(p, ForwardPoint)]
-    answers = Answers(scene, runs, truth, forward, [p for p in points if isinstance(p, ReducedPoint)])
+    answers = Answers(runs, truth, forward, [p for p in points if isinstance(p, ReducedPoint)])
     by_tolerance = [] if request.tolerance is None else [answers.tolerance(request.tolerance)]
     by_budget = [] if request.budget is None else [answers.budget(request.budget)]
     return by_tolerance + by_budget, answers.measured

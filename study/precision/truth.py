@@ -38,14 +38,15 @@ ROUGH = 0.05  # error of a reference that is worth a warning
 STILL = 1e-12  # of the displacement: an output that moves less against the hand moves with it
 
 
-def make_truth(scene: Scene, runs: FullRuns, tolerance: float | None = None) -> Truth:
+def make_truth(runs: FullRuns, tolerance: float | None = None) -> Truth:
     """Run graded meshes until the finest is good enough or too large for the next, then more steps. Collective.
 
     Raises:
         SolverError: a run failed.
         SceneError: the outputs move with the hand, so that there is no deformation to measure.
     """
-    d, few, base = runs.dimension, few_steps(scene), scene.time.steps
+    scene, d = runs.scene, runs.dimension
+    few, base = few_steps(scene), scene.time.steps
     aim = FINEST[d] if tolerance is None else min(FINEST[d], ROOM * tolerance)
     meshes: dict[Setting, TimedRun] = {}
     for goal in LADDER:
