@@ -25,16 +25,10 @@ FORMAT = 3  # of the cached files
 
 
 class Cache:
-    """Frozen dataclasses by hash, each file one list of a class.
+    """Frozen dataclasses by hash in a folder, each file one list of a class.
 
     The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
-    of ranks and the version. Collective.
-
-    Args:
-        folder: where the files are.
-        comm: ranks.
-        scene: the study's scene.
-        guard: asked before a point; None for a new one.
+    of ranks and the version. The guard is asked before a point. Collective.
     """
 
     def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene, guard: Guard | None = None) -> None:

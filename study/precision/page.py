@@ -183,9 +183,8 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
     ]
     truth = study.truth
     if truth is not None:
-        parts = (("space", truth.space), ("time", truth.time), ("mixed", truth.mixed))
         rows = [(f"error estimate, {name}", f"{a:.1e} of the deformation, {b:.1e} of the displacement")
-                for name, (a, b) in parts]  # fmt: skip
+                for name, (a, b) in truth.parts.items()]  # fmt: skip
         rows.append(("runs behind it", "; ".join(s.label for s in truth.settings)))
         sections.append(Section("Reference", text=truth.note, rows=rows))
     for budget in study.error_budgets:

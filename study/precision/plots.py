@@ -63,6 +63,13 @@ class Between(Formatter):
         return f"{x:g}" if powers <= 1 and digit in (2, 5) else ""
 
 
+def _one_and_two(ratio: float) -> list[Any]:
+    """A figure with one panel, by this wider, beside two."""
+    figure = plt.figure(figsize=(WIDTH, 4.6), layout="constrained")
+    grid = figure.add_gridspec(2, 2, width_ratios=(ratio, 1))
+    return [figure, *(figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))]
+
+
 def _axes_log(ax: Any, x: str, y: str) -> None:
     """Logarithmic axes with labels and a pale grid."""
     ax.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
@@ -108,17 +115,10 @@ def _mark(axes: Sequence[Any], paper: bool, seconds: float, label: str, **style:
 def figure_forward(
     points: Sequence[ForwardPoint], slopes: Sequence[Slope], truth_error: float, paper: bool, out_png: Path
 ) -> tuple[Path, ...]:
-    """Error of the deformation against the time of a whole run; beside it orders in space and time; PNG and PDF.
-
-    Args:
-        slopes: fitted, for the labels.
-        truth_error: below it nothing can be told.
-    """
+    """Error of the deformation against the time of a whole run; beside it orders in space and time; PNG and PDF."""
     good = [p for p in usable(points) if p.series != "solver"]
     with paper_style():
-        figure = plt.figure(figsize=(WIDTH, 4.6), layout="constrained")
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
-        ax, space, time = (figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))
+        figure, ax, space, time = _one_and_two(1.7)
         for line in series_of(sorted(good, key=lambda p: p.steps)).values():
             _curve(ax, line, **_look(line[-1]), **THIN)
         for last in (line[-1] for line in on_meshes(good).values() if line[-1].refine != "off"):
@@ -170,9 +170,7 @@ def _orders(space: Any, time: Any, points: Sequence[ForwardPoint], slopes: Seque
 def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out_png: Path) -> tuple[Path, ...]:
     """Error of the deformation against the online time, and against that from nothing; PNG and PDF.
 
-    Args:
-        full: seconds of the full run on the same mesh and steps.
-        paper: draw the paper's times; its error is one of the state.
+    Beside them the seconds of the full run, and times of the paper, whose error is one of the state.
     """
     names = list(series_of(points))
     others = [n for n in names if n not in LOOKS]
@@ -239,11 +237,7 @@ def figure_budget(points: Sequence[WorkPoint], budget: float, out_png: Path) -> 
 
 
 def figure_riccati(points: Sequence[RiccatiPoint], error: float | None, paper: bool, out_png: Path) -> tuple[Path, ...]:
-    """Error of the gain and true residual against time, one line a method along its tolerances; PNG and PDF.
-
-    Args:
-        error: estimated error of the reference.
-    """
+    """Error of the gain and true residual against time, one line a method along its tolerances; PNG and PDF."""
     lines = series_of(usable(points))
     look: dict[str, dict[str, Any]] = {
         name: {"color": colour, "marker": marker, "ms": 3.4, "lw": 0.7}
@@ -268,8 +262,7 @@ def figure_riccati(points: Sequence[RiccatiPoint], error: float | None, paper: b
 def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, out_png: Path) -> tuple[Path, ...]:
     """Error of the gain and excess cost, each against N and against the time of the equation; PNG and PDF.
 
-    Args:
-        points: of the question; gains that are not ok are crossed out.
+    Gains that are not ok are crossed out.
     """
     good = [replace(p, error=max(p.error, LOW), cost_excess=max(p.cost_excess, LOW)) for p in usable(points)]
     bad = [p for p in points if not p.ok and not p.reason]
@@ -314,17 +307,11 @@ def _basis_lines(row: Any, line: Sequence[ReducedRiccatiPoint], y: str, style: d
 
 
 def figure_loop(points: Sequence[LoopPoint], error: float | None, out_png: Path) -> tuple[Path, ...]:
-    """Error of the trajectory against time, error in time against the steps, time of a step; PNG and PDF.
-
-    Args:
-        error: estimated error of the reference.
-    """
+    """Error of the trajectory against time, error in time against the steps, time of a step; PNG and PDF."""
     lines = series_of(points)
     gains = list(dict.fromkeys((p.basis, p.N) for p in points))
     with paper_style():
-        figure = plt.figure(figsize=(WIDTH, 4.6), layout="constrained")
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
-        ax, order, step = (figure.add_subplot(grid[k]) for k in ((slice(None), 0), (0, 1), (1, 1)))
+        figure, ax, order, step = _one_and_two(1.5)
         handles = []
         for k, (name, every) in enumerate(lines.items()):
             first, line = every[0], usable(every)

@@ -131,11 +131,7 @@ def error_budget(
 ) -> ErrorBudget:
     """Parts of a setting of the full model that was run, and of the reduced model and the feedback that go with it.
 
-    Args:
-        predictor: of errors and times.
-        setting: of the full model.
-        points: of all questions.
-        skipped: questions without points, with the reason.
+    The points are those of all questions; skipped are questions without points, with the reason.
     """
     forward = [p for p in points if isinstance(p, ForwardPoint)]
     reduced = [p for p in points if isinstance(p, ReducedPoint)]

@@ -54,15 +54,11 @@ class TimedModel(Point):
 
 
 class ReducedRuns:
-    """Reduced models of one mesh and step; the full run is made again when the cache lacks a point. Collective.
-
-    Attributes:
-        timed: the full run behind the models, without its snapshots.
-    """
+    """Reduced models of one mesh and step; the full run is made again when the cache lacks a point. Collective."""
 
     def __init__(self, setting: Setting, runs: FullRuns, truth: Truth) -> None:
         self.scene, self.setting, self.runs, self.truth = runs.scene, setting, runs, truth
-        self.timed = runs.run(setting)
+        self.timed = runs.run(setting)  # the full run behind the models, without its snapshots
         self._full: tuple[FullRun, Probe, Model] | None = None
 
     def full(self) -> tuple[FullRun, Probe, Model]:
