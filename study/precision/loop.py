@@ -24,7 +24,7 @@ from softgrasp.lqr.design.orders import fast_order, orders
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
-from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory, SmallPlant, galerkin
+from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import BasisFamily, make_family
@@ -188,17 +188,12 @@ class LoopSweep:
             loop.destroy()
         return first, means
 
-    def _reduced_plant(self, what: Feedback) -> tuple[SmallPlant, Array]:
-        """The reduced plant of an a-priori gain, and the gain on it."""
-        problem, n_s, n = self.runs.problem, self.layout.n_s, self.layout.n_local
-        V = self.family(what.basis).at(what.N).U.tall[n:, -((what.N - 2 * n_s) // 2) :]
-        plant, shapes = galerkin(problem, V)
-        return plant, shapes.reduce_gain(problem, self.gain(what))
-
     def _reduced(self, what: LoopSetting, steps: int) -> tuple[ReducedLoopTrajectory, list[float]]:
-        """Runs of the reduced plant on rank 0."""
-        plant, K = self._reduced_plant(what.gain)
-        design, problem, n_s = self.runs.design, self.runs.problem, self.layout.n_s
+        """Runs of the reduced plant of an a-priori gain on rank 0."""
+        design, problem, n_s, n = self.runs.design, self.runs.problem, self.layout.n_s, self.layout.n_local
+        V = self.family(what.gain.basis).at(what.gain.N).U.tall[n:, -((what.gain.N - 2 * n_s) // 2) :]
+        plant, shapes = galerkin(problem, V)
+        K = shapes.reduce_gain(problem, self.gain(what.gain))
         start = plant.rest_at(np.zeros(n_s))[0]
         if self.scene.time.start != "equilibrium":
             start[2 * n_s :] = 0.0
@@ -252,16 +247,11 @@ class LoopSweep:
         )  # fmt: skip
 
 
-def largest(values: Array, columns: Columns) -> float:
-    """Largest distance of any output at any instant [m]; values (m, p)."""
-    return float(farthest(values, np.zeros(values.shape[1]), columns).max())
-
-
 def errors_of(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
-    """Largest error over the largest value, of each half of the columns (m, 2 p)."""
-    p = true.shape[1] // 2
-    halves = (slice(0, p), slice(p, 2 * p))
-    return tuple(largest(values[:, h] - true[:, h], columns) / largest(true[:, h], columns) for h in halves)  # type: ignore[return-value]
+    """Largest error of any output at any instant over the largest value, of each half of the columns (m, 2 p)."""
+    still = np.zeros(true.shape[1] // 2)
+    gaps, sizes = ([farthest(half, still, columns).max() for half in np.hsplit(v, 2)] for v in (values - true, true))
+    return float(gaps[0] / sizes[0]), float(gaps[1] / sizes[1])
 
 
 def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -> Array:
