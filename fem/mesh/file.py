@@ -12,11 +12,11 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, agree
 from softgrasp.fem.mesh.cells import (
+    DIMENSIONS,
     check_interfaces,
     check_straight,
     corners,
     cut_cells,
-    dimension_of,
     shape_of,
     simplices,
 )
@@ -117,7 +117,7 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     kinds = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]
     filled = [shape for shape, block in zip(shapes, raw.cells, strict=True) if shape and len(block.data)]
-    dimension = max((dimension_of(shape) for shape in filled), default=0)
+    dimension = max((DIMENSIONS[shape] for shape in filled), default=0)
     if None in shapes or dimension < 2:
         raise MeshError(
             f"{path} holds cells of type {', '.join(kinds) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
@@ -193,7 +193,7 @@ def _blocks(raw: meshio.Mesh, dimension: int) -> list[tuple[int, str, Integers]]
     return [
         (i, shape, np.asarray(block.data, dtype=np.int64))
         for i, block in enumerate(raw.cells)
-        if len(block.data) and (shape := shape_of(block.type)) and dimension_of(shape) == dimension
+        if len(block.data) and (shape := shape_of(block.type)) and DIMENSIONS[shape] == dimension
     ]
 
 
