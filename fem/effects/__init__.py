@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from softgrasp.fem.effects.catalog import Damping, FiniteStrain, Gravity, Layers, Reaction, Rotation
+from softgrasp.fem.effects import catalog
 from softgrasp.fem.effects.gate import Effect, Gate, Problem
 
 __all__ = ["EFFECTS", "Effect", "Gate", "Problem"]
 
-EFFECTS: dict[str, Effect] = {
-    effect.name: effect for effect in (Gravity(), Damping(), Reaction(), Rotation(), Layers(), FiniteStrain())
-}
+EFFECTS: dict[str, Effect] = {effect.name: effect for effect in catalog.ALL}
 """All effects by name, in the order in which they are reported."""

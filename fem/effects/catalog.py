@@ -8,8 +8,7 @@ from softgrasp.fem.effects.gate import Effect, Gate, Problem, force_drives
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.system import Damping as DampingOperator
-from softgrasp.fem.system import LayerBlocks, LayerMaterial, layered_viscosity
+from softgrasp.fem.system import Damping, LayerBlocks, LayerMaterial, layered_viscosity
 
 EARTH = 9.81  # [m/s2], assumed when the scene leaves gravity off
 # Error of linear elasticity over rms|grad z|, measured: on the paper's scene 0.29 to 0.37 over seven materials and six
@@ -27,13 +26,13 @@ def acceleration(scene: Scene, n_s: int) -> Array | None:
     return np.pad(np.asarray(gravity.g, dtype=float), (0, n_s - len(gravity.g)))
 
 
-def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> DampingOperator:
+def operator(scene: Scene, layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...]) -> Damping:
     """D = alpha M + beta K, or with a matrix when the layers differ in beta. Collective."""
     law = scene.effects.damping
     if law is None:
-        return DampingOperator()
+        return Damping()
     matrix = layered_viscosity(layers, materials)
-    return DampingOperator(law.alpha, 0.0 if matrix is not None else materials[0].beta, law.drag == "space", matrix)
+    return Damping(law.alpha, 0.0 if matrix is not None else materials[0].beta, law.drag == "space", matrix)
 
 
 def ratios(alpha: float, beta: float, omega: Array) -> Array:
@@ -71,7 +70,7 @@ def linear_error(rms: float, dimension: int) -> float:
     return SLOPE[dimension] * rms
 
 
-class Gravity(Effect):
+class GravityEffect(Effect):
     """Body force rho g: f_e = G g, for K_ee T + K_es = 0 makes falling the same as accelerating the hand."""
 
     name = "gravity"
@@ -94,7 +93,7 @@ class Gravity(Effect):
         return Gate(number, "|grad z| of its sag", self.threshold, number > self.threshold, sentence, proviso)
 
 
-class Damping(Effect):
+class DampingEffect(Effect):
     """D = alpha M + beta K on the motion against the hand, or with drag = "space" against space."""
 
     name = "damping"
@@ -137,7 +136,7 @@ class Damping(Effect):
         return Gate(zeta, symbol, threshold, zeta > threshold, sentence)
 
 
-class Reaction(Effect):
+class ReactionEffect(Effect):
     """The inertia of the tissue in the hand's equation; makes M and K symmetric."""
 
     name = "reaction"
@@ -170,7 +169,7 @@ class Reaction(Effect):
         return Gate(number, "tissue mass / hand mass", self.threshold, driven and large, sentence, proviso, condition)
 
 
-class Rotation(Effect):
+class RotationEffect(Effect):
     """d (d - 1) / 2 linearised rotations in q_s."""
 
     name = "rotation"
@@ -197,7 +196,7 @@ class Rotation(Effect):
             number = float(np.max(np.asarray(problem.tissue_inertia) / hand))
         if not self.active(scene):
             reaction = scene.effects.reaction
-            pulled = reaction or problem.tissue_mass / scene.hand.mass > Reaction.threshold
+            pulled = reaction or problem.tissue_mass / scene.hand.mass > ReactionEffect.threshold
             matters = pulled and force_drives(scene) and number > self.threshold
             sentence = (
                 "Off, though the tissue pulls on a hand that a force drives and would turn it."
@@ -229,7 +228,7 @@ class Rotation(Effect):
         return Gate(number, symbol, self.threshold, turned or torque, sentence, condition=condition if contrary else "")
 
 
-class Layers(Effect):
+class LayersEffect(Effect):
     """K = sum_k mu_k K_mu,k + lambda_k K_lambda,k and M = sum_k rho_k M_1,k over the layers k."""
 
     name = "layers"
@@ -270,7 +269,7 @@ class Layers(Effect):
         return Gate(number, symbol, self.threshold, matters, sentence, condition=condition)
 
 
-class FiniteStrain(Effect):
+class FiniteStrainEffect(Effect):
     """f(z) = dW/dz of a law W(F), F = I + grad z, instead of K_ee z."""
 
     name = "finite_strain"
@@ -298,3 +297,9 @@ class FiniteStrain(Effect):
             sentence = f"Off; linear elasticity is off by about {number:.2g} of the deformation"
             sentence += ": set effects.finite_strain.law = 'neo-hooke'." if number > self.threshold else "."
         return Gate(number, symbol, self.threshold, number > self.threshold, sentence)
+
+
+ALL: tuple[Effect, ...] = (
+    GravityEffect(), DampingEffect(), ReactionEffect(), RotationEffect(), LayersEffect(), FiniteStrainEffect(),
+)  # fmt: skip
+"""In the order in which they are reported."""

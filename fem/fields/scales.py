@@ -78,10 +78,7 @@ def slowest(system: BlockSystem, Z: Array) -> float:
 def measure_sag(model: Model, a: Array) -> tuple[Sag, Gradient]:
     """K_ee z = G g under the weight, and the gradient of z under G (g - a), with one factor. Collective.
 
-    Args:
-        a: largest acceleration of the hand, (n_s,).
-
-    Raises SolverError: the solve failed or missed its tolerance.
+    ``a``: largest acceleration of the hand, (n_s,). Raises SolverError: the solve failed or missed its tolerance.
     """
     scene, system = model.scene, model.system
     layout, d = system.layout, system.layout.dimension

@@ -46,8 +46,7 @@ class CellStress:
     def __call__(self, u: Array) -> tuple[Array, Array, Array]:
         """Strain [1] (m, 6), stress [Pa] (m, 6), both as xx, yy, zz, xy, yz, xz, and von Mises stress [Pa] (m,).
 
-        Args:
-            u: displacement of the local nodes, ghosts included [m], shape (n, d).
+        ``u``: displacement of the local nodes, ghosts included [m], shape (n, d).
         """
         d = u.shape[1]
         H = np.zeros((len(self.dofs), 3, 3))

@@ -10,13 +10,9 @@ import re
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from softgrasp.fem.errors import MeshError
-from softgrasp.fem.mesh.check import FLAT, counted, longest_edges, place_text, signed_volumes
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
+from softgrasp.fem.mesh.check import FLAT, Floats, Integers, counted, longest_edges, place_text, signed_volumes
 
 STRAIGHT = 1e-5  # of the longest edge: above the 6 digits of text files, far below the error of the elements
 
@@ -187,10 +183,8 @@ def cut_cells(points: Floats, cells: Integers, shape: str, name: str) -> tuple[I
 def check_interfaces(points: Floats, blocks: list[tuple[Integers, str]], name: str) -> None:
     """Refuse a mesh in which two triangles meet a quadrilateral face that `simplices` cuts by its other diagonal.
 
-    Args:
-        blocks: corner nodes and shape of the cells of each type.
-
-    Raises MeshError: there are such faces; the body would be open there.
+    ``blocks``: corner nodes and shape of the cells of each type. Raises MeshError: there are such faces; the body would
+    be open there.
     """
     faces = [cells[:, face] for cells, shape in blocks if DIMENSIONS[shape] == 3 for face in _FACES[shape]]
     quads = [face for face in faces if face.shape[1] == 4]

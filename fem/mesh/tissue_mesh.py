@@ -9,17 +9,14 @@ import basix.ufl
 import dolfinx.io
 import dolfinx.mesh
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
-from softgrasp.fem.mesh.check import Parts
+from softgrasp.fem.mesh.check import Floats, Integers, Ints, Parts
 
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 Sets = dict[int | str, tuple[int, ...]]  # marks of each tag number and named set of a file
-Marks = dict[str, tuple[int, Integers, npt.NDArray[np.int32]]]  # dimension of entities, their nodes, one value each
+Marks = dict[str, tuple[int, Integers, Ints]]  # dimension of entities, their nodes, one value each
 
 
 @dataclass(frozen=True)
@@ -28,7 +25,7 @@ class Whole:
 
     mesh: dolfinx.mesh.Mesh  # on MPI.COMM_SELF
     source: str  # its name, for messages
-    cells: dict[str, npt.NDArray[np.int32]]  # one mark a cell by field of TissueMesh: cell_tags, layers
+    cells: dict[str, Ints]  # one mark a cell by field of TissueMesh: cell_tags, layers
     facets: dict[str, dolfinx.mesh.MeshTags]  # marks likewise: facet_tags, contact
     facet_sets: Sets = field(default_factory=dict)  # see TissueMesh
     cell_sets: Sets = field(default_factory=dict)
@@ -39,16 +36,16 @@ class Whole:
         return int(self.mesh.topology.dim)
 
     @property
-    def points(self) -> npt.NDArray[np.float64]:
+    def points(self) -> Floats:
         """Coordinates, (n_points, d) [m]."""
         return np.asarray(self.mesh.geometry.x[:, : self.dimension])
 
     @property
-    def simplices(self) -> npt.NDArray[np.int64]:
+    def simplices(self) -> Integers:
         """Nodes of the cells, (n_cells, d + 1)."""
         return np.asarray(cell_nodes(self.mesh), dtype=np.int64)
 
-    def facet_nodes(self, name: str) -> npt.NDArray[np.int64]:
+    def facet_nodes(self, name: str) -> Integers:
         """Nodes of the marked facets, (n, d)."""
         indices = self.facets[name].indices
         self.mesh.topology.create_connectivity(self.dimension - 1, self.dimension)
@@ -89,7 +86,7 @@ class TissueMesh:
         return np.asarray(self.mesh.geometry.x[cell_nodes(self.mesh)[: self.owned], : self.dimension])
 
 
-def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
+def cell_nodes(mesh: dolfinx.mesh.Mesh) -> Ints:
     """Local node numbers of the cells, shape (n_cells, d + 1)."""
     geometry = mesh.geometry
     # DOLFINx 0.10 has no list of dofmaps, 0.11 warns of the single one

@@ -48,8 +48,7 @@ class RunOptions:
 class Run(Stepped):
     """One run in progress: the TS context and what it carries.
 
-    Args:
-        force: feedback force on the hand; None takes the scene's motion.
+    ``force``: feedback force on the hand; None takes the scene's motion.
 
     Attributes:
         name: of this run and those that it resumes, in no other run; its files carry it.
