@@ -134,14 +134,6 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
-def _scene_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
-    if scene.tissue.refine is None:
-        return make_mesh(comm, scene)
-    from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it
-
-    return refined_mesh(comm, scene)
-
-
 def build(
     scene: Scene | str | Path,
     overrides: Sequence[str] = (),
@@ -176,7 +168,11 @@ def build(
     if boxed:
         check_memory(scene, comm, run, len(boxed), simplices(boxed))
     with watch.stage("mesh"):
-        mesh = mesh or _scene_mesh(comm, scene)
+        if mesh is None and scene.tissue.refine is not None:
+            from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it
+
+            mesh = refined_mesh(comm, scene)
+        mesh = mesh or make_mesh(comm, scene)
     if not boxed:
         d = mesh.dimension
         check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)
