@@ -28,9 +28,8 @@ from softgrasp.fem.mesh.check import (
     signed_volumes,
     sort_facets,
 )
-from softgrasp.fem.mesh.make import structured_mesh
 from softgrasp.fem.mesh.singular import Ends
-from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread
+from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread, structured_mesh
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene

@@ -14,8 +14,7 @@ from mpi4py import MPI
 from softgrasp.fem.effects.catalog import acceleration, hand_mass
 from softgrasp.fem.effects.catalog import operator as damping_operator
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.mesh.make import make_mesh
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, make_mesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
