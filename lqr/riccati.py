@@ -1,36 +1,38 @@
-"""One entry to the large Riccati equation: the method by size and wish, with the reason."""
+"""One entry to the large Riccati equation, the method by size and wish with the reason, and modal feedback by name."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, get_args
+
+import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.lqr.dense.modal import DenseRiccati
+from softgrasp.fem.petsc import on_root
+from softgrasp.lqr.dense.care import care_of
+from softgrasp.lqr.dense.modal import DenseRiccati, closed_loop_rates, factor_psd, lowest_plant
 from softgrasp.lqr.diagnosis import diagnose
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
-from softgrasp.lqr.lowrank.solver import Progress
+from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.lowrank.solver import LowRankSolver, Progress
+from softgrasp.lqr.plant.checks import ControlError, check_weights
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.reduced.bases import modal_basis
+from softgrasp.lqr.reduced.riccati import full_gain, project_plant
 
 Method = Literal["auto", "dense", "newton_adi", "radi", "galerkin"]
-METHODS: tuple[Method, ...] = ("auto", "dense", "newton_adi", "radi", "galerkin")
+METHODS: tuple[Method, ...] = get_args(Method)
 # Exact to rounding, without a start or shifts that could fail, and still as fast as low rank within some tenths of a
 # second; the faster one of the two changes between 92 and 160 states (softgrasp.study.bench.switches).
 DENSE_STATES = 200
 # A complex factorisation a shift: beyond these sizes 70 to 100 of them take more than a quarter of an hour on two ranks
 # (softgrasp.study.bench.switches --large times one), while Galerkin needs about 5.
 LOW_RANK_LIMIT = {1: 800_000, 2: 800_000, 3: 40_000}  # 1: systems without a mesh
-
-
-class Solver(Protocol):
-    """What every method offers."""
-
-    def solve(self, problem: RiccatiProblem) -> RiccatiSolution:
-        """Solve. Collective."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def choose(problem: RiccatiProblem, method: Method = "auto") -> SolverChoice:
 
 def make_solver(
     method: Method, tol: float | None = None, progress: Progress | None = None, checkpoint: Path | None = None
-) -> Solver:
+) -> DenseRiccati | LowRankSolver[Any]:
     """The solver object.
 
     Args:
@@ -136,3 +138,56 @@ def solve(
         choice = SolverChoice("radi", f"newton_adi failed ({error})")
         solution = make_solver("radi", tol, progress).solve(problem)
     return replace(solution, reason=choice.reason)
+
+
+def modal_lqr(problem: RiccatiProblem, modes: int = 10, candidates: int = 40) -> RiccatiSolution:
+    """Riccati equation of the hand and the lowest modes that feedback can stabilise, expanded by the filter Phi'M_ee.
+
+    One-way coupling and a modal filter leave the other modes where they are: with damping they decay by themselves,
+    without damping they stay on the imaginary axis, driven but not destabilised. With two-way coupling the hand feels
+    them, so that the whole loop must be checked with :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`. Collective.
+
+    Args:
+        modes: number of modes in the model.
+        candidates: lowest modes they are taken from; modes that inputs do not reach or outputs do not see are skipped.
+
+    Returns:
+        A solution of rank up to 2 n_s + 2 modes. ``residual`` is the true one of the whole plant: it is large when
+        modes that matter are left out.
+
+    Raises:
+        ControlError: fewer than ``modes`` of the candidates can be stabilised, or the small equation has no solution.
+    """
+    system, comm = problem.system, problem.layout.comm
+    begin = time.perf_counter()
+    check_weights(problem.Q, problem.R, problem.C_s.shape[0], problem.inputs)
+    if modes < 0:
+        raise ControlError(f"modal_lqr: modes = {modes} must be 0 or more")
+    k = min(max(candidates, modes, 1), system.layout.n_e)
+    plant = lowest_plant(problem, k)
+    good = np.flatnonzero(closed_loop_rates(problem, plant).lost == 0)
+    if len(good) < modes:
+        raise ControlError(
+            f"modal_lqr: only {len(good)} of the lowest {k} modes can be stabilised, {modes} are asked for; ask for at "
+            f"most {len(good)}"
+        )
+    pick = good[:modes]
+    basis = modal_basis(problem, "modal_lqr", plant, pick)
+    m = project_plant(problem, basis)
+    middle = time.perf_counter()
+    P_N = on_root(comm, lambda: care_of(m).X)
+    Z = basis.W.times(on_root(comm, lambda: factor_psd(P_N)))
+    gain = full_gain(problem, basis, P_N)
+    left = system.layout.n_e - modes
+    word = (
+        "decay by their own damping" if system.damping.active else "are not stabilised and stay on the imaginary axis"
+    )
+    return RiccatiSolution(
+        Z,
+        gain,
+        residual(problem, Z),
+        "modal_lqr",
+        f"hand and {modes} modes; the other {left} modes {word}",
+        counts={"newton_steps": 0, "adi_steps": 0, "solves": 0},
+        seconds={"modes": middle - begin, "small": time.perf_counter() - middle},
+    )

@@ -68,8 +68,7 @@ def certified_controller(design: Design, basis: BasisGains | None, order: int | 
         basis: the a-priori gains; None where there are none.
         order: take this one; None takes the least cost up to :func:`softgrasp.lqr.design.orders.fast_order`.
 
-    Raises:
-        NoController: no gain is certified.
+    Raises NoController: no gain is certified.
     """
     problem, layout, scene = design.problem, design.problem.layout, design.model.scene
     method, gain, V = _gain(design, basis, order)

@@ -12,12 +12,11 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.scene import actuation, problem, sampling, scene_target
 from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.gain import Block, Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainJudge
-from softgrasp.lqr.riccati import Method, choose, solve
+from softgrasp.lqr.riccati import Method, choose, modal_lqr, solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality, ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
 
@@ -34,9 +33,8 @@ class Design:
     model: Model  # the built scene
     problem: RiccatiProblem  # plant, outputs and weights
     solution: RiccatiSolution  # Riccati solution and gain
-    # target, start: where the loop goes and where it begins
-    target: Target
-    start: PlantState
+    target: Target  # where the loop goes
+    start: PlantState  # where it begins
     error: Block  # start minus target, one column
     diagnosis: Diagnosis  # what was known before the solve
     judge: GainJudge  # compares gains with the optimal one

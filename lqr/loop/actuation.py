@@ -35,6 +35,11 @@ class Actuation:
             raise ControlError(f"limits = {self.limits} must be one positive number, or {inputs}, one per input")
         return np.broadcast_to(given, (inputs,)).copy()
 
+    def saturated(self, inputs: Array) -> float:
+        """Share of the steps in which one of the inputs, (steps, inputs), sits at its limit."""
+        bound = self.bound(inputs.shape[1])
+        return 0.0 if bound is None else float((np.abs(inputs) >= bound).any(axis=1).mean())
+
     def ticks(self, dt: float) -> int:
         """Steps of length dt in one tick; 0 for continuous feedback.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
@@ -19,29 +20,28 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 
 FORMAT = 1
+PLANT = ("E", "A", "B", "C", "f", "S_q", "S_v")  # arrays of the reduced plant in a file
 
 
 def layout_hash(layout: BlockLayout) -> str:
     """SHA-256 of sizes, reference point and all free nodes in sorted order: the same on any rank count. Collective."""
-    order, nodes = _order(layout)
-    text = None
-    if nodes is not None and order is not None:
-        digest = hashlib.sha256(json.dumps([layout.dimension, layout.n_s, layout.n_e]).encode())
-        scale = float(np.abs(nodes).max(initial=0.0)) or 1.0
-        # rounded, so that the last bits of another mesh generator do not count; + 0.0 turns -0 into 0
-        digest.update((np.round(np.vstack([layout.reference, nodes[order]]) / scale, 9) + 0.0).tobytes())
-        text = digest.hexdigest()
-    return str(layout.comm.bcast(text))
+    sorted_ = _sorted(layout)
+    return str(layout.comm.bcast(sorted_ and sorted_[1]))
 
 
-def _order(layout: BlockLayout) -> tuple[np.ndarray | None, Array | None]:
-    """Permutation that sorts the free nodes by coordinates, and the nodes, on rank 0. Collective."""
+def _sorted(layout: BlockLayout) -> tuple[NDArray[np.int64], str] | None:
+    """Permutation of the free dofs to nodes sorted by coordinates, and the hash; None off rank 0. Collective."""
     parts = layout.comm.gather(np.array(layout.nodes))
     if parts is None:
-        return None, None
-    nodes = np.concatenate(parts)
+        return None
+    nodes, d = np.concatenate(parts), layout.dimension
     scale = float(np.abs(nodes).max(initial=0.0)) or 1.0
-    return np.lexsort(np.round(nodes / scale, 9).T[::-1]), nodes
+    # rounded, so that the last bits of another mesh generator do not count; + 0.0 turns -0 into 0
+    rounded = np.round(np.vstack([layout.reference, nodes]) / scale, 9)
+    order = np.lexsort(rounded[1:].T[::-1])
+    digest = hashlib.sha256(json.dumps([d, layout.n_s, layout.n_e]).encode())
+    digest.update((np.vstack([rounded[:1], rounded[1:][order]]) + 0.0).tobytes())
+    return np.asarray((order[:, None] * d + np.arange(d)).ravel()), digest.hexdigest()
 
 
 @dataclass
@@ -112,9 +112,8 @@ class Controller:
     def reset(self, tissue: Array | None = None) -> None:
         """Forget the past; the tissue starts at [eta, eta'] or, by default, hangs still."""
         n_s = self.n_s
-        still = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else np.array(tissue, dtype=float)
         self._x = np.zeros(self.plant.N)
-        self._x[2 * n_s :] = still
+        self._x[2 * n_s :] = self.plant.rest_at(np.zeros(n_s))[0][2 * n_s :] if tissue is None else tissue
         self._fresh = True
 
     def command(self, x: Array) -> Array:
@@ -151,18 +150,11 @@ class Controller:
     def save(self, path: str | Path) -> Path:
         """Write everything into one .npz file. Not collective: call it on one rank.
 
-        Raises:
-            ControlError: the file cannot be written.
+        Raises ControlError: the file cannot be written.
         """
-        meta = {
-            "format": FORMAT,
-            "period": self.period,
-            "scene_hash": self.scene_hash,
-            "layout_hash": self.layout_hash,
-            "names": list(self.plant.names),
-            "about": self.about,
-        }
-        arrays = {f"plant_{key}": getattr(self.plant, key) for key in ("E", "A", "B", "C", "f", "S_q", "S_v")}
+        meta = {key: getattr(self, key) for key in ("period", "scene_hash", "layout_hash", "about")}
+        meta |= {"format": FORMAT, "names": list(self.plant.names)}
+        arrays = {f"plant_{key}": getattr(self.plant, key) for key in PLANT}
         arrays |= {"K": self.K, "x_bar": self.x_bar, "u_bar": self.u_bar}
         if self.limits is not None:
             arrays["limits"] = self.limits
@@ -172,26 +164,15 @@ class Controller:
     def load(cls, path: str | Path, scene_hash: str | None = None, layout_hash: str | None = None) -> Controller:
         """Read a file of :meth:`save`.
 
-        Args:
-            scene_hash, layout_hash: refuse a controller that was made for another scene or mesh.
+        ``scene_hash``, ``layout_hash``: refuse a controller that was made for another scene or mesh.
 
-        Raises:
-            ControlError: the file is missing, damaged, or made for something else.
+        Raises ControlError: the file is missing, damaged, or made for something else.
         """
         meta, arrays = read_npz(Path(path), {"scene_hash": scene_hash, "layout_hash": layout_hash})
         try:
-            small = {key: arrays[f"plant_{key}"] for key in ("E", "A", "B", "C", "f", "S_q", "S_v")}
-            return cls(
-                arrays["K"],
-                arrays["x_bar"],
-                arrays["u_bar"],
-                SmallPlant(**small, names=tuple(meta["names"])),
-                meta["period"],
-                arrays.get("limits"),
-                meta["scene_hash"],
-                meta["layout_hash"],
-                meta["about"],
-            )
+            plant = SmallPlant(**{key: arrays[f"plant_{key}"] for key in PLANT}, names=tuple(meta["names"]))
+            about = {key: meta[key] for key in ("period", "scene_hash", "layout_hash", "about")}
+            return cls(arrays["K"], arrays["x_bar"], arrays["u_bar"], plant, limits=arrays.get("limits"), **about)
         except KeyError as error:
             raise ControlError(f"{path} holds no controller ({error} is missing); save it again") from error
 
@@ -206,70 +187,59 @@ def _tissue_step(plant: SmallPlant, period: float) -> tuple[Array, Array, Array 
     left, right = plant.E[e, e] - period / 2 * plant.A[e, e], plant.E[e, e] + period / 2 * plant.A[e, e]
     columns = np.hstack([right, -plant.E[e, v], period / 2 * plant.A[e, v], period * plant.f[e, None]])
     k = len(left)
-    solved = np.ascontiguousarray(np.linalg.solve(left, columns))
-    step, accelerated, dragged, constant = np.split(solved, [k, k + n_s, k + 2 * n_s], axis=1)
-    parts = [np.ascontiguousarray(a) for a in (step, accelerated, dragged)]
-    return parts[0], parts[1], parts[2] if plant.A[e, v].any() else None, constant[:, 0].copy()
+    parts = np.split(np.linalg.solve(left, columns), [k, k + n_s, k + 2 * n_s], axis=1)
+    step, accelerated, dragged, constant = (np.ascontiguousarray(part) for part in parts)
+    return step, accelerated, dragged if plant.A[e, v].any() else None, constant[:, 0].copy()
 
 
 def save_gain(path: Path, gain: Gain, target: PlantState, layout: BlockLayout, scene_hash: str) -> Path:
     """Write a full-order gain and its target into one .npz file, rows in the order of the nodes. Collective.
 
-    Raises:
-        ControlError: the file cannot be written.
+    Raises ControlError: the file cannot be written.
     """
-    order, nodes = _order(layout)
-    tall = np.column_stack([gain.K_z, gain.K_v, target.z, target.v_z])
-    parts = layout.comm.gather(tall)
-    meta = {"format": FORMAT, "scene_hash": scene_hash, "layout_hash": layout_hash(layout)}
+    sorted_ = _sorted(layout)
+    parts = layout.comm.gather(np.column_stack([gain.K_z, gain.K_v, target.z, target.v_z]))
     with agree(layout.comm):
-        if parts is not None and order is not None and nodes is not None:
+        if parts is not None and sorted_ is not None:
+            meta = {"format": FORMAT, "scene_hash": scene_hash, "layout_hash": sorted_[1]}
             arrays = {"K_s": gain.K_s, "q_s": target.q_s, "v_s": target.v_s}
-            arrays["tissue"] = np.concatenate(parts)[_dofs(order, layout.dimension)]
-            write_npz(path, meta, arrays)
-    return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+            write_npz(path, meta, arrays | {"tissue": np.concatenate(parts)[sorted_[0]]})
+    return _named(path)
 
 
 def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) -> tuple[Gain, PlantState]:
     """Read a file of :func:`save_gain` on any number of ranks; gain and target. Collective.
 
-    Raises:
-        ControlError: the file is missing or damaged, or belongs to another mesh (or scene).
+    Raises ControlError: the file is missing or damaged, or belongs to another mesh (or scene).
     """
-    order, nodes = _order(layout)
-    expected = {"layout_hash": layout_hash(layout), "scene_hash": scene_hash}
-    answer: tuple[Array, Array, Array, Array] | None = None
+    sorted_, ranges = _sorted(layout), layout.comm.gather((layout.start, layout.start + layout.n_local))
+    pieces: list[tuple[Array, ...]] | None = None  # each rank is sent its own rows
     with agree(layout.comm):
-        if order is not None and nodes is not None:
-            _, arrays = read_npz(path, expected)
+        if sorted_ is not None and ranges is not None:
+            _, arrays = read_npz(path, {"layout_hash": sorted_[1], "scene_hash": scene_hash})
             try:
                 rows = np.empty_like(arrays["tissue"])
-                rows[_dofs(order, layout.dimension)] = arrays["tissue"]
-                answer = (arrays["K_s"], arrays["q_s"], arrays["v_s"], rows)
+                rows[sorted_[0]] = arrays["tissue"]
+                hand = (arrays["K_s"], arrays["q_s"], arrays["v_s"])
+                pieces = [(*hand, np.array(rows[a:b])) for a, b in ranges]
             except (KeyError, IndexError, ValueError) as error:
                 raise ControlError(f"{path} holds no full-order gain ({error}); save it again") from error
-    # each rank is sent its own rows; the whole block stays on rank 0
-    ranges = layout.comm.gather((layout.start, layout.start + layout.n_local))
-    pieces = None
-    if ranges is not None and answer is not None:
-        pieces = [(*answer[:3], np.array(answer[3][a:b])) for a, b in ranges]
     K_s, q_s, v_s, rows = layout.comm.scatter(pieces)
-    n_s = layout.n_s
-    K_z, K_v = np.asfortranarray(rows[:, :n_s]), np.asfortranarray(rows[:, n_s : 2 * n_s])
-    return Gain(K_s, K_z, K_v), PlantState(q_s, v_s, rows[:, -2].copy(), rows[:, -1].copy())
+    K_z, K_v, (z, v_z) = (*np.split(rows[:, :-2], 2, axis=1), rows[:, -2:].T)
+    return Gain(K_s, np.asfortranarray(K_z), np.asfortranarray(K_v)), PlantState(q_s, v_s, z.copy(), v_z.copy())
 
 
-def _dofs(order: np.ndarray, d: int) -> np.ndarray:
-    return np.asarray((order[:, None] * d + np.arange(d)).ravel())
+def _named(path: Path) -> Path:
+    """The name with .npz that NumPy would make of it."""
+    return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
 
 
 def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Path:
     """Write arrays and their description; a torn file never replaces a good one.
 
-    Raises:
-        ControlError: the folder cannot be written.
+    Raises ControlError: the folder cannot be written.
     """
-    path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+    path = _named(path)
     fresh = path.with_name("new-" + path.name)
     try:
         write_arrays(fresh, {"meta": np.array(json.dumps(meta)), **arrays})
@@ -282,8 +252,7 @@ def write_npz(path: Path, meta: dict[str, Any], arrays: dict[str, Array]) -> Pat
 def read_npz(path: Path, expected: dict[str, str | None]) -> tuple[dict[str, Any], dict[str, Array]]:
     """Read a file of :func:`write_npz` and check what it was made for.
 
-    Raises:
-        ControlError: the file is missing or damaged, or a hash differs.
+    Raises ControlError: the file is missing or damaged, or a hash differs.
     """
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -38,9 +38,7 @@ def accumulated_cost(outputs: Array, inputs: Array, Q: Array, R: Array, dt: floa
 def overshoot(outputs: Array, target: Array) -> float:
     """Farthest that an output runs past its target, over the way that it had to go; 0 where none does [1].
 
-    Args:
-        outputs: y at the grid points [m], (steps + 1, p).
-        target: y_bar [m], (p,).
+    ``outputs``: y at the grid points [m], (steps + 1, p); ``target``: y_bar [m], (p,).
     """
     way = target - outputs[0]
     going = np.abs(way) > 1e-9 * np.abs(way).max(initial=0.0)

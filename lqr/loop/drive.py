@@ -97,9 +97,10 @@ class LoopDrive(ABC):
 class GainDrive(LoopDrive):
     """The input is u_bar + K (x - x_bar) = offset + K x, with or without limits."""
 
-    def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
+    def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, steps)
-        self.gain, self.bound, n_s = gain, bound, plant.system.layout.n_s
+        self.gain, n_s = gain, plant.system.layout.n_s
+        self.bound = actuation.bound(n_s)
         self.K_q, self.K_v = gain.K_s[:, :n_s], gain.K_s[:, n_s:]
         rest = target.state
         self.offset = target.u - self.K_q @ rest.q_s - total(plant.comm, gain.K_z.T @ rest.z)
@@ -117,14 +118,14 @@ class ImplicitDrive(GainDrive):
     tissue solve and one small reduction a step.
     """
 
-    def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
-        super().__init__(plant, gain, target, bound, steps)
+    def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
+        super().__init__(plant, gain, target, actuation, steps)
         n_s, dt = plant.system.layout.n_s, plant.dt
         self.N = gain.K_z + plant.s * gain.K_v
         self.NY = total(plant.comm, self.N.T @ plant.Y)
         F = dt**2 / 4 * self.K_q + dt / 2 * self.K_v - plant.kappa * self.NY
         self.FL = F @ plant.inverse
-        self.input = ImplicitInput(self.FL, bound)
+        self.input = ImplicitInput(self.FL, self.bound)
         self.sums = np.zeros(3 * n_s if plant.system.two_way else 2 * n_s)
 
     def solve(self, n: int, state: TissueState) -> None:
@@ -155,7 +156,7 @@ class HeldDrive(GainDrive):
     """
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
-        super().__init__(plant, gain, target, actuation.bound(plant.system.layout.n_s), steps)
+        super().__init__(plant, gain, target, actuation, steps)
         self.every, self.delay = actuation.ticks(plant.dt), actuation.delay
         self.K = np.vstack([gain.K_z, gain.K_v])
         self.held = self.waiting = self._clip(target.u)
@@ -232,10 +233,10 @@ class FiniteDrive(GainDrive):
     Inputs beyond their limits are fixed there, and the step is solved once more.
     """
 
-    def __init__(self, plant: PlantStep, gain: Gain, target: Target, bound: Array | None, steps: int) -> None:
-        super().__init__(plant, gain, target, bound, steps)
+    def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
+        super().__init__(plant, gain, target, actuation, steps)
         self.step = FiniteStep(plant, gain)
-        self.limit = np.full(len(self.offset), np.inf) if bound is None else bound
+        self.limit = np.full(len(self.offset), np.inf) if self.bound is None else self.bound
 
     def solve(self, n: int, state: TissueState) -> None:
         """One step. Collective."""

@@ -49,40 +49,23 @@ class LoopOptions:
 
 @dataclass(frozen=True)
 class LoopTrajectory:
-    """What a closed-loop run returns; small arrays are on every rank.
+    """What a closed-loop run returns; small arrays are on every rank."""
 
-    Attributes:
-        times: grid [s], (steps + 1,).
-        q_s, v_s: hand, (steps + 1, n_s).
-        inputs: u of each step [N, N m], (steps, n_s).
-        outputs: y = C_s q_s + C_z' z [m, rad], (steps + 1, p).
-        outputs_rigid: C_s q_s, the same without deformation, (steps + 1, p).
-        columns: one per output component.
-        cost: J up to each grid point, (steps + 1,).
-        final: the state at the end.
-        snapshots: stored states, or None.
-        saturated: share of the steps in which an input sat at its limit.
-        residuals: relative residual of the first and the last solve.
-        solver: name and reason.
-        seconds: factor (with the responses) and steps; the slowest rank.
-        newton: how the steps of finite strain converged, or None.
-    """
-
-    times: Array
-    q_s: Array
+    times: Array  # grid [s], (steps + 1,)
+    q_s: Array  # hand, (steps + 1, n_s)
     v_s: Array
-    inputs: Array
-    outputs: Array
-    outputs_rigid: Array
-    columns: Columns
-    cost: Array
-    final: PlantState
-    snapshots: Snapshots | None
-    saturated: float
-    residuals: tuple[float, float]
-    solver: tuple[str, str]
-    seconds: dict[str, float] = field(default_factory=dict)
-    newton: NewtonFigures | None = None
+    inputs: Array  # u of each step [N, N m], (steps, n_s)
+    outputs: Array  # y = C_s q_s + C_z' z [m, rad], (steps + 1, p)
+    outputs_rigid: Array  # C_s q_s, the same without deformation, (steps + 1, p)
+    columns: Columns  # one per output component
+    cost: Array  # J up to each grid point, (steps + 1,)
+    final: PlantState  # the state at the end
+    snapshots: Snapshots | None  # stored states, or None
+    saturated: float  # share of the steps in which an input sat at its limit
+    residuals: tuple[float, float]  # relative residual of the first and the last solve
+    solver: tuple[str, str]  # name and reason
+    seconds: dict[str, float] = field(default_factory=dict)  # factor (with the responses) and steps; the slowest rank
+    newton: NewtonFigures | None = None  # how the steps of finite strain converged, or None
 
     @property
     def output_names(self) -> tuple[str, ...]:
@@ -161,19 +144,12 @@ class ClosedLoop:
         actuation, options = actuation or Actuation(), options or LoopOptions()
         if not isinstance(target, Target):
             target = hand_target(self.problem, np.asarray(target, dtype=np.float64))
-        bound = actuation.bound(self.problem.layout.n_s)
-        held = actuation.ticks(self.dt) > 0
-        start = start or rest(self.problem.system)
-        drive: LoopDrive = (
-            HeldDrive(self.plant, gain, target, actuation, steps)
-            if held
-            else FiniteDrive(self.plant, gain, target, bound, steps)
-            if self.problem.system.points is not None
-            else ImplicitDrive(self.plant, gain, target, bound, steps)
-        )
-        run = LoopRun(self, drive, start, steps, options, target)
+        implicit = ImplicitDrive if self.problem.system.points is None else FiniteDrive
+        kind = HeldDrive if actuation.ticks(self.dt) else implicit
+        drive = kind(self.plant, gain, target, actuation, steps)
+        run = LoopRun(self, drive, start or rest(self.problem.system), steps, options, target)
         run.execute()
-        return run.trajectory(bound)
+        return run.trajectory(actuation)
 
     def destroy(self) -> None:
         """Free all PETSc objects. Collective."""
@@ -217,8 +193,7 @@ class LoopRun(Stepped):
     def execute(self) -> None:
         """Let TS run to the last step, in segments. Collective.
 
-        Raises:
-            SolverError: a solve failed, the state is no longer finite, or the cost leaves its bound.
+        Raises SolverError: a solve failed, the state is no longer finite, or the cost leaves its bound.
         """
         frames = {int(n) for n in self.options.frames} if self.options.frame is not None else set()
         ends = set(np.linspace(0, self.steps, min(CHUNKS, self.steps) + 1).round().astype(int).tolist())
@@ -281,17 +256,12 @@ class LoopRun(Stepped):
         u = self.drive.u[first : first + len(outputs) - 1] - self.target.u
         return accumulated_cost(outputs - self.target.y, u, self.problem.Q, self.problem.R, self.dt)
 
-    def trajectory(self, bound: Array | None) -> LoopTrajectory:
+    def trajectory(self, actuation: Actuation) -> LoopTrajectory:
         """Gather the small results; the tissue stays distributed. Collective."""
         problem, drive = self.problem, self.drive
         comm, n = problem.layout.comm, problem.layout.n_local
         rigid, outputs = drive.q @ problem.C_s.T, self._outputs(0, self.steps)
-        cost = self._cost(outputs, 0)
-        times = np.asarray(self.dt * np.arange(self.steps + 1), dtype=np.float64)
-        saturated = 0.0
-        if bound is not None:
-            saturated = float((np.abs(drive.u) >= bound).any(axis=1).mean())
-        array = self.state.array
+        times, array = np.asarray(self.dt * np.arange(self.steps + 1), dtype=np.float64), self.state.array
         return LoopTrajectory(
             times=times,
             q_s=drive.q,
@@ -300,10 +270,10 @@ class LoopRun(Stepped):
             outputs=outputs,
             outputs_rigid=rigid,
             columns=problem.columns,
-            cost=cost,
+            cost=self._cost(outputs, 0),
             final=PlantState(drive.q[-1].copy(), drive.v[-1].copy(), array[:n].copy(), array[n:].copy()),
             snapshots=self.store.finish(times, drive.q, drive.v),
-            saturated=saturated,
+            saturated=actuation.saturated(drive.u),
             residuals=(self.residual_first, self.residual_last),
             solver=self.solver,
             newton=self.midpoint.figures(),

@@ -41,6 +41,7 @@ from softgrasp.lqr.plant.target import Target
 
 Notify = Callable[[int, int], None]
 TOGETHER = 32  # states behind one product with the functionals
+ROUNDING = 1e-12  # of a cost: sums over the steps with the growing responses of the hand
 
 
 @dataclass(frozen=True)
@@ -90,12 +91,7 @@ def feedback_inputs(law: Responses) -> Array:
 
 
 def responses(
-    problem: RiccatiProblem,
-    W: Block,
-    start: Block,
-    dt: float,
-    steps: int,
-    notify: Notify | None = None,
+    problem: RiccatiProblem, W: Block, start: Block, dt: float, steps: int, notify: Notify | None = None
 ) -> Responses:
     """One factor and n_s runs of the full plant, one more where the start moves by itself. Collective.
 
@@ -104,14 +100,13 @@ def responses(
         start: x(0) as a difference to a state of rest, one column.
         notify: called with the number of steps done and in all.
 
-    Raises:
-        SolverError: a solve failed.
+    Raises SolverError: a solve failed.
     """
     n_s, n = problem.layout.n_s, problem.layout.n_local
     # differences of two states feel no gravity
     problem = replace(problem, system=replace(problem.system, gravity=None, hand_weight=False))
     rest = PlantState(np.zeros(n_s), np.zeros(n_s), np.zeros(n), np.zeros(n))
-    begin = PlantState(start.hand[:n_s, 0], start.hand[n_s:, 0], start.tall[:n, 0], start.tall[n:, 0])
+    begin = PlantState(*(part[:, 0] for part in start.parts))
     inputs = np.zeros((n_s + 1, steps, n_s))
     inputs[range(n_s), 0, range(n_s)] = 1.0
     runs = [(rest, u) for u in inputs[:n_s]]
@@ -156,9 +151,6 @@ class _Record(LoopRun):
         self.execute()
         hand = np.hstack([self.drive.q, self.drive.v])
         return np.asarray(total(self.problem.layout.comm, self.values_here) + hand @ self.W.hand)
-
-
-ROUNDING = 1e-12  # of a cost: sums over the steps with the growing responses of the hand
 
 
 @dataclass(frozen=True)
@@ -208,8 +200,7 @@ def duality_gaps(
         factor: Z; None takes the cost up to the end alone.
         notify: called with the number of steps done and in all.
 
-    Raises:
-        SolverError: a solve failed.
+    Raises SolverError: a solve failed.
     """
     p, n_s, n = len(problem.Q), problem.layout.n_s, problem.layout.n_local
     hand, tall = np.zeros((2 * n_s, p)), np.zeros((2 * n, p))

@@ -26,15 +26,13 @@ from softgrasp.reduction.lti import LTI, make_lti
 class SmallPlant:
     """E x' = A x + B u + f, y = C x, q_s = S_q x, v_s = S_v x, of dimension N."""
 
-    # E, A: (N, N)
-    E: Array
-    A: Array
+    E: Array  # (N, N)
+    A: Array  # (N, N)
     B: Array  # (N, n_s)
     C: Array  # (p, N)
     f: Array  # constant load, gravity (N,)
-    # S_q, S_v: (n_s, N)
-    S_q: Array
-    S_v: Array
+    S_q: Array  # (n_s, N)
+    S_v: Array  # (n_s, N)
     names: tuple[str, ...] = ()  # one per output
 
     @property
@@ -162,8 +160,7 @@ class ReducedLoop:
         self.seconds = time.perf_counter()
         try:
             columns = np.linalg.solve(
-                plant.E - dt / 2 * plant.A,
-                np.hstack([plant.E, dt / 2 * plant.B, dt / 2 * plant.f[:, None]]),
+                plant.E - dt / 2 * plant.A, np.hstack([plant.E, dt / 2 * plant.B, dt / 2 * plant.f[:, None]])
             )
         except np.linalg.LinAlgError as error:
             raise ControlError(f"E - dt/2 A of the reduced plant is singular for dt = {dt:g} s") from error
@@ -216,7 +213,6 @@ class ReducedLoop:
                 "not stabilise the plant at this rate, delay and limit"
             )
         outputs = states @ plant.C.T
-        saturated = 0.0 if bound is None else float((np.abs(inputs) >= bound).any(axis=1).mean())
         cost = accumulated_cost(outputs - plant.C @ x_bar, inputs - u_bar, *weights, self.dt)
         return ReducedLoopTrajectory(
             times=np.asarray(self.dt * np.arange(steps + 1), dtype=np.float64),
@@ -225,7 +221,7 @@ class ReducedLoop:
             inputs=inputs,
             outputs=outputs,
             cost=cost,
-            saturated=saturated,
+            saturated=actuation.saturated(inputs),
             seconds={"prepare": self.seconds, "steps": time.perf_counter() - begin},
         )
 

@@ -10,9 +10,8 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex, on_root
-from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, mass_right
 from softgrasp.lqr.lowrank.compress import compress, gram
-from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.lowrank.plant import Plant, Right, Solution, closed_adjoint, mass_right
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import WINDOW, ShiftQueue
 from softgrasp.lqr.plant.gain import Block

@@ -62,9 +62,7 @@ def residual_weight(plant: Plant, Z: Block) -> Array:
 
 def _tissue_products(plant: Plant, Z: Block) -> tuple[Array, Array, Array, Array]:
     """[a, b], K_ee [a, b], M_ee b and v = K_ee a - D_ee b for tissue rows a, b of Z. Collective."""
-    n, c = plant.n_local, Z.columns
-    both = np.empty((n, 2 * c))
-    both[:, :c], both[:, c:] = Z.tall[:n], Z.tall[n:]
+    c, both = Z.columns, np.hstack(Z.parts[2:])
     b, K_both = both[:, c:], plant.stiff(both)
     M_b = plant.mass(b)
     return both, K_both, M_b, K_both[:, :c] - damp(plant.system, b, M_b, K_both[:, c:])
@@ -109,6 +107,6 @@ def _leading(G: Array, allowed: float) -> Array:
     L = np.zeros((k, rank))
     L[pivots - 1] = np.tril(factor)[:, :rank]
     values, vectors = np.linalg.eigh(L.T @ L)
-    floor = k * EPS * float(values[-1]) if rank else 0.0
-    keep = np.cumsum(values) > max(allowed, floor)
+    rounding = k * EPS * float(values[-1]) if rank else 0.0
+    keep = np.cumsum(values) > max(allowed, rounding)
     return np.ascontiguousarray((L @ (vectors[:, keep] / np.sqrt(values[keep])))[:, ::-1])

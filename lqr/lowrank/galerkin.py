@@ -27,8 +27,7 @@ BUDGET = 0.45  # share of omega at which a response's damping ratio is held belo
 class Space:
     """A displacement basis with its products, grown by blocks of columns."""
 
-    # V, M_V, K_V: local rows (n_local, r)
-    V: Array
+    V: Array  # local rows (n_local, r)
     M_V: Array
     K_V: Array
 
@@ -66,12 +65,11 @@ class Space:
 class Level:
     """One Galerkin space with its solution."""
 
-    small: modal_start.ModalSubspace  # the projected plant
-    solution: modal_start.SmallSolution  # its Riccati equation
+    omega: Array  # frequencies of the basis, (r,)
+    X: Array  # of the projected plant
     Z: Block  # X ~ Z Z', costate form
-    # a, b: tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m)
-    a: Array
-    b: Array
+    a: Array  # tissue part of the gain in costate form, K_z' = K_ee a, local rows (n_local, m)
+    b: Array  # and K_v' = M_ee b
     gain: Block  # K', z-row as it stands
 
 
@@ -84,26 +82,24 @@ def _root(X: Array) -> Array:
 
 def _prolonged(plant: Plant, old: Level, S: Array, omega: Array) -> Array:
     """X of a level in the basis of the next: V_old = V_new T, T the columns of S^{-1} that the old basis filled."""
-    s, r = 2 * plant.n_s, old.small.order
+    s, r = 2 * plant.n_s, len(old.omega)
     T = np.linalg.inv(S)[:, :r]
     W = np.zeros((s + 2 * len(omega), s + 2 * r))
     W[:s, :s] = np.eye(s)
-    W[s : s + len(omega), s : s + r] = omega[:, None] * T / old.small.omega
+    W[s : s + len(omega), s : s + r] = omega[:, None] * T / old.omega
     W[s + len(omega) :, s + r :] = T
-    return np.asarray(W @ old.solution.X @ W.T)
+    return np.asarray(W @ old.X @ W.T)
 
 
 def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[Level, Space]:
     """Project, solve and expand: X = W X_m W', W = blkdiag(I, I, K V / omega, V) on the costate. Collective.
 
-    Args:
-        space: the Ritz basis of ``old`` and more.
-        old: the level before, near the solution.
+    ``space``: the Ritz basis of ``old`` and more; ``old``: the level before, near the solution.
     """
     ritz, omega, S = space.ritz(plant)
     small = modal_start.restrict(plant, ritz.V, omega, ritz.M_V)
-    solution = modal_start.solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
-    root = on_root(plant.comm, partial(_root, solution.X))
+    X = modal_start.solve_small(plant, small, None if old is None else _prolonged(plant, old, S, omega))
+    root = on_root(plant.comm, partial(_root, X))
     s, r = 2 * plant.n_s, len(omega)
     q, v = root[s : s + r] / omega[:, None], root[s + r :]
     Z = Block(root[:s], np.vstack([ritz.V @ q, ritz.V @ v]))
@@ -114,7 +110,7 @@ def solve_level(plant: Plant, space: Space, old: Level | None = None) -> tuple[L
     tall = np.vstack([ritz.K_V @ (q @ small_gain), ritz.M_V @ (v @ small_gain)])
     if plant.two_way:
         tall[plant.n_local :] += plant.G @ (root[plant.n_s : s] @ small_gain)
-    return Level(small, solution, Z, a, b, Block(hand, tall)), ritz
+    return Level(omega, X, Z, a, b, Block(hand, tall)), ritz
 
 
 def gain_change(plant: Plant, new: Level, old: Level) -> float:
@@ -174,10 +170,10 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z
         level, space = solve_level(plant, space)
         history, change, used, whole = list[dict[str, float]](), np.inf, 0, plant.layout.n_e
-        if level.small.order == whole:
+        if len(level.omega) == whole:
             history.append({"basis": float(whole), "solve": 0.0, "change": 0.0})
         for i in range(self.max_iterations):
-            if change <= self.tol or level.small.order == whole:
+            if change <= self.tol or len(level.omega) == whole:
                 break
             # the static response first; shift number k + 1 belongs to frequency number k
             take = [0j] if i == 0 else [_response_shift(plant, w) for w in grid[used - 1 :][: self.per_step]]
@@ -186,12 +182,12 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
                 parts = [response.real] if p.imag == 0 else [response.real, response.imag]
                 space = space.grown(plant, np.hstack(parts))
             used += len(take)
-            if space.V.shape[1] < min(level.small.order + len(take), whole):  # nothing new: no evidence either
+            if space.V.shape[1] < min(len(level.omega) + len(take), whole):  # nothing new: no evidence either
                 continue
             new, space = solve_level(plant, space, level)
             change, level = gain_change(plant, new, level), new
-            self.record(history, {"basis": float(new.small.order), "solve": float(used), "change": change})
-        order = level.small.order
+            self.record(history, {"basis": float(len(new.omega)), "solve": float(used), "change": change})
+        order = len(level.omega)
         if not (change <= self.tol or order == whole):
             raise SolverError(
                 f"galerkin: the gain still changes by {change:.1e} at {order} basis vectors, tolerance {self.tol:.0e}; "

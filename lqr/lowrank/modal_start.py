@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -26,35 +25,11 @@ CORRECTIONS = 4  # Newton steps from the solution on a smaller space; more cost 
 
 
 @dataclass(frozen=True)
-class ModalSubspace:
-    """Galerkin projection of the plant on a displacement basis, z = V eta, in xi = [q_s, v_s, omega eta, eta']."""
-
-    V: Array  # local rows of the basis, (n_local, r)
-    omega: Array  # frequencies of the basis vectors, V' K_ee V = diag(omega^2), (r,)
-    space: StateSpace  # E, A, B, C of xi
-
-    @property
-    def order(self) -> int:
-        """Number of basis vectors."""
-        return len(self.omega)
-
-
-@dataclass(frozen=True)
-class SmallSolution:
-    """X of the small equation, the gain K = B'XE (weights folded in) and the closed loop."""
-
-    X: Array  # (N, N) for E = E of the small plant
-    gain: Array  # (m, N), acting on xi
-
-
-@dataclass(frozen=True)
 class ModalStart:
     """Gain and shifts of the modal problem."""
 
-    small: ModalSubspace  # the plant on the modes
-    solution: SmallSolution  # its Riccati equation
     gain: Block  # K', local rows, z-row as it stands
-    poles: np.ndarray  # its closed-loop poles, most important first, one of each pair, Im >= 0
+    poles: np.ndarray  # closed-loop poles, most important first, one of each pair, Im >= 0
 
 
 class _MovedMass:
@@ -87,8 +62,8 @@ def plant_modes(plant: Plant, k: int) -> tuple[Array, Array]:
         shell.destroy()
 
 
-def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> ModalSubspace:
-    """Galerkin projection on V with V' K_ee V = diag(omega^2). Collective."""
+def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> StateSpace:
+    """Galerkin projection on z = V eta with V' K_ee V = diag(omega^2), in [q_s, v_s, omega eta, eta']. Collective."""
     r = len(omega)
     columns = [M_V, damp(plant.system, V, M_V), plant.G, plant.C_z]
     products = total(plant.comm, V.T @ np.hstack(columns))
@@ -96,40 +71,38 @@ def restrict(plant: Plant, V: Array, omega: Array, M_V: Array) -> ModalSubspace:
     folded = replace(plant.problem, C_s=plant.C_s)  # weights are in the outputs already
     tissue = TissueMatrices((M + M.T) / 2, np.diag(omega**2), (D + D.T) / 2, G, C_z)
     space = in_energy(assemble_space(folded, tissue), omega)
-    B = np.zeros((len(space.E), plant.inputs))
+    B = np.zeros((space.N, plant.inputs))
     if plant.B_z is None:
         B[plant.n_s : 2 * plant.n_s] = plant.B
     else:
         B[2 * plant.n_s + r :] = total(plant.comm, V.T @ plant.B_z)
-    return ModalSubspace(V, omega, replace(space, B=B, Q=np.eye(len(space.C)), R=np.eye(plant.inputs)))
+    return replace(space, B=B, Q=np.eye(len(space.C)), R=np.eye(plant.inputs))
 
 
-def solve_small(plant: Plant, small: ModalSubspace, guess: Array | None = None) -> SmallSolution:
-    """Riccati equation of the small plant on rank 0, the result on all. Collective.
+def solve_small(plant: Plant, space: StateSpace, guess: Array | None = None) -> Array:
+    """X of a restricted plant, (N, N), solved on rank 0. Collective.
 
     ``guess``: an X near the solution, (N, N). Raises ControlError: not stabilisable or not detectable.
     """
 
-    def solve() -> SmallSolution:
-        space, start = small.space, _few_modes(small) if guess is None else guess
+    def solve() -> Array:
+        start = _few_modes(space, space.N // 2 - plant.n_s) if guess is None else guess
         X = None if start is None else _corrected(space, start)
-        X = solve_reduced(space) if X is None else X
-        return SmallSolution(X, space.B.T @ X @ space.E)
+        return solve_reduced(space) if X is None else X
 
     return on_root(plant.comm, solve)
 
 
-def _few_modes(small: ModalSubspace) -> Array | None:
-    """X of the lowest modes alone, zero for the others; None where all are few.
+def _few_modes(m: StateSpace, r: int) -> Array | None:
+    """X of the lowest of r modes alone, zero for the others; None where all are few.
 
     With the two Newton steps that follow it takes a third of the time of one Schur form for all modes.
     """
-    m, N, r, k = small.space, small.space.N, small.order, FEW_MODES
+    N, k = m.N, FEW_MODES
     if r < 2 * k:
         return None
     at = np.r_[: N - 2 * r + k, N - r : N - r + k]
-    few = replace(m, E=m.E[np.ix_(at, at)], A=m.A[np.ix_(at, at)], B=m.B[at], C=m.C[:, at])
-    solution = fast_solution(few)
+    solution = fast_solution(replace(m, E=m.E[np.ix_(at, at)], A=m.A[np.ix_(at, at)], B=m.B[at], C=m.C[:, at]))
     if solution is None:
         return None
     X = np.zeros((N, N))
@@ -159,13 +132,13 @@ def _corrected(space: StateSpace, X: Array) -> Array | None:
     return None
 
 
-def _ordered(plant: Plant, small: ModalSubspace, gain: Array) -> np.ndarray:
-    """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2): what a mode adds to the cost."""
-    poles, vectors = np.linalg.eig(np.linalg.solve(small.space.E, small.space.A - small.space.B @ gain))
-    kinetic = np.real(np.einsum("ij,ij->j", vectors.conj(), small.space.E @ vectors))
-    s, r = plant.n_s, small.order
-    potential = np.sum(np.abs(vectors[:s]) ** 2, axis=0) + np.sum(np.abs(vectors[2 * s : 2 * s + r]) ** 2, axis=0)
-    seen = np.sum(np.abs(small.space.C @ vectors) ** 2, axis=0)
+def _ordered(space: StateSpace, s: int, gain: Array) -> np.ndarray:
+    """Closed-loop poles by |c_k|^2 / (|Re p_k| omega_k^2), what a mode adds to the cost; s freedoms of the hand."""
+    poles, vectors = np.linalg.eig(np.linalg.solve(space.E, space.A - space.B @ gain))
+    kinetic = np.real(np.einsum("ij,ij->j", vectors.conj(), space.E @ vectors))
+    stored = (vectors[:s], vectors[2 * s : s + space.N // 2])
+    potential = np.sum(np.abs(stored[0]) ** 2, axis=0) + np.sum(np.abs(stored[1]) ** 2, axis=0)
+    seen = np.sum(np.abs(space.C @ vectors) ** 2, axis=0)
     score = seen / (np.abs(poles.real) * np.maximum(kinetic - potential, 1e-12 * kinetic))
     # the hand first: its poles carry most of the cost and its energy is in q_s, which has none
     hand = np.sum(np.abs(vectors[:s]) ** 2, axis=0) / np.sum(np.abs(vectors) ** 2, axis=0)
@@ -175,17 +148,17 @@ def _ordered(plant: Plant, small: ModalSubspace, gain: Array) -> np.ndarray:
     return np.asarray(poles[keep])
 
 
-def filtered_gain(plant: Plant, small: ModalSubspace, solution: SmallSolution, M_V: Array) -> Block:
-    """K'x of the small gain through the modal filter: other modes are neither seen nor moved.
+def filtered_gain(plant: Plant, gain: Array, V: Array, omega: Array, M_V: Array) -> Block:
+    """K'x of the small gain B'XE through the modal filter: other modes are neither seen nor moved.
 
     eta = V'M~ z and, two-way, q_s + M_s^{-1} G'(z - V eta) instead of q_s; M~ = M_ee - G M_s^{-1} G'. For modes
     (V'M~V = I) the closed loop is block triangular, so every mode that was stable stays so. Collective.
     """
-    s, r = plant.n_s, small.order
-    K_s, K_q, K_v = np.split(solution.gain, [2 * s, 2 * s + r], axis=1)
-    z, v = M_V @ (small.omega[:, None] * K_q.T), M_V @ K_v.T
+    s, r = plant.n_s, len(omega)
+    K_s, K_q, K_v = np.split(gain, [2 * s, 2 * s + r], axis=1)
+    z, v = M_V @ (omega[:, None] * K_q.T), M_V @ K_v.T
     if plant.two_way:
-        g = total(plant.comm, small.V.T @ plant.G)
+        g = total(plant.comm, V.T @ plant.G)
         rest = np.linalg.solve(plant.M_s, (plant.G - M_V @ g).T).T
         z, v = z + rest @ K_s[:, :s].T, v + rest @ K_s[:, s:].T
     return Block(np.ascontiguousarray(K_s.T), np.vstack([z, v]))
@@ -211,17 +184,14 @@ def modal_start(plant: Plant, modes: int | None = None) -> ModalStart:
     count = MODES if modes is None else modes
     omega, Phi = plant_modes(plant, min(count, plant.layout.n_e))
     M_Phi = plant.mass(Phi)
-    small = restrict(plant, Phi, omega, M_Phi)
-    if modes is None and plant.layout.n_e > MORE_MODES and on_root(plant.comm, partial(_light, small)):
-        return modal_start(plant, MORE_MODES)
-    solution = solve_small(plant, small)
+    space = restrict(plant, Phi, omega, M_Phi)
+    if modes is None and plant.layout.n_e > MORE_MODES:
+        light = bool(-space.A[-1, -1] < 2 * LIGHT * omega[-1])  # of the last mode
+        if plant.comm.bcast(light):
+            return modal_start(plant, MORE_MODES)
+    X = solve_small(plant, space)
+    gain = on_root(plant.comm, lambda: space.B.T @ X @ space.E)
     if plant.two_way:
         M_Phi = M_Phi - plant.G @ np.linalg.solve(plant.M_s, total(plant.comm, plant.G.T @ Phi))
-    gain = filtered_gain(plant, small, solution, M_Phi)
-    poles = on_root(plant.comm, lambda: _ordered(plant, small, solution.gain))
-    return ModalStart(small, solution, gain, poles)
-
-
-def _light(small: ModalSubspace) -> bool:
-    damping = -np.diag(small.space.A)[-small.order :]
-    return bool(damping[-1] < 2 * LIGHT * small.omega[-1])
+    poles = on_root(plant.comm, lambda: _ordered(space, plant.n_s, gain))
+    return ModalStart(filtered_gain(plant, gain, Phi, omega, M_Phi), poles)

@@ -11,10 +11,9 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, FactorColumns, LowRankSweep
-from softgrasp.lqr.lowrank.adjoint import Right, Solution, make_right, mass_right
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.lowrank.modal_start import ModalStart, modal_start
-from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.lowrank.plant import Plant, Right, Solution, make_right, mass_right
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
 from softgrasp.lqr.lowrank.solver import STOP, Iterate, LowRankSolver

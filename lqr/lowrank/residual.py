@@ -27,8 +27,8 @@ def residual(problem: RiccatiProblem, Z: Block) -> float:
     Returns the relative residual; 2-norm in hand-relative coordinates.
     """
     system, comm = problem.system, problem.layout.comm
-    n_s, n, rank, p = problem.layout.n_s, len(Z.tall) // 2, Z.columns, problem.C_s.shape[0]
-    a_s, b_s, Z_v = Z.hand[:n_s], Z.hand[n_s:], Z.tall[n:]
+    a_s, b_s, Z_z, Z_v = Z.parts
+    n_s, n, rank, p = len(a_s), len(Z_z), Z.columns, problem.C_s.shape[0]
     B_Z = b_s if problem.B_z is None else comm.allreduce(problem.B_z.T @ Z_v)
     h = 2 * n_s if comm.rank == 0 else 0
     U = np.zeros((h + 2 * n, 2 * rank + p), order="F")
@@ -57,8 +57,7 @@ def residual(problem: RiccatiProblem, Z: Block) -> float:
 def _fill_tissue(problem: RiccatiProblem, Z: Block, top: Array, bottom: Array) -> None:
     """Local rows z and v_z of [A'Z, E'Z, C']. Collective."""
     system, damping = problem.system, problem.system.damping
-    n, rank, b_s = len(top), Z.columns, Z.hand[problem.layout.n_s :]
-    Z_z, Z_v = Z.tall[:n], Z.tall[n:]
+    rank, (_, b_s, Z_z, Z_v) = Z.columns, Z.parts
     stiff, mass = times_columns(system.K_ee, Z_v), times_columns(system.M_ee, Z_v)
     np.negative(stiff, out=top[:, :rank])
     bottom[:, :rank] = Z_z - damping.beta * stiff - damping.alpha * mass

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from softgrasp.fem.errors import ResourceError, SolverError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, Complex, PETSc, petsc_options, whole_copy
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.lowrank.factor_ahead import FactorsAhead
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
 PREFIX = "softgrasp_shifted_"
@@ -34,6 +34,60 @@ AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next fa
 # memory in 3D.
 THREADS = {1: 2, 2: 2, 3: 1}
 _SYMMETRIC = {"SymmetricMode": True, "Equil": False}
+
+
+class FactorsAhead:
+    """A few threads of one factor each.
+
+    SciPy frees the memory of a factor in the thread that made it and in no other, so each factor goes back there.
+
+    ``make``: factor of a shift; the second argument is the number of the thread, for what it may overwrite.
+    """
+
+    def __init__(self, make: Callable[[complex, int], scipy.sparse.linalg.SuperLU], threads: int) -> None:
+        self.make = make
+        self.threads = [ThreadPoolExecutor(1) for _ in range(threads)]
+        self.coming: dict[complex, tuple[int, Future[scipy.sparse.linalg.SuperLU]]] = {}
+        self.maker = 0
+
+    def take(self, shifts: Sequence[complex]) -> scipy.sparse.linalg.SuperLU:
+        """The factor of the first shift; the others are begun as far as threads are idle.
+
+        The caller hands what it holds of an older factor to :meth:`free` before.
+        """
+        known = len(self.threads) - (shifts[0] not in self.coming)  # one thread has to be left for the first
+        for p in [p for p in self.coming if p not in shifts[: 1 + known]]:
+            self._drop(p)
+        self._begin(shifts)
+        self.maker, future = self.coming.pop(shifts[0])
+        try:
+            factor = future.result()
+        finally:
+            del future  # in a traceback it would keep everything alive that the caller holds
+        self._begin(shifts[1:])
+        return factor
+
+    def _drop(self, p: complex) -> None:
+        self.maker = self.coming[p][0]
+        self.free([self.coming.pop(p)])  # no name may hold it when the thread lets it go
+
+    def _begin(self, shifts: Sequence[complex]) -> None:
+        for p in shifts[: 1 + len(self.threads)]:
+            idle = set(range(len(self.threads))) - {i for i, _ in self.coming.values()}
+            if p not in self.coming and idle:
+                i = min(idle)
+                self.coming[p] = (i, self.threads[i].submit(self.make, p, i))
+
+    def free(self, box: list[object]) -> None:
+        """Empty a list with the only reference to the factor taken last, in the thread that made it."""
+        self.threads[self.maker].submit(box.clear)
+
+    def close(self) -> None:
+        """Finish what is under way and free it."""
+        for p in list(self.coming):
+            self._drop(p)
+        for thread in self.threads:
+            thread.shutdown()
 
 
 class ShiftedTissue(ABC):
@@ -54,8 +108,7 @@ class ShiftedTissue(ABC):
             p: shift; 0 gives K_ee^{-1}.
             ahead: shifts that will probably come next.
 
-        Raises:
-            SolverError: the factorisation or the solve fails.
+        Raises SolverError: the factorisation or the solve fails.
         """
         p = complex(p)
         begin = time.perf_counter()

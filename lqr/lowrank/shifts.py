@@ -10,8 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.lowrank.adjoint import Right
-from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.lowrank.plant import Plant, Right
 from softgrasp.lqr.plant.gain import Block
 
 WINDOW = 10  # blocks of Z whose Ritz values give the next shifts
@@ -67,10 +66,7 @@ def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np
     H^{-1}, H = blkdiag(1, M_s, K_ee, M_ee): without feedback the plant is dissipative in this product, so no Ritz value
     is unstable. Collective.
 
-    Args:
-        V: columns of Z, costate form.
-        W: residual factor.
-        gain: K', None for K = 0.
+    ``V``: columns of Z, costate form; ``W``: residual factor; ``gain``: K', None for K = 0.
 
     Returns the values, and the norm of the component of W along each Ritz vector.
     """
@@ -86,10 +82,9 @@ def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, 
 
     On the tissue V'H^{-1}E'V = a'K a + b'M b and V'H^{-1}A'V = b'K a - (b'K a)' - b'D b. Collective.
     """
-    n, s, k = plant.n_local, plant.n_s, V.columns
-    both = np.empty((n, 2 * k))
-    both[:, :k], both[:, k:] = V.tall[:n], V.tall[n:]
-    stiff, a, b, b_s = plant.stiff(both), both[:, :k], both[:, k:], V.hand[s:]
+    k, (a_s, b_s, a, b) = V.columns, V.parts
+    both = np.hstack([a, b])
+    stiff, a, b = plant.stiff(both), both[:, :k], both[:, k:]
     kinetic, (power, G_K) = b.T @ plant.mass(b), np.split(b.T @ stiff, 2, axis=1)
     damping = plant.system.damping
     resisted = damping.alpha * kinetic + damping.beta * G_K
@@ -105,14 +100,14 @@ def energy_products(plant: Plant, V: Block, W: Block, X: Block) -> tuple[Array, 
     widths = np.cumsum([k, k, W.columns, X.columns])
     F, G, seen, X_part, coupling = np.split(total(plant.comm, np.hstack(parts)), widths, axis=1)
     E_hand = plant.M_s @ b_s + coupling.T
-    A_hand = V.hand[:s] - plant.drag_es * coupling.T - plant.drag_hand * (plant.system.M_rigid @ b_s)
+    A_hand = a_s - plant.drag_es * coupling.T - plant.drag_hand * (plant.system.M_rigid @ b_s)
     if plant.two_way:  # the hand's share in the rows of the tissue
         F, G = F - plant.drag_hand * coupling @ b_s, G + coupling @ b_s
     # H^{-1} E'V: two-way the mass blocks of hand and tissue invert together
-    test_q, test_v = V.hand[:s], b_s if plant.two_way else np.linalg.solve(plant.M_s, E_hand)
+    test_q, test_v = a_s, b_s if plant.two_way else np.linalg.solve(plant.M_s, E_hand)
     test = np.vstack([test_q, test_v])
     F += test_v.T @ A_hand
-    G += test_q.T @ V.hand[:s] + test_v.T @ E_hand
+    G += test_q.T @ a_s + test_v.T @ E_hand
     return F, G, seen + test.T @ W.hand, X_part + test.T @ X.hand
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, PETSc
 
 EPS = float(np.finfo(np.float64).eps)
 MODAL_KEY = "control.method = 'modal'"  # of a scene: modal_lqr, which needs no damping
@@ -48,12 +48,13 @@ def check_weights(Q: Array, R: Array, outputs: int, inputs: int) -> None:
         )
 
 
-def check_finite(**arrays: Array | None) -> None:
-    """Every array holds finite numbers only. ``arrays``: by the name that a message should use; None is skipped.
+def check_finite(**arrays: Array | PETSc.Mat | None) -> None:
+    """All entries on this rank are finite. ``arrays``: by the name that a message should use; None is skipped.
 
     Raises ControlError: an entry is infinite or no number.
     """
-    for name, array in arrays.items():
+    for name, given in arrays.items():
+        array = given.getValuesCSR()[2] if isinstance(given, PETSc.Mat) else given
         if array is not None and not np.isfinite(array).all():
             raise ControlError(f"{name} has {int((~np.isfinite(array)).sum())} entries that are not finite numbers")
 

@@ -26,6 +26,17 @@ class Block:
     def __getitem__(self, part: slice | Array) -> Self:
         return type(self)(self.hand[:, part], self.tall[:, part])
 
+    @property
+    def parts(self) -> tuple[Array, Array, Array, Array]:
+        """Rows q_s, v_s, z and v_z (views)."""
+        n_s, n = len(self.hand) // 2, len(self.tall) // 2
+        return self.hand[:n_s], self.hand[n_s:], self.tall[:n], self.tall[n:]
+
+    @classmethod
+    def of_parts(cls, q_s: Array, v_s: Array, z: Array, v_z: Array) -> Self:
+        """The block with these rows."""
+        return cls(np.concatenate([q_s, v_s]), np.concatenate([z, v_z]))
+
     def times(self, small: Array) -> Block:
         """Block @ small."""
         return Block(self.hand @ small, self.tall @ small)
@@ -40,12 +51,10 @@ class Block:
 class PlantState:
     """x = [q_s, v_s, z, v_z] with z = q_e - T q_s."""
 
-    # q_s, v_s: hand [m, rad] and [m/s, rad/s], (n_s,), on every rank
-    q_s: Array
-    v_s: Array
-    # z, v_z: relative displacement [m] and velocity [m/s] of the tissue, local rows (n_local,)
-    z: Array
-    v_z: Array
+    q_s: Array  # hand [m, rad], (n_s,), on every rank
+    v_s: Array  # [m/s, rad/s]
+    z: Array  # displacement of the tissue [m], local rows (n_local,)
+    v_z: Array  # [m/s]
 
     def __sub__(self, other: PlantState) -> PlantState:
         return PlantState(self.q_s - other.q_s, self.v_s - other.v_s, self.z - other.z, self.v_z - other.v_z)
@@ -53,7 +62,7 @@ class PlantState:
     @property
     def block(self) -> Block:
         """The state as one column."""
-        return Block(np.concatenate([self.q_s, self.v_s])[:, None], np.concatenate([self.z, self.v_z])[:, None])
+        return Block.of_parts(*(part[:, None] for part in (self.q_s, self.v_s, self.z, self.v_z)))
 
 
 @dataclass(frozen=True)
@@ -61,9 +70,8 @@ class Gain:
     """u = K x = K_s [q_s; v_s] + K_z' z + K_v' v_z."""
 
     K_s: Array  # gain on the hand [N/m, N s/m; N m for torques], (n_s, 2 n_s), on every rank
-    # K_z, K_v: gain on z and v_z, transposed, local rows (n_local, n_s)
-    K_z: Array
-    K_v: Array
+    K_z: Array  # gain on z, transposed, local rows (n_local, n_s)
+    K_v: Array  # gain on v_z
 
     @property
     def block(self) -> Block:
@@ -73,8 +81,8 @@ class Gain:
     @classmethod
     def of_block(cls, K: Block) -> Gain:
         """The gain whose columns K' are given."""
-        n = len(K.tall) // 2
-        return cls(np.ascontiguousarray(K.hand.T), np.asfortranarray(K.tall[:n]), np.asfortranarray(K.tall[n:]))
+        *_, K_z, K_v = K.parts
+        return cls(np.ascontiguousarray(K.hand.T), np.asfortranarray(K_z), np.asfortranarray(K_v))
 
     def apply(self, comm: MPI.Intracomm, x: PlantState) -> Array:
         """K x, (n_s,), on every rank. Collective."""

@@ -41,14 +41,13 @@ def damp(system: BlockSystem, X: Array, M_X: Array | None = None, K_X: Array | N
 
 def descriptor(problem: RiccatiProblem, X: Block, *, adjoint: bool = False) -> Block:
     """E X, or E' X. Collective."""
-    system, n_s, n = problem.system, problem.layout.n_s, problem.layout.n_local
-    v_s, v = X.hand[n_s:], X.tall[n:]
+    system, (q_s, v_s, z, v) = problem.system, X.parts
     hand, momentum = problem.M_s @ v_s, times_columns(system.M_ee, v)
     if system.two_way or adjoint:
         hand = hand + total(system.layout.comm, system.G.T @ v)
     if system.two_way or not adjoint:
         momentum = momentum + system.G @ v_s
-    return Block(np.concatenate([X.hand[:n_s], hand]), np.concatenate([X.tall[:n], momentum]))
+    return Block.of_parts(q_s, hand, z, momentum)
 
 
 def descriptor_adjoint(problem: RiccatiProblem, Z: Block) -> Block:
@@ -58,8 +57,7 @@ def descriptor_adjoint(problem: RiccatiProblem, Z: Block) -> Block:
 
 def dynamics(problem: RiccatiProblem, X: Block) -> Block:
     """A X. Collective."""
-    system, n_s, n = problem.system, problem.layout.n_s, problem.layout.n_local
-    v_s, z, v = X.hand[n_s:], X.tall[:n], X.tall[n:]
+    system, (_, v_s, z, v) = problem.system, X.parts
     force = -times_columns(system.K_ee, z) - damp(system, v)
     hand = np.zeros_like(v_s)
     if system.damping.in_space:
@@ -67,14 +65,13 @@ def dynamics(problem: RiccatiProblem, X: Block) -> Block:
         force -= drag * (system.G @ v_s)
         if system.two_way:
             hand = -drag * (system.M_rigid @ v_s + total(system.layout.comm, system.G.T @ v))
-    return Block(np.concatenate([v_s, hand]), np.concatenate([v, force]))
+    return Block.of_parts(v_s, hand, v, force)
 
 
 def inputs_adjoint(problem: RiccatiProblem, Z: Block) -> Array:
     """B'Z, (m, k), on every rank. Collective without a hand."""
-    if problem.B_z is None:
-        return Z.hand[problem.layout.n_s :]
-    return total(problem.layout.comm, problem.B_z.T @ Z.tall[problem.layout.n_local :])
+    _, v_s, _, v = Z.parts
+    return v_s if problem.B_z is None else total(problem.layout.comm, problem.B_z.T @ v)
 
 
 def normalising(gram: Array, share: float, least: float = 0.0) -> Array:
@@ -86,13 +83,8 @@ def normalising(gram: Array, share: float, least: float = 0.0) -> Array:
 
 def outputs(problem: RiccatiProblem, X: Block) -> Array:
     """C X, (p, k), on every rank. Collective."""
-    n_s, n = problem.layout.n_s, problem.layout.n_local
-    return np.asarray(problem.C_s @ X.hand[:n_s] + total(problem.layout.comm, problem.C_z.T @ X.tall[:n]))
-
-
-def _split(system: BlockSystem, X: Block) -> tuple[Array, Array, Array, Array]:
-    n_s, n = system.layout.n_s, system.layout.n_local
-    return X.hand[:n_s], X.hand[n_s:], X.tall[:n], X.tall[n:]
+    q_s, _, z, _ = X.parts
+    return np.asarray(problem.C_s @ q_s + total(problem.layout.comm, problem.C_z.T @ z))
 
 
 def _under(system: BlockSystem, local: Array) -> Array:
@@ -102,16 +94,16 @@ def _under(system: BlockSystem, local: Array) -> Array:
 
 def states_to_relative(system: BlockSystem, X: Block, sign: int = 1) -> Block:
     """S X; S^{-1} X for the other sign."""
-    q_s, v_s, q, v = _split(system, X)
+    q_s, v_s, q, v = X.parts
     return Block(X.hand, np.concatenate([q - sign * (system.T @ q_s), v - sign * (system.T @ v_s)]))
 
 
 def costates_to_absolute(system: BlockSystem, Z: Block, sign: int = 1) -> Block:
     """L' Z, a factor of P from a factor of X; L'^{-1} Z for the other sign. Collective."""
-    q_s, v_s, z, v = _split(system, Z)
+    q_s, v_s, z, v = Z.parts
     if system.two_way:
         v = v + sign * (system.T @ v_s)
-    return Block(np.concatenate([q_s - sign * _under(system, z), v_s]), np.concatenate([z, v]))
+    return Block.of_parts(q_s - sign * _under(system, z), v_s, z, v)
 
 
 def costates_to_relative(system: BlockSystem, Z: Block) -> Block:
@@ -121,5 +113,5 @@ def costates_to_relative(system: BlockSystem, Z: Block) -> Block:
 
 def gain_to_absolute(system: BlockSystem, K: Block, sign: int = 1) -> Block:
     """S' K' for a transposed gain, K = K_rel S; S'^{-1} K' for the other sign. Collective."""
-    q_s, v_s, z, v = _split(system, K)
+    q_s, v_s, z, v = K.parts
     return Block(np.concatenate([q_s - sign * _under(system, z), v_s - sign * _under(system, v)]), K.tall)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
@@ -26,23 +28,15 @@ class RiccatiProblem:
 
     A second-order system without a hand, M_ee z'' + D_ee z' + K_ee z = B_z u, is the case n_s = 0, B = [0; B_z]; see
     :func:`softgrasp.lqr.plant.second_order.second_order`.
-
-    Attributes:
-        system: the operators; never a dense n x n array.
-        C_s: outputs of the hand's displacement, (p, n_s), on every rank.
-        C_z: outputs of the relative displacement, transposed, local rows (n_local, p).
-        Q: (p, p), symmetric positive semidefinite [1/(m2 s)].
-        R: (m, m), symmetric positive definite [1/(N2 s)], m = n_s.
-        columns: one per output component, or none.
-        B_z: forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None.
     """
 
-    system: BlockSystem
-    C_s: Array
-    C_z: Array
-    Q: Array
-    R: Array
-    columns: Columns = ()
+    system: BlockSystem  # the operators; never a dense n x n array
+    C_s: Array  # outputs of the hand's displacement, (p, n_s), on every rank
+    C_z: Array  # outputs of the relative displacement, transposed, local rows (n_local, p)
+    Q: Array  # (p, p), symmetric positive semidefinite [1/(m2 s)]
+    R: Array  # (m, m), symmetric positive definite [1/(N2 s)], m = n_s
+    columns: Columns = ()  # one per output component, or none
+    # forces of the inputs on the tissue, local rows (n_local, m), when there is no hand; else None
     B_z: Array | None = None
 
     @property
@@ -68,29 +62,17 @@ class RiccatiProblem:
 
 @dataclass(frozen=True)
 class RiccatiSolution:
-    """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`.
+    """X ~ Z Z' and the feedback u = K x, in the hand-relative coordinates of :class:`RiccatiProblem`."""
 
-    Attributes:
-        factor: Z, hand rows [q_s, v_s] and local tissue rows [z; v_z], ``rank`` columns.
-        gain: K = -R^{-1} B'XE.
-        residual: true relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z at the end.
-        method: the solver.
-        about: what the solver did, in words.
-        reason: why this solver was chosen; empty when the caller made it.
-        history: one dictionary per iteration.
-        counts: newton_steps, adi_steps, solves.
-        seconds: time by stage.
-    """
-
-    factor: Block
-    gain: Gain
-    residual: float
-    method: SolverName
-    about: str = ""
-    reason: str = ""
-    history: tuple[dict[str, float], ...] = ()
-    counts: dict[str, int] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
+    factor: Block  # Z, hand rows [q_s, v_s] and local tissue rows [z; v_z], ``rank`` columns
+    gain: Gain  # K = -R^{-1} B'XE
+    residual: float  # true relative residual ||Res||_2 / ||C'QC||_2, recomputed from Z at the end
+    method: SolverName  # the solver
+    about: str = ""  # what the solver did, in words
+    reason: str = ""  # why this solver was chosen; empty when the caller made it
+    history: tuple[dict[str, float], ...] = ()  # one dictionary per iteration
+    counts: dict[str, int] = field(default_factory=dict)  # newton_steps, adi_steps, solves
+    seconds: dict[str, float] = field(default_factory=dict)  # time by stage
 
     @property
     def rank(self) -> int:
@@ -102,3 +84,33 @@ class RiccatiSolution:
         """Method, what it did and why it was chosen, in one line."""
         about = f": {self.about}" if self.about else ""
         return f"{self.method}{about}" + (f" (chosen: {self.reason})" if self.reason else "")
+
+
+def rigid_gains(problem: RiccatiProblem, solution: RiccatiSolution) -> tuple[Array, Array]:
+    """Gain u for the whole body displaced by unit translations [N/m], and moving so [N s/m], (n_s, d) each."""
+    n_s, d, K = problem.layout.n_s, problem.layout.dimension, solution.gain.K_s
+    return K[:, :d], K[:, n_s : n_s + d]
+
+
+def translation_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float:
+    """||(K x_T)'R(K x_T) - C_s'QC_s|| / ||C_s'QC_s||, zero for every mesh, material and damping.
+
+    For x_T = [I; 0; 0; 0] (the whole body displaced rigidly by unit motions of the hand) and v_T = [0; I; 0; 0] (moving
+    rigidly) A x_T = 0 and, without damping against space, A v_T = E x_T: the Riccati equation between them.
+    """
+    K = solution.gain.K_s[:, : problem.layout.n_s]
+    exact = problem.C_s.T @ problem.Q @ problem.C_s
+    return float(np.linalg.norm(K.T @ problem.R @ K - exact) / (np.linalg.norm(exact) or 1.0))
+
+
+def velocity_defect(problem: RiccatiProblem, solution: RiccatiSolution) -> float | None:
+    """||(K x_T)'R(K v_T) - x_T'E'XE x_T|| / ||x_T'E'XE x_T||.
+
+    None when the damping drags against space: the identity does not hold then.
+    """
+    if problem.system.damping.in_space and problem.system.damping.alpha > 0:
+        return None
+    n_s = problem.layout.n_s
+    left = solution.gain.K_s[:, :n_s].T @ problem.R @ solution.gain.K_s[:, n_s:]
+    right = solution.factor.hand[:n_s] @ solution.factor.hand[:n_s].T
+    return float(np.linalg.norm(left - right) / (np.linalg.norm(right) or 1.0))

@@ -35,8 +35,7 @@ def second_order(
         Q, R: (p, p), symmetric positive semidefinite, and (m, m), symmetric positive definite; None stands for I.
         damping: what D is when it is known to be alpha M + beta K, which modes do not couple by; D is ignored then.
 
-    Raises:
-        SolverError: the shapes do not fit, or a matrix is not symmetric.
+    Raises SolverError: the shapes do not fit, or a matrix is not symmetric.
     """
     M, D, K = matrices
     comm = M.comm.tompi4py()

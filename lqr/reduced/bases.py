@@ -25,6 +25,7 @@ from softgrasp.reduction.bases.engines import EPS, factor, small_svd
 from softgrasp.reduction.bases.states import BasisError
 
 A_PRIORI = "structured"  # the basis that needs no P
+STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,7 @@ class BasisFamily:
     """Nested bases of one method."""
 
     name: str  # key of BASES
-    # smallest, largest: orders that exist
-    smallest: int
+    smallest: int  # order that exists
     largest: int
     step: int  # distance of orders that exist
     sigma: tuple[Array, ...]  # singular values the truncation is chosen from, one array per POD
@@ -144,17 +144,13 @@ def componentwise_pod(problem: RiccatiProblem, Z: Block) -> BasisFamily:
 
     k1 = k2, or k1 = k2 + 1 when N is odd.
     """
-    n_s, n = problem.layout.n_s, problem.layout.n_local
-    R_c = triangular(problem.layout.comm, Block(Z.hand[:n_s], Z.tall))
+    q_s, _, z, v = Z.parts
+    R_c = triangular(problem.layout.comm, Block(q_s, Z.tall))
     none = np.zeros((0, len(R_c)))
-    V_q, s_q = left_singular(problem, Block(none, Z.tall[:n] @ R_c.T))
-    V_v, s_v = left_singular(problem, Block(none, Z.tall[n:] @ R_c.T))
+    (V_q, s_q), (V_v, s_v) = (left_singular(problem, Block(none, part @ R_c.T)) for part in (z, v))
 
     def columns(k: int) -> Array:
-        k_1, k_2 = (k + 1) // 2, k // 2
-        result = np.zeros((2 * n, k))
-        result[:n, :k_1], result[n:, k_1:] = V_q.tall[:, :k_1], V_v.tall[:, :k_2]
-        return result
+        return np.asarray(scipy.linalg.block_diag(V_q.tall[:, : (k + 1) // 2], V_v.tall[:, : k // 2]))
 
     count = 2 * min(V_q.columns, V_v.columns)
     return _tissue(problem, "componentwise_pod", columns, count, 1, (s_q, s_v))
@@ -171,9 +167,6 @@ def pod_decomposed(problem: RiccatiProblem, Z: Block) -> BasisFamily:
         return np.asarray(scipy.linalg.block_diag(V_1, V_1))
 
     return _tissue(problem, "pod_decomposed", columns, 2 * V.columns, 2, (s,))
-
-
-STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
 
 
 def structured(problem: RiccatiProblem) -> BasisFamily:
@@ -212,11 +205,10 @@ def energy_scaled(problem: RiccatiProblem, basis: RiccatiBasis) -> RiccatiBasis:
     V P_N V' depends on the span alone; in this form the reduced equation needs no balancing. The hand's displacement
     has no energy of its own and takes the stiffness (C_s'QC_s)^{1/2} of the feedback.
     """
-    system, U, n_s, n = problem.system, basis.U, problem.layout.n_s, problem.layout.n_local
+    system, (q_s, v_s, z, v) = problem.system, basis.U.parts
     spring = np.sqrt(np.linalg.norm(problem.C_s.T @ problem.Q @ problem.C_s, 2)) or 1.0
-    hand = np.concatenate([spring * U.hand[:n_s], problem.M_s @ U.hand[n_s:]])
-    tall = np.concatenate([times_columns(system.K_ee, U.tall[:n]), times_columns(system.M_ee, U.tall[n:])])
-    G = gram(system.layout.comm, U, Block(hand, tall))
+    H_U = Block.of_parts(spring * q_s, problem.M_s @ v_s, times_columns(system.K_ee, z), times_columns(system.M_ee, v))
+    G = gram(system.layout.comm, basis.U, H_U)
     scale = 1 / np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
 
     def inverse() -> Array | None:
@@ -242,14 +234,10 @@ def weight_blocks(problem: RiccatiProblem) -> tuple[Array, Array]:
 
 def weight_times(problem: RiccatiProblem, X: Block) -> Block:
     """W X for states in the paper's coordinates. Collective."""
-    system, n_s, n = problem.system, problem.layout.n_s, problem.layout.n_local
+    system, (q_s, v_s, q, v) = problem.system, X.parts
     M_ss, coupling = weight_blocks(problem)
-    v_s, v = X.hand[n_s:], X.tall[n:]
     hand = M_ss @ v_s + total(system.layout.comm, coupling.T @ v)
-    return Block(
-        np.concatenate([X.hand[:n_s], hand]),
-        np.concatenate([X.tall[:n], times_columns(system.M_ee, v) + coupling @ v_s]),
-    )
+    return Block.of_parts(q_s, hand, q, times_columns(system.M_ee, v) + coupling @ v_s)
 
 
 def check_weight(problem: RiccatiProblem) -> None:
@@ -286,8 +274,7 @@ def make_family(name: str, problem: RiccatiProblem, Z: Block) -> BasisFamily:
         name: key of :data:`BASES`.
         Z: factor of X in hand-relative coordinates, see :class:`softgrasp.lqr.plant.problem.RiccatiSolution`.
 
-    Raises:
-        ControlError: the name is unknown, or the method does not apply.
+    Raises ControlError: the name is unknown, or the method does not apply.
     """
     if name not in BASES:
         raise ControlError(f"basis '{name}' is unknown; choose one of {', '.join(BASES)}")

@@ -11,6 +11,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import PETSc, combine, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.lqr.dense.modal import modes_of_plant
+from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.plant.checks import EPS, ControlError
 from softgrasp.lqr.plant.gain import Block, Gain
 from softgrasp.lqr.plant.operators import damp, descriptor
@@ -52,27 +53,9 @@ class Abscissa:
 
 
 def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
-    """Largest real part of the spectrum of x' = (A + B K) x [1/s], see :func:`certified_abscissa`. Collective.
+    """Largest real part of the spectrum of x' = (A + B K) x [1/s], with a certificate of its sign. Collective.
 
-    Args:
-        problem: the plant; damped in every layer for a certificate.
-        gain: u = K x.
-
-    Raises:
-        ControlError: the plant has no hand.
-        SolverError: no eigenvalue converges.
-
-    >>> import softgrasp as sg
-    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
-    >>> sg.abscissa(problem, sg.solve(problem).gain).value < 0
-    True
-    """
-    return certified_abscissa(problem, gain.block)
-
-
-def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
-    """Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it. Collective.
-
+    Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it:
     :class:`softgrasp.lqr.spectrum.tail.Tail` excludes eigenvalues with Re s >= 0 beyond a radius r; the circle
     |s - sigma| <= d with d^2 = r^2 + sigma^2 holds all others with Re s >= 0. Kelvin-Voigt damping makes infinitely
     many eigenvalues accumulate at -1/beta as the mesh gets finer; sigma is chosen so that the circle leaves them
@@ -84,13 +67,18 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
 
     Args:
         problem: the plant; damped in every layer for a certificate.
-        K: gain, transposed, hand-relative.
+        gain: u = K x, K = [K_q, K_v] on the hand (n_s, 2 n_s) and on the tissue's local rows (n_local, n_s).
 
     Raises:
         ControlError: the plant has no hand.
         SolverError: no eigenvalue converges.
+
+    >>> import softgrasp as sg
+    >>> problem = sg.problem(sg.build("paper_lqr", ["tissue.cells=[2, 4]"]))
+    >>> sg.abscissa(problem, sg.solve(problem).gain).value < 0
+    True
     """
-    n_s = problem.layout.n_s
+    n_s, K = problem.layout.n_s, gain.block
     if n_s == 0:
         raise ControlError(
             "the certified abscissa belongs to a hand; without one take softgrasp.lqr.spectrum.modal_loop.ModalLoop"
@@ -108,7 +96,7 @@ def certified_abscissa(problem: RiccatiProblem, K: Block) -> Abscissa:
         for count in (guess, *(more for more in GROWTH if more > guess)):
             number = min(count, problem.layout.states - 2)
             values = resolvent.nearest(number)
-            result: Abscissa = problem.layout.comm.bcast(_judge(values, shift, tail, why))
+            result: Abscissa = problem.layout.comm.bcast(_conclude(values, shift, tail, why))
             short = len(values) < number  # asking for more would not help
             enough = result.certified and (result.exact or result.radius >= ENOUGH * aim)
             if result.value >= 0 or short or enough or why:
@@ -137,7 +125,7 @@ def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, i
     return radius, max(radius / 4, beta * radius**2), min(2 * problem.layout.n_s + 2 * inside, GROWTH[-1])
 
 
-def _judge(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:
+def _conclude(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:
     """What the eigenvalues nearest to the shift say."""
     distance = np.abs(values - shift)
     order = np.argsort(distance)
@@ -196,22 +184,17 @@ class Resolvent:
             hand = hand + sigma * self.drag * system.M_rigid
             hand = hand - factor**2 * total(self.comm, system.G.T @ self.S_G)
         self.hand = np.linalg.inv(hand)
-        columns = []
-        for unit in np.eye(n_s):
-            load = Block(np.concatenate([np.zeros(n_s), unit])[:, None], np.zeros((2 * self.n, 1)))
-            columns.append(self._open(load))
-        self.columns = Block.join(columns)
-        input_ = self.K.hand.T @ self.columns.hand + total(self.comm, self.K.tall.T @ self.columns.tall)
-        self.small = np.linalg.inv(np.eye(n_s) - input_)
+        loads = Block(np.eye(2 * n_s, n_s, -n_s), np.zeros((2 * self.n, n_s)))
+        self.columns = Block.join([self._open(loads[i : i + 1]) for i in range(n_s)])
+        self.small = np.linalg.inv(np.eye(n_s) - gram(self.comm, self.K, self.columns))
 
     def _open(self, b: Block) -> Block:
         """(sigma E - A)^{-1} b for one column. Collective."""
-        system, sigma, n, s = self.system, self.shift, self.n, self.n_s
-        a_s, a, b_s, f = b.hand[:s], b.tall[:n], b.hand[s:], b.tall[n:]
+        system, sigma, (a_s, b_s, a, f) = self.system, self.shift, b.parts
         # v = sigma q - a: the displacements alone remain
-        moved = descriptor(self.problem, Block(np.concatenate([0 * a_s, a_s]), np.concatenate([0 * a, a])))
-        right = b_s + sigma * moved.hand[s:]
-        force = f + sigma * moved.tall[n:] + damp(system, a) + self.drag * (system.G @ a_s)
+        _, moved_s, _, moved = descriptor(self.problem, Block.of_parts(0 * a_s, a_s, 0 * a, a)).parts
+        right = b_s + sigma * moved_s
+        force = f + sigma * moved + damp(system, a) + self.drag * (system.G @ a_s)
         if system.two_way and self.drag:
             right = right + self.drag * (system.M_rigid @ a_s + total(self.comm, system.G.T @ a))
         factor = sigma**2 + sigma * self.drag
@@ -222,7 +205,7 @@ class Resolvent:
         else:
             q_s = self.hand @ right
             z = self._solve((force - factor * (system.G @ q_s))[:, 0])[:, None]
-        return Block(np.concatenate([q_s, sigma * q_s - a_s]), np.concatenate([z, sigma * z - a]))
+        return Block.of_parts(q_s, sigma * q_s - a_s, z, sigma * z - a)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply y = (sigma E - A - B K)^{-1} E x. Collective."""
@@ -231,8 +214,7 @@ class Resolvent:
         self.comm.Bcast(hand)
         state = Block(hand[:, None], np.array(local[self.extra :])[:, None])
         answer = self._open(descriptor(self.problem, state))
-        input_ = self.K.hand.T @ answer.hand + total(self.comm, self.K.tall.T @ answer.tall)
-        input_ = self.small @ input_
+        input_ = self.small @ gram(self.comm, self.K, answer)
         out = y.array_w
         out[: self.extra] = (answer.hand + self.columns.hand @ input_)[: self.extra, 0]
         out[self.extra :] = (answer.tall + self.columns.tall @ input_)[:, 0]
@@ -247,8 +229,7 @@ class Resolvent:
 
         Collective.
 
-        Raises:
-            SolverError: none converges, or an eigenpair has a large residual.
+        Raises SolverError: none converges, or an eigenpair has a large residual.
         """
         eps = SLEPc.EPS().create(self.comm)
         eps.setOptionsPrefix(PREFIX)

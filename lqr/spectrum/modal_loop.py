@@ -40,7 +40,7 @@ class LoopQuality:
 
     abscissa: float  # largest real part of the closed-loop spectrum [1/s], or a lower bound where not ``exact``
     cost_excess: float  # J(K_hat) / J(K) - 1 from the start given; infinite when the loop is not stable
-    # its sign is certain: from the whole spectrum, or from softgrasp.lqr.spectrum.certificate.certified_abscissa
+    # its sign is certain: from the whole spectrum, or from softgrasp.lqr.spectrum.certificate.abscissa
     certified: bool = True
     exact: bool = True  # the abscissa is that of the whole spectrum, or exceeded by it by at most a thousandth
     poles: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=complex))  # eigenvalues behind it
@@ -56,7 +56,7 @@ class ModalLoop:
     """xi' = (A + B K) xi, xi = [q_s, v_s, omega eta, eta'], all modes of a small scene or the lowest of a large one.
 
     With all modes the spectrum is that of the full plant. With some, the modes left out are not in it: use
-    :func:`softgrasp.lqr.spectrum.certificate.certified_abscissa` for large scenes.
+    :func:`softgrasp.lqr.spectrum.certificate.abscissa` for large scenes.
 
     Args:
         modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`SOME_MODES`. All modes are
@@ -74,14 +74,12 @@ class ModalLoop:
 
     def gain(self, K: Block) -> Array:
         """K on modal states from a transposed gain in hand-relative coordinates, (n_s, 2 n_s + 2 k). Collective."""
-        n = self.problem.layout.n_local
-        z, v = total(self.comm, np.stack([self.plant.Phi.T @ K.tall[:n], self.plant.Phi.T @ K.tall[n:]]))
+        z, v = total(self.comm, np.stack([self.plant.Phi.T @ part for part in K.parts[2:]]))
         return np.asarray(np.vstack([K.hand, z / self.plant.omega[:, None], v]).T)
 
     def state(self, x: Block) -> Array:
         """Modal states of full ones. Collective."""
-        n = self.problem.layout.n_local
-        z, v = total(self.comm, np.stack([self.plant.massed.T @ x.tall[:n], self.plant.massed.T @ x.tall[n:]]))
+        z, v = total(self.comm, np.stack([self.plant.massed.T @ part for part in x.parts[2:]]))
         return np.asarray(np.vstack([x.hand, z * self.plant.omega[:, None], v]))
 
     def poles(self, K: Block) -> np.ndarray:
@@ -103,7 +101,7 @@ class ModalLoop:
         """
         k, difference, xi = self.gain(K), self.gain(K) - self.gain(best), self.state(x)
 
-        def judge() -> LoopQuality:
+        def evaluate() -> LoopQuality:
             F = self.A + self.B @ k
             if not np.isfinite(F).all():
                 return LoopQuality(np.inf, np.inf, poles=np.array([np.inf + 0j]))
@@ -115,7 +113,7 @@ class ModalLoop:
             Y = lyapunov(T, U, difference.T @ self.problem.R @ difference)
             return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal, poles=poles)
 
-        return on_root(self.comm, judge)
+        return on_root(self.comm, evaluate)
 
 
 def _all(problem: RiccatiProblem) -> ModalPlant:

@@ -170,19 +170,12 @@ class SampledLoop:
         y+ = step y + accelerated (v+ - v) + dragged (v+ + v) runs beside the plant. One-way the hand does not feel the
         plant's own tissue, so that hand and y decide alone and the small plant of the controller is exact.
 
-        Args:
-            K: as it would be saved.
-            law: instants of the plant; one tick is the controller's period.
+        ``K``: as it would be saved; ``law``: instants of the plant; one tick is the controller's period.
         """
-        system, n_s = self.problem.system, K.n_s
-        if not system.two_way:
-            A, B = np.split(np.linalg.solve(K.plant.E, np.hstack([K.plant.A, K.plant.B])), [K.plant.N], axis=1)
-            hand = np.eye(2 * n_s, len(A))
-        else:
-            loop = self._modes()
-            A, B, hand = loop.A, loop.B, np.eye(2 * n_s, len(loop.A))
-        exact = not system.two_way or self._modes().complete
-        return replace(on_root(self.comm, lambda: _carried(A, B, hand, K, law)), exact=exact)
+        loop = self._modes() if self.problem.system.two_way else None
+        space = K.plant if loop is None else loop.plant.space
+        A, B = np.split(np.linalg.solve(space.E, np.hstack([space.A, space.B])), [len(space.A)], axis=1)
+        return replace(on_root(self.comm, lambda: _carried(A, B, K, law)), exact=loop is None or loop.complete)
 
     def _modes(self) -> ModalLoop:
         """All modes as far as they fit, else the lowest. Collective."""
@@ -219,10 +212,10 @@ class SampledLoop:
         return _Parts(A, B, k, False, _Rest(size, left_out, tail.alpha + tail.beta * left_out**2, tail.drag))
 
     def _radius(self, parts: _Parts, law: Sampling) -> SampledRadius:
-        return on_root(self.comm, lambda: _judge(parts, law))
+        return on_root(self.comm, lambda: _conclude(parts, law))
 
 
-def _judge(parts: _Parts, law: Sampling) -> SampledRadius:
+def _conclude(parts: _Parts, law: Sampling) -> SampledRadius:
     """Eigenvalues of the modes kept, and the bound on the rest."""
     A_d, B_d = tick(parts.A, parts.B, law)
     m = B_d.shape[1]
@@ -294,21 +287,17 @@ def _responses(rest: _Rest, law: Sampling) -> tuple[float, float]:
     return tuple(float(np.max(np.where(fine & np.isfinite(x), x, np.inf))) for x in (constant, ramp))  # type: ignore[return-value]
 
 
-def _carried(A: Array, B: Array, hand: Array, K: Controller, law: Sampling) -> SampledRadius:
+def _carried(A: Array, B: Array, K: Controller, law: Sampling) -> SampledRadius:
     """Plant x, tissue y of the controller, and the command under way."""
     n_s, n = K.n_s, len(A)
     A_d, B_d = tick(A, B, law)
     step, accelerated, dragged, _ = K.model
     drag = np.zeros_like(accelerated) if dragged is None else dragged
-    C_v, m = hand[n_s:], n_s
+    hand = np.eye(2 * n_s, n)
+    C_v = hand[n_s:]
     gain = np.hstack([K.K[:, : 2 * n_s] @ hand, K.K[:, 2 * n_s :]])
-    one = np.eye(n)
-
-    def moved(x: Array) -> Array:
-        """What an increment of x+ does to y+."""
-        return np.asarray((accelerated + drag) @ C_v @ x)
-
-    free = np.block([[A_d, np.zeros((n, len(step)))], [moved(A_d) - (accelerated - drag) @ C_v @ one, step]])
-    push = np.vstack([B_d, moved(B_d)])
-    T = np.block([[free, push], [gain, np.zeros((m, m))]]) if law.delay else free + push @ gain
+    moved = (accelerated + drag) @ C_v  # what an increment of x+ does to y+
+    free = np.block([[A_d, np.zeros((n, len(step)))], [moved @ A_d - (accelerated - drag) @ C_v, step]])
+    push = np.vstack([B_d, moved @ B_d])
+    T = np.block([[free, push], [gain, np.zeros((n_s, n_s))]]) if law.delay else free + push @ gain
     return SampledRadius(float(np.abs(np.linalg.eigvals(T)).max()))

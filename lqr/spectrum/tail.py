@@ -70,16 +70,14 @@ class Tail:
     """
 
     def __init__(self, problem: RiccatiProblem, K: Block, modes: tuple[Array, Array] | None = None) -> None:
-        system, n, n_s = problem.system, problem.layout.n_local, problem.layout.n_s
-        comm = problem.layout.comm
+        system, n_s, comm = problem.system, problem.layout.n_s, problem.layout.comm
         inverse = np.linalg.inv(problem.M_s)
-        hand_q, hand_v = K.hand[:n_s], K.hand[n_s:]
+        hand_q, hand_v, gain_z, gain_v = K.parts
         self.K_q, self.K_v = (float(np.linalg.norm(k.T @ inverse, 2)) for k in (hand_q, hand_v))
         self.alpha, self.beta = system.damping.alpha, least_beta(problem)
         self.coupled = modes_couple(system)
         self.drag = self.alpha if system.damping.in_space else 0.0
         force = system.G @ inverse
-        gain_z, gain_v = K.tall[:n], K.tall[n:]
         if system.two_way:  # the hand gives way: q_s = M_s^{-1} (u / s^2 - G'z)
             gain_z, gain_v = gain_z - force @ hand_q, gain_v - force @ hand_v
         self.omega, Phi = tail_modes(problem, min(MODES, problem.layout.n_e)) if modes is None else modes

@@ -18,8 +18,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
-from softgrasp.lqr.dense.modal import factor_psd
-from softgrasp.lqr.dense.paper import paper_form
+from softgrasp.lqr.dense.modal import factor_psd, paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI

@@ -148,8 +148,7 @@ class HardCaseResult:
     @property
     def counts(self) -> dict[str, int]:
         """The counts of all families together."""
-        each = [f.counts for f in self.families]
-        return {name: sum(count[name] for count in each) for name in ("cases", "passed", "refused")}
+        return {name: sum(f.counts[name] for f in self.families) for name in ("cases", "passed", "refused")}
 
     @property
     def failed(self) -> list[str]:

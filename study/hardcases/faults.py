@@ -29,27 +29,19 @@ from softgrasp.study.shell.processes import IN_MPI_JOB, child_environment, find_
 BAD = ("nan", "inf", "-inf")
 SCENE = """
 name = "every key"
+contact = { sides = ["left", "right"], box = [[0.0, 1.5], [1.0, 2.0]] }
+hand = { mass = 20.0 }
+motion = { target = [5.0, 3.0] }
+time = { steps = 5 }
+control = { outputs = [{ kind = "node", point = [0.5, 0.0] }] }
+[effects]
+gravity = { g = [0.0, -9.0] }
+damping = { kind = "rayleigh", beta = 0.01, alpha = 0.4 }
 [tissue]
 size = [1.0, 2.0]
 cells = [2, 4]
 material = { lambda = 50.0, mu = 50.0, rho = 1.0 }
-[tissue.layers.low]
-box = [[0.0, 0.0], [1.0, 0.5]]
-material = { lambda = 90.0, mu = 20.0, rho = 2.5 }
-[contact]
-sides = ["left", "right"]
-box = [[0.0, 1.5], [1.0, 2.0]]
-[hand]
-mass = 20.0
-[effects]
-gravity = { g = [0.0, -9.0] }
-damping = { kind = "rayleigh", beta = 0.01, alpha = 0.4 }
-[motion]
-target = [5.0, 3.0]
-[time]
-steps = 5
-[control]
-outputs = [{ kind = "node", point = [0.5, 0.0] }]
+layers.low = { box = [[0.0, 0.0], [1.0, 0.5]], material = { lambda = 90.0, mu = 20.0, rho = 2.5 } }
 """
 
 
@@ -141,17 +133,14 @@ def _file_rows(folder: Path, scene: Path, at: int) -> Iterator[HardCase]:
     mesh = ["tissue={mesh='body.mesh', material={lambda=1.0, mu=1.0, rho=1.0}}", "contact={sides=['left']}"]
 
     def run(changes: list[str]) -> float:
-        simulate(build(load_scene(scene, changes), comm=MPI.COMM_SELF))
-        return 1.0
+        return simulate(build(load_scene(scene, changes), comm=MPI.COMM_SELF)).energy_drift
 
-    def read() -> float:
-        return float(np.isnan(np.genfromtxt(folder / "hand.csv", delimiter=",")).sum())
-
+    read = textbook(lambda: float(np.isnan(np.genfromtxt(folder / "hand.csv", delimiter=",")).sum()))
     reason = "a file must be refused before the first step"
     lines = (folder / "body.mesh").read_text().split()
     taken = Outcome(float(sum(not np.isfinite(float(x)) for x in lines if x[0].isdigit() or x == "nan")))
-    yield HardCase("NaN in a trajectory file", at, here(lambda: run(motion)), textbook(read), None, reason)
-    yield HardCase("NaN in a mesh file", at + 1, here(lambda: run(mesh)), taken, None, reason)
+    yield HardCase("NaN in a trajectory file", at, here(run, motion), read, None, reason)
+    yield HardCase("NaN in a mesh file", at + 1, here(run, mesh), taken, None, reason)
 
 
 def _force_row(at: int) -> HardCase:
@@ -159,8 +148,7 @@ def _force_row(at: int) -> HardCase:
     model = make("paper_forward", "tissue.cells=[2, 4]", "time.steps=60")
 
     def run() -> float:
-        simulate(model, force=lambda n, t, q, v: np.full(2, np.nan if n == 30 else 1.0))
-        return 1.0
+        return simulate(model, force=lambda n, t, q, v: np.full(2, np.nan if n == 30 else 1.0)).energy_drift
 
     def loop() -> float:
         z = np.full(model.system.layout.n_e, np.nan)
@@ -215,7 +203,7 @@ def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
     return status, output, time.perf_counter() - begin
 
 
-def judge(command: list[str], patience: float, healthy: float, sentence: str) -> Outcome:
+def ending(command: list[str], patience: float, healthy: float, sentence: str) -> Outcome:
     """Time until both ranks have ended over that of a healthy run, or why that is no good end."""
     status, output, seconds = job(command, patience * healthy)
     if status is None:
@@ -237,8 +225,8 @@ def rank_rows(quick: bool) -> Iterator[HardCase]:
     for i, fault in enumerate(["disk"] if quick else list(FAULTS)):
         text, sentence, same = FAULTS[fault]
         with tempfile.TemporaryDirectory() as folder:
-            outcome = judge([*FAULTY, fault, folder], PATIENCE, healthy, sentence)
-        bare = textbook(judge, ["-c", BARE.format(fault=same)], BARE_PATIENCE, healthy, "")
+            outcome = ending([*FAULTY, fault, folder], PATIENCE, healthy, sentence)
+        bare = textbook(ending, ["-c", BARE.format(fault=same)], BARE_PATIENCE, healthy, "")
         yield HardCase(text, i + 1, outcome, bare, PATIENCE, reason)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -13,13 +13,11 @@ import scipy.linalg
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import force_values
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.bases.inner import orthonormality
 from softgrasp.reduction.bases.registry import make_bases, make_basis
@@ -27,36 +25,18 @@ from softgrasp.reduction.bases.states import States, states_of
 from softgrasp.reduction.model import SmallModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.projection import project
+from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, qr_rounding, textbook, thin
 
 REASON = "rounding of a QR factorisation, rows x columns x eps [H02]"
 
 
-@dataclass(frozen=True)
-class Moved:
-    """A run of the full model, its snapshots and the force that drives the hand."""
-
-    model: Model
-    trajectory: Trajectory
-    snapshots: Snapshots
-    force: Array
-
-    @property
-    def states(self) -> States:
-        """All snapshots."""
-        return states_of(self.model.system, self.snapshots)
-
-
 @cache
-def moved(cells: int, every: int = 1, periods: int = 1) -> Moved:
+def moved(cells: int, every: int = 1, periods: int = 1) -> FullRun:
     """The paper's move in 3 s, driven by force, on a mesh of cells x 2 cells; then rest up to 3 s times periods."""
     scene = (f"tissue.cells=[{cells}, {2 * cells}]", "motion.drive='force'", f"output.every={every}")
     model = make("paper_forward", *scene, f"time={{steps={300 * periods}, end={3.0 * periods!r}}}")
-    trajectory = simulate(model)
-    if trajectory.snapshots is None:
-        raise ValueError("the scene keeps no snapshots in memory")
-    force = force_values(model.scene, model.system.layout.n_s, model.system.M_hand)
-    return Moved(model, trajectory, trajectory.snapshots, force)
+    return full_run(model, simulate(model))
 
 
 def stacked(snapshots: Snapshots, T: Array) -> Array:
@@ -94,7 +74,7 @@ def sigma_rows(quick: bool) -> Iterator[HardCase]:
 # --- snapshots of any scale, of no rank
 
 
-def _scaled(case: Moved, factor: float) -> States:
+def _scaled(case: FullRun, factor: float) -> States:
     s = case.snapshots
     return states_of(case.model.system, replace(s, Z=factor * s.Z, q_s=factor * s.q_s, v_s=factor * s.v_s))
 
@@ -120,7 +100,7 @@ def scale_rows(quick: bool) -> Iterator[HardCase]:
         yield HardCase(f"snapshots times {unit:.0e}", unit, pod, gram, qr_rounding(*X.shape), REASON)
 
 
-def _columns(case: Moved, pick: NDArray[Any]) -> States:
+def _columns(case: FullRun, pick: NDArray[Any]) -> States:
     s = case.snapshots
     Z, steps, times = np.asfortranarray(s.Z[:, pick]), s.steps[pick], s.times[pick]
     chosen = replace(s, steps=steps, times=times, Z=Z, q_s=s.q_s[:, pick], v_s=s.v_s[:, pick])
@@ -155,7 +135,7 @@ def edge_rows(quick: bool) -> Iterator[HardCase]:
     m = X.shape[1] - 1  # the first snapshot is zero
     for N in thin([4, 12, 20, 28, 36, 44, m, m + 1], quick):
         n = int(N)
-        pod, gram = here(_pod_defect, case.states, n), textbook(_gram_defect, X, n)
+        pod, gram = here(_pod_defect, states_of(case.model.system, case.snapshots), n), textbook(_gram_defect, X, n)
         bound = qr_rounding(*X.shape) if n <= m else None
         reason = REASON + "; above the numerical rank a refusal is right" if bound else f"there are only {m} snapshots"
         yield HardCase(f"N = {n}", n, pod, gram, bound, reason, may_refuse=n > m // 2)
@@ -177,9 +157,9 @@ def textbook_loop(rom: SmallModel, dt: float, force: Array) -> Array:
     return np.asarray(X @ rom.outputs.C_z.T + X @ op.S_q.T @ rom.outputs.C_s.T)
 
 
-def _tip_error(case: Moved, rom: SmallModel, dt: float, checked: bool) -> float:
+def _tip_error(case: FullRun, rom: SmallModel, force: Array, checked: bool) -> float:
     """Largest error of the outputs over the largest deformation seen."""
-    outputs = run(rom, dt, force=case.force).outputs if checked else textbook_loop(rom, dt, case.force)
+    outputs = run(rom, case.dt, force=force).outputs if checked else textbook_loop(rom, case.dt, force)
     if not np.isfinite(outputs).all():
         return math.inf
     exact = case.trajectory.outputs
@@ -190,22 +170,22 @@ def growth_rows(quick: bool) -> Iterator[HardCase]:
     """Bases from the move of 3 s, run five times as long; and what happens to models that grow."""
     case = moved(5 if quick else 10, periods=5)
     scene, system = case.model.scene, case.model.system
-    dt, outputs = scene.time_end / scene.time.steps, make_outputs(scene, system)
+    force, outputs = force_values(scene, system.layout.n_s, system.M_hand), make_outputs(scene, system)
     trained = _columns(case, np.arange(301))
     dimensions = [10, 20, 40] if quick else [10, 14, 18, 22, 26, 30, 34, 38, 42, 46, 50, 60]
     sweeps = {name: make_bases(name, trained, dimensions) for name in ("psd", "global_pod")}
     growing = []
     for i, N in enumerate(dimensions):
         roms = {name: project(bases[i], system, outputs).at() for name, bases in sweeps.items()}
-        midpoint = here(_tip_error, case, roms["psd"], dt, True)
-        loop = textbook(_tip_error, case, roms["global_pod"], dt, False)
+        midpoint = here(_tip_error, case, roms["psd"], force, True)
+        loop = textbook(_tip_error, case, roms["global_pod"], force, False)
         reason = "two vibrations of one size differ by twice their size at most: nothing grows"
         yield HardCase(f"N = {N}", N, midpoint, loop, 2.0, reason)
         if not roms["global_pod"].stable:
             growing.append((N, roms["global_pod"], loop))
     for N, model, loop in growing[:: max(1, len(growing) // 3)]:
         name = f"(q, v) POD, N = {N}, grows by {model.spectral_abscissa:.1e}/s"
-        refusal, reason = here(_tip_error, case, model, dt, True), "a growing model must not be run silently"
+        refusal, reason = here(_tip_error, case, model, force, True), "a growing model must not be run silently"
         yield HardCase(name, N, refusal, loop, None, reason, group="(q, v) POD")
 
 

@@ -28,30 +28,16 @@ REST = 1.0  # [s] the last frame stays longer
 
 
 def gif_move(
-    picture: PictureMesh,
-    frames: Array,
-    times: Array,
-    table: Array,
-    target: npt.ArrayLike | None,
-    out_gif: Path,
+    picture: PictureMesh, frames: Array, times: Array, table: Array, target: npt.ArrayLike | None, out_gif: Path
 ) -> Path:
     """Body, hand, path and target in motion, in real time from 0.3 to 30 s; at most 60 frames and 3 MB.
 
-    Args:
-        picture: the body.
-        frames: absolute vertex displacements, shape (k, n, d) [m]; too many are thinned out.
-        times: instants of the frames, shape (k,) [s].
-        table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
-        target: hand coordinates aimed at, d or n_s entries, or None.
-        out_gif: name of the file.
-
-    Returns:
-        The name of the file.
+    Too many frames are thinned out; for the arguments see :func:`softgrasp.study.pictures.body.figure_move`.
     """
-    kept, ticks = _timing(np.asarray(times, dtype=np.float64))
-    frames, times = np.asarray(frames, dtype=np.float64)[kept], np.asarray(times, dtype=np.float64)[kept]
-    shot = make_shot(picture, frames, times, np.asarray(table, dtype=np.float64), target)
-    durations = [int(10 * n) for n in ticks] + [int(1000 * REST)]
+    kept, ticks = _timing(times)
+    frames, times = frames[kept].astype(np.float64), times[kept]
+    shot = make_shot(picture, frames, times, table, target)
+    durations = [*(10 * n for n in ticks), int(1000 * REST)]
     return write_gif(_render(shot, frames, times), durations, out_gif, _palette())
 
 
@@ -70,23 +56,21 @@ def _timing(times: Array) -> tuple[list[int], list[int]]:
 
 def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
     """One picture per frame, all of one size."""
-    images = []
-    fast = speed_up(times)
+    images, fast = [], speed_up(times)
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
     note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
         figure, axes = make_axes(shot, 1, captions=False, width=5.4, tallest=4.2)
-        ax = axes[0]
         # The longest text first, so that all frames have the size of the first.
-        stamp = ax.set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
+        stamp = axes[0].set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
         film = Film(figure, axes, [stamp])
-        for i in range(len(frames)):
+        for t, u, hand in zip(times, frames, shot.hands, strict=True):
             film.clear()
-            draw_scene(ax, shot, frames[i : i + 1], None, shot.hands[i : i + 1])
-            name_layers(ax, shot, frames[i], inside=True)  # beside the body they would change sides
-            stamp.set_text(f"t = {times[i]:.{digits}f} s{note}")
+            draw_scene(axes[0], shot, u[None], None, hand[None])
+            name_layers(axes[0], shot, u, inside=True)  # beside the body they would change sides
+            stamp.set_text(f"t = {t:.{digits}f} s{note}")
             images.append(film.frame())
         plt.close(figure)
     return images
@@ -95,10 +79,7 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
 class Film:
     """Frames of one figure: axes, colour bar and legend are drawn once, what moves over them in every frame.
 
-    Args:
-        figure: without what moves; all frames get its size.
-        axes: whose lines lie under and over the collections and texts that move.
-        others: further artists that change.
+    The figure comes without what moves: the collections and texts of ``axes``, and ``others``.
     """
 
     def __init__(self, figure: Any, axes: list[Any], others: Sequence[Any] = ()) -> None:
@@ -145,15 +126,11 @@ def _fit(figure: Any, box: Any) -> None:
 
 
 def write_gif(images: list[Any], durations: list[int], out_gif: Path, palette: Any = None) -> Path:
-    """Write an animation, smaller if it would take more than 3 MB.
+    """Write frames of one size, each with its duration [ms], smaller if they would take more than 3 MB.
 
-    Args:
-        images: frames of one size.
-        durations: of each [ms].
-        out_gif: name of the file.
-        palette: its colours; by default the 256 of the frame in the middle.
+    Without a palette the colours are the 256 of the frame in the middle.
     """
-    palette = palette or palette_of(images[len(images) // 2])
+    palette = palette or _palette_of(images[len(images) // 2])
     for scale in (1.0, 0.8, 0.6, 0.45):
         size = tuple(round(scale * n) for n in images[0].size)
         scaled = images if scale == 1.0 else [image.resize(size, Image.Resampling.LANCZOS) for image in images]
@@ -166,7 +143,7 @@ def write_gif(images: list[Any], durations: list[int], out_gif: Path, palette: A
     return out_gif
 
 
-def palette_of(image: Any) -> Any:
+def _palette_of(image: Any) -> Any:
     """The 256 colours of a picture, its paper pure white."""
     palette = image.quantize(256)
     colours = np.reshape(palette.getpalette(), (-1, 3))
@@ -178,9 +155,7 @@ def palette_of(image: Any) -> Any:
 def _palette() -> Any:
     """The 256 colours that occur: colour map in four shades, greys to pure white, and the target fading out."""
     shades = np.linspace(0.75, 1.0, 4)[:, None, None] * colour_map()(np.linspace(0.0, 1.0, 48))[:, :3]
-    greys = np.repeat(
-        np.append(np.linspace(0.0, 0.92, 47), 1.0)[:, None], 3, axis=1
-    )  # Pillow rounds: nothing near white
+    greys = np.append(np.linspace(0.0, 0.92, 47), 1.0)[:, None].repeat(3, axis=1)  # Pillow rounds: nothing near white
     fade = np.linspace(0.0, 0.8, 16)[:, None]
     target = (1 - fade) * np.array(to_rgb(TARGET)) + fade
     palette = Image.new("P", (1, 1))

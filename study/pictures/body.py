@@ -82,12 +82,8 @@ class Shot:
 
 def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> Shot:
     """Prepare the views of a move; see `figure_move` for the arguments."""
-    hands = hands_at(table, times)
-    aim = None
-    if target is not None:
-        aim = np.zeros(picture.n_s)
-        given = np.asarray(target, dtype=np.float64)
-        aim[: len(given)] = given
+    hands, given = hands_at(table, times), np.asarray([] if target is None else target, dtype=np.float64)
+    aim = None if target is None else np.pad(given, (0, picture.n_s - len(given)))
     relative = [np.linalg.norm(u - picture.rigid(q), axis=1).max() for u, q in zip(states, hands, strict=True)]
     largest = float(max(relative))
     if largest <= ROUNDING * float(np.ptp(picture.points, axis=0).max()):
@@ -107,14 +103,9 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
 
 
 def figure_move(
-    picture: PictureMesh,
-    states: Array,
-    times: Array,
-    table: Array,
-    target: npt.ArrayLike | None,
-    out_png: Path,
+    picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None, out_png: Path
 ) -> tuple[Path, ...]:
-    """The deformed body at a few instants with hand, path and target; PNG and PDF.
+    """The deformed body at a few instants with hand, path and target; PNG and PDF, whose names are returned.
 
     Bodies that would hide each other get a panel each.
 
@@ -125,12 +116,9 @@ def figure_move(
         table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
         target: hand coordinates aimed at, d or n_s entries, or None.
         out_png: name of the picture; the PDF gets its stem.
-
-    Returns:
-        Names of PNG and PDF.
     """
-    states, times = np.asarray(states, dtype=np.float64), np.asarray(times, dtype=np.float64)
-    shot = make_shot(picture, states, times, np.asarray(table, dtype=np.float64), target)
+    states = states.astype(np.float64)
+    shot = make_shot(picture, states, times, table, target)
     with paper_style():
         apart = len(states) > 1 and (picture.dimension == 3 or overlap(picture, states))  # in 3D captions meet bodies
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
@@ -163,11 +151,8 @@ def make_axes(
 ) -> tuple[Any, list[Any]]:
     """Figure and axes of the right shape for the scene, with path and target; call within `paper_style`.
 
-    Args:
-        shot: the move.
-        panels: how many pictures side by side; one fills a column unless it is flat, several the page.
-        captions: leave room for them, beside the bodies of one panel or above each of several.
-        width, tallest: of the figure and of all panels together [inch].
+    One panel fills a column unless it is flat, several the page; captions get room beside the bodies of one panel or
+    above each of several. ``width`` is that of the figure, ``tallest`` the height of all panels together [inch].
     """
     solid, many = shot.picture.dimension == 3, panels > 1
     span = np.maximum(shot.high - shot.low, 1e-3 * float((shot.high - shot.low).max()))
@@ -215,10 +200,7 @@ def make_axes(
 
 
 def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
-    """Colour bar of the relative displacement beside the axes, at most 2.4 inch high.
-
-    None for outlines, nor where nothing deforms: one colour needs no scale.
-    """
+    """Colour bar of the relative displacement, at most 2.4 inch high; none for outlines and where nothing deforms."""
     if len(shot.picture.cells) > MANY_CELLS or not shot.norm.vmax > 0:
         return
     boxes = [ax.get_position() for ax in axes]

@@ -34,18 +34,10 @@ def seen(x: Array) -> Array:
 
 
 def pick_instants(picture: PictureMesh, states: Array, times: Array, table: Array) -> list[int]:
-    """Instants for one picture: first, last and one or two between, near even steps of way and much bent.
+    """Numbers of the states for one picture: first, last and one or two between, near even steps of way and much bent.
 
-    Four if they fit into one picture without hiding each other, else three if those do, else four for panels.
-
-    Args:
-        picture: the body.
-        states: absolute vertex displacements, shape (k, n, d) [m].
-        times: shape (k,) [s].
-        table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s).
-
-    Returns:
-        Numbers of the states.
+    Four if they fit into one picture without hiding each other, else three if those do, else four for panels. For the
+    arguments see :func:`softgrasp.study.pictures.body.figure_move`.
     """
     last = len(states) - 1
     if last < 3:
@@ -90,8 +82,7 @@ def hands_at(table: Array, times: Array) -> Array:
 def hand_polygons(picture: PictureMesh) -> tuple[list[Array], Array]:
     """Pads on the contact facets of a 2D body and the palm that joins them, where the hand starts.
 
-    Returns:
-        Polygons, each (corners, 2) [m], and the point where the arm holds the hand, (2,) [m].
+    Returns polygons, each (corners, 2) [m], and the point where the arm holds the hand, (2,) [m].
     """
     x, contact = picture.points, picture.contact
     low, high = x.min(axis=0), x.max(axis=0)
@@ -219,15 +210,9 @@ def facet_normals(corners: Array) -> Array:
 
 
 def shadow(flat: Array, facets: Any, fine: int = 700) -> list[Array]:
-    """Closed lines around the union of triangles in the plane, exact to 1 / ``fine`` of its size.
+    """Closed lines, each (k, 2) [m], around the union of triangles in the plane, exact to 1 / ``fine`` of its size.
 
-    Args:
-        flat: points, shape (n, 2) [m].
-        facets: triangles, shape (m, 3).
-        fine: pixels along the longer side.
-
-    Returns:
-        Lines, each (k, 2) [m].
+    ``flat`` are the points, (n, 2) [m], and ``facets`` the triangles, (m, 3).
     """
     low = flat.min(axis=0)
     pixel = float(np.ptp(flat, axis=0).max()) / fine

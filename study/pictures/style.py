@@ -37,24 +37,13 @@ STEPS = [1, 2, 5, 10]  # between ticks
 def paper_style() -> Iterator[None]:
     """Matplotlib settings for figures in print, restored afterwards."""
     settings: Any = {
-        "font.family": "sans-serif",
-        "font.size": 8,
-        "axes.labelsize": 8,
-        "axes.titlesize": 8,
+        "font.family": "sans-serif", "font.size": 8, "axes.labelsize": 8, "axes.titlesize": 8,
+        "legend.fontsize": 7.5, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5,
         "axes.titley": 1.0,  # else every draw looks for room
-        "legend.fontsize": 7.5,
-        "xtick.labelsize": 7.5,
-        "ytick.labelsize": 7.5,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.linewidth": 0.7,
-        "lines.linewidth": 1.2,
-        "legend.frameon": False,
-        "axes.prop_cycle": cycler(color=CYCLE),
-        "pdf.fonttype": 42,
-        "figure.dpi": DPI,
-        "savefig.dpi": DPI,
-    }
+        "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "lines.linewidth": 1.2,
+        "axes.prop_cycle": cycler(color=CYCLE), "legend.frameon": False,
+        "pdf.fonttype": 42, "figure.dpi": DPI, "savefig.dpi": DPI,
+    }  # fmt: skip
     with mpl.rc_context(settings):
         yield
 
@@ -95,10 +84,7 @@ def log_axis(ax: Any, top: float | None) -> None:
 def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: float = 7.0) -> None:
     """Names of curves right of the axes, each beside the end of its own, moved apart where they would touch.
 
-    Args:
-        ax: axes with their final limits and scales.
-        ends: x and y of the last point, name and colour of each curve.
-        size: of the font [pt].
+    The axes have their final limits and scales; ``ends`` are x and y of the last point, name and colour of each curve.
     """
     inverse, inch = ax.transAxes.inverted(), ax.get_position().height * ax.figure.get_figheight()
     gap = 1.25 * size / 72 / inch

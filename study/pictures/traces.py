@@ -29,15 +29,10 @@ def figure_traces(
 
     Args:
         times: shape (m,) [s].
-        outputs: absolute displacements, shape (m, c) [m].
-        columns: one per output; rotations have a panel of their own, of the hand.
-        q_s: hand, shape (m, n_s) [m, rad].
-        out_png: name of the picture; the PDF gets its stem.
+        outputs: absolute displacements, shape (m, c) [m], with their columns.
+        q_s: hand, shape (m, n_s) [m, rad]; its rotations have a panel of their own.
         rigid: share of the outputs that moves with the hand, shape (m, c); by default the hand's translation.
         dimension: 2 or 3; needed when a 2D hand turns.
-
-    Returns:
-        Names of PNG and PDF.
     """
     d = dimension or min(q_s.shape[1], 3)
     axes_of = [AXES.index(column.axis) if column.axis in AXES else -1 for column in columns]
@@ -52,10 +47,8 @@ def figure_traces(
             panels, 1, figsize=(COLUMN, 0.4 + 1.5 * panels), sharex=True, layout="constrained", squeeze=False
         )
         axes = axes[:, 0]
-        factors = [
-            length_unit(float(np.abs(a).max(initial=0.0)))
-            for a in (np.hstack([outputs[:, shown], q_s[:, :d]]), relative)
-        ]
+        drawn = np.hstack([outputs[:, shown], q_s[:, :d]])
+        factors = [length_unit(float(np.abs(a).max(initial=0.0))) for a in (drawn, relative)]
         for k, i in enumerate(shown):
             style = ("-", "-.", ":")[bodies.index(columns[i].name) % 3]
             look: dict[str, Any] = {"color": CYCLE[axes_of[i]], "ls": style}

@@ -15,20 +15,9 @@ PEAK = 99  # percentile of the colours' end: corners are singular, and the few c
 
 
 class Move:
-    """The field files of all parts of a run, instant by instant.
+    """The field files of all parts of a run, instant by instant, coloured by a field.
 
-    Args:
-        folder: of the run.
-        field: colours the body.
-
-    Attributes:
-        times: of the instants [s].
-        title: the field with its unit.
-        range: ends of its colours, from the bodies of a picture; for a vector its length counts.
-
-    Raises:
-        SceneError: the folder has no field files, or they have no such field.
-        ResourceError: PyVista is missing.
+    Raises SceneError: the folder has no field files, or they have no such field; ResourceError: PyVista is missing.
     """
 
     def __init__(self, folder: Path, field: str) -> None:
@@ -49,7 +38,7 @@ class Move:
             raise SceneError(f"{folder} has no field files; name the output folder of simulate or control")
         ends = [reader.time_values[0] for reader in readers[1:]] + [np.inf]
         self._instants = [(t, r) for r, end in zip(readers, ends, strict=True) for t in r.time_values if t < end]
-        self.times, self.field = [t for t, _ in self._instants], field
+        self.times, self.field = [t for t, _ in self._instants], field  # [s]
         first = self._read(0)
         self.flat = first.bounds.z_max == first.bounds.z_min
         known = {*first.point_data.keys(), *first.cell_data.keys()}
@@ -61,6 +50,7 @@ class Move:
         self.title = f"{field} [{unit}]" if unit else field
         self.shown = sorted({round(i) for i in np.linspace(0, len(self.times) - 1, SHOWN)})
         sizes = np.concatenate([self._value(self._read(i)) for i in self.shown])
+        # ends of the colours, from the bodies of a picture; for a vector its length counts
         self.range = float(sizes.min()), float(np.percentile(sizes, PEAK))
 
     def body(self, i: int) -> Any:
@@ -88,14 +78,7 @@ class Move:
 def view(folder: Path, field: str, save: Path | None) -> None:
     """Show the move in a window with a time slider, or save a picture of some instants.
 
-    Args:
-        folder: output folder of a run.
-        field: colours the body.
-        save: a PNG file; None opens a window.
-
-    Raises:
-        SceneError: there is no display, or the picture is no PNG, or as for `Move`.
-        ResourceError: PyVista is missing.
+    Raises SceneError: there is no display, or the picture is no PNG, or as for `Move`.
     """
     if save is not None and save.suffix != ".png":
         raise SceneError(f"--save {save}: the picture is a PNG; name a file that ends in .png")
@@ -104,11 +87,11 @@ def view(folder: Path, field: str, save: Path | None) -> None:
         raise SceneError("there is no display here for a window; give --save move.png")
     import pyvista
 
-    look = {"scalars": "value", "clim": move.range, "cmap": "viridis", "ambient": 0.4, "show_edges": True}
-    look |= {
-        "edge_opacity": 0.2,
-        "scalar_bar_args": {"title": f"{move.title}\n", "color": "black", "n_labels": 3, "fmt": "%.3g"},
-    }
+    bar = {"title": f"{move.title}\n", "color": "black", "n_labels": 3, "fmt": "%.3g"}
+    look = {
+        "scalars": "value", "clim": move.range, "cmap": "viridis", "ambient": 0.4, "show_edges": True,
+        "edge_opacity": 0.2, "scalar_bar_args": bar,
+    }  # fmt: skip
     shown = [0] if save is None else move.shown
     plotter = pyvista.Plotter(off_screen=save is not None, shape=(1, len(shown)), window_size=(1280, 640), border=False)
     for column, i in enumerate(shown):

@@ -20,7 +20,7 @@ from softgrasp.study.report.tables import Table
 
 
 @dataclass(frozen=True)
-class Answer:
+class CertifiedAnswer:
     """What is known at one parameter."""
 
     materials: Materials  # one per layer
@@ -82,12 +82,12 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Answers:
+class QueryResult:
     """All answers to one query."""
 
     path: Path  # file of the certified model
     model: CertifiedModel
-    each: Sequence[Answer]
+    each: Sequence[CertifiedAnswer]
     seconds: float  # of the reduced model
     many: bool  # asked by a table of parameters
 
@@ -129,7 +129,7 @@ class Answers:
         return Table(tuple(header), np.column_stack(parts).tolist())
 
 
-def _row(answer: Answer, count: int) -> list[Any]:
+def _row(answer: CertifiedAnswer, count: int) -> list[Any]:
     first, c = answer.materials[0], answer.certificate
     estimate = None if c.estimate is None else c.estimate.relative
     mesh = None if c.mesh is None else c.mesh.largest
@@ -138,7 +138,7 @@ def _row(answer: Answer, count: int) -> list[Any]:
     return [*row, *([None] * (3 * count) if answer.run is None else (x for out in answer.outputs() for x in out[1:4]))]
 
 
-def answer_rows(answer: Answer) -> list[tuple[str, str]]:
+def answer_rows(answer: CertifiedAnswer) -> list[tuple[str, str]]:
     """The run of one parameter as label and text."""
     run, c = answer.shown, answer.certificate
     rows = [

@@ -8,7 +8,7 @@ from typing import Any
 from softgrasp.reduction.certified.certificate import Certificate
 from softgrasp.reduction.certified.model import Box
 from softgrasp.study.forward.accuracy import percent
-from softgrasp.study.query.answer import Answer, Answers
+from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.page import Section, captioned, write_report
 from softgrasp.study.report.tables import Table, listed
@@ -21,7 +21,7 @@ CAPTIONS = {
 }
 
 
-def write_page(out: Path, answers: Answers, line: str) -> list[Path]:
+def write_page(out: Path, answers: QueryResult, line: str) -> list[Path]:
     """Write result.json, the table, a figure and report.html, which ends in the command line."""
     from softgrasp.study.query.plots import figure_answer, figure_batch  # brings Matplotlib
 
@@ -70,14 +70,14 @@ def error_table(c: Certificate) -> Table:
     return Table(("error of the", "at most or about", "it is", "relative to"), rows, "Errors")
 
 
-def output_table(answer: Answer) -> Table:
+def output_table(answer: CertifiedAnswer) -> Table:
     """Every output at the end, its largest deformation, and how far both can be off."""
     bound = f"error {answer.certificate.how} [m]"
     header = ("output", "at the end [m]", "largest deformation [m]", bound, "error estimated [m]")
     return Table(header, answer.outputs(), "Outputs")
 
 
-def _summary(answer: Answer, seconds: float) -> list[str]:
+def _summary(answer: CertifiedAnswer, seconds: float) -> list[str]:
     c, at = answer.certificate, f"At {answer.parameters}"
     off = [] if c.time_step is None else [f"that of the time step is about {percent(c.time_step)}"]
     off += [f"that of the mesh about {percent(c.mesh.largest)} of the deformation"] if c.mesh is not None else []
@@ -91,7 +91,7 @@ def _summary(answer: Answer, seconds: float) -> list[str]:
     return [f"{at} the {answer.source} ends with {ends}{took}.", error, *last]
 
 
-def _summary_batch(answers: Answers) -> list[str]:
+def _summary_batch(answers: QueryResult) -> list[str]:
     refused, full, outside = answers.counts
     worst = answers.each[answers.worst[0]]
     return [

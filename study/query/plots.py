@@ -20,12 +20,12 @@ from softgrasp.study.pictures.style import (
     paper_style,
     save,
 )
-from softgrasp.study.query.answer import Answer, Answers
+from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 
 LEAST = 1e-16  # of an error that is drawn
 
 
-def figure_answer(answer: Answer, out: Path) -> tuple[Path, ...]:
+def figure_answer(answer: CertifiedAnswer, out: Path) -> tuple[Path, ...]:
     """Deformation of the outputs with its band, bounds over time, and the three errors; only the last if refused."""
     c, run = answer.certificate, answer.run
     with paper_style():
@@ -59,7 +59,7 @@ def figure_answer(answer: Answer, out: Path) -> tuple[Path, ...]:
         return save(figure, out / ("answer.png" if rows == 3 else "errors.png"))
 
 
-def _three(ax: Any, answer: Answer) -> None:
+def _three(ax: Any, answer: CertifiedAnswer) -> None:
     """The errors of reduction, time step and mesh as bars, proofs filled."""
     c = answer.certificate
     mesh = None if c.mesh is None else c.mesh.largest
@@ -78,7 +78,7 @@ def _three(ax: Any, answer: Answer) -> None:
     few_ticks(ax.xaxis)
 
 
-def figure_batch(answers: Answers, file: Path) -> tuple[Path, ...]:
+def figure_batch(answers: QueryResult, file: Path) -> tuple[Path, ...]:
     """Error of every answer at its lambda and mu."""
     lam, mu = (np.array([getattr(a.materials[0], key) for a in answers.each]) for key in ("lam", "mu"))
     errors = np.array([a.certificate.reduction for a in answers.each])

@@ -20,9 +20,9 @@ from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.reduction.certified.archive import load_certified
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive, Materials
-from softgrasp.study.query.answer import Answer, Answers, answer_rows
-from softgrasp.study.query.asked import drive_of, materials_of, parse_settings, read_batch
+from softgrasp.study.query.answer import CertifiedAnswer, QueryResult, answer_rows
 from softgrasp.study.query.page import box_text, write_page
+from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.folder import claim
@@ -90,13 +90,15 @@ def run_query(
     runs = model.run_batch(many, drive, tolerance=tolerance)
     seconds = time.perf_counter() - begin
     each = [
-        Answer(m, run.certificate, run.trajectory if allow or run.certificate.passed else None, model.fine.outputs.C_s)
+        CertifiedAnswer(
+            m, run.certificate, run.trajectory if allow or run.certificate.passed else None, model.fine.outputs.C_s
+        )
         for m, run in zip(many, runs, strict=True)
     ]
     if fallback and any(answer.run is None for answer in each):
         full = _full_model(model, path, scene, motion, drive)
         each = [replace(a, run=_full_run(full, a.materials)) if a.run is None else a for a in each]
-    answers = Answers(path, model, each, seconds, batch is not None)
+    answers = QueryResult(path, model, each, seconds, batch is not None)
     _show(console, answers)
     if out is not None and any(answer.run is not None for answer in each):
         with agree(MPI.COMM_WORLD):
@@ -114,7 +116,7 @@ def run_query(
     return REFUSED if answers.counts[0] else 0
 
 
-def _show(console: Console, answers: Answers) -> None:
+def _show(console: Console, answers: QueryResult) -> None:
     took = f"{1e3 * answers.seconds:.3g} ms"
     if not answers.many:
         (answer,) = answers.each

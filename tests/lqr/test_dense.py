@@ -19,14 +19,13 @@ from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Block, Gain
-from softgrasp.lqr.plant.identities import translation_defect, velocity_defect
 from softgrasp.lqr.plant.operators import (
     costates_to_absolute,
     costates_to_relative,
     gain_to_absolute,
     states_to_relative,
 )
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution, translation_defect, velocity_defect
 from tests.helpers.models import (
     Array,
     close,

@@ -12,10 +12,9 @@ from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.diagnosis import Diagnosis, diagnose
-from softgrasp.lqr.modal_feedback import modal_lqr
 from softgrasp.lqr.plant.checks import ControlError, check_finite, check_weights, square_root
-from softgrasp.lqr.plant.identities import translation_defect
-from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.plant.problem import RiccatiProblem, translation_defect
+from softgrasp.lqr.riccati import modal_lqr
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.models import close, make_scene, same_everywhere
 

@@ -19,9 +19,8 @@ from softgrasp.lqr.plant.gain import Block, Gain
 from softgrasp.lqr.plant.operators import costates_to_absolute, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, energy_scaled, make_family
-from softgrasp.lqr.reduced.retune import Retuner, retuned_gain
-from softgrasp.lqr.reduced.riccati import GainJudge, project_plant, reduce_riccati
-from softgrasp.lqr.spectrum.certificate import abscissa, certified_abscissa
+from softgrasp.lqr.reduced.riccati import GainJudge, Retuner, full_gain, project_plant, reduce_riccati, retuned_gain
+from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.models import (
     Array,
@@ -313,7 +312,7 @@ def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
     """Shift-and-invert finds what LAPACK finds, and the bound certifies the optimal gain."""
     _, problem, solution = plant(two_way)
     gain = solution.gain.block
-    found = certified_abscissa(problem, gain)
+    found = abscissa(problem, Gain.of_block(gain))
     values = GainJudge(problem, solution, hand_start(problem, -TARGET)).loop.poles(gain)
     inside = values[np.abs(values) <= found.radius]
     assert abs(found.value - inside.real.max()) < 1e-7  # tolerance 1e-9 of eigenvalues of size 10
@@ -330,7 +329,7 @@ def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
     assert largest <= found.bound
     for factor in (1e4, -1e4):  # the bound may give up on a stable gain, never the other way round
         loud = Block(gain.hand, factor * gain.tall)
-        exact, claim = space.poles(loud).real.max(), certified_abscissa(problem, loud)
+        exact, claim = space.poles(loud).real.max(), abscissa(problem, Gain.of_block(loud))
         assert exact < 0 or not claim.stable, factor
         assert exact > 0 or abs(claim.value - exact) < 1e-6, factor  # an unstable one far out is not searched for
     assert two_way or exact > 0.1  # one-way that one is unstable indeed: 13
@@ -339,11 +338,11 @@ def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
 def test_what_cannot_be_certified_is_not_called_stable() -> None:
     _, problem, solution = plant()
     none = replace(problem, system=replace(problem.system, damping=type(problem.system.damping)()))
-    found = certified_abscissa(none, solution.gain.block)
+    found = abscissa(none, solution.gain)
     assert not found.stable
     assert "no damping" in found.reason or found.value >= 0
     free = Block(np.zeros((4, 2)), solution.gain.block.tall)
-    assert not certified_abscissa(problem, free).stable  # a hand that nothing holds
+    assert not abscissa(problem, Gain.of_block(free)).stable  # a hand that nothing holds
 
 
 def test_retuning_equals_projection_at_the_new_material() -> None:
@@ -360,7 +359,7 @@ def test_retuning_equals_projection_at_the_new_material() -> None:
             tuned = retuner.solve(new)
             direct = reduce_riccati(moved, family(name).at(12)) if (lam, mu) == (50.0, 50.0) else None
             if direct is not None:
-                full = retuner.full_gain(tuned)
+                full = full_gain(problem, retuner.basis, tuned.P_N)
                 assert close(ordered(full.block), ordered(direct.gain.block)) < 1e-8  # same equation
     assert solution.rank > 12
 

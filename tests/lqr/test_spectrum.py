@@ -15,10 +15,10 @@ from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.gain import Block, Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
-from softgrasp.lqr.spectrum.certificate import certified_abscissa
+from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, ModalLoop
 from softgrasp.lqr.spectrum.tail import Tail
 from tests.helpers.models import LAYERS, make_scene
@@ -69,7 +69,7 @@ def test_shipped_scenes_are_certified(name: str, changes: tuple[str, ...]) -> No
     """Also where the poles of fast modes accumulate at -1/beta, before and behind those of the hand."""
     problem = shipped(name, *changes)
     K = solve(problem).gain.block if "control.Q=1e6" in changes else gain(problem)
-    found, exact = certified_abscissa(problem, K), poles(problem, K)
+    found, exact = abscissa(problem, Gain.of_block(K)), poles(problem, K)
     assert found.certified, found.reason
     assert found.bound < 1
     # rounding of LAPACK is eps |A| = 1e-12 of the fastest pole, that of the iteration 1e-9 of 1 / distance
@@ -81,7 +81,7 @@ def test_the_bound_holds_where_damping_is_not_proportional(changes: tuple[dict[s
     """Layers and a floating hand under alpha have no modes of their own, the bound still lies above |h(i w)|."""
     problem = small(*changes)
     K = gain(problem)
-    found = certified_abscissa(problem, K)
+    found = abscissa(problem, Gain.of_block(K))
     assert found.stable, found.reason
     loop = ModalLoop(problem, DENSE_LIMIT)
     assert abs(found.value - loop.poles(K).real.max()) < 1e-8  # tolerance 1e-9 of poles of size 10
@@ -104,7 +104,7 @@ def test_the_shifted_bound_holds_left_of_the_axis() -> None:
         size = max(np.linalg.norm(k @ np.linalg.solve(s * one - loop.A, loop.B), 2) for s in line)
         assert size <= tail.bound(r, a), (a, r)
     assert tail.bound(0.5 * tail.omega[0], 1.2 * own) == np.inf  # the first mode is not excluded there
-    found = certified_abscissa(problem, K)
+    found = abscissa(problem, Gain.of_block(K))
     assert found.exact
     assert abs(found.value - loop.poles(K).real.max()) < 1e-8  # tolerance 1e-9 of poles of size 10
 
@@ -122,7 +122,7 @@ def test_no_unstable_mode_is_missed() -> None:
         tall = K.tall.copy()
         tall[n:] -= size * np.outer(loop.plant.massed[:, mode], direction / np.linalg.norm(direction))
         loud = Block(K.hand, tall)
-        exact, found = loop.poles(loud).real.max(), certified_abscissa(problem, loud)
+        exact, found = loop.poles(loud).real.max(), abscissa(problem, Gain.of_block(loud))
         assert exact > 0
         assert not found.stable, mode
         assert found.value >= 0 or found.reason
@@ -135,7 +135,7 @@ def test_reasons_where_there_is_no_bound() -> None:
     ):
         problem = small(*changes)
         K = gain(problem)
-        found = certified_abscissa(problem, K)
+        found = abscissa(problem, Gain.of_block(K))
         assert not found.certified
         assert words in found.reason
         assert abs(found.value - poles(problem, K).real.max()) < 1e-8  # tolerance 1e-9 of poles of size 10

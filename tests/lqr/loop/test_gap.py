@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.design.duration import LoopPlan, with_bounds
+from softgrasp.lqr.design.orders import LoopPlan, with_bounds
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.loop.gap import DualityGap, duality_gaps
 from softgrasp.lqr.plant.gain import Block, Gain

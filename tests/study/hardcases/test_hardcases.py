@@ -237,6 +237,6 @@ def test_a_loaded_machine_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_rank_that_waits_for_ever_fails() -> None:
     command = ["-c", faults.BARE.format(fault="raise OSError")]
-    outcome = faults.judge(command, 1.0, 0.5, "")  # half a second; the bare script never ends
+    outcome = faults.ending(command, 1.0, 0.5, "")  # half a second; the bare script never ends
     assert outcome.value == math.inf
     assert not number(outcome.value, faults.PATIENCE).ok

@@ -24,7 +24,7 @@ from softgrasp.reduction.certified.archive import save_certified
 from softgrasp.reduction.certified.model import Box, CertifiedModel
 from softgrasp.reduction.certified.training import certified_model
 from softgrasp.study.cli import app
-from softgrasp.study.query.asked import drive_of, materials_of, parse_settings, read_batch
+from softgrasp.study.query.request import drive_of, materials_of, parse_settings, read_batch
 from softgrasp.study.query.run import run_query
 from softgrasp.study.shell.folder import claim
 
