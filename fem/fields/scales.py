@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.effects.catalog import EARTH, acceleration, ratios
+from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
+from softgrasp.fem.effects.gravity import EARTH, acceleration
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.assembly import layer_numbers

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.effects.catalog import acceleration, hand_mass
-from softgrasp.fem.effects.catalog import operator as damping_operator
+from softgrasp.fem.effects.damping import operator as damping_operator
+from softgrasp.fem.effects.gravity import acceleration
+from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, make_mesh
