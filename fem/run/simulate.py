@@ -17,10 +17,11 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
+from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.midpoint import make_midpoint
 from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
 from softgrasp.fem.run.snapshots import make_store
-from softgrasp.fem.run.stepping import Stepped, interruptible, make_ts
+from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.sealed import AGAIN

@@ -14,7 +14,7 @@ from softgrasp.fem.accuracy.adapt import build_to_tolerance
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.refined import scene_ends
-from softgrasp.fem.run.stepping import interruptible
+from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
