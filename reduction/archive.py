@@ -57,9 +57,7 @@ def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
     >>> online.N, online.at().stable
     (14, True)
 
-    Args:
-        model: reduced model.
-        path: of the file; folders are created.
+    Folders are created.
 
     Raises:
         OSError: the file cannot be written.
@@ -151,17 +149,9 @@ def _read_shared(file: h5py.File, data: dict[str, Any]) -> dict[str, Any]:
 def write_model(
     path: Path, kind: str, about: dict[str, Any], lift: Lift | None, small: Callable[[h5py.File], None]
 ) -> None:
-    """Write a file beside its place and move it there whole. Collective with a lift.
+    """Write a file of kind :data:`LINEAR` or :data:`STRAIN` beside its place and move it there whole.
 
-    Args:
-        path: of the file; folders are created.
-        kind: :data:`LINEAR` or :data:`STRAIN`.
-        about: what goes into JSON, the scene's hash among it.
-        lift: every rank adds its rows in turn.
-        small: writes the arrays, on one rank.
-
-    Raises:
-        OSError: the file cannot be written.
+    Collective with a lift, whose rows every rank adds in turn; ``small`` writes the arrays. Raises OSError.
     """
     comm = MPI.COMM_SELF if lift is None else lift.layout.comm
     partial = path.with_name(path.name + ".part")
@@ -191,9 +181,7 @@ def write_model(
 def reading(
     path: Path, layout: BlockLayout | None, scene_hash: str | None = None
 ) -> Iterator[tuple[h5py.File, dict[str, Any]]]:
-    """A file that is what was written, and what it says about its model. Collective over ``layout.comm``.
-
-    The block must not communicate. The hash of the lift counts where a layout takes it.
+    """A file that is what was written, and its :func:`about`. Collective over ``layout.comm``, but not the block.
 
     Raises ModelError: the file is missing, damaged, or of another version or scene; or the block finds a key missing.
     """

@@ -61,10 +61,7 @@ def state_rows(view: View, system: BlockSystem, z: Array, v_z: Array, q_s: Array
     On graded meshes rows count by the diagonal d of the mass, over its mean m: sqrt(d / m) of displacements and
     velocities, sqrt(m / d) of momenta, which makes |X|_F a norm that does not see where nodes crowd [W87].
 
-    Args:
-        system: gives T, G and the mass.
-        z, v_z: local rows (n_local, m).
-        q_s, v_s: (n_s, m), the same on every rank.
+    ``z``, ``v_z``: local rows (n_local, m); ``q_s``, ``v_s``: (n_s, m), the same on every rank.
     """
     tissue, hand = row_weights(system)
     if view == "deformation":
@@ -102,7 +99,7 @@ def shown_rows(view: View, model: ReducedModel, small: SmallModel, system: Block
 class Span:
     """Snapshots in the columns of one orthonormal basis, X = Q C + rest."""
 
-    comm: MPI.Intracomm  # ranks that share the rows
+    comm: MPI.Intracomm
     Q: Array  # local rows (rows, k)
     C: Array  # (k, m), on every rank
     rest: float  # |X - Q C|_F^2
@@ -121,10 +118,7 @@ class Span:
         return ratio(self.rest + squares(self.C - R @ Y), self.square)
 
     def projection_error(self, R: Array) -> float:
-        """min_Y |X - V Y|_F / |X|_F.
-
-        Nearly dependent columns keep all their digits: no Gram matrix is formed.
-        """
+        """min_Y |X - V Y|_F / |X|_F; no Gram matrix is formed, so that nearly dependent columns keep their digits."""
         norms = np.linalg.norm(R, axis=0)
         U, s, _ = np.linalg.svd(R / np.where(norms > 0, norms, 1.0), full_matrices=False)
         U = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
@@ -158,7 +152,7 @@ def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> 
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ModelComparison:
     """Errors of one model, or of a whole family of nested ones, against one full run."""
 
     model: ReducedModel  # model, small: the largest model of the family, at the parameter of the snapshots
@@ -169,10 +163,7 @@ class Comparison:
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
 
     def span(self, view: View) -> Span:
-        """Snapshots in what the largest model shows; factored at the first call. Collective.
-
-        Raises ModelError: the model holds no basis on the mesh.
-        """
+        """Snapshots in what the largest model shows; factored at the first call. Collective."""
         if view not in self._spans:
             V = shown_rows(view, self.model, self.small, self.system)
             self._spans[view] = span_of(view, V, self.system, self.snapshots)
@@ -198,9 +189,7 @@ class Comparison:
         return ModelErrors(velocities, momenta, deformation, float(off) / (peak if peak > 0 else 1.0))
 
     def projection_error(self, view: View, model: ReducedModel, small: SmallModel) -> float:
-        """min_Y |X - V Y|_F / |X|_F over all states V y that the model can show. Collective.
-
-        The hand of V y is that of the state, q_s = S_q y and v_s = S_v y.
+        """min_Y |X - V Y|_F / |X|_F over all states V y, with the hand q_s = S_q y and v_s = S_v y. Collective.
 
         Raises ModelError: the model shows more than the largest.
         """

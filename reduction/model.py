@@ -49,28 +49,17 @@ class SmallModel:
 
     Everything that a run needs, nothing of full order. The state x has no unit of its own: with fixed solid modes its
     first 2 n_s entries are q_s [m, rad] and v_s [m/s, rad/s].
-
-    Attributes:
-        name: of the basis.
-        operators: E, A (N, N), B (N, n_s), readouts of the hand and energies.
-        f: load of gravity, (N,).
-        outputs: C_z (p, N) and C_s (p, n_s) [m].
-        M_hand: hand mass matrix, (n_s, n_s) [kg, kg m^2].
-        fixed_solid: the first 2 n_s coordinates are q_s and v_s.
-        two_way: the hand feels the tissue.
-        structured: without damping the model conserves its energy by construction.
-        scale: density over that of the projection (canonical models, else 1).
     """
 
-    name: str
-    operators: Operators
-    f: Array
-    outputs: Outputs
-    M_hand: Array
-    fixed_solid: bool
-    two_way: bool
-    structured: bool
-    scale: float = 1.0
+    name: str  # of the basis
+    operators: Operators  # E, A (N, N), B (N, n_s), readouts of the hand and energies
+    f: Array  # load of gravity, (N,)
+    outputs: Outputs  # C_z (p, N) and C_s (p, n_s) [m]
+    M_hand: Array  # hand mass matrix, (n_s, n_s) [kg, kg m^2]
+    fixed_solid: bool  # the first 2 n_s coordinates are q_s and v_s
+    two_way: bool  # the hand feels the tissue
+    structured: bool  # without damping the model conserves its energy by construction
+    scale: float = 1.0  # density over that of the projection (canonical models, else 1)
 
     @property
     def N(self) -> int:
@@ -164,46 +153,27 @@ class ReducedModel:
 
     The matrices are sums over the layers, A = A_0 + sum_l lambda_l A_lambda,l + mu_l A_mu,l and so on, which
     :meth:`at` assembles; a run needs the :class:`SmallModel` that it returns.
-
-    Attributes:
-        name: of the basis.
-        N: number of basis vectors.
-        coordinates: "qv" is the paper's Galerkin model, "qp" a canonical one.
-        frame: absolute or relative to the hand.
-        structure: of the basis.
-        fixed_solid: the first 2 n_s coordinates are q_s and v_s.
-        parts: small matrices, the same bits on every rank.
-        materials: those of the projection.
-        outputs: of the scene.
-        split: columns of every part of the basis, see :class:`softgrasp.reduction.bases.basis.Basis`.
-        alpha, in_space: mass-proportional damping [1/s], and whether it drags the rigid motion.
-        damped: damping terms were projected.
-        hand_weight, two_way: effects of the scene.
-        gravity: acceleration of free fall in the hand's degrees of freedom, (n_s,), or None.
-        lift: how states return to the mesh, or None.
-        scene_hash: of the scene the model was made for.
-        seconds: offline time by stage.
     """
 
-    name: str
-    N: int
-    coordinates: Coordinates
-    frame: Frame
-    structure: Structure
-    fixed_solid: bool
-    parts: Parts
-    materials: tuple[LayerMaterial, ...]
-    outputs: Outputs
-    split: tuple[int, ...] = ()
-    alpha: float = 0.0
-    in_space: bool = False
-    damped: bool = False
-    hand_weight: bool = False
-    two_way: bool = False
-    gravity: Array | None = None
-    lift: Lift | None = None
-    scene_hash: str = ""
-    seconds: dict[str, float] = field(default_factory=dict)
+    name: str  # of the basis
+    N: int  # number of basis vectors
+    coordinates: Coordinates  # "qv" is the paper's Galerkin model, "qp" a canonical one
+    frame: Frame  # absolute or relative to the hand
+    structure: Structure  # of the basis
+    fixed_solid: bool  # the first 2 n_s coordinates are q_s and v_s
+    parts: Parts  # small matrices, the same bits on every rank
+    materials: tuple[LayerMaterial, ...]  # those of the projection
+    outputs: Outputs  # of the scene
+    split: tuple[int, ...] = ()  # columns of every part of the basis, as in its ``split``
+    alpha: float = 0.0  # mass-proportional damping [1/s]
+    in_space: bool = False  # alpha drags the rigid motion too
+    damped: bool = False  # damping terms were projected
+    hand_weight: bool = False  # gravity acts on the hand's own mass
+    two_way: bool = False  # the hand feels the tissue
+    gravity: Array | None = None  # acceleration of free fall in the hand's degrees of freedom, (n_s,), or None
+    lift: Lift | None = None  # how states return to the mesh, or None
+    scene_hash: str = ""  # of the scene the model was made for
+    seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage
 
     def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> SmallModel:
         """Assemble E x' = A x + B u + F g at new materials and gravity. Online; not collective.

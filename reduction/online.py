@@ -51,8 +51,7 @@ def run(
     They equal the full model's steps [HLW06], so that structure and errors carry over; many are taken in one product.
 
     Args:
-        model: small model, or a propagator made beforehand.
-        dt: step [s]; needed with a small model.
+        dt: step [s]; needed without a propagator made beforehand.
         force: u on the hand at the step midpoints, (steps, n_s) [N, N m].
         hand: q_s and v_s of a prescribed hand, (steps + 1, n_s) each, instead of a force.
         x0: initial state (N,); None is zero. With a prescribed hand its first 2 n_s entries are replaced.
@@ -87,10 +86,7 @@ def prepared(model: SmallModel | Propagator, dt: float | None, driven: bool) -> 
 
 
 def consistent(q: Array, v: Array, dt: float) -> Array:
-    """Positions that the midpoint rule reaches with the velocities v: q_0 + dt sum (v_n + v_{n+1}) / 2.
-
-    A table of an analytic motion differs from them by O(dt^2); the tissue feels velocities and accelerations.
-    """
+    """Positions that the midpoint rule reaches with the velocities v: q_0 + dt sum (v_n + v_{n+1}) / 2."""
     return np.vstack([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
 
 

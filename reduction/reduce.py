@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, overload
 
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.reduction.bases.basis import Basis, ReductionError
 from softgrasp.reduction.bases.engines import EngineName
@@ -21,9 +18,10 @@ from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, as_full, errors_linear, replay_linear
 
-if TYPE_CHECKING:  # only scenes with finite strain pay for them
-    from softgrasp.reduction.strain.compare import StrainErrors
+if TYPE_CHECKING:  # only scenes with finite strain pay for its models
+    from softgrasp.fem.model.build import Model
     from softgrasp.reduction.strain.model import StrainModel, StrainRun
+    from softgrasp.reduction.strain.training import StrainErrors
 
 
 def reduce(
@@ -187,7 +185,7 @@ def project_scene(basis: Basis, model: Model) -> ReducedModel:
         ReductionError: the scene has finite strain.
     """
     _check_linear(model)
-    return project(basis, model.system, make_outputs(model.scene, model.system), scene_hash(model.scene))
+    return project(basis, model.system, model.outputs, model.scene_hash)
 
 
 def _check_linear(model: Model) -> None:

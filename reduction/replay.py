@@ -16,7 +16,7 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction import online
 from softgrasp.reduction.bases.engines import factor
-from softgrasp.reduction.errors import Comparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
+from softgrasp.reduction.errors import ModelComparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.propagator import Propagator, propagator
@@ -57,11 +57,7 @@ class FullRun:
 
 
 def full_run(model: Model, trajectory: Trajectory) -> FullRun:
-    """A run of ``simulate`` as bases are built from it and reduced runs are compared with it. Collective.
-
-    Args:
-        model: at the materials of the run.
-        trajectory: of a scene with ``output.snapshots = "memory"``.
+    """A run of ``simulate`` at the materials of ``model`` as reduced runs are compared with it. Collective.
 
     Raises:
         SceneError: the run kept no snapshots in memory, or too few of them for the force on the hand, or the body is at
@@ -70,7 +66,13 @@ def full_run(model: Model, trajectory: Trajectory) -> FullRun:
     snapshots = trajectory.snapshots
     if snapshots is None:
         raise SceneError("output.snapshots must be 'memory' for a reduction; bases are built from the states in memory")
-    if at_rest(snapshots):
+    layout, n = snapshots.layout, snapshots.layout.n_local
+    z, q_s = snapshots.Z[:n], snapshots.q_s
+    change, size = (
+        layout.comm.allreduce(max(float(np.abs(x).max(initial=0.0)) for x in parts), MPI.MAX)
+        for parts in ((z - z[:, :1], q_s - q_s[:, :1]), (z, q_s))
+    )
+    if change <= REST * size:
         raise SceneError(
             f"hand and tissue of scene {model.scene.name} stay at rest for the whole run, so there is no motion to "
             "reduce; give a motion.target away from the start, or another time.start"
@@ -78,17 +80,6 @@ def full_run(model: Model, trajectory: Trajectory) -> FullRun:
     if model.system.two_way and len(snapshots.steps) != len(trajectory.times):
         raise SceneError("output.every must be 1 with effects.reaction; the force on the hand needs every state")
     return FullRun(model, trajectory, snapshots)
-
-
-def at_rest(snapshots: Snapshots) -> bool:
-    """Whether no displacement changes by more than rounding from the first snapshot on. Collective."""
-    layout = snapshots.layout
-    z = snapshots.Z[: layout.n_local]
-    change, size = (
-        layout.comm.allreduce(max(float(np.abs(x).max(initial=0.0)) for x in parts), MPI.MAX)
-        for parts in ((z - z[:, :1], snapshots.q_s - snapshots.q_s[:, :1]), (z, snapshots.q_s))
-    )
-    return bool(change <= REST * size)
 
 
 def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots) -> Array:
@@ -130,10 +121,10 @@ def as_full(model: Model, run: Trajectory | FullRun) -> FullRun:
     return run if isinstance(run, FullRun) else full_run(model, run)
 
 
-def comparison_of(rom: ReducedModel, full: FullRun) -> Comparison:
+def comparison_of(rom: ReducedModel, full: FullRun) -> ModelComparison:
     """What errors of this model and of smaller ones of its family are computed from, at the materials of the run."""
     system = full.model.system
-    return Comparison(rom, rom.at(system.materials), system, full.snapshots, full.energy)
+    return ModelComparison(rom, rom.at(system.materials), system, full.snapshots, full.energy)
 
 
 def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[Propagator, dict[str, Any]]:

@@ -1,11 +1,12 @@
-"""Docstrings as Markdown: examples become code, references lose their role. An extension of griffe for `make docs`."""
+"""Docstrings as Markdown: examples become code, references lose their role, fields bring their comments (griffe)."""
 
 from __future__ import annotations
 
 import re
+from itertools import takewhile
 from typing import Any
 
-from griffe import Extension, Object
+from griffe import Class, Extension, Object
 
 
 class PlainDocstrings(Extension):
@@ -15,6 +16,26 @@ class PlainDocstrings(Extension):
         """Change the text of one object."""
         if obj.docstring is not None:
             obj.docstring.value = markdown(obj.docstring.value)
+
+    def on_class_members(self, *, cls: Class, **_: Any) -> None:
+        """Say what the comments of the fields say, where the docstring does not."""
+        comments = field_comments(cls).items()
+        rows = ["    " + (text if text.startswith(f"{name}, ") else f"{name}: {text}") for name, text in comments]
+        if rows and cls.docstring is not None and "\nAttributes:" not in cls.docstring.value:
+            cls.docstring.value += "\n\nAttributes:\n" + "\n".join(rows)
+
+
+def field_comments(cls: Class) -> dict[str, str]:
+    """The comment beside each field, or the lines above it."""
+    comments = {}
+    for name, field in cls.attributes.items():
+        beside = re.search(r"  # (.+)$", "".join(field.lines[-1:]))
+        above = list(
+            takewhile(lambda line: line.strip().startswith("# "), cls.lines[field.lineno - cls.lineno - 1 :: -1])
+        )
+        if beside or above:
+            comments[name] = beside[1] if beside else " ".join(line.strip()[2:] for line in reversed(above))
+    return comments
 
 
 def markdown(text: str) -> str:

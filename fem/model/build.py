@@ -15,10 +15,12 @@ from softgrasp.fem.effects.catalog import acceleration, hand_mass
 from softgrasp.fem.effects.catalog import operator as damping_operator
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
+from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
@@ -97,6 +99,16 @@ class Model:
     def states(self) -> int:
         """Number of first-order states 2n = 2 (n_s + n_e)."""
         return self.system.layout.states
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Outputs y of the scene. Collective."""
+        return make_outputs(self.scene, self.system)
+
+    @property
+    def scene_hash(self) -> str:
+        """See :func:`softgrasp.fem.mesh.scene_hash.scene_hash`."""
+        return scene_hash(self.scene)
 
     def with_materials(self, lam: float | None = None, mu: float | None = None, rho: float | None = None) -> Model:
         """The same mesh with other numbers in every layer: K = mu K_mu + lambda K_lambda, M = rho M_1. Collective.

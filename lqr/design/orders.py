@@ -23,6 +23,8 @@ MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by
 WHOLE_SPECTRUM = 500  # n_e from which the Schur form of all modes for every gain takes seconds, so few orders are tried
 FEW_ORDERS = 3
 ORDERS = (4, 6, 8, 10, 12, 16, 20, 30, 40)  # of a scene without a [control] table
+SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
+LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle
 
 
 @dataclass(frozen=True)
@@ -90,10 +92,6 @@ def best_gains(bases: Sequence[BasisGains], layout: BlockLayout) -> list[GainRep
     limits = {A_PRIORI: fast_order(layout.n_s)}
     best = [report for b in bases if (report := b.best(limits.get(b.name))) is not None]
     return best if layout.states <= MANY_STATES else [r for r in best if r.method == A_PRIORI]
-
-
-SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
-LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle
 
 
 @dataclass(frozen=True)

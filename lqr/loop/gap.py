@@ -41,6 +41,7 @@ from softgrasp.lqr.plant.target import Target
 
 Notify = Callable[[int, int], None]
 TOGETHER = 32  # states behind one product with the functionals
+ROUNDING = 1e-12  # of a cost: sums over the steps with the growing responses of the hand
 
 
 @dataclass(frozen=True)
@@ -150,9 +151,6 @@ class _Record(LoopRun):
         self.execute()
         hand = np.hstack([self.drive.q, self.drive.v])
         return np.asarray(total(self.problem.layout.comm, self.values_here) + hand @ self.W.hand)
-
-
-ROUNDING = 1e-12  # of a cost: sums over the steps with the growing responses of the hand
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,6 @@ def _leading(G: Array, allowed: float) -> Array:
     L = np.zeros((k, rank))
     L[pivots - 1] = np.tril(factor)[:, :rank]
     values, vectors = np.linalg.eigh(L.T @ L)
-    floor = k * EPS * float(values[-1]) if rank else 0.0
-    keep = np.cumsum(values) > max(allowed, floor)
+    rounding = k * EPS * float(values[-1]) if rank else 0.0
+    keep = np.cumsum(values) > max(allowed, rounding)
     return np.ascontiguousarray((L @ (vectors[:, keep] / np.sqrt(values[keep])))[:, ::-1])

@@ -26,6 +26,8 @@ from softgrasp.lqr.plant.checks import MODAL_KEY
 from softgrasp.lqr.plant.gain import Block
 
 FORMAT = 4
+LINE_SEARCH = 0.5  # of the residual before: a Newton step that leaves more is shortened
+SHORTEST = 1e-2  # step length
 
 
 @dataclass
@@ -129,10 +131,6 @@ def _restore(plant: Plant, state: Iteration, data: dict[str, Array], tol: float)
     sweep = AdiSweep(Right(data["sweep_hand"], data["sweep_rows"]), Z, steps, first=first)
     state.gain = sweep.gain
     return sweep
-
-
-LINE_SEARCH = 0.5  # of the residual before: a Newton step that leaves more is shortened
-SHORTEST = 1e-2  # step
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,6 +25,7 @@ from softgrasp.reduction.bases.engines import EPS, factor, small_svd
 from softgrasp.reduction.bases.states import BasisError
 
 A_PRIORI = "structured"  # the basis that needs no P
+STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
 
 
 @dataclass(frozen=True)
@@ -166,9 +167,6 @@ def pod_decomposed(problem: RiccatiProblem, Z: Block) -> BasisFamily:
         return np.asarray(scipy.linalg.block_diag(V_1, V_1))
 
     return _tissue(problem, "pod_decomposed", columns, 2 * V.columns, 2, (s,))
-
-
-STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
 
 
 def structured(problem: RiccatiProblem) -> BasisFamily:

@@ -31,6 +31,7 @@ from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoo
 from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radius
 
 NAN = float("nan")
+Materials = tuple[LayerMaterial, ...]
 
 
 @dataclass(frozen=True)
@@ -236,9 +237,6 @@ class GainJudge:
             report, gain=gain, error_K=gain_error(self.problem, self.gain, gain), cost_excess=quality.cost_excess,
             abscissa_full=quality.abscissa, certified=quality.certified, sampled=quality.sampled,
         )  # fmt: skip
-
-
-Materials = tuple[LayerMaterial, ...]
 
 
 @dataclass(frozen=True)

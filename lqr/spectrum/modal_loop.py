@@ -101,7 +101,7 @@ class ModalLoop:
         """
         k, difference, xi = self.gain(K), self.gain(K) - self.gain(best), self.state(x)
 
-        def judge() -> LoopQuality:
+        def evaluate() -> LoopQuality:
             F = self.A + self.B @ k
             if not np.isfinite(F).all():
                 return LoopQuality(np.inf, np.inf, poles=np.array([np.inf + 0j]))
@@ -113,7 +113,7 @@ class ModalLoop:
             Y = lyapunov(T, U, difference.T @ self.problem.R @ difference)
             return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal, poles=poles)
 
-        return on_root(self.comm, judge)
+        return on_root(self.comm, evaluate)
 
 
 def _all(problem: RiccatiProblem) -> ModalPlant:

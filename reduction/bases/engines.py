@@ -39,13 +39,12 @@ SVD_TOLERANCE = 1e-13
 
 @dataclass(frozen=True)
 class Factor:
-    """scale * Q R = X up to rounding (or its best approximation of rank r when ``partial``)."""
+    """scale * Q R = X up to rounding, or its best approximation of rank r where leading triplets are enough."""
 
     Q: Array  # local rows (n_local, r), orthonormal columns over all ranks
     R: Array  # (r, c), the same bits on every rank
     scale: float  # power of two that keeps squares of R from under- and overflow
     noise: float  # singular values below ``noise * sigma_1`` are rounding
-    partial: bool  # only the leading singular triplets were computed
     square: float  # sum of all sigma^2 of X / scale, also of those that are not in R
 
 
@@ -90,8 +89,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
             Q, R = _tsqr(comm, X, rows)
         else:
             Q, R = _svd(comm, X, rows, k)
-    partial = engine != "tsqr" and k is not None and Q.shape[1] < min(rows, X.shape[1])
-    return Factor(Q, R, scale, noise, partial, square)
+    return Factor(Q, R, scale, noise, square)
 
 
 def _dense(comm: MPI.Intracomm, X: Array, rows: int) -> PETSc.Mat:
@@ -165,12 +163,9 @@ def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
     if comm.size == 1:
         return np.asfortranarray(Q_local), R_local
     parts = comm.gather(R_local)
-    blocks: list[Array] | None = None
-    R: Array | None = None
-    if parts is not None:
-        Q, R = np.linalg.qr(np.vstack(parts))
-        blocks = np.split(Q, np.cumsum([len(p) for p in parts])[:-1])
-    return np.asfortranarray(Q_local @ comm.scatter(blocks)), np.asarray(comm.bcast(R))
+    Q, R = on_root(comm, lambda: np.linalg.qr(np.vstack(parts or [])))
+    first = comm.exscan(len(R_local)) or 0
+    return np.asfortranarray(Q_local @ Q[first : first + len(R_local)]), R
 
 
 def triangle(comm: MPI.Intracomm, X: Array, top: Array | None = None) -> Array:

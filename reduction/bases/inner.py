@@ -10,7 +10,7 @@ coordinates a basis can be orthonormal and symplectic at once only if the weight
 K^-1 in place of M^-1. The rate c [1/s or s] makes both halves of the snapshots equally large, whatever the units are.
 
 Euclidean products of q and p compare lengths with momenta, whose nodal entries shrink with the mesh. Errors of
-[q_s, p_s, q_e, p_e] (:meth:`softgrasp.reduction.errors.Comparison.state_error`) on the paper's forward scene, solid
+[q_s, p_s, q_e, p_e] (:meth:`softgrasp.reduction.errors.ModelComparison.state_error`), the paper's forward scene, solid
 modes fixed, N = 18: 14 vectors beside the hand's four:
 
     basis                            euclidean    mass     energy
@@ -128,20 +128,18 @@ def orthonormality(basis: Basis, system: BlockSystem) -> float:
 
     With fixed solid modes the tissue columns alone count: those of the hand are unit vectors.
     """
-    rows = Rows(basis.layout, 2, hand=True)
+    rows, by = Rows(basis.layout, 1, hand=True), weights(system, basis.inner)
     first = 2 * basis.layout.n_s if basis.fixed_solid else 0
-    V = rows.stack((basis.V_sq, basis.V_q), (basis.V_sv, basis.V_p))[:, first:]
-    by = weights(system, basis.inner)
-    if by is not None and basis.coordinates == "qp":
-        W_V = np.empty_like(V)
-        weight, q, p = by[0], rows.tissue_rows(0), rows.tissue_rows(1)
-        W_V[q] = basis.rate * times_columns(weight.tissue, V[q])
-        W_V[p] = solve_columns(weight.tissue, basis.layout, V[p]) / basis.rate
-        if rows.top:
-            W_V[rows.hand_rows(0)] = basis.rate * weight.hand @ V[rows.hand_rows(0)]
-            W_V[rows.hand_rows(1)] = np.linalg.solve(weight.hand, V[rows.hand_rows(1)]) / basis.rate
-    elif by is not None and basis.pairs:
-        W_V = rows.weigh(V, (by[0], by[0]))
-    else:
-        W_V = rows.weigh(V, by)
-    return float(np.abs(rows.gram(V, W_V) - np.eye(V.shape[1])).max(initial=0.0))
+    (s_q, s_p), (e_q, e_p) = (
+        (X[:, first:] for X in pair) for pair in ((basis.V_sq, basis.V_sv), (basis.V_q, basis.V_p))
+    )
+    q, p = rows.stack((s_q, e_q)), rows.stack((s_p, e_p))
+    W_q, W_p = q, p
+    if by is not None:
+        W_q = basis.rate * rows.weigh(q, by[:1])
+        if basis.coordinates == "qp":
+            inverse = np.linalg.solve(by[0].hand, s_p), solve_columns(by[0].tissue, basis.layout, e_p)
+            W_p = rows.stack(inverse) / basis.rate
+        else:
+            W_p = rows.weigh(p, by[:1] if basis.pairs else by[1:])
+    return float(np.abs(rows.gram(q, W_q) + rows.gram(p, W_p) - np.eye(basis.N - first)).max(initial=0.0))

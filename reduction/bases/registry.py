@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+from typing import get_args
 
 import numpy as np
 
@@ -74,20 +76,16 @@ def _methods() -> dict[str, Method]:
         for suffix, fixed, paper in (("", False, whole), ("_fixed", True, apart)):
             key = "pod_fixed" if stem + suffix == "global_pod_fixed" else stem + suffix
             words = ("POD" if key == "pod_fixed" else title) + (", fixed solid modes" if fixed else "")
-            for canonical in (True, False) if pairs else (False,):
-                tail = "_qv" if pairs and not canonical else ""
+            for canonical, frame in product((True, False) if pairs else (False,), get_args(Frame)):
+                tail, title_tail = ("_qv", " in (q, v)") if pairs and not canonical else ("", "")
+                own = paper if frame == "absolute" else None
+                if frame == "relative":
+                    tail, title_tail = f"{tail}_relative", f"{title_tail}, hand-relative"
                 # SVD-like pairs hardly depend on the product; the paper's are Euclidean
-                inner: InnerName = "energy" if canonical and stem != "psd_svd_like" else "euclidean"
-                method = Method(
-                    key + tail, words + (" in (q, v)" if tail else ""), paper, canonical, build,
-                    "qp" if canonical else "qv", "absolute", "symplectic" if canonical else "none", fixed, pairs,
-                    inner="euclidean" if paper else inner,
-                )  # fmt: skip
-                result[method.key] = method
-                relative = f"{method.key}_relative"
-                result[relative] = replace(
-                    method, key=relative, title=f"{method.title}, hand-relative", paper=None, frame="relative",
-                    inner=inner,
+                inner: InnerName = "energy" if canonical and stem != "psd_svd_like" and not own else "euclidean"
+                result[key + tail] = Method(
+                    key + tail, words + title_tail, own, canonical, build, "qp" if canonical else "qv", frame,
+                    "symplectic" if canonical else "none", fixed, pairs, inner=inner,
                 )  # fmt: skip
     result["craig_bampton"] = Method(
         "craig_bampton", "Craig-Bampton", None, True, craig_bampton_parts,

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import force_values, motion_table
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.motion import Drive
 from softgrasp.reduction.certified.residual import ResidualSpace, kinematic_triangles
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.reduce import project_scene
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
+    from softgrasp.fem.scene.scene import Scene
 
 FINER = 8  # steps for one, of the run that measures the error of the step
 
@@ -116,7 +117,7 @@ def certified_any(model: Model, rom: ReducedModel, **about: Any) -> CertifiedMod
 
 def output_columns(model: Model) -> Array:
     """C' of the tissue for all outputs of the scene, local rows (n_local, p). Collective."""
-    outputs = make_outputs(model.scene, model.system)
+    outputs = model.outputs
     C = np.zeros((model.system.layout.n_local, sum(o.size for o in outputs)))
     at = 0
     for o in outputs:

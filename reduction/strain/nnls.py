@@ -32,11 +32,6 @@ def nnls(G: Array, b: Array, tau: float) -> Weights:
 
     Each round solves the normal equations of the columns in use by Cholesky; what turns negative leaves again.
 
-    Args:
-        G: (m, n).
-        b: (m,).
-        tau: relative residual to reach, at least 1e-6.
-
     Raises:
         ReductionError: tau is too small, or no non-negative weights reach it.
     """
@@ -87,13 +82,9 @@ def _solve(gram: Array, right: Array) -> Array:
 
 
 def on_one_rank(comm: MPI.Intracomm, G: Array) -> tuple[Array, Array]:
-    """G and b = G 1 with the columns of all ranks, in their order, on rank 0; collective.
+    """G (m, n) and b = G 1 on rank 0, empty elsewhere, from the columns (m, n_local) of every rank. Collective.
 
     With more rows than columns, the triangle of G = Q R and Q'b instead: the same least squares problem.
-
-    ``G``: all rows of this rank's columns, (m, n_local).
-
-    Returns G or R, and b or Q'b, on rank 0; empty elsewhere.
     """
     columns = rows_on_root(comm, G.T)
     if columns is None:

@@ -59,11 +59,9 @@ class March:
 
 
 def march(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
-    """All steps under loads l (steps, k). Not collective but where the potential is distributed.
+    """All steps from a0, v0 (k,) under loads l (steps, k) at their midpoints. Collective if the potential is.
 
     Args:
-        load: l_n at the step midpoints.
-        a0, v0: start, (k,).
         tol: |residual| over the largest |h| seen; rounding of the force is enough in any case.
         engine: "C" or "NumPy"; empty takes C where there is a compiler, NumPy with a warning where not.
 

@@ -7,6 +7,9 @@ weighting [FCA15]: xi >= 0, most of them zero, with
 
 The states are those of the model on all cells, which is what the sampled one is to repeat. tau is half of that model's
 own error unless another is asked for: a smaller one would cost cells that the basis makes nothing of.
+
+Errors: everything comes from small products with the snapshots, made once for a basis and all that begin it:
+|Z - Phi A|_W^2 = |Z|_W^2 - 2 (Phi'W Z) : A + A : (Phi'W Phi) A, W = I, K_ee or M_ee. Rounding leaves 1e-8 of it.
 """
 
 from __future__ import annotations
@@ -16,21 +19,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.petsc import Array, on_root, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.bases.inner import Rows, Weight
 from softgrasp.reduction.bases.pod import pod_part
 from softgrasp.reduction.bases.states import BasisError
+from softgrasp.reduction.errors import column_blocks, ratio
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.operators import Lift, layer_products, symmetric
@@ -38,14 +40,100 @@ from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun
 from softgrasp.reduction.strain.cells import Cells, Potential
-from softgrasp.reduction.strain.compare import Reference, StrainErrors, errors_of, reference_of
 from softgrasp.reduction.strain.model import SmallStrainModel, StrainModel, StrainRun, TrainedBox, coordinates
 from softgrasp.reduction.strain.nnls import nnls, on_one_rank
+
+if TYPE_CHECKING:
+    from softgrasp.fem.model.build import Model
 
 SNAPSHOTS = 400  # behind a basis, of all runs together
 STATES = 80  # of each run behind the weights
 ENTRIES = 1 << 26  # of the matrix of their forces, which one rank takes: 512 MB
 TAUS = (1e-4, 3e-2)  # least and largest tau chosen from the error of the model on all cells
+
+
+@dataclass(frozen=True)
+class StrainErrors:
+    """Relative errors over the snapshots of one full run, or of several, dimensionless."""
+
+    z: float  # |Z - Phi A|_F / |Z|_F of the deformation
+    v: float  # |V - Phi A'|_M / |V|_M of its velocity
+    energy_norm: float  # of (z, v) in (z' K_ee z + v' M_ee v)^(1/2), K_ee at rest
+
+
+@dataclass(frozen=True)
+class Products:
+    """Phi'W Phi (k, k), Phi'W X (k, m) and |X|_W^2 of snapshots X in one product W."""
+
+    gram: Array
+    cross: Array
+    square: float
+
+    def missed(self, a: Array) -> float:
+        """|X - Phi A'|_W^2 of coordinates (m, k), of the leading ones alone where they are fewer."""
+        k = a.shape[1]
+        return self.square + float(np.sum(a * (a @ self.gram[:k, :k] - 2 * self.cross[:k].T)))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A full run in terms of a basis."""
+
+    full: FullRun  # the run
+    flat: Products  # flat, stiff: z in the products I and K_ee
+    stiff: Products
+    mass: Products  # v in M_ee, so that its ``gram`` is I
+    a: Array  # Phi' M Z, the coordinates of every snapshot, (m, k)
+
+    def missed(self, a: Array, v: Array) -> Array:
+        """[missed, whole] squares of z, v and the energy norm for states (steps + 1, k), (3, 2).
+
+        Raises ModelError: the run is shorter than the snapshots.
+        """
+        steps = self.full.snapshots.steps
+        if len(a) <= int(steps.max(initial=0)):
+            raise ModelError(f"the reduced run has {len(a) - 1} steps, the snapshots reach step {int(steps.max())}")
+        z, stiff, mass = self.flat, self.stiff, self.mass
+        v_missed = mass.missed(v[steps])
+        return np.array(
+            [
+                (z.missed(a[steps]), z.square),
+                (v_missed, mass.square),
+                (stiff.missed(a[steps]) + v_missed, stiff.square + mass.square),
+            ]
+        )
+
+    def errors(self, a: Array, v: Array) -> StrainErrors:
+        """Errors of one run."""
+        return errors_of([self.missed(a, v)])
+
+    def projection_error(self, k: int) -> float:
+        """min_A |Z - Phi A|_F / |Z|_F over the first k columns."""
+        cross = self.flat.cross[:k]
+        best = np.linalg.solve(self.flat.gram[:k, :k], cross)
+        return ratio(max(self.flat.square - float(np.sum(cross * best)), 0.0), self.flat.square)
+
+
+def errors_of(missed: list[Array]) -> StrainErrors:
+    """Errors over several runs together, from what :meth:`Reference.missed` gives of each."""
+    sums = np.sum(missed, axis=0)
+    return StrainErrors(*(ratio(max(float(part), 0.0), float(whole)) for part, whole in sums))
+
+
+def reference_of(full: FullRun, Phi: Array) -> Reference:
+    """Products of the snapshots with local rows Phi (n_local, k). Collective."""
+    system, n = full.model.system, full.model.system.layout.n_local
+    Z, V = full.snapshots.Z[:n], full.snapshots.Z[n:]
+    comm = system.layout.comm
+    M_Phi = times_columns(system.M_ee, Phi)
+
+    def products(W_Phi: Array, W: PETSc.Mat, X: Array) -> Products:
+        square = sum(float(np.vdot(X[:, b], times_columns(W, X[:, b]))) for b in column_blocks(X.shape[1]))
+        return Products(total(comm, Phi.T @ W_Phi), total(comm, W_Phi.T @ X), float(comm.allreduce(square)))
+
+    eye = Products(total(comm, Phi.T @ Phi), total(comm, Phi.T @ Z), float(comm.allreduce(float(np.vdot(Z, Z)))))
+    stiff = products(times_columns(system.K_ee, Phi), system.K_ee, Z)
+    return Reference(full, eye, stiff, products(M_Phi, system.M_ee, V), total(comm, M_Phi.T @ Z).T)
 
 
 @dataclass
@@ -68,12 +156,12 @@ class Training:
         system, Phi = self.model.system, self.Phi
         comm, layout = system.layout.comm, system.layout
         K_mu, K_lambda = (symmetric(layer_products(system, key, Phi, Phi)[0]) for key in ("K_mu", "K_lambda"))
-        outputs = project_outputs(make_outputs(self.model.scene, system), Lift(layout, Phi, Phi))
+        outputs = project_outputs(self.model.outputs, Lift(layout, Phi, Phi))
         G, K_mu, K_lambda = comm.bcast((total(comm, Phi.T @ system.G), K_mu, K_lambda))
         count = comm.allreduce(int(self.cells.cell.max(initial=-1)) + 1)
         return StrainModel(
             self.cells, K_mu, K_lambda, G, system.materials, outputs, self._box(), count, system.damping.alpha,
-            system.damping.in_space, system.gravity, layout=layout, Phi=Phi, scene_hash=scene_hash(self.model.scene),
+            system.damping.in_space, system.gravity, layout=layout, Phi=Phi, scene_hash=self.model.scene_hash,
         )  # fmt: skip
 
     def _box(self) -> TrainedBox:
@@ -213,12 +301,7 @@ def basis_of(system: BlockSystem, runs: Sequence[Snapshots], k: int) -> Array:
 
 
 def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
-    """Basis for models up to dimension N, and all cells in its coordinates. Collective.
-
-    Args:
-        model: scene with effects.finite_strain.
-        runs: full runs to train on.
-        N: largest dimension, the hand's 2 n_s included.
+    """Basis for models up to dimension N, the hand's 2 n_s included, and all cells in its coordinates. Collective.
 
     Raises:
         ReductionError: the scene has no finite strain, or the snapshots carry fewer columns.
@@ -243,14 +326,14 @@ def train(model: Model, runs: Sequence[FullRun], N: int) -> Training:
     return Training(model, fulls, Phi, cells, offset, tuple(reference_of(run, Phi) for run in fulls), seconds)
 
 
-def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False, engine: str = "") -> StrainRun:
+def replay_strain(rom: StrainModel, full: FullRun, *, outside: bool = False) -> StrainRun:
     """Under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
-    return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full, engine)
+    return _replay(rom.at(full.dt, full.model.system.materials, outside=outside), full)
 
 
-def _replay(small: SmallStrainModel, full: FullRun, engine: str = "") -> StrainRun:
+def _replay(small: SmallStrainModel, full: FullRun) -> StrainRun:
     a0 = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
-    return small.run(full.hand, a0=a0, engine=engine)
+    return small.run(full.hand, a0=a0)
 
 
 def errors_strain(rom: StrainModel, reduced_run: ReducedTrajectory, full: FullRun) -> StrainErrors:

@@ -40,7 +40,7 @@ from softgrasp.lqr.reduced.riccati import GainReport, Materials, RetunedGain, Re
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES
 from softgrasp.reduction.parameters import grid_of, materials_at, outside
-from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, Note, ReducedLoopRun, Retuned
+from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, ReducedLoopRun, Retuned
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import move_steps
 from softgrasp.study.shell.timing import repeated
@@ -53,7 +53,7 @@ REPEATS = 5  # of a re-tuning, the best counts
 BOX_STATES = 30_000  # above, nine more full solutions would take minutes
 
 
-def gain_study(design: Design, bases: Sequence[BasisGains], notes: Sequence[Note]) -> GainStudy:
+def gain_study(design: Design, bases: Sequence[BasisGains], *notes: str) -> GainStudy:
     """With the small controller and the time of its tick, or with a note why there is none. Collective."""
     controller: CertifiedController | None = None
     tick = float("nan")
@@ -61,8 +61,8 @@ def gain_study(design: Design, bases: Sequence[BasisGains], notes: Sequence[Note
         controller = certified_controller(design, a_priori(bases))
         tick = design.problem.layout.comm.bcast(tick_seconds(controller.controller))
     except NoController as error:
-        notes = [*notes, Note("controller", f"There is no small controller: {error}")]
-    return GainStudy(design, tuple(bases), controller, tick, tuple(notes))
+        notes = (*notes, f"There is no small controller: {error}")
+    return GainStudy(design, tuple(bases), controller, tick, tuple(filter(None, notes)))
 
 
 def a_priori(bases: Sequence[BasisGains]) -> BasisGains | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,15 +26,11 @@ PER_UNKNOWN = {2: 1.5e-5, 3: 4e-5}
 PER_STEP = 3e-5  # of the small models that are run
 
 
-def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | None, list[str]]:
+def estimate_error(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | None, list[str]]:
     """The estimate of a model's mesh where it is there, cheap or asked for, and why it is not. Collective.
 
-    Args:
-        seconds: what its run took, equal on all ranks.
-        certify: estimate whatever it costs.
-
-    Raises:
-        SoftgraspError: the estimate fails and ``certify`` asks for it.
+    ``seconds``: what its run took, equal on all ranks; ``certify``: estimate whatever it costs, and raise
+    SoftgraspError where that fails.
     """
     if model.system.points is not None:  # the small models are of linear elasticity
         reason = "The error of mesh and time step is estimated for linear elasticity only"
@@ -55,70 +53,59 @@ def judge(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | N
         return None, [f"The error of the mesh could not be estimated: {error}"]
 
 
-def keys(result: MeshEstimate | None, run: Trajectory) -> dict[str, Any]:
-    """What result.json holds of it: ``mesh_error`` and ``time_error``."""
+@dataclass(frozen=True)
+class AccuracyReport:
+    """What a run says of its error; empty where none was estimated."""
+
+    keys: Mapping[str, Any] = field(default_factory=dict)  # of result.json: ``mesh_error`` and ``time_error``
+    rows: Sequence[tuple[str, str]] = ()  # of the short table
+    summary: Sequence[str] = ()  # the same in one sentence
+    warnings: Sequence[str] = ()
+
+
+def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyReport:
+    """The estimate of a run's error as numbers and text."""
     if result is None:
-        return {}
-    return {
-        "mesh_error": {
-            "estimate": result.estimate,
-            "bound": result.bound,
-            "corrected": result.corrected(run.outputs)[-1].tolist(),
-            "omega": list(result.omega),
-            "passes": result.passes,
-            "n_e": result.n_e,
-            "compared_with": {"by": result.by, "n_e": result.finer},
-            "zone_shift": result.shift,
-            "tolerance": result.tolerance,
-            "reached": result.tolerance is None or (not result.obstacle and result.estimate <= result.tolerance),
-            "seconds": result.seconds,
-        },
-        "time_error": result.time_error,
+        return AccuracyReport()
+    keys = {
+        "estimate": result.estimate,
+        "bound": result.bound,
+        "corrected": result.corrected(run.outputs)[-1].tolist(),
+        "omega": list(result.omega),
+        "passes": result.passes,
+        "n_e": result.n_e,
+        "compared_with": {"by": result.by, "n_e": result.finer},
+        "zone_shift": result.shift,
+        "tolerance": result.tolerance,
+        "reached": result.tolerance is None or (not result.obstacle and result.estimate <= result.tolerance),
+        "seconds": result.seconds,
     }
-
-
-def rows(result: MeshEstimate | None) -> list[tuple[str, str]]:
-    """Lines of the short table."""
-    if result is None:
-        return []
+    off, bound, in_time = percent(result.estimate), percent(result.bound), percent(result.time_error)
     better = ""
     if result.offer is not None and result.estimate > result.offer[0]:
         goal, n_e = result.offer
         better = f"; {percent(goal)} at n_e = {n_e} with tissue.refine.tolerance = {goal:g}, tissue.order = 2"
-    return [
-        ("deformation", f"about {percent(result.estimate)} off on this mesh (bound {percent(result.bound)}){better}"),
-        ("", f"about {percent(result.time_error)} off by the time step"),
-    ]
-
-
-def summary(result: MeshEstimate | None) -> list[str]:
-    """The same in one sentence."""
-    if result is None:
-        return []
-    return [
-        f"The deformation is about {percent(result.estimate)} off by the mesh and {percent(result.time_error)} by the "
-        "time step."
-    ]
-
-
-def warnings(result: MeshEstimate | None) -> list[str]:
-    """What the estimate warns of."""
-    if result is None:
-        return []
-    texts = []
+    warnings = []
     if result.obstacle:
         sure = "not reached" if result.estimate > (result.tolerance or 0.0) else "not certain to be reached"
-        texts.append(
-            f"tissue.refine.tolerance = {result.tolerance:g} is {sure}: the error of the deformation is about "
-            f"{percent(result.estimate)} (bound {percent(result.bound)}) at n_e = {result.n_e}, since "
-            f"{result.obstacle}."
+        warnings.append(
+            f"tissue.refine.tolerance = {result.tolerance:g} is {sure}: the error of the deformation is about {off} "
+            f"(bound {bound}) at n_e = {result.n_e}, since {result.obstacle}."
         )
     if result.shift > 0:
-        texts.append(
+        warnings.append(
             f"The contact zone ends {result.shift:.3g} m off contact.box, because its facets count by their midpoints; "
             "[tissue.refine] makes mesh lines meet it."
         )
-    return texts
+    return AccuracyReport(
+        keys={"mesh_error": keys, "time_error": result.time_error},
+        rows=[
+            ("deformation", f"about {off} off on this mesh (bound {bound}){better}"),
+            ("", f"about {in_time} off by the time step"),
+        ],
+        summary=[f"The deformation is about {off} off by the mesh and {in_time} by the time step."],
+        warnings=warnings,
+    )
 
 
 def percent(share: float) -> str:

@@ -54,14 +54,9 @@ def turned(angle: float) -> list[str]:
 
 
 def inexact(drift: float, residual: float, solver: str, nu: float, rounding: float = 0.0) -> list[str]:
-    """Drift of the energy, residual of a solve or loss to rounding, as the digits they leave.
+    """Drift of the energy, residual of a solve or loss to rounding, as the digits they leave; all are relative.
 
-    Args:
-        drift: energy that nothing explains, over the largest seen [1]; counts for direct solvers.
-        residual: largest relative residual of the checked solves [1].
-        solver: cholesky, mumps or cg.
-        nu: largest Poisson's ratio [1].
-        rounding: what :func:`magnified` gives [1].
+    The drift is of energy that nothing explains, and counts for direct solvers; ``rounding`` is of :func:`magnified`.
     """
     shares = {"residual": residual, "energy drift": 0.0 if solver == "cg" else drift, "rounding of K": rounding}
     name = max(shares, key=lambda key: shares[key])

@@ -1,7 +1,8 @@
-"""What a scene solves, before it is solved: its equation, sizes, time scales and which effects matter."""
+"""What a scene solves, before it is solved: equation, sizes, time scales, effects that matter, error of the mesh."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -11,19 +12,23 @@ from mpi4py import MPI
 from softgrasp.fem.effects import EFFECTS, Gate
 from softgrasp.fem.effects.gate import Sag
 from softgrasp.fem.fields.scales import SMALL_STRAIN, measure
+from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.memory import Need, factor_bytes, need
+from softgrasp.fem.model.refined import by_lines, scene_ends
 from softgrasp.fem.run.motion import largest_acceleration
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
 from softgrasp.fem.solve.solvers import DIRECT_LIMIT, choose_solver, factor_on_every_rank
+from softgrasp.study.forward.accuracy import estimate_error
 from softgrasp.study.forward.cautions import coarse, locking, poisson_ratios, turned
-from softgrasp.study.forward.explain_mesh import MeshReport, mesh_report
 from softgrasp.study.forward.result import ModelSizes, model_sizes, output_places
 from softgrasp.study.report.equation import Equation, equation
 from softgrasp.study.report.files import to_json
 
 MODES = 6
+ESTIMATE_SECONDS, ESTIMATE_UNKNOWNS = 4.0, 25_000  # a dearer estimate of the mesh is left to simulate --certify
+LARGE = 200_000  # cells beyond which rank 0 does not look for the ends
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,30 @@ class EffectReport:
     operators: tuple[str, ...]
     cost: str
     gate: Gate
+
+
+@dataclass(frozen=True)
+class EndReport:
+    """Singular ends of one kind: how many points (2D) or edges (3D), and the smallest exponent alpha [1]."""
+
+    kind: str
+    count: int
+    alpha: float
+
+
+@dataclass(frozen=True)
+class MeshReport:
+    """What is known of the mesh's error before a run."""
+
+    ends: tuple[EndReport, ...]  # singular ends by kind and exponent, the strongest first
+    order: float  # expected order of the outputs in n_e^(1/d) d/2, that is in the cell size h on even meshes [1]
+    graded: bool  # whether cells shrink towards the ends
+    first: bool  # whether a run may refine this mesh further
+    # estimate, bound: relative error of the deformation [1]; None where the estimate takes long
+    estimate: float | None
+    bound: float | None
+    time_error: float | None  # that of the time steps [1]
+    shift: float | None  # of the ends of the zone against contact.box [m]
 
 
 @dataclass(frozen=True)
@@ -139,6 +168,24 @@ def explain_model(model: Model) -> Explanation:
         mesh=mesh_report(model),
         dimension=d,
     )
+
+
+def mesh_report(model: Model) -> MeshReport:
+    """Look for singular ends and estimate the error. Collective."""
+    scene, tissue = model.scene, model.space.mesh
+    refine = scene.tissue.refine
+    small = tissue.mesh.topology.index_map(tissue.dimension).size_global <= LARGE
+    ends = scene_ends(model.system.layout.comm, tissue, scene) if small else None
+    pairs = () if ends is None else zip(ends.kind, ends.alpha, strict=True)
+    counts = Counter((kind, round(float(alpha), 3)) for kind, alpha in pairs)
+    kinds = tuple(EndReport(k, n, a) for (k, a), n in sorted(counts.items(), key=lambda item: item[0][1]))
+    graded = refine is not None and refine.grading != "off"
+    edges = graded and tissue.dimension == 3 and not by_lines(scene)
+    order = 2.0 * scene.tissue.order if ends is None else expected_order(ends, scene.tissue.order, graded, edges)
+    error = estimate_error(model, ESTIMATE_SECONDS if model.system.layout.n_e <= ESTIMATE_UNKNOWNS else 0.0, False)[0]
+    values = (None,) * 4 if error is None else (error.estimate, error.bound, error.time_error, error.shift)
+    first = refine is not None and refine.tolerance is not None and refine.passes > 0
+    return MeshReport(kinds, order, graded, first, *values)
 
 
 def _warnings(

@@ -12,8 +12,8 @@ from rich.padding import Padding
 from softgrasp.fem.effects.gate import SMALL_SHARE
 from softgrasp.fem.fields.scales import SMALL_STRAIN
 from softgrasp.fem.model.memory import size_text
-from softgrasp.study.forward.explain import EffectReport, Explanation, explain
-from softgrasp.study.forward.explain_mesh import mesh_lines
+from softgrasp.study.forward.accuracy import percent
+from softgrasp.study.forward.explain import EffectReport, Explanation, MeshReport, explain
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import EQUATION, Section
 from softgrasp.study.report.tables import Table, listed
@@ -127,6 +127,35 @@ def sag_rows(result: Explanation) -> list[tuple[str, str]]:
         ("linear elasticity", f"{'holds' if steep.linear else 'does not hold'}: |grad z| is above {SMALL_STRAIN} in "
          f"{steep.share:.2%} of the body, at most {SMALL_SHARE:.0%} may be"),
     ]  # fmt: skip
+
+
+def mesh_lines(report: MeshReport, dimension: int) -> list[str]:
+    """The report in sentences."""
+    place = "point" if dimension == 2 else "edge"
+    lines = [
+        f"At {e.count} {place}{'s' * (e.count > 1)} of kind '{e.kind}' the displacement grows like r^{e.alpha:.3g}."
+        for e in report.ends[:6]
+    ]
+    if len(report.ends) > len(lines):
+        lines.append(f"{len(report.ends) - len(lines)} more kinds of ends have larger exponents.")
+    if report.graded:
+        lines.append(f"The cells are graded: outputs converge with the order {report.order:g} in n_e^(1/{dimension}).")
+    elif report.ends:
+        lines.append(
+            f"The cells are even: outputs converge with the order {report.order:.2g} in h, whatever tissue.order is."
+        )
+    if report.first:
+        lines.append("This is the first mesh: simulate may refine it further, to meet tissue.refine.tolerance.")
+    if report.estimate is not None and report.bound is not None and report.time_error is not None:
+        lines.append(
+            f"The deformation is about {percent(report.estimate)} off on this mesh (bound {percent(report.bound)}) and "
+            f"about {percent(report.time_error)} by the time step."
+        )
+    else:
+        lines.append(
+            "The error of the mesh is not estimated here, as that takes some time; simulate --certify does it."
+        )
+    return lines
 
 
 def verdict(effect: EffectReport) -> str:

@@ -14,7 +14,7 @@ from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import Interrupted, ResourceError, SceneError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.study.forward import accuracy
+from softgrasp.study.forward.accuracy import accuracy_report, draw, estimate_error
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
@@ -70,21 +70,21 @@ def run_simulate(
                 list_files(console, files)
             raise
     fields = frames.close()
-    mesh_error, unknown = accuracy.judge(model, run.seconds["steps"], certify)
-    warnings = [*run_warnings(model, run, frames.most[1:]), *accuracy.warnings(mesh_error), *unknown]
+    mesh_error, unknown = estimate_error(model, run.seconds["steps"], certify)
+    accuracy = accuracy_report(mesh_error, run)
+    warnings = [*run_warnings(model, run, frames.most[1:]), *accuracy.warnings, *unknown]
     result = simulate_result(model, run, warnings)
-    rows = [*result.rows(), *accuracy.rows(mesh_error)]
+    rows = [*result.rows(), *accuracy.rows]
 
     def page() -> Page:
         drawn = frames.draw(out, run)
         if session.pictures and mesh_error is not None:
-            drawn += accuracy.draw(out / "mesh_error.png", run, mesh_error)
+            drawn += draw(out / "mesh_error.png", run, mesh_error)
         sections = _sections(result, rows, drawn)
-        told = [*result.summary(), *accuracy.summary(mesh_error)]
         tables = {"trajectory.csv": result.trajectory()}
-        return Page(scene.name, told, sections, tables, [*fields, *drawn])
+        return Page(scene.name, [*result.summary(), *accuracy.summary], sections, tables, [*fields, *drawn])
 
-    numbers = result.to_json() | accuracy.keys(mesh_error, run)
+    numbers = {**result.to_json(), **accuracy.keys}
     console.print(pairs(rows))
     show_warnings(console, warnings)
     list_files(console, session.write(scene, numbers, page))

@@ -10,15 +10,15 @@ import numpy as np
 
 from softgrasp.study.pictures.style import BLUE, COLUMN, CYCLE, OUTLINE, colour_map, few_ticks, paper_style, save
 from softgrasp.study.report.tables import Table
-from softgrasp.study.runs.sweep import Axis, Row
+from softgrasp.study.runs.sweep import SweepAxis, SweepPoint
 
 BARS = 16  # numbers that a picture of two runs shows: the largest changes
 PANELS = 4  # outputs of a picture
 
 
-def figure_sweep(axes: Sequence[Axis], rows: Sequence[Row], file: Path) -> tuple[Path, ...]:
+def figure_sweep(axes: Sequence[SweepAxis], points: Sequence[SweepPoint], file: Path) -> tuple[Path, ...]:
     """Lag of every output against the first key, one curve a value of the second."""
-    names = [name for name in next(iter(r for r in rows if "reason" not in r)) if " lag " in name][:PANELS]
+    names = list(next(p for p in points if not p.reason).lags())[:PANELS]
     first, second = axes[0], axes[1] if len(axes) > 1 else None
     curves = [(None, BLUE)] if second is None else [
         (v, CYCLE[i] if len(second.values) <= len(CYCLE) else colour_map()(i / (len(second.values) - 1)))
@@ -30,10 +30,10 @@ def figure_sweep(axes: Sequence[Axis], rows: Sequence[Row], file: Path) -> tuple
         )
         for axis, name in zip(panels[:, 0], names, strict=True):
             for value, colour in curves:
-                shown = [r for r in rows if second is None or r[second.key] == value]
-                y = [r.get(name, np.nan) for r in shown]
+                shown = [p for p in points if second is None or p.values[second.key] == value]
+                y = [p.lags().get(name, np.nan) for p in shown]
                 label = None if second is None else f"{second.key.rsplit('.', 1)[-1]} = {value:.4g}"
-                axis.plot([r[first.key] for r in shown], y, ".-", color=colour, label=label)
+                axis.plot([p.values[first.key] for p in shown], y, ".-", color=colour, label=label)
             axis.set_ylabel(name.replace(" lag ", ", largest lag\nbehind the rigid motion "))
         panels[-1, 0].set_xlabel(first.key)
         if first.log:

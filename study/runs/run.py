@@ -14,7 +14,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.study.report.origin import origin
 from softgrasp.study.report.page import SHOWN, Section, shown
 from softgrasp.study.report.tables import Table
-from softgrasp.study.runs.sweep import METHOD, Row, Sweep, parse_axis, run_sweep_points
+from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, parse_axis, run_sweep_points
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
 
 UNITS = {"energy_drift": "energy drift", "seconds": "time [s]"}
@@ -26,22 +26,19 @@ REDUCED = (
 )
 
 
-def sweep_table(rows: list[Row]) -> Table:
+def sweep_table(points: Sequence[SweepPoint]) -> Table:
     """One row a point; a reason where it failed."""
+    rows = [point.row() for point in points]
     keys = list(dict.fromkeys(key for row in rows for key in row))
     best = sorted({round(i * (len(rows) - 1) / (SHOWN - 1)) for i in range(SHOWN)})
     header = tuple(UNITS.get(key, key) for key in keys)
     return Table(header, [[row.get(key) for key in keys] for row in rows], best=best)
 
 
-def short_table(rows: list[Row], width: int) -> Table:
+def short_table(points: Sequence[SweepPoint], width: int) -> Table:
     """The keys by their last words, the lags and the error, as many as a terminal has room for."""
-    hidden = {"reason", *UNITS}
-    names = {
-        key: key if " " in key else key.rsplit(".", 1)[-1]
-        for key in dict.fromkeys(key for row in rows for key in row)
-        if " end " not in key and key not in hidden
-    }
+    rows = [{**p.values, **{n: x for n, x in p.numbers.items() if " end " not in n and n not in UNITS}} for p in points]
+    names = {key: key if " " in key else key.rsplit(".", 1)[-1] for row in rows for key in row}
     while len(names) > 1:
         cells = {key: [*name.split(), *(shown(row.get(key)) for row in rows)] for key, name in names.items()}
         if sum(1 + max(map(len, texts)) for texts in cells.values()) <= width:
@@ -50,19 +47,20 @@ def short_table(rows: list[Row], width: int) -> Table:
     return Table(tuple(names.values()), [[row.get(key) for key in names] for row in rows])
 
 
-def summary(sweep: Sweep, rows: Sequence[Row]) -> list[str]:
+def summary(sweep: Sweep, points: Sequence[SweepPoint]) -> list[str]:
     """What came out, in three sentences."""
-    good = [row for row in rows if "reason" not in row]
+    good = [point for point in points if not point.reason]
     keys = [f"{a.key} ({len(a.values)} values from {min(a.values):g} to {max(a.values):g})" for a in sweep.axes]
     model = f"a reduced model of {sweep.N} columns" if sweep.N else "the full model"
-    texts = [f"{len(good)} of {len(rows)} points of {' and '.join(keys)} were run with {model}."]
-    if name := next((name for name in good[0] if " lag " in name), ""):
-        low, high = (pick(good, key=lambda row: row[name]) for pick in (min, max))
-        at = [", ".join(f"{a.key} = {row[a.key]:g}" for a in sweep.axes) for row in (low, high)]
-        texts.append(
-            f"The largest {name} is least, {low[name]:.3g}, at {at[0]}, and most, {high[name]:.3g}, at {at[1]}."
-        )
-    return [*texts, f"One run took {median(row['seconds'] for row in good):.2g} s in the median."]
+    texts = [f"{len(good)} of {len(points)} points of {' and '.join(keys)} were run with {model}."]
+    if name := next(iter(good[0].lags()), ""):
+        low, high = (pick(good, key=lambda point: point.lags()[name]) for pick in (min, max))
+        at = [
+            f"{p.lags()[name]:.3g}, at {', '.join(f'{a.key} = {p.values[a.key]:g}' for a in sweep.axes)}"
+            for p in (low, high)
+        ]
+        texts.append(f"The largest {name} is least, {at[0]}, and most, {at[1]}.")
+    return [*texts, f"One run took {median(point.numbers['seconds'] or 0.0 for point in good):.2g} s in the median."]
 
 
 def run_sweep(
@@ -88,30 +86,31 @@ def run_sweep(
     out.mkdir(parents=True, exist_ok=True)
     with session.progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("points", total=len(sweep.points()))
-        rows = run_sweep_points(sweep, out, comm, each, lambda n, total: bar.update(task, completed=n, total=total))
-    failed = [row for row in rows if "reason" in row]
-    if len(failed) == len(rows):
-        raise SceneError(f"no point of the sweep could be run; the first: {failed[0]['reason']}")
-    table = sweep_table(rows)
-    notes = [f"{len(failed)} of {len(rows)} points failed: {failed[0]['reason']}"] if failed else []
-    if (worst := max((row.get("error_deformation") or 0.0 for row in rows), default=0.0)) > COARSE:
+        points = run_sweep_points(sweep, out, comm, each, lambda n, total: bar.update(task, completed=n, total=total))
+    failed = [point.reason for point in points if point.reason]
+    if len(failed) == len(points):
+        raise SceneError(f"no point of the sweep could be run; the first: {failed[0]}")
+    table = sweep_table(points)
+    notes = [f"{len(failed)} of {len(points)} points failed: {failed[0]}"] if failed else []
+    if (worst := max(point.numbers.get("error_deformation") or 0.0 for point in points)) > COARSE:
         notes.append(f"The reduced model is off by {worst:.0%} at an end of the sweep; take more columns, --reduced.")
-    result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced, "points": rows, "warnings": notes}
+    result = {"command": "sweep", **origin(scene, comm.size), "reduced": reduced}
+    result |= {"points": [point.row() for point in points], "warnings": notes}
 
     def page() -> Page:
         from softgrasp.study.runs.plots import figure_sweep  # brings Matplotlib
 
-        files = figure_sweep(sweep.axes, rows, out / "sweep.png") if pictures else ()
+        files = figure_sweep(sweep.axes, points, out / "sweep.png") if pictures else ()
         text = f"{LAG} {REDUCED}" if reduced else LAG
         parts = [Section("", figures=[(files[0], "Largest lag of every output.")] if files else []),
                  *([Section("Warnings", text="\n\n".join(notes))] if notes else []),
                  table.section(text, "Points")]  # fmt: skip
         options = "".join(f" {text}" for text in axes) + (f" --reduced {reduced}" if reduced else "")
-        return Page(f"{scene.name}: sweep", summary(sweep, rows), parts, {"sweep.csv": table}, files, options)
+        return Page(f"{scene.name}: sweep", summary(sweep, points), parts, {"sweep.csv": table}, files, options)
 
-    short = short_table(rows, console.width)
+    short = short_table(points, console.width)
     console.print(short.terminal(wrap=range(len(short.header)), width=console.width))
-    if (left := len(rows[0]) - len(short.header)) > 0:
+    if (left := len(points[0].row()) - len(short.header)) > 0:
         console.print(f"{left} more columns are in sweep.csv")
     show_warnings(console, notes)
     list_files(console, session.write(scene, result, page))

@@ -24,13 +24,12 @@ from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.reduce import reduce_linear
 from softgrasp.reduction.replay import errors_linear, full_run, replay_linear
 
-Row = dict[str, Any]
 METHOD = "craig_bampton"  # needs no snapshots of the other values, and is stable at all of them
 FORM = "write KEY=FIRST:LAST:COUNT, KEY=FIRST:LAST:COUNT:log or KEY=A,B,C, as in tissue.material.mu=100:500:9"
 
 
 @dataclass(frozen=True)
-class Axis:
+class SweepAxis:
     """One key and its values."""
 
     key: str
@@ -38,7 +37,7 @@ class Axis:
     log: bool = False
 
 
-def parse_axis(text: str) -> Axis:
+def parse_axis(text: str) -> SweepAxis:
     """``key=first:last:count[:log]`` or ``key=a,b,c``; whole numbers stay whole where all values are."""
     key, _, right = text.partition("=")
     parts, log = right.split(":"), right.endswith(":log")
@@ -55,7 +54,7 @@ def parse_axis(text: str) -> Axis:
     if not good:
         raise SceneError(f"'{text}' is no sweep; {FORM}")
     whole = all(x == int(x) for x in values) and "." not in right and "e" not in right.lower()
-    return Axis(key, tuple(int(x) for x in values) if whole else tuple(values), log)
+    return SweepAxis(key, tuple(int(x) for x in values) if whole else tuple(values), log)
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Sweep:
 
     path: Path  # scene file
     overrides: Sequence[str]  # arguments of ``--set``
-    axes: tuple[Axis, ...]  # keys with their values; all combinations are run
+    axes: tuple[SweepAxis, ...]  # keys with their values; all combinations are run
     N: int | None = None  # columns of the reduced model that runs instead of the full one; None for the full model
 
     def points(self) -> list[dict[str, float]]:
@@ -76,6 +75,23 @@ class Sweep:
         """The scene of a point. Raises SceneError: a key or a value is wrong."""
         kept = ["output.snapshots=none"] if self.N is None else []
         return load_scene(self.path, [*self.overrides, *kept, *(f"{key}={value!r}" for key, value in values.items())])
+
+
+@dataclass(frozen=True)
+class SweepPoint:
+    """One point: the values of its keys, and its numbers or why there are none."""
+
+    values: dict[str, float]
+    numbers: dict[str, float | None]  # lag and end of each output, energy drift or error of the reduced model, seconds
+    reason: str = ""
+
+    def row(self) -> dict[str, Any]:
+        """The keys of result.json."""
+        return {**self.values, **self.numbers, **({"reason": self.reason} if self.reason else {})}
+
+    def lags(self) -> dict[str, float]:
+        """Largest distance of each output from the rigid motion, by the label of its column."""
+        return {name: x for name, x in self.numbers.items() if " lag " in name and x is not None}
 
 
 def only_material(a: Scene, b: Scene) -> bool:
@@ -100,14 +116,14 @@ class Runner:
         m = scene.tissue.material
         return self.model.with_materials(m.lam, m.mu, m.rho) if only_material(self.model.scene, scene) else self.model
 
-    def row(self, values: dict[str, float], scene: Scene, with_error: bool) -> Row:
+    def numbers(self, scene: Scene, with_error: bool) -> dict[str, float | None]:
         """Largest distance of each output from the rigid motion, final outputs, energy drift, seconds. Collective."""
         N = self.sweep.N
         if N is None:
             model = self.at(scene)
             run = simulate(model, RunOptions(self.out))
-            return {**values, **_outputs(run, run.outputs), "energy_drift": run.energy_drift,
-                    "seconds": run.seconds["steps"]}  # fmt: skip
+            lags = _outputs(run, run.outputs)
+            return {**lags, "energy_drift": run.energy_drift, "seconds": run.seconds["steps"]}
         if self.rom is None:
             first = self.at(self.sweep.scene({}))
             self.base = simulate(first)
@@ -120,10 +136,10 @@ class Runner:
         seconds, off = MPI.Wtime() - begin, None
         if with_error:
             off = float(errors_linear(self.rom, small, full_run(model, simulate(model))).error_deformation)
-        return {**values, **_outputs(self.base, small.outputs), "seconds": seconds, "error_deformation": off}
+        return {**_outputs(self.base, small.outputs), "seconds": seconds, "error_deformation": off}
 
 
-def _outputs(run: Trajectory, outputs: np.ndarray) -> Row:
+def _outputs(run: Trajectory, outputs: np.ndarray) -> dict[str, float]:
     """Numbers of the outputs, by the labels of their columns."""
     numbers = {"lag": np.abs(outputs - run.outputs_rigid).max(axis=0), "end": outputs[-1]}
     return {
@@ -135,8 +151,8 @@ def _outputs(run: Trajectory, outputs: np.ndarray) -> Row:
 
 def run_sweep_points(
     sweep: Sweep, out: Path, comm: MPI.Intracomm, each: int, progress: Callable[[int, int], None]
-) -> list[Row]:
-    """All points, ``comm.size / each`` at a time; rows in the order of the points, on all ranks. Collective.
+) -> list[SweepPoint]:
+    """All points, ``comm.size / each`` at a time, in their order on all ranks. Collective.
 
     A point that fails has its reason instead of numbers and is tried again by the next call. ``out`` takes a file of
     points a group of ranks; ``progress`` gets the points done (of the own group, times the groups) and in all.
@@ -148,40 +164,44 @@ def run_sweep_points(
     points = sweep.points()
     scenes = [sweep.scene(values) for values in points]
     keys = [f"{scene_hash(scene)}-{sweep.N}-{package_version()}" for scene in scenes]
-    done: dict[str, Row] = comm.bcast(_read(out) if comm.rank == 0 else None)
+    done: dict[str, SweepPoint] = comm.bcast(
+        _read(out, dict(zip(keys, points, strict=True))) if comm.rank == 0 else None
+    )
     groups = max(1, comm.size // each)
     number = min(comm.rank // each, groups - 1)
     group = comm.Split(number, comm.rank)
     runner, file = Runner(sweep, MPI.Intracomm(group), out / f"stopped-{number}"), out / f"points-{number}.jsonl"
     missing = [i for i, key in enumerate(keys) if key not in done]
-    own: dict[str, Row] = {}
+    own: dict[str, SweepPoint] = {}
     for count, i in enumerate(missing[number::groups], start=1):
         try:
-            row = runner.row(points[i], scenes[i], with_error=i in (0, len(points) - 1))
+            point = SweepPoint(points[i], runner.numbers(scenes[i], with_error=i in (0, len(points) - 1)))
         except Interrupted:
             raise
         except SoftgraspError as error:
-            own[keys[i]] = {**points[i], "reason": str(error)}
+            own[keys[i]] = SweepPoint(points[i], {}, str(error))
         else:
-            own[keys[i]] = row
+            own[keys[i]] = point
             if group.rank == 0:
                 with file.open("a") as lines:
-                    lines.write(json.dumps({"key": keys[i], "row": row}) + "\n")
+                    lines.write(json.dumps({"key": keys[i], "row": point.row()}) + "\n")
         progress(min(len(points), len(points) - len(missing) + count * groups), len(points))
-    for rows in comm.allgather(own):
-        done |= rows
+    for part in comm.allgather(own):
+        done |= part
     group.Free()
     return [done[key] for key in keys]
 
 
-def _read(out: Path) -> dict[str, Row]:
-    """Rows of earlier calls; a line that was cut off is no row."""
-    rows = {}
+def _read(out: Path, points: dict[str, dict[str, float]]) -> dict[str, SweepPoint]:
+    """Which of these points earlier calls have run; a line that was cut off is no point."""
+    done = {}
     for file in sorted(out.glob("points-*.jsonl")):
         for line in file.read_text().splitlines():
             try:
                 entry = json.loads(line)
             except ValueError:
                 continue
-            rows[entry["key"]] = entry["row"]
-    return rows
+            if (values := points.get(entry["key"])) is not None:
+                numbers = {name: x for name, x in entry["row"].items() if name not in values}
+                done[entry["key"]] = SweepPoint(values, numbers)
+    return done

@@ -14,11 +14,10 @@ from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.modal import turns
 from softgrasp.reduction.model import ModelError, SmallModel
 from softgrasp.reduction.online import run, run_batch
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.propagator import march, propagator
+from softgrasp.reduction.propagator import march, propagator, turns
 from tests.helpers.models import Array, close, make_scene
 from tests.helpers.reduced import DAMPED, KINDS, TINY, model_of, reduced, small_of, step_of, symplectic_basis, wiggle
 

@@ -18,11 +18,10 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.archive import LINEAR, load, save, write_model
 from softgrasp.reduction.bases.registry import make_basis
 from softgrasp.reduction.bases.states import states_of
-from softgrasp.reduction.modal import rotation
 from softgrasp.reduction.model import ModelError, SmallModel
 from softgrasp.reduction.online import Stepper, run, run_batch
 from softgrasp.reduction.projection import project
-from softgrasp.reduction.propagator import propagator
+from softgrasp.reduction.propagator import propagator, rotation
 from tests.helpers.models import Array, close, gather_rows, make_scene
 from tests.helpers.reduced import (
     DAMPED,

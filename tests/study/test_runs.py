@@ -22,7 +22,7 @@ from softgrasp.study.runs import sweep as sweep_module
 from softgrasp.study.runs.listing import apart, compare, run_compare, runs_below
 from softgrasp.study.runs.run import run_sweep, short_table
 from softgrasp.study.runs.start import SCHEMA, materials_table, new_scene
-from softgrasp.study.runs.sweep import parse_axis
+from softgrasp.study.runs.sweep import SweepPoint, parse_axis
 
 SMALL = ["tissue.cells=[3,6]", "time.steps=60"]
 SCENE = shipped_scenes()["paper_forward"]
@@ -58,7 +58,7 @@ def test_a_sweep_agrees_with_single_runs_and_resumes(mpi_tmp_path: Path, monkeyp
     )  # fmt: skip
     for alone, row in zip(result["points"][::2], together["points"], strict=True):
         assert row["tip_x lag [m]"] == pytest.approx(alone["tip_x lag [m]"], rel=1e-9)  # rounding, as above
-    monkeypatch.setattr(sweep_module.Runner, "row", lambda *_: pytest.fail("it was there already"))
+    monkeypatch.setattr(sweep_module.Runner, "numbers", lambda *_: pytest.fail("it was there already"))
     assert (
         run_sweep(SCENE, mpi_tmp_path, SMALL[:1], QUIET, axes=axes, quiet=True, pictures=False)["points"]
         == result["points"]
@@ -86,7 +86,7 @@ def test_a_reduced_sweep_tells_its_error_and_a_failed_point_its_reason(tmp_path:
 
 def test_the_table_of_a_sweep_fits_into_a_terminal() -> None:
     outputs = {f"tip_{x} {what} [m]": 0.123456 for what in ("lag", "end") for x in "xyz"}
-    rows = [{"tissue.material.mu": 20.0, **outputs, "energy_drift": 1.2e-15, "seconds": 1.1e-3}] * 2
+    rows = [SweepPoint({"tissue.material.mu": 20.0}, {**outputs, "energy_drift": 1.2e-15, "seconds": 1.1e-3})] * 2
     for width, kept in ((80, 3), (20, 2)):
         table = short_table(rows, width)
         assert table.header == ("mu", "tip_x lag [m]", "tip_y lag [m]", "tip_z lag [m]")[: 1 + kept]

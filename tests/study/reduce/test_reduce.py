@@ -129,7 +129,7 @@ def dense_error(against: FullRun, name: str, N: int) -> tuple[float, float]:
     system, snapshots = against.model.system, against.snapshots
     layout = system.layout
     swept = sweep(name, against, wanted(against, [N]))
-    model = swept.models[0]
+    model = swept.models[N]
     reduced = model.at()
     found = replay_linear(model, against.model, against, allow_unstable=True)
     T, G = gather_rows(layout, system.T), gather_rows(layout, system.G)
@@ -249,7 +249,7 @@ def test_training_is_as_the_scene_says() -> None:
     states = training_states(against, training_of(against.model))
     assert [system.materials[0].mu for system, _ in states.runs] == [50.0, 60.0]
     assert [s.steps.tolist()[::30] for _, s in states.runs] == [[0, 120]] * 2  # 31 of 61 each, first and last
-    assert states.columns == 62
+    assert sum(s.Z.shape[1] for _, s in states.runs) == 62
     swept = [sweep("psd_fixed", against, wanted(against, [14]))]
     lonely = made(load_scene(PAPER, [*SMALL, "reduction.train=[]", "output.every=2"]))
     assert [case.several for case in box_models(lonely, swept, None)] == [False]
@@ -413,7 +413,7 @@ def test_dimension_counts_every_column_of_every_method(coarse: FullRun) -> None:
     for name in (*PAPER_METHODS, *FURTHER):
         swept = sweep(name, coarse, wanted(coarse, [10]))
         (p,) = swept.points
-        assert (p.N, swept.models[0].N, sum(p.split)) == (10, 10, p.N_tissue), name
+        assert (p.N, swept.models[10].N, sum(p.split)) == (10, 10, p.N_tissue), name
         assert p.N_tissue == (10 - hand if METHODS[name].fixed else 10), name
 
 
