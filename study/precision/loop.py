@@ -77,13 +77,9 @@ class LoopSetting:
 
 
 def step_counts(shares: Sequence[float], steps: int, n_e: int = 1, most: float = np.inf) -> list[int]:
-    """Whole multiples and parts of the scene's steps that nest, most first.
+    """Whole multiples and parts of the scene's steps that nest, most first, as the shares are.
 
-    Args:
-        shares: multiples and parts, most first.
-        steps: of the scene.
-        n_e: unknowns.
-        most: unknowns times steps that a run may have; the scene's own and fewer steps always may.
+    Only the scene's own and fewer steps may have more unknowns n_e times steps than ``most``.
     """
     whole = [round(steps * s) for s in shares if float(steps * s).is_integer()]
     return [n for n in whole if n >= LEAST_STEPS and (n <= steps or n * n_e <= most)]
@@ -93,9 +89,6 @@ class LoopSweep:
     """Closed loops of one scene; gains and reference are made when the first point is not in the cache. Collective.
 
     Limits and delay of the scene's loop are left out: the law is linear.
-
-    Args:
-        runs: the control problem.
     """
 
     def __init__(self, runs: ControlRuns) -> None:
@@ -144,8 +137,7 @@ class LoopSweep:
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
             return [LoopReference(error, modes, loop.complete, design.judge.optimal, rest)]
 
-        self.runs.guard.next("closed loop, reference")
-        return self.cache.get("loop", {"reference": self.counts}, LoopReference, measure)[0]
+        return self.cache.point("closed loop, reference", "loop", {"reference": self.counts}, LoopReference, measure)[0]
 
     # --- controllers
 
@@ -227,9 +219,8 @@ class LoopSweep:
             stable = not gain.basis or self.runs.design.judge.report(self.family(gain.basis).at(gain.N)).stable
             return [self._point(what, steps, stable) for steps in self.counts]
 
-        self.runs.guard.next(f"closed loop, {what.label}")
         key = {"controller": what.label, "counts": self.counts, "repeats": self.runs.repeats}
-        return self.cache.get("loop", key, LoopPoint, measure)
+        return self.cache.point(f"closed loop, {what.label}", "loop", key, LoopPoint, measure)
 
     def _point(self, what: LoopSetting, steps: int, stable: bool) -> LoopPoint:
         """Errors, cost and seconds of one controller and step."""
@@ -316,8 +307,7 @@ def ask_loop(runs: ControlRuns) -> Question:
 def loop_slopes(points: Sequence[LoopPoint]) -> list[Slope]:
     """Order in time of every controller on the full plant, against the same gain without time step."""
     slopes: list[Slope] = []
-    for name, line in series_of([p for p in points if p.ok and not p.reduced_plant]).items():
+    for line in series_of([p for p in points if p.ok and not p.reduced_plant]).values():
         last = sorted(line, key=lambda p: -p.steps)[:FINEST]
-        errors = [p.error_time for p in last]
-        slopes += slope("loop", name, "error in time against steps", [p.steps for p in last], errors)
+        slopes += slope(last, "error in time against steps", "steps", "error_time")
     return slopes
