@@ -15,9 +15,11 @@ from rich.progress import Progress, TaskProgressColumn
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.scene.control import Loop
+from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, plan, reduce_gains
-from softgrasp.lqr.design.scene import finite_problem, linearised, with_control
+from softgrasp.lqr.design.linearise import finite_problem, linearised
+from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
+from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, report
