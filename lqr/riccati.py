@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from softgrasp.lqr.reduced.bases import modal_basis
 from softgrasp.lqr.reduced.riccati import full_gain, project_plant
 
 Method = Literal["auto", "dense", "newton_adi", "radi", "galerkin"]
-METHODS: tuple[Method, ...] = ("auto", "dense", "newton_adi", "radi", "galerkin")
+METHODS: tuple[Method, ...] = get_args(Method)
 # Exact to rounding, without a start or shifts that could fail, and still as fast as low rank within some tenths of a
 # second; the faster one of the two changes between 92 and 160 states (softgrasp.study.bench.switches).
 DENSE_STATES = 200

@@ -75,8 +75,7 @@ def number(value: float | None, unit: str = "") -> str:
     return "not finite" if value is None else f"{value:.3g}{unit}"
 
 
-def span(values: list[float], unit: str = "") -> str:
-    """Smallest to largest of some numbers."""
+def _span(values: list[float], unit: str) -> str:
     return f"{number(min(values))} to {number(max(values), unit)}" if values else "none"
 
 
@@ -126,7 +125,7 @@ def forward_rows(forward: dict[str, Any], reduced: dict[str, Any]) -> list[Row]:
          "the matrix is factored once, by compiled kernels on another machine"),
         (f"reduced run, {chosen}", "0.097 s", number(psd["time_online"], " s"), less(psd["time_online"], 0.097),
          "a step is one small product, everything else is done before"),
-        ("reduced runs, all six methods and N", "0.097 to 0.101 s", span(online, " s"),
+        ("reduced runs, all six methods and N", "0.097 to 0.101 s", _span(online, " s"),
          less(max(online, default=None), 0.101), "as above; N matters more here"),
         (f"speed-up, {chosen}", "167", f"{number(again)} for the same model again, "
          f"{number(speed['psd']['speedup_new_parameter'])} for a new parameter", less(-again, -167),
@@ -206,7 +205,7 @@ def control_rows(control: dict[str, Any]) -> list[Row]:
         ("states 2n", "880", str(states), verdict(states == 880), "the same"),
         ("full Riccati equation", "84.53 s", number(seconds, " s"), less(seconds, 84.53), "of low rank; "
          "Kelvin-Voigt damping of 0.002 s, without which the problem is ill-posed in double precision"),
-        ("reduced equations, five methods, all N", "0.051 to 0.057 s", span(times, " s"),
+        ("reduced equations, five methods, all N", "0.051 to 0.057 s", _span(times, " s"),
          less(max(times, default=None), 0.057), "a direct solver"),
         (f"speed-up, POD of P, N = {first['N']}", "1600", number(gained), less(-gained, -1600),
          "the full equation is solved in low rank; both need P for the basis"),
@@ -244,11 +243,7 @@ def _small(reduced: dict[str, Any]) -> Row:
 
 
 def write_page(out: Path, results: dict[str, dict[str, Any]]) -> list[Path]:
-    """paper.html and paper.json from the results of the three commands.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
+    """paper.html and paper.json from the results of the three commands."""
     forward, control = forward_rows(results["forward"], results["reduce"]), control_rows(results["control"])
     forward += mesh_rows(results["forward"], results["accurate"])
     figures = [(out / name, text) for name, text in FIGURES if (out / name).exists()]

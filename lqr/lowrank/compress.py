@@ -8,8 +8,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
-from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import damp
 from softgrasp.reduction.bases.engines import triangle
 
@@ -107,6 +107,6 @@ def _leading(G: Array, allowed: float) -> Array:
     L = np.zeros((k, rank))
     L[pivots - 1] = np.tril(factor)[:, :rank]
     values, vectors = np.linalg.eigh(L.T @ L)
-    floor = k * EPS * float(values[-1]) if rank else 0.0
-    keep = np.cumsum(values) > max(allowed, floor)
+    rounding = k * EPS * float(values[-1]) if rank else 0.0
+    keep = np.cumsum(values) > max(allowed, rounding)
     return np.ascontiguousarray((L @ (vectors[:, keep] / np.sqrt(values[keep])))[:, ::-1])

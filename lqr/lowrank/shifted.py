@@ -22,6 +22,19 @@ from softgrasp.fem.petsc import Array, Complex, PETSc, petsc_options, whole_copy
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
+PREFIX = "softgrasp_shifted_"
+# Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
+# in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
+# (softgrasp.study.bench.switches). Beyond, a whole factor on each rank costs too much memory.
+GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
+# n_e up to which SuperLU works column by column in 2D, where it is the faster way; in 3D it needs its panels
+THIN_UP_TO = 20_000
+AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next factors
+# Threads that do: two in 2D, where this rank would wait for one. Up to four factors are then alive at a time, too much
+# memory in 3D.
+THREADS = {1: 2, 2: 2, 3: 1}
+_SYMMETRIC = {"SymmetricMode": True, "Equil": False}
+
 
 class FactorsAhead:
     """A few threads of one factor each.
@@ -75,20 +88,6 @@ class FactorsAhead:
             self._drop(p)
         for thread in self.threads:
             thread.shutdown()
-
-
-PREFIX = "softgrasp_shifted_"
-# Every rank factors whole matrices up to here, each rank another shift: no messages in the factorisation, and SuperLU
-# in complex numbers is about as fast as MUMPS on the real form of twice the order in 2D, faster in 3D
-# (softgrasp.study.bench.switches). Beyond, a whole factor on each rank costs too much memory.
-GATHER_LIMIT = {1: 150_000, 2: 150_000, 3: 40_000}  # 1: systems without a mesh
-# n_e up to which SuperLU works column by column in 2D, where it is the faster way; in 3D it needs its panels
-THIN_UP_TO = 20_000
-AHEAD_FROM = 5_000  # n_e from which other cores, if there are, make the next factors
-# Threads that do: two in 2D, where this rank would wait for one. Up to four factors are then alive at a time, too much
-# memory in 3D.
-THREADS = {1: 2, 2: 2, 3: 1}
-_SYMMETRIC = {"SymmetricMode": True, "Equil": False}
 
 
 class ShiftedTissue(ABC):

@@ -17,14 +17,15 @@ from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.lqr.dense.modal import ModalPlant, closed_loop_rates, lowest_plant
 from softgrasp.lqr.lowrank.compress import gram, triangular
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import costates_to_absolute, costates_to_relative, states_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.reduction.bases.engines import EPS, factor, small_svd
 from softgrasp.reduction.bases.states import BasisError
 
 A_PRIORI = "structured"  # the basis that needs no P
+STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
 
 
 @dataclass(frozen=True)
@@ -166,9 +167,6 @@ def pod_decomposed(problem: RiccatiProblem, Z: Block) -> BasisFamily:
         return np.asarray(scipy.linalg.block_diag(V_1, V_1))
 
     return _tissue(problem, "pod_decomposed", columns, 2 * V.columns, 2, (s,))
-
-
-STRUCTURED_MODES = 60  # candidates; more of them hardly enter an order that runs in a control loop
 
 
 def structured(problem: RiccatiProblem) -> BasisFamily:

@@ -11,8 +11,10 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import PETSc, combine, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.lqr.dense.modal import modes_of_plant
+from softgrasp.lqr.lowrank.compress import gram
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import damp, descriptor
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
@@ -95,7 +97,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
         for count in (guess, *(more for more in GROWTH if more > guess)):
             number = min(count, problem.layout.states - 2)
             values = resolvent.nearest(number)
-            result: Abscissa = problem.layout.comm.bcast(_judge(values, shift, tail, why))
+            result: Abscissa = problem.layout.comm.bcast(_conclude(values, shift, tail, why))
             short = len(values) < number  # asking for more would not help
             enough = result.certified and (result.exact or result.radius >= ENOUGH * aim)
             if result.value >= 0 or short or enough or why:
@@ -124,7 +126,7 @@ def _circle(problem: RiccatiProblem, tail: Tail | None) -> tuple[float, float, i
     return radius, max(radius / 4, beta * radius**2), min(2 * problem.layout.n_s + 2 * inside, GROWTH[-1])
 
 
-def _judge(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:
+def _conclude(values: np.ndarray, shift: float, tail: Tail | None, why: str) -> Abscissa:
     """What the eigenvalues nearest to the shift say."""
     distance = np.abs(values - shift)
     order = np.argsort(distance)
@@ -183,13 +185,9 @@ class Resolvent:
             hand = hand + sigma * self.drag * system.M_rigid
             hand = hand - factor**2 * total(self.comm, system.G.T @ self.S_G)
         self.hand = np.linalg.inv(hand)
-        columns = []
-        for unit in np.eye(n_s):
-            load = Block(np.concatenate([np.zeros(n_s), unit])[:, None], np.zeros((2 * self.n, 1)))
-            columns.append(self._open(load))
-        self.columns = Block.join(columns)
-        input_ = self.K.hand.T @ self.columns.hand + total(self.comm, self.K.tall.T @ self.columns.tall)
-        self.small = np.linalg.inv(np.eye(n_s) - input_)
+        loads = Block(np.eye(2 * n_s, n_s, -n_s), np.zeros((2 * self.n, n_s)))
+        self.columns = Block.join([self._open(loads[i : i + 1]) for i in range(n_s)])
+        self.small = np.linalg.inv(np.eye(n_s) - gram(self.comm, self.K, self.columns))
 
     def _open(self, b: Block) -> Block:
         """(sigma E - A)^{-1} b for one column. Collective."""
@@ -217,8 +215,7 @@ class Resolvent:
         self.comm.Bcast(hand)
         state = Block(hand[:, None], np.array(local[self.extra :])[:, None])
         answer = self._open(descriptor(self.problem, state))
-        input_ = self.K.hand.T @ answer.hand + total(self.comm, self.K.tall.T @ answer.tall)
-        input_ = self.small @ input_
+        input_ = self.small @ gram(self.comm, self.K, answer)
         out = y.array_w
         out[: self.extra] = (answer.hand + self.columns.hand @ input_)[: self.extra, 0]
         out[self.extra :] = (answer.tall + self.columns.tall @ input_)[:, 0]

@@ -11,7 +11,7 @@ import scipy.linalg
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, TissueMatrices, dense_modes, gather_tissue, lowest_plant
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
@@ -101,7 +101,7 @@ class ModalLoop:
         """
         k, difference, xi = self.gain(K), self.gain(K) - self.gain(best), self.state(x)
 
-        def judge() -> LoopQuality:
+        def evaluate() -> LoopQuality:
             F = self.A + self.B @ k
             if not np.isfinite(F).all():
                 return LoopQuality(np.inf, np.inf, poles=np.array([np.inf + 0j]))
@@ -113,7 +113,7 @@ class ModalLoop:
             Y = lyapunov(T, U, difference.T @ self.problem.R @ difference)
             return LoopQuality(abscissa, max(float(xi[:, 0] @ Y @ xi[:, 0]), 0.0) / optimal, poles=poles)
 
-        return on_root(self.comm, judge)
+        return on_root(self.comm, evaluate)
 
 
 def _all(problem: RiccatiProblem) -> ModalPlant:

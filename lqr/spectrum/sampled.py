@@ -12,7 +12,7 @@ from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifts import shift_range
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, ModalLoop, SampledRadius
@@ -212,10 +212,10 @@ class SampledLoop:
         return _Parts(A, B, k, False, _Rest(size, left_out, tail.alpha + tail.beta * left_out**2, tail.drag))
 
     def _radius(self, parts: _Parts, law: Sampling) -> SampledRadius:
-        return on_root(self.comm, lambda: _judge(parts, law))
+        return on_root(self.comm, lambda: _conclude(parts, law))
 
 
-def _judge(parts: _Parts, law: Sampling) -> SampledRadius:
+def _conclude(parts: _Parts, law: Sampling) -> SampledRadius:
     """Eigenvalues of the modes kept, and the bound on the rest."""
     A_d, B_d = tick(parts.A, parts.B, law)
     m = B_d.shape[1]

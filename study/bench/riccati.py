@@ -22,13 +22,15 @@ from softgrasp.fem.errors import CheckpointError, SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
-from softgrasp.lqr.dense.modal import factor_psd, paper_form
+from softgrasp.lqr.dense.modal import factor_psd
+from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import NewtonADI
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error

@@ -16,18 +16,10 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
+from softgrasp.lqr.design.duration import LoopPlan, largest_cost
 from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.design.orders import (
-    BasisGains,
-    LoopPlan,
-    Notify,
-    best_gains,
-    fast_order,
-    largest_cost,
-    reduce_gains,
-    with_bounds,
-)
-from softgrasp.lqr.design.scene import finite_problem
+from softgrasp.lqr.design.linearise import finite_problem
+from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains, fast_order, reduce_gains, with_bounds
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
@@ -36,11 +28,12 @@ from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import rest
 from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
-from softgrasp.lqr.reduced.riccati import GainReport, Materials, RetunedGain, Retuner, retuned_gain
+from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
+from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES
 from softgrasp.reduction.parameters import grid_of, materials_at, outside
-from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, Note, ReducedLoopRun, Retuned
+from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, ReducedLoopRun, Retuned
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.pictures.shapes import move_steps
 from softgrasp.study.shell.timing import repeated
@@ -53,7 +46,7 @@ REPEATS = 5  # of a re-tuning, the best counts
 BOX_STATES = 30_000  # above, nine more full solutions would take minutes
 
 
-def gain_study(design: Design, bases: Sequence[BasisGains], notes: Sequence[Note]) -> GainStudy:
+def gain_study(design: Design, bases: Sequence[BasisGains], *notes: str) -> GainStudy:
     """With the small controller and the time of its tick, or with a note why there is none. Collective."""
     controller: CertifiedController | None = None
     tick = float("nan")
@@ -61,8 +54,8 @@ def gain_study(design: Design, bases: Sequence[BasisGains], notes: Sequence[Note
         controller = certified_controller(design, a_priori(bases))
         tick = design.problem.layout.comm.bcast(tick_seconds(controller.controller))
     except NoController as error:
-        notes = [*notes, Note("controller", f"There is no small controller: {error}")]
-    return GainStudy(design, tuple(bases), controller, tick, tuple(notes))
+        notes = (*notes, f"There is no small controller: {error}")
+    return GainStudy(design, tuple(bases), controller, tick, tuple(filter(None, notes)))
 
 
 def a_priori(bases: Sequence[BasisGains]) -> BasisGains | None:

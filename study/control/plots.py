@@ -61,8 +61,12 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ..
         figure, axes = plt.subplots(3, 1, figsize=(style.COLUMN + 1.8, 6.6), sharex=True)
         figure.subplots_adjust(left=0.13, right=0.66, bottom=0.07, top=0.93, hspace=0.16)
         for ax, (key, label) in zip(axes, QUANTITIES, strict=True):
+            ends = []
             for j, s in enumerate(ran):
-                ax.plot(*drawn(s, key), **_look(s))
+                line = drawn(s, key)
+                ax.plot(*line, **_look(s))
+                if shown := [point for point in zip(*line, strict=True) if point[1] > 0]:
+                    ends.append((*shown[-1], TITLES[s.name], LOOKS[s.name][0]))
                 N, values = unstable(s, key)
                 bad |= bool(N)
                 ax.plot(N, values, zorder=4, **CROSS)
@@ -73,15 +77,7 @@ def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ..
             style.log_axis(ax, 2.5 * TOP)
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
             ax.set_ylabel(label)
-            ends = [(drawn(s, key), s) for s in ran]
-            style.direct_labels(
-                ax,
-                [
-                    (*[(n, x) for n, x in zip(N, v, strict=True) if x > 0][-1], TITLES[s.name], LOOKS[s.name][0])
-                    for (N, v), s in ends
-                    if any(x > 0 for x in v)
-                ],
-            )
+            style.direct_labels(ax, ends)
         axes[-1].set_xlabel("$N$, order of the reduced equation")
         if bad:
             text = "unstable loop; on the edge: error above 1"
@@ -96,46 +92,35 @@ def _look(basis: BasisGains) -> dict[str, Any]:
 
 def figure_retune(retuned: Sequence[Retuned], out_png: Path) -> tuple[Path, ...]:
     """Excess cost of the re-tuned gains over the box of lambda and mu, one panel a basis; PNG and PDF."""
+    values = [p.cost_excess for r in retuned for p in r.points if p.stable]
+    low, high = min(values, default=LOWEST), max(values, default=TOP)
+    norm = LogNorm(max(low, LOWEST) / 1.5, max(high, 10 * LOWEST) * 1.5)
     with style.paper_style():
         count = len(retuned)
         figure, axes = plt.subplots(
             count, 1, figsize=(style.COLUMN + 0.8, 0.4 + 2.3 * count), squeeze=False, sharex=True, layout="constrained"
         )
-        values = [p.cost_excess for r in retuned for p in r.points if p.stable]
-        low, high = min(values, default=LOWEST), max(values, default=TOP)
-        low, high = max(low, LOWEST) / 1.5, max(high, 10 * LOWEST) * 1.5
-        norm = LogNorm(low, high)
         picture: Any = None
         for ax, r in zip(axes[:, 0], retuned, strict=True):
-            lam = [p.materials[0].lam for p in r.points]
-            mu = [p.materials[0].mu for p in r.points]
-            fine = [i for i, p in enumerate(r.points) if p.stable]
-            picture = ax.scatter(
-                [lam[i] for i in fine], [mu[i] for i in fine], s=900, marker="s", norm=norm, cmap="viridis_r",
-                c=[max(r.points[i].cost_excess, LOWEST) for i in fine],
-            )  # fmt: skip
-            for i in fine:  # the number on its colour, white on dark
-                value = max(r.points[i].cost_excess, LOWEST)
+            places = np.array([(p.materials[0].lam, p.materials[0].mu) for p in r.points])
+            stable = np.array([p.stable for p in r.points])
+            excess = np.maximum([p.cost_excess for p in r.points], LOWEST)
+            look: dict[str, Any] = {"s": 900, "marker": "s", "norm": norm, "cmap": "viridis_r"}
+            picture = ax.scatter(*places[stable].T, c=excess[stable], **look)
+            for place, value in zip(places[stable], excess[stable], strict=True):  # on its colour, white on dark
                 ink = "white" if norm(value) > 0.45 else "black"
-                ax.text(lam[i], mu[i], f"{value:.0e}", ha="center", va="center", fontsize=6.5, color=ink)
-            rest = [i for i in range(len(lam)) if i not in fine]
-            ax.plot([lam[i] for i in rest], [mu[i] for i in rest], "x", color=style.UNSTABLE, ms=8, mew=1.6)
-            ax.set(xscale="log", yscale="log", ylabel=r"$\mu$ [Pa]")
+                ax.text(*place, f"{value:.0e}", ha="center", va="center", fontsize=6.5, color=ink)
+            ax.plot(*places[~stable].T, "x", color=style.UNSTABLE, ms=8, mew=1.6)
+            ax.set(xscale="log", yscale="log", ylabel=r"$\mu$ [Pa]", title=f"{TITLES[r.name]}, $N = {r.N}$")
             ax.margins(0.25)
-            _few_ticks(ax, sorted(set(lam)), sorted(set(mu)))
-            ax.set_title(f"{TITLES[r.name]}, $N = {r.N}$")
+            for axis, settings in zip((ax.xaxis, ax.yaxis), places.T, strict=True):  # ticks at the settings themselves
+                axis.set_ticks(np.unique(settings), [f"{v:.3g}" for v in np.unique(settings)])
+                axis.set_minor_formatter(NullFormatter())
+                axis.set_ticks([], minor=True)
         axes[-1, 0].set_xlabel(r"$\lambda$ [Pa]")
         if picture is not None:
             figure.colorbar(picture, ax=axes[:, 0].tolist(), label=QUANTITIES[2][1])
         return style.save(figure, out_png)
-
-
-def _few_ticks(ax: Any, lam: Sequence[float], mu: Sequence[float]) -> None:
-    """Ticks at the settings themselves."""
-    for axis, values in ((ax.xaxis, lam), (ax.yaxis, mu)):
-        axis.set_ticks(values, [f"{v:.3g}" for v in values])
-        axis.set_minor_formatter(NullFormatter())
-        axis.set_ticks([], minor=True)
 
 
 def figure_bode(margins: LoopMargins, out_png: Path) -> tuple[Path, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -11,13 +12,15 @@ import numpy as np
 from softgrasp.fem.columns import farthest
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.controller import CertifiedController
+from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.design.orders import BasisGains, LoopPlan
+from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
 from softgrasp.lqr.plant.problem import rigid_gains, translation_defect, velocity_defect
 from softgrasp.lqr.plant.target import Target
-from softgrasp.lqr.reduced.riccati import GainQuality, GainReport, RetunedGain
+from softgrasp.lqr.reduced.retune import RetunedGain
+from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.forward.result import newton_keys
 from softgrasp.study.report.origin import origin, peak_memory_mb
 
@@ -30,13 +33,8 @@ TITLES = {
     "structured": "modes by cost, a priori",
 }
 
-
-@dataclass(frozen=True)
-class Note:
-    """What was chosen for the user, or why a part is missing."""
-
-    topic: str  # table, modal, orders, retune, controller, sampling, end
-    text: str  # one sentence
+REPORT = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
+BOUNDS = ("cost_excess_proved", "cost_excess_at_most", "unbounded")
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,7 @@ class GainStudy:
     bases: tuple[BasisGains, ...]  # gains of the reduced equations
     controller: CertifiedController | None  # the small controller; None when no small gain is certified
     tick: float  # seconds of one tick of it, median
-    notes: tuple[Note, ...]  # what was chosen for the user, and why parts are missing
+    notes: tuple[str, ...]  # what was chosen for the user, and why parts are missing
 
     @cached_property
     def margins(self) -> LoopMargins | None:
@@ -121,6 +119,17 @@ class GainStudy:
         d, layout = self.design, self.design.problem.layout
         problem, solution, quality, sampled = d.problem, d.solution, d.quality, d.quality.sampled
         displaced, moving = rigid_gains(problem, solution)
+        controller: dict[str, Any] | None = None
+        if self.controller is not None and self.margins is not None:
+            small, margins = self.controller.controller, self.margins
+            controller = {
+                "method": self.controller.method,
+                "N": small.plant.N,
+                "period": small.period,
+                "time_tick": self.tick,
+                "sampled_radius": self.controller.radius.value,
+                "margins": {"axes": [asdict(axis) for axis in margins.axes], "distance": margins.distance},
+            }
         return {
             "command": "control",
             **origin(d.model.scene, layout.comm.size),
@@ -141,8 +150,8 @@ class GainStudy:
             "stable": quality.stable,
             "findings": self.findings,
             "damping_enough": d.diagnosis.damping_enough,
-            "controller": _controller(self),
-            "notes": [note.text for note in self.notes],
+            "controller": controller,
+            "notes": self.notes,
             "time": {**seconds, "solver": dict(solution.seconds)},
             "memory_peak_mb": peak_memory_mb(layout.comm),
         }
@@ -163,7 +172,7 @@ class ControlStudy(GainStudy):
     def result(self, seconds: dict[str, float]) -> dict[str, Any]:
         """The keys of ``result.json``. Collective."""
         return super().result(seconds) | {
-            "reduced": {b.name: [report_dict(r) | bounds_dict(r) for r in b.reports] for b in self.bases},
+            "reduced": {b.name: [report_dict(r, REPORT + BOUNDS) for r in b.reports] for b in self.bases},
             "refused": {b.name: b.refused for b in self.bases if b.refused},
             "retune": [_retuned(r) for r in self.retuned],
             "loop": _loop(self),
@@ -171,15 +180,9 @@ class ControlStudy(GainStudy):
         }
 
 
-def report_dict(report: GainReport) -> dict[str, Any]:
-    """One point of result.json."""
-    keys = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
-    return {**{key: getattr(report, key) for key in keys}, "sampled_radius": radius_of(report)}
-
-
-def bounds_dict(report: GainQuality) -> dict[str, Any]:
-    """Bounds on the excess cost, and why there is none."""
-    return {key: getattr(report, key) for key in ("cost_excess_proved", "cost_excess_at_most", "unbounded")}
+def report_dict(gain: GainQuality, keys: Sequence[str] = REPORT) -> dict[str, Any]:
+    """One gain in result.json."""
+    return {key: getattr(gain, key) for key in keys} | {"sampled_radius": radius_of(gain)}
 
 
 def radius_of(report: GainQuality) -> float:
@@ -188,28 +191,20 @@ def radius_of(report: GainQuality) -> float:
 
 
 def _retuned(r: Retuned) -> dict[str, Any]:
-    keys = ("error_K", "cost_excess", "abscissa_full", "stable", "reason")
+    keys = ("error_K", "cost_excess", "abscissa_full", "stable", "reason", *BOUNDS)
     points = [
-        {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "sampled_radius": radius_of(p), "time": p.seconds}
-        | {key: getattr(p, key) for key in keys}
-        | bounds_dict(p)
+        {"lambda": p.materials[0].lam, "mu": p.materials[0].mu, "time": p.seconds} | report_dict(p, keys)
         for p in r.points
     ]
     return {"method": r.name, "N": r.N, "slowest": r.slowest, "points": points}
 
 
-def _controller(study: GainStudy) -> dict[str, Any] | None:
-    if study.controller is None or study.margins is None:
-        return None
-    c, margins = study.controller.controller, study.margins
-    return {"method": study.controller.method, "N": c.plant.N, "period": c.period, "time_tick": study.tick,
-            "sampled_radius": study.controller.radius.value,
-            "margins": {"axes": [asdict(axis) for axis in margins.axes], "distance": margins.distance}}  # fmt: skip
-
-
 def _loop(study: ControlStudy) -> dict[str, Any]:
     loops, full = study.loops, study.loops.full
-    away = study.distance(full)
+    away, reduced = study.distance(full), []
+    for r in loops.reduced:
+        ran = {} if r.run is None else {"distance_final": study.distance(r.run)[-1], "cost": r.run.cost[-1]}
+        reduced.append({"method": r.method, "N": r.N, **ran, "reason": r.reason})
     return {
         "steps": loops.plan.steps,
         "dt": loops.plan.dt,
@@ -226,7 +221,7 @@ def _loop(study: ControlStudy) -> dict[str, Any]:
         "saturated": full.saturated,
         "solver": {"name": full.solver[0], "reason": full.solver[1]},
         "time": dict(full.seconds),
-        "reduced": [_reduced_run(study, r) for r in loops.reduced],
+        "reduced": reduced,
     }
 
 
@@ -236,11 +231,6 @@ def _finite(finite: FiniteLoop) -> dict[str, Any]:
     if finite.run is not None and finite.run.newton is not None:
         result |= {"cost": float(finite.run.cost[-1]), "newton": newton_keys(finite.run.newton)}
     return result
-
-
-def _reduced_run(study: ControlStudy, r: ReducedLoopRun) -> dict[str, Any]:
-    ran = {} if r.run is None else {"distance_final": float(study.distance(r.run)[-1]), "cost": float(r.run.cost[-1])}
-    return {"method": r.method, "N": r.N, **ran, "reason": r.reason}
 
 
 def settled(times: Array, distance: Array, share: float = 0.01) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -15,13 +15,15 @@ from rich.progress import Progress, TaskProgressColumn
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.scene.control import Loop
+from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, plan, reduce_gains
-from softgrasp.lqr.design.scene import finite_problem, linearised, with_control
+from softgrasp.lqr.design.linearise import finite_problem, linearised
+from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
+from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, tables
-from softgrasp.study.control.result import ControlStudy, GainStudy, Note, Retuned
+from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.page import Section
@@ -43,10 +45,11 @@ def run_control(
     """
     session = Session("control", path, overrides, out, console, **flags)
     model, sentence = with_control(session.model(session.scene(), steps=False))
-    notes = [Note("table", sentence)] if sentence else []
     if sentence:
         console.print(sentence, soft_wrap=True, markup=False)
-    watch, restart = Stopwatch(session.comm), restart_folder(model, out)
+    watch, layout = Stopwatch(session.comm), model.system.layout
+    folder = out / f"restart-{scene_hash(model.scene)[:12]}-{layout.comm.size}"  # of one scene and rank count
+    restart = folder if layout.states >= RESTART_STATES else None
     fields: list[Path] = []
     drawn: Callable[[], list[Path]] = list
     with session.progress(TaskProgressColumn()) as bar:
@@ -56,22 +59,21 @@ def run_control(
             console.print(f"{word} {restart}", soft_wrap=True, markup=False)
         feedback = design(linearised(model), watch, solver_bar(bar, model), restart)
         if gain_only:
-            study = small_study(feedback, watch, notes)
+            study = small_study(feedback, watch, sentence)
         else:
-            study, fields, drawn = loop_study(session, model, feedback, watch, bar, notes)
+            study, fields, drawn = loop_study(session, model, feedback, watch, bar, sentence)
     with watch.stage("controllers"):
         out.mkdir(parents=True, exist_ok=True)
         saved = measure.save_controllers(study, out, end_state(model, study))
     seconds = {**model.watch.seconds, **watch.seconds}
     result = study.result(seconds)
     if session.comm.rank == 0:
-        show(console, study, seconds)
+        show(console, study, seconds, sentence)
 
     def page() -> Page:
-        name = model.scene.name
         if not isinstance(study, ControlStudy):
-            parts = [Section("Result", rows=tables.gain_rows(study))]
-            return Page(f"{name}: optimal gain", tables.gain_summary(study), parts, {}, saved, " --gain-only")
+            parts = [Section("Result", rows=tables.result_rows(study, seconds))]
+            return Page(f"{model.scene.name}: optimal gain", tables.summary(study), parts, {}, saved, " --gain-only")
         pictures: list[Path] = []
         if session.pictures and study.retuned:
             from softgrasp.study.control.plots import figure_retune  # brings Matplotlib
@@ -79,7 +81,8 @@ def run_control(
             pictures += figure_retune(study.retuned, out / "retune.png")
         pictures += drawn()
         parts, files = tables.sections(study, seconds, pictures), [*pictures, *fields, *saved]
-        return Page(f"{name}: optimal feedback", tables.summary(study), parts, tables.csv_tables(study), files)
+        title = f"{model.scene.name}: optimal feedback"
+        return Page(title, tables.summary(study), parts, tables.csv_tables(study), files)
 
     list_files(console, session.write(model.scene, result, page))
     if session.comm.rank == 0 and restart is not None:
@@ -88,21 +91,13 @@ def run_control(
     return result
 
 
-def restart_folder(model: Model, out: Path) -> Path | None:
-    """Where the solver keeps restart files: one folder a scene and rank count; None for small plants."""
-    layout = model.system.layout
-    if layout.states < RESTART_STATES:
-        return None
-    return out / f"restart-{scene_hash(model.scene)[:12]}-{layout.comm.size}"
-
-
-def small_study(feedback: Design, watch: Stopwatch, notes: Sequence[Note]) -> GainStudy:
+def small_study(feedback: Design, watch: Stopwatch, note: str) -> GainStudy:
     """The a-priori gains and the small controller, without closed loop. Collective."""
     bases: tuple[BasisGains, ...] = ()
     if not feedback.modal:
         with watch.stage("reduced"):
             bases = reduce_gains(feedback, orders(feedback)[0], names=(A_PRIORI,))
-    return measure.gain_study(feedback, bases, notes)
+    return measure.gain_study(feedback, bases, note)
 
 
 def end_state(model: Model, study: GainStudy) -> PlantState:
@@ -115,29 +110,26 @@ def end_state(model: Model, study: GainStudy) -> PlantState:
 
 
 def loop_study(
-    session: Session, model: Model, feedback: Design, watch: Stopwatch, bar: Progress, notes: Sequence[Note]
+    session: Session, model: Model, feedback: Design, watch: Stopwatch, bar: Progress, note: str
 ) -> tuple[ControlStudy, list[Path], Callable[[], list[Path]]]:
     """All reduced gains, the closed loops, and gains re-tuned while those are drawn. Collective.
 
     Returned are also the field files, and what waits for the pictures on rank 0.
     """
-    duration = plan(feedback, own_end=not notes)  # a scene made for control says how long its loop runs
+    duration = plan(feedback, own_end=not note)  # a scene made for control says how long its loop runs
     finite_strain, sampled = model.system.points is not None, feedback.quality.sampled
     bases: tuple[BasisGains, ...] = ()
     if feedback.modal:
-        text = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
-        notes = [*notes, Note("modal", text)]
+        reason = "control.method = 'modal': there is no P of the whole plant to compare reduced equations with"
     else:
-        sizes, few = orders(feedback)
+        sizes, reason = orders(feedback)
         with watch.stage("reduced"):
             bases = measure.timed_gains(feedback, sizes, counted(bar, "reduced equations"))
         with watch.stage("bounds"):
             bases = bases_with_bounds(feedback, bases, duration, counted(bar, "duality gaps"))
-        notes = [*notes, Note("orders", few)]
-    small = measure.gain_study(feedback, bases, notes)
-    reason = "" if sampled is None else sampled.reason
-    sampling = Note("sampling", reason and f"the loop from tick to tick is not certified: {reason}")
-    all_notes = [*small.notes, sampling, *unused_rate(model), Note("end", duration.note)]
+    small = measure.gain_study(feedback, bases, note, reason)
+    lost = f"the loop from tick to tick is not certified: {sampled.reason}" if sampled and sampled.reason else ""
+    notes = (*small.notes, *filter(None, (lost, unused_rate(model), duration.note)))
     frames = Frames(model, session.out, session.pictures)
     with watch.stage("loop"):
         loops = measure.run_loops(feedback, bases, duration, frames, counted(bar, "closed loop"))
@@ -145,9 +137,7 @@ def loop_study(
     if finite_strain:
         with watch.stage("finite strain"):
             finite = measure.run_finite(feedback, model, loops.full, duration, counted(bar, "loop of finite strain"))
-    study = ControlStudy(
-        feedback, bases, small.controller, small.tick, tuple(n for n in all_notes if n.text), loops, finite
-    )
+    study = ControlStudy(feedback, bases, small.controller, small.tick, notes, loops, finite)
     fields, drawn = frames.close(), _drawn(session, study, frames)
     if feedback.modal:
         return study, fields, drawn
@@ -157,8 +147,8 @@ def loop_study(
             why = "the stiffness is that of the equilibrium, which moves with the material"
         else:
             retuned, why = measure.retune(feedback, bases, duration, counted(bar, "re-tuning"))
-    told = (*study.notes, *([Note("retune", f"no re-tuning: {why}")] if why else []))
-    return replace(study, retuned=retuned, notes=told), fields, drawn
+    notes = (*notes, f"no re-tuning: {why}") if why else notes
+    return replace(study, retuned=retuned, notes=notes), fields, drawn
 
 
 def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[], list[Path]]:
@@ -175,13 +165,12 @@ def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[]
     return beside(session.comm, session.out, draw)
 
 
-def unused_rate(model: Model) -> list[Note]:
+def unused_rate(model: Model) -> str:
     """Says that a rate other than the default does nothing, where the loop is not sampled."""
     loop = Loop() if model.scene.control is None else model.scene.control.loop
     if loop.sampling == "held" or loop.rate == Loop().rate:
-        return []
-    text = f"control.loop.rate = {loop.rate:g} Hz has no effect: set control.loop.sampling = 'held' to sample the loop"
-    return [Note("sampling", text)]
+        return ""
+    return f"control.loop.rate = {loop.rate:g} Hz has no effect: set control.loop.sampling = 'held' to sample the loop"
 
 
 def solver_bar(bar: Progress, model: Model) -> Callable[[dict[str, float]], None]:
@@ -210,13 +199,11 @@ def counted(bar: Progress, text: str) -> Callable[[int, int], None]:
     return note
 
 
-def show(console: Console, study: GainStudy, seconds: dict[str, float]) -> None:
-    """Summary, then the reduced gains."""
-    if not isinstance(study, ControlStudy):
-        console.print(pairs(tables.gain_rows(study)))
-        return
-    for sentence in (*study.findings, *(note.text for note in study.notes if note.topic != "table")):
-        console.print(f"note: {sentence}", soft_wrap=True, markup=False)
-    console.print(pairs(tables.summary_rows(study, seconds)))
-    if study.bases:
+def show(console: Console, study: GainStudy, seconds: dict[str, float], said: str) -> None:
+    """Notes but the one that was ``said`` at the start, summary, and the reduced gains."""
+    if isinstance(study, ControlStudy):
+        for sentence in (*study.findings, *(note for note in study.notes if note != said)):
+            console.print(f"note: {sentence}", soft_wrap=True, markup=False)
+    console.print(pairs(tables.result_rows(study, seconds)))
+    if isinstance(study, ControlStudy) and study.bases:
         console.print(tables.best_table(study.bases).terminal(wrap=[0], width=console.width))

@@ -47,92 +47,72 @@ CAPTIONS = {
 }
 
 
-def summary_rows(study: ControlStudy, seconds: Mapping[str, float]) -> list[tuple[str, str]]:
-    """The short table as label and text."""
-    full, loops, away = study.loops.full, study.loops, study.distance(study.loops.full)
-    arrived = settled(full.times, away)
-    rows = [
-        *solution_rows(study.design),
-        ("distance to the target", f"{away[0]:.3g} m at first, {away[-1]:.3g} m at the end"),
-        ("stays within 1 % of the way from", "not within the run" if arrived is None else f"{arrived:.4g} s on"),
-        ("cost of the run + still to come", f"{full.cost[-1]:.6g} + {loops.to_come:.3g}"),
-    ]
-    if study.finite is not None:
-        rows.append((f"on the plant of finite strain ({study.finite.law})", study.finite.text))
-    if full.saturated:
-        rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
-    rows += controller_rows(study)
-    if study.margins is not None:
-        low, high, phase = study.margins.together
-        up = f"to {high:.3g}" if high < 1e3 else "or more"
-        rows.append(("its margins, all inputs at once", f"gain x {low:.3g} {up}, phase {phase:.3g} deg"))
-    rows += [("re-tuned", _fast(r)) for r in study.retuned]
-    stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
-    return [*rows, ("time: ARE, reduced, loop", stages)]
-
-
-def gain_rows(study: GainStudy) -> list[tuple[str, str]]:
-    """Riccati equation and small controller as label and text."""
-    return [*solution_rows(study.design), *controller_rows(study)]
-
-
-def solution_rows(design: Design) -> list[tuple[str, str]]:
-    """The solution of the Riccati equation and its closed loop as label and text."""
-    solution, gains = design.solution, rigid_gains(design.problem, design.solution)
+def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[str, str]]:
+    """The short table as label and text: Riccati equation, closed loop, small controller, re-tuning."""
+    solution, gains = study.design.solution, rigid_gains(study.design.problem, study.design.solution)
     counts = [str(n) for n in (solution.rank, *(solution.counts.get(k, 0) for k in ("newton_steps", "solves")))]
     displaced, moving = ("; ".join(" ".join(f"{v:.5g}" for v in row) for row in gain) for gain in gains)
-    return [
+    rows = [
         ("method", solution.summary),
         ("rank, Newton steps, solves", ", ".join(counts)),
         ("true relative residual", f"{solution.residual:.1e}"),
-        ("optimal cost from the start", f"{design.judge.optimal:.6g}"),
-        *_spectrum(design),
+        ("optimal cost from the start", f"{study.design.judge.optimal:.6g}"),
+        *_spectrum(study.design),
         ("gain, body displaced", displaced),
         ("gain, body moving", moving),
     ]
+    whole = study if isinstance(study, ControlStudy) else None
+    if whole is not None:
+        full, away = whole.loops.full, whole.distance(whole.loops.full)
+        arrived = settled(full.times, away)
+        rows += [
+            ("distance to the target", f"{away[0]:.3g} m at first, {away[-1]:.3g} m at the end"),
+            ("stays within 1 % of the way from", "not within the run" if arrived is None else f"{arrived:.4g} s on"),
+            ("cost of the run + still to come", f"{full.cost[-1]:.6g} + {whole.loops.to_come:.3g}"),
+        ]
+        if whole.finite is not None:
+            rows.append((f"on the plant of finite strain ({whole.finite.law})", whole.finite.text))
+        if full.saturated:
+            rows.append(("steps with a load at its limit", f"{100 * full.saturated:.3g} %"))
+    if study.controller is not None:
+        c = study.controller.controller
+        rows.append(("small controller", f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms"))
+    if whole is not None and study.margins is not None:
+        low, high, phase = study.margins.together
+        up = f"to {high:.3g}" if high < 1e3 else "or more"
+        rows.append(("its margins, all inputs at once", f"gain x {low:.3g} {up}, phase {phase:.3g} deg"))
+    if whole is not None:
+        rows += [("re-tuned", _fast(r)) for r in whole.retuned]
+        stages = ", ".join(f"{seconds.get(k, 0.0):.3g} s" for k in ("are", "reduced", "loop"))
+        rows.append(("time: ARE, reduced, loop", stages))
+    return rows
 
 
-def controller_rows(study: GainStudy) -> list[tuple[str, str]]:
-    """The small controller as label and text, if there is one."""
-    if study.controller is None:
-        return []
-    c = study.controller.controller
-    return [("small controller", f"N = {c.plant.N}, {1e6 * study.tick:.2g} us a tick of {1e3 * c.period:g} ms")]
-
-
-def summary(study: ControlStudy) -> list[str]:
+def summary(study: GainStudy) -> list[str]:
     """What came out, in three sentences."""
-    full, loops, optimal = study.loops.full, study.loops, study.design.judge.optimal
-    arrived = settled(full.times, study.distance(full))
-    reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
-        f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
-    )  # fmt: skip
-    if full.saturated:
-        excess = (full.cost[-1] + loops.to_come) / optimal - 1
-        cost = f"With the limits of the loads the move costs {excess:.2%} more than without them."
-    else:
-        cost = f"The move costs {full.cost[-1]:.4g}; the Riccati equation predicts {optimal:.4g}."
-    return [f"The optimal gain {reaches}.", cost, _controller(study)]
-
-
-def gain_summary(study: GainStudy) -> list[str]:
-    """What came out of the Riccati equation alone, in three sentences."""
-    d = study.design
-    return [
-        f"The Riccati equation is solved to the relative residual {d.solution.residual:.1e}.",
-        f"The move costs {d.judge.optimal:.4g} at least; the abscissa of its loop is {d.quality.abscissa:.3g} 1/s.",
-        _controller(study),
-    ]
-
-
-def _controller(study: GainStudy) -> str:
+    design, optimal = study.design, study.design.judge.optimal
+    first = f"The Riccati equation is solved to the relative residual {design.solution.residual:.1e}."
+    cost = f"The move costs {optimal:.4g} at least; the abscissa of its loop is {design.quality.abscissa:.3g} 1/s."
+    if isinstance(study, ControlStudy):
+        full = study.loops.full
+        arrived, paid = settled(full.times, study.distance(full)), full.cost[-1]
+        reaches = "does not settle within 1 % of the way in this run" if arrived is None else (
+            f"reaches the target, within 1 % of the way, in {arrived:.3g} s"
+        )  # fmt: skip
+        first = f"The optimal gain {reaches}."
+        cost = f"The move costs {paid:.4g}; the Riccati equation predicts {optimal:.4g}."
+        if full.saturated:
+            excess = (paid + study.loops.to_come) / optimal - 1
+            cost = f"With the limits of the loads the move costs {excess:.2%} more than without them."
     if study.controller is None:
-        return "No small controller is certified, see the notes."
+        return [first, cost, "No small controller is certified, see the notes."]
     c = study.controller.controller
-    return (
+    return [
+        first,
+        cost,
         f"The small controller has N = {c.plant.N} columns and takes {1e6 * study.tick:.2g} us of each tick of "
-        f"{1e3 * c.period:g} ms."
-    )
+        f"{1e3 * c.period:g} ms.",
+    ]
 
 
 def _spectrum(design: Design) -> list[tuple[str, str]]:
@@ -195,12 +175,11 @@ def best_table(bases: Sequence[BasisGains]) -> Table:
     rows: list[Row] = []
     for b in bases:
         r, unstable = b.best(), ", ".join(str(x.N) for x in b.reports if not x.stable)
-        if r is None:
-            rows.append((TITLES[b.name], *([""] * 7), unstable or b.refused))
-            continue
-        excess = (f"{r.cost_excess:.1e}", f"{r.cost_excess_at_most:.1e}")
-        values = (f"{r.error_P:.1e}", f"{r.error_K:.1e}", *excess, f"{r.abscissa_full:.4g}")
-        rows.append((TITLES[b.name], r.N, *values, f"{1e3 * r.time_are:.2g}", unstable))
+        cells: Row = ("",) * 7
+        if r is not None:
+            errors = (f"{x:.1e}" for x in (r.error_P, r.error_K, r.cost_excess, r.cost_excess_at_most))
+            cells = (r.N, *errors, f"{r.abscissa_full:.4g}", f"{1e3 * r.time_are:.2g}")
+        rows.append((TITLES[b.name], *cells, unstable if r is not None else unstable or b.refused))
     return Table(BEST_HEADER, rows)
 
 
@@ -241,20 +220,15 @@ def loop_table(study: ControlStudy) -> Table:
     return Table(LOOP_HEADER, rows, "Closed loop")
 
 
-def trajectory_table(study: ControlStudy) -> Table:
-    """Hand, outputs, load and cost at every instant under the optimal gain."""
+def csv_tables(study: ControlStudy) -> dict[str, Table]:
+    """CSV file name -> table; the first has hand, outputs, load and cost at every instant under the optimal gain."""
     full, d = study.loops.full, study.design.problem.layout.dimension
     n_s = full.q_s.shape[1]
     names = trajectory_header(n_s, d, full.columns, velocity=False)
     names += [*(f"{u.label} [{u.load_unit}]" for u in hand_columns(n_s, d, "u")), "cost"]
     inputs = np.vstack([full.inputs, full.inputs[-1:]])
     data = np.column_stack([full.times, full.q_s, full.outputs, inputs, full.cost])
-    return Table(tuple(names), data.tolist())
-
-
-def csv_tables(study: ControlStudy) -> dict[str, Table]:
-    """CSV file name -> table."""
-    files = {"trajectory.csv": trajectory_table(study)}
+    files = {"trajectory.csv": Table(tuple(names), data.tolist())}
     if study.bases:
         files["reduced.csv"] = reduced_table(study.bases)
     if study.retuned:
@@ -272,11 +246,11 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
     def pick(*names: str) -> list[tuple[Path, str]]:
         return [figures[name] for name in names if name in figures]
 
-    notes = "\n\n".join((*study.findings, *(note.text for note in study.notes)))
+    notes = "\n\n".join((*study.findings, *study.notes))
     parts = [
         Section("", figures=pick("move.png", "move.gif")),
         *([Section("Notes", text=notes)] if notes else []),
-        Section("Result", rows=summary_rows(study, seconds), figures=pick("histories.png", "decay.png")),
+        Section("Result", rows=result_rows(study, seconds), figures=pick("histories.png", "decay.png")),
         Section("Equation", equation=controlled(study.design.model.scene)),
     ]
     if study.bases:

@@ -28,25 +28,16 @@ class Frames:
 
     A run that is stopped and resumed leaves one field series a leg, named by the step it starts from. What the pictures
     need lies beside its checkpoint, one small file a frame.
-
-    Args:
-        model: the model.
-        directory: where the field files go, and of the run.
-        pictures: keep what figures and animation need.
-
-    Attributes:
-        foreign: whether field files of an earlier leg are gone, for another run wrote in their place; rank 0 only.
-        most: of the frame with the largest displacement since the start or resume: |z|^2, time [s], z (local rows).
     """
 
     def __init__(self, model: Model, directory: Path, pictures: bool = True) -> None:
         self.model, self.directory, self.pictures = model, directory, pictures
-        self.writer = None
-        if model.scene.output.fields != "none":
-            self.writer = SeriesWriter(model, directory)
-        self.legs, self.foreign = [0], False
+        self.writer = SeriesWriter(model, directory) if model.scene.output.fields != "none" else None
+        self.legs = [0]
+        self.foreign = False  # another run wrote in place of the field files of an earlier leg; rank 0 only
         self.saved = 0  # of the frames below, how many lie beside the checkpoint
         self.steps: list[int] = []
+        # of the frame with the largest displacement since the start or resume: |z|^2, time [s], z (local rows)
         self.most: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(0))
         self.picture = gather_picture(model) if pictures else None
         vertices = model.space.mesh.mesh.geometry.index_map().size_global
@@ -59,10 +50,7 @@ class Frames:
     def begin(self, run: Run) -> None:
         """Join the legs that led here: field files get their name, pictures what lies beside the checkpoint.
 
-        Collective.
-
-        Raises:
-            CheckpointError: a frame is damaged or gone.
+        Collective. Raises CheckpointError: a frame is damaged or gone.
         """
         self.legs = run.legs
         if self.writer is not None:
@@ -100,24 +88,20 @@ class Frames:
     def keep(self, run: Run) -> None:
         """Write the new frames beside the checkpoint that is about to be written. Collective.
 
-        Raises:
-            CheckpointError: they cannot be written.
+        Raises CheckpointError: they cannot be written.
         """
         with agree(run.layout.comm):
-            if run.layout.comm.rank == 0:
-                try:
-                    self._save(run)
-                except OSError as error:
-                    raise CheckpointError(
-                        f"{self.directory}: the frames cannot be written ({error}); free the disk"
-                    ) from error
-
-    def _save(self, run: Run) -> None:
-        for i in range(self.saved, len(self.states)):
-            name = f"{run.name}-frame{self.steps[i]}.npz"
-            frame = {"step": self.steps[i], "t": self.times[i], "hand": self.hands[i], "state": self.states[i]}
-            run.beside[name] = write_arrays(self.directory / "checkpoint" / name, frame)
-        self.saved = len(self.states)
+            if run.layout.comm.rank > 0:
+                return
+            try:
+                for i in range(self.saved, len(self.states)):
+                    name = f"{run.name}-frame{self.steps[i]}.npz"
+                    frame = {"step": self.steps[i], "t": self.times[i], "hand": self.hands[i], "state": self.states[i]}
+                    run.beside[name] = write_arrays(self.directory / "checkpoint" / name, frame)
+            except OSError as error:
+                text = f"{self.directory}: the frames cannot be written ({error}); free the disk"
+                raise CheckpointError(text) from error
+            self.saved = len(self.states)
 
     def lacking(self, begun: int) -> int:
         """How many frames before a step the pictures must do without; rank 0 only."""
@@ -169,11 +153,8 @@ class Frames:
         from softgrasp.study.pictures.body import figure_move
         from softgrasp.study.pictures.traces import figure_traces
 
-        scene, picture = self.model.scene, self.picture
-        table = np.column_stack([run.times, run.q_s])
-        target = scene.motion.target
-        states = np.stack(self.states)
-        times = np.array(self.times)
+        picture, target = self.picture, self.model.scene.motion.target
+        table, states, times = np.column_stack([run.times, run.q_s]), np.stack(self.states), np.array(self.times)
 
         def moving(out: Path) -> list[Path]:
             return [] if self.few else [gif_move(picture, states, times, table, target, out / "move.gif")]

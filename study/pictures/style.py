@@ -37,24 +37,13 @@ STEPS = [1, 2, 5, 10]  # between ticks
 def paper_style() -> Iterator[None]:
     """Matplotlib settings for figures in print, restored afterwards."""
     settings: Any = {
-        "font.family": "sans-serif",
-        "font.size": 8,
-        "axes.labelsize": 8,
-        "axes.titlesize": 8,
+        "font.family": "sans-serif", "font.size": 8, "axes.labelsize": 8, "axes.titlesize": 8,
+        "legend.fontsize": 7.5, "xtick.labelsize": 7.5, "ytick.labelsize": 7.5,
         "axes.titley": 1.0,  # else every draw looks for room
-        "legend.fontsize": 7.5,
-        "xtick.labelsize": 7.5,
-        "ytick.labelsize": 7.5,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.linewidth": 0.7,
-        "lines.linewidth": 1.2,
-        "legend.frameon": False,
-        "axes.prop_cycle": cycler(color=CYCLE),
-        "pdf.fonttype": 42,
-        "figure.dpi": DPI,
-        "savefig.dpi": DPI,
-    }
+        "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.7, "lines.linewidth": 1.2,
+        "axes.prop_cycle": cycler(color=CYCLE), "legend.frameon": False,
+        "pdf.fonttype": 42, "figure.dpi": DPI, "savefig.dpi": DPI,
+    }  # fmt: skip
     with mpl.rc_context(settings):
         yield
 

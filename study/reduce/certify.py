@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
-from rich.progress import TaskProgressColumn
+from rich.progress import Progress, TaskProgressColumn
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.certified.archive import load_certified, save_certified
-from softgrasp.reduction.certified.certificate import MeshNumber
 from softgrasp.reduction.certified.greedy import REASONS, Greedy
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.trainer import (
@@ -28,17 +30,22 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
+from softgrasp.reduction.errors import full_energy
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
-from softgrasp.study.reduce.certify_check import BoxCheck, check_box
+from softgrasp.reduction.replay import FullRun
 from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.report.page import Section
+from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
-from softgrasp.study.shell.timing import median_seconds
+from softgrasp.study.shell.timing import median_seconds, timed
 
 FILE = "certified.h5"
 REPEATS = 7  # behind the median time of a query
+TESTS, FEWER, LARGE = 5, 3, 20_000  # tests of each constant, and from so many unknowns on
+SHARES = (1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 3, 1 / 2)  # of the modes: sizes that are shown
+SECOND = 3  # times as many modes in the basis that certifies, as far as there are
+NEAR = 0.2  # of the model's own k: sizes that would hide it
 
 CAPTIONS = {
     "certified_box.png": "Relative error of the deformation over the box, in the energy norm: the proved bound, the "
@@ -51,54 +58,122 @@ CAPTIONS = {
 }
 
 
-def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
-    """Build, save and show the certified model of a scene; an interrupted run goes on from its last round. Collective.
+@dataclass(frozen=True)
+class Tested:
+    """One size at one parameter; errors relative to the largest energy norm of the full run."""
 
-    Raises:
-        SoftgraspError: with one sentence.
+    lam: float  # lam, mu: [Pa]
+    mu: float
+    truth: float  # against the full run
+    bound: float  # proved
+    estimate: float  # difference of the two bases; nan with one
+
+    @property
+    def effectivity(self) -> float:
+        """Bound over truth."""
+        return self.bound / self.truth if self.truth > 0 else float("nan")
+
+
+@dataclass(frozen=True)
+class Size:
+    """A certified model of k modes at all tests."""
+
+    k: int  # k, k2: modes of the answer, and of the basis that certifies it
+    k2: int
+    N: int  # dimension of the answer
+    query: float  # median seconds of an answer with its certificate
+    tested: tuple[Tested, ...]  # one a parameter
+
+    def largest(self, key: str) -> float:
+        """Over the tests."""
+        return max(float(getattr(t, key)) for t in self.tested)
+
+
+@dataclass(frozen=True)
+class BoxCheck:
+    """A certified model and smaller ones of its basis over the box."""
+
+    own: Size  # the model as it was built
+    sizes: tuple[Size, ...]  # in the order of k, ``own`` among them
+    full: float  # median seconds of a full run with its factor
+
+
+def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
+    """Full runs on a grid between the corners of the box, and every size against them. Collective.
+
+    None where the bound is of tissue and hand together (a force on the hand, coupled both ways), or nothing moves.
     """
+    drive, lift, box, layout = certified.drive, certified.fine.lift, certified.box, model.system.layout
+    if drive is None or lift is None or box is None or (certified.fine.two_way and drive.hand is None):
+        return None
+    drive, hand, comm = replace(drive, finer=None), 2 * layout.n_s, layout.comm
+    Phi = lift.L_q[:, hand : hand + certified.k2]
+    models = {sizes: certified.with_sizes(*sizes) for sizes in sizes_of(certified)}
+    tests: dict[tuple[int, int], list[Tested]] = {sizes: [] for sizes in models}
+    count = TESTS if layout.n_e < LARGE else FEWER
+    inner = (np.arange(count) + 0.5) / count  # of the box; the training has its edges
+    lam, mu = (low * (high / low) ** inner for low, high in (box.lam, box.mu))
+    seconds: list[float] = []
+    for place in product(lam.tolist(), mu.tolist()):
+        runs: list[FullRun] = []
+        seconds.append(timed(comm, lambda place=place, runs=runs: runs.append(run_at(model, *place))))  # type: ignore[misc]
+        (full,) = runs
+        size, steps = float(np.sqrt(2 * full.energy.max())), full.snapshots.steps
+        if size == 0:
+            return None
+        for (k, k2), part in models.items():
+            answer = part.run(full.model.system.materials, drive, allow=True)
+            a, b = np.split(answer.trajectory.x[steps, hand:].T, 2)
+            off = full.snapshots.Z - np.vstack([Phi[:, :k] @ a, Phi[:, :k] @ b])
+            error = float(np.sqrt(2 * full_energy(full.model.system, off).max()))
+            c = answer.certificate
+            estimate = float("nan") if c.estimate is None else float(c.estimate.largest) / size
+            tests[k, k2].append(Tested(*place, error / size, float(c.energy.largest) / size, estimate))
+    sizes = {}
+    for (k, k2), part in models.items():
+        query = median_seconds(comm, lambda part=part: part.run(allow=True), REPEATS)  # type: ignore[misc]
+        sizes[k, k2] = Size(k, k2, part.coarse.N, query, tuple(tests[k, k2]))
+    return BoxCheck(sizes[certified.k, certified.k2], tuple(sizes.values()), float(median(seconds)))
+
+
+def sizes_of(certified: CertifiedModel) -> list[tuple[int, int]]:
+    """Pairs k, k2 that are shown: the model's own, and leading parts of its basis."""
+    K = certified.k2
+    pairs = {max(1, round(share * K)) for share in SHARES}
+    own = {(k, min(SECOND * k, K)) for k in pairs if k < K and abs(k / certified.k - 1) > NEAR}
+    return sorted({*own, (certified.k, certified.k2)})
+
+
+def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
+    """Build, save and show a certified model of a scene; an interrupted run goes on from its last round. Collective."""
     model, file, console = session.model(scene), session.out / "models" / FILE, session.console
-    watch, tolerance = Stopwatch(session.comm), scene.reduction.tolerance
+    watch, tolerance, options = Stopwatch(session.comm), scene.reduction.tolerance, scene.reduction
     earlier = _earlier(model, file)
     state = None if earlier is None else state_of(earlier)
     if state is not None:
         console.print(f"going on from round {len(state.rounds)} in {file}", soft_wrap=True, markup=False)
     trainer = Trainer(model, earlier)
-    count = scene.reduction.grid
-    about = f"trained in lambda {_range(trainer.box.lam)} and mu {_range(trainer.box.mu)} on {count} x {count} points"
+    lam, mu = (f"{low:.4g} to {high:.4g} Pa" for low, high in (trainer.box.lam, trainer.box.mu))
+    about = f"trained in lambda {lam} and mu {mu} on {options.grid} x {options.grid} points"
     console.print(about, soft_wrap=True, markup=False)
-    with watch.stage("greedy"), session.progress(TaskProgressColumn()) as bar:
-        task, goal = bar.add_task("greedy", total=1.0), SHARE * tolerance
-
-        def after(state: Greedy, so_far: CertifiedModel) -> None:
-            save_certified(so_far, file)
-            bounds = [r.bound for r in state.rounds if np.isfinite(r.bound)]
-            if bounds and bounds[-1] < bounds[0]:
-                share = np.log(bounds[0] / bounds[-1]) / np.log(bounds[0] / min(goal, bounds[-1] * 0.999))
-                bar.update(task, completed=float(min(share, 0.99)))
-            r, (lam, mu) = state.rounds[-1], trainer.points[state.rounds[-1].worst]
-            bar.console.print(
-                f"round {len(state.rounds)}: k = {r.k}, largest bound {_shown(r.bound)} at ({lam:.3g}, {mu:.3g}), "
-                f"{r.evaluations} evaluations, {r.seconds:.1f} s",
-                markup=False,
-            )
-
-        certified = build_certified(trainer, tolerance, state, after)
     try:
-        validation = None
-        if scene.reduction.validation:
+        with watch.stage("greedy"), session.progress(TaskProgressColumn()) as bar:
+            certified = build_certified(trainer, tolerance, state, _saver(bar, trainer, file, SHARE * tolerance))
+        training = dict(certified.training)
+        if options.validation:
             with watch.stage("validation"):
-                validation = validate(trainer, certified, scene.reduction.validation)
+                training["validation"] = asdict(validate(trainer, certified, options.validation))
     finally:
         trainer.destroy()
-    with watch.stage("mesh"):
-        mesh = _mesh(model, trainer, certified)
-    tested = {} if validation is None else {"validation": asdict(validation)}
-    certified = replace(certified, mesh=mesh, training={**certified.training, **tested})
+    places = list(dict.fromkeys(trainer.parameters[r["at"]] for r in training["rounds"]))[:PLACES]
+    with watch.stage("mesh"), suppress(SoftgraspError):  # some meshes have no estimate
+        certified = replace(certified, mesh=mesh_number(model, places))
+    certified = replace(certified, training=training)
     save_certified(certified, file)
     with watch.stage("tests"):
         check = check_box(model, certified)
     result = certify_result(model, certified, check, watch)
+    told = sentences(certified, check, result)
 
     def page() -> Page:
         drawn: list[Path] = []
@@ -106,24 +181,38 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
             from softgrasp.study.reduce.certify_plots import draw  # brings Matplotlib
 
             drawn = draw(session.out, certified, check, tolerance)
-        tables = {"greedy.csv": greedy_table(certified)}
-        if check is not None:
-            tables["tests.csv"] = tests_table(check)
-        title, told = f"{scene.name}: certified reduced model", sentences(certified, result)[:3]
-        return Page(title, told, sections(certified, result, drawn), tables, [*drawn, file])
+        greedy = greedy_table(certified)
+        parts = [
+            Section("What holds", text="\n\n".join(told), figures=captioned(drawn, CAPTIONS)),
+            greedy.section("Each round runs the full model where the proved bound was largest."),
+        ]
+        tables = {"greedy.csv": greedy} | ({} if check is None else {"tests.csv": tests_table(check)})
+        return Page(f"{scene.name}: certified reduced model", told[:3], parts, tables, [*drawn, file])
 
-    for sentence in sentences(certified, result):
+    for sentence in told:
         console.print(sentence, markup=False)
     list_files(console, session.write(scene, result, page))
     return result
 
 
-def _shown(bound: float) -> str:
-    return f"{bound:.1e}" if np.isfinite(bound) else "above 1"
+def _saver(bar: Progress, trainer: Trainer, file: Path, goal: float) -> Callable[[Greedy, CertifiedModel], None]:
+    """Called after every round: saves the model so far, and says how far its largest bound is on the way to a goal."""
+    task = bar.add_task("greedy", total=1.0)
 
+    def after(state: Greedy, so_far: CertifiedModel) -> None:
+        save_certified(so_far, file)
+        bounds = [r.bound for r in state.rounds if np.isfinite(r.bound)]
+        if bounds and bounds[-1] < bounds[0]:
+            share = np.log(bounds[0] / bounds[-1]) / np.log(bounds[0] / min(goal, bounds[-1] * 0.999))
+            bar.update(task, completed=float(min(share, 0.99)))
+        r, (lam, mu) = state.rounds[-1], trainer.points[state.rounds[-1].worst]
+        bar.console.print(
+            f"round {len(state.rounds)}: k = {r.k}, largest bound {_shown(r.bound)} at ({lam:.3g}, {mu:.3g}), "
+            f"{r.evaluations} evaluations, {r.seconds:.1f} s",
+            markup=False,
+        )
 
-def _range(pair: tuple[float, float]) -> str:
-    return f"{pair[0]:.4g} to {pair[1]:.4g} Pa"
+    return after
 
 
 def _earlier(model: Model, file: Path) -> CertifiedModel | None:
@@ -137,30 +226,17 @@ def _earlier(model: Model, file: Path) -> CertifiedModel | None:
     return old if old.training.get("key") == train_key(model) and old.fine.lift is not None else None
 
 
-def _mesh(model: Model, trainer: Trainer, certified: CertifiedModel) -> MeshNumber | None:
-    """What is known of the mesh at some of the trained parameters; None where it has no estimate."""
-    places = list(dict.fromkeys(trainer.parameters[r["at"]] for r in certified.training["rounds"]))[:PLACES]
-    try:
-        return mesh_number(model, places)
-    except SoftgraspError:
-        return None
-
-
 def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | None, watch: Stopwatch) -> dict[str, Any]:
     """The keys of ``result.json``. Collective."""
     first, comm = model.system.materials[0], model.system.layout.comm
     with watch.stage("full"):
         full = run_at(model, first.lam, first.mu)
     run = certified.run(allow=True)
-    assert certified.drive is not None
-    query = median_seconds(comm, lambda: certified.run(allow=True), REPEATS)
     certificate, training = run.certificate, certified.training
+    query = median_seconds(comm, lambda: certified.run(allow=True), REPEATS)
     own = {
-        "reduction": certificate.reduction,
-        "proved": certificate.proved,
+        **{key: getattr(certificate, key) for key in ("reduction", "proved", "effectivity_at_most", "time_step")},
         "estimate": None if certificate.estimate is None else certificate.estimate.relative,
-        "effectivity_at_most": certificate.effectivity_at_most,
-        "time_step": certificate.time_step,
         "mesh": None if certificate.mesh is None else certificate.mesh.largest,
         "outputs_proved": certificate.outputs.largest.tolist(),
         "outputs_error": np.abs(full.trajectory.outputs - run.trajectory.outputs).max(axis=0).tolist(),
@@ -168,20 +244,20 @@ def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | No
         "reasons": certificate.reasons,
     }
     about = {
-        "k": certified.k,
+        **{key: getattr(certified, key) for key in ("k", "k2", "certify", "tolerance", "norm")},
         "N": certified.coarse.N,
-        "k2": certified.k2,
         "N2": certified.fine.N,
-        "certify": certified.certify,
-        "tolerance": certified.tolerance,
-        "norm": certified.norm,
-        "box": asdict(certified.box) if certified.box is not None else None,
+        "box": None if certified.box is None else asdict(certified.box),
         "mesh": None if certified.mesh is None else asdict(certified.mesh),
         "own": own,
         **{key: value for key, value in training.items() if key not in ("known", "points", "key")},
     }
     tests = None if check is None else asdict(check)
     return reduce_result(full, {"certified": about, "tests": tests}, {**watch.seconds, "query": query})
+
+
+def _shown(bound: float) -> str:
+    return f"{bound:.1e}" if np.isfinite(bound) else "above 1"
 
 
 def tests_table(check: BoxCheck) -> Table:
@@ -212,22 +288,23 @@ def greedy_table(certified: CertifiedModel) -> Table:
     return Table(header, rows, "The greedy")
 
 
-def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
+def sentences(certified: CertifiedModel, check: BoxCheck | None, result: dict[str, Any]) -> list[str]:
     """What was built and how good it is."""
-    about, time = result["certified"], result["time"]
-    how = "estimated" if certified.certify == "estimate" else "proved"
-    share, tolerance = certified.training["proved"], about["tolerance"]
-    box = f"everywhere on the grid and at {about['checked'] - len(certified.training['points'])} random parameters"
-    result_line = f"The certified model has N = {about['N']} columns"
+    about, time, share = result["certified"], result["time"], certified.training["proved"]
+    lines = [f"The certified model has N = {about['N']} columns"]
     if certified.k < certified.k2:
-        result_line += f" and is measured by one of N = {about['N2']}"
+        lines[0] += f" and is measured by one of N = {about['N2']}"
     if np.isfinite(share):
-        result_line += f": its error is at most {share:.1e} of the deformation {box}, {how}."
+        lines[0] += (
+            f": its error is at most {share:.1e} of the deformation everywhere on the grid and at "
+            f"{about['checked'] - len(certified.training['points'])} random parameters, "
+            f"{'estimated' if certified.certify == 'estimate' else 'proved'}."
+        )
     else:
-        result_line += ": in parts of the box its bound is larger than the deformation itself."
-    if share > tolerance:
-        result_line += f" That is above the tolerance {tolerance:g}: runs above it are refused."
-    lines = [result_line, f"The greedy stopped after {len(about['rounds'])} rounds: {REASONS[about['reason']]}."]
+        lines[0] += ": in parts of the box its bound is larger than the deformation itself."
+    if share > about["tolerance"]:
+        lines[0] += f" That is above the tolerance {about['tolerance']:g}: runs above it are refused."
+    lines.append(f"The greedy stopped after {len(about['rounds'])} rounds: {REASONS[about['reason']]}.")
     if added := len(about["added"]):
         lines.append(f"Of the random parameters {added} had a larger bound than the grid and were trained on too.")
     if "validation" in about:
@@ -236,27 +313,19 @@ def sentences(certified: CertifiedModel, result: dict[str, Any]) -> list[str]:
             f"In {v.n} random full runs the error was at most {v.factor:.3g} times the estimate; with 95 % confidence "
             f"it is larger on at most {v.share:.1%} of the box."
         )
-    lines.append(f"At the scene's own material: {about['own']['sentence']}.")
-    lines += about["own"]["reasons"]
     query, full = time["query"], time["full"]
-    lines.append(f"A query takes {query * 1e3:.3g} ms, a full run {full * 1e3:.3g} ms with its factor.")
-    if result["tests"] is not None:
-        own, count = result["tests"]["own"], len(result["tests"]["own"]["tested"])
-        ratios = [t["bound"] / t["truth"] for t in own["tested"] if t["truth"]]
-        true = max(t["truth"] for t in own["tested"])
+    lines += [
+        f"At the scene's own material: {about['own']['sentence']}.",
+        *about["own"]["reasons"],
+        f"A query takes {query * 1e3:.3g} ms, a full run {full * 1e3:.3g} ms with its factor.",
+    ]
+    if check is not None:
+        ratios = [t.effectivity for t in check.own.tested if t.truth]
         lines.append(
-            f"Against {count} full runs between the corners of the box: true error at most {true:.1e}, bound "
-            f"{np.median(ratios):.3g} times as large in the median, {max(ratios):.3g} at most."
+            f"Against {len(check.own.tested)} full runs between the corners of the box: true error at most "
+            f"{check.own.largest('truth'):.1e}, bound {np.median(ratios):.3g} times as large in the median, "
+            f"{max(ratios):.3g} at most."
         )
     if query > full:
         lines.append("A query takes longer than a full run here: the model pays on a finer mesh only.")
     return lines
-
-
-def sections(certified: CertifiedModel, result: dict[str, Any], drawn: Sequence[Path] = ()) -> list[Section]:
-    """Parts of the page."""
-    figures = [(file, CAPTIONS[file.name]) for name in CAPTIONS for file in drawn if file.name == name]
-    return [
-        Section("What holds", text="\n\n".join(sentences(certified, result)), figures=figures),
-        greedy_table(certified).section("Each round runs the full model where the proved bound was largest."),
-    ]

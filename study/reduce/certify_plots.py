@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, UNSTABLE, WIDTH, few_ticks, paper_style, save
-from softgrasp.study.reduce.certify_check import BoxCheck, Size
+
+if TYPE_CHECKING:
+    from softgrasp.study.reduce.certify import BoxCheck, Size
 
 KINDS = (
     ("bound", "bound (proved)", BLUE, "o"),
@@ -47,21 +48,16 @@ def figure_box(own: Size, out_png: Path) -> tuple[Path, ...]:
         for ax, (key, title, *_) in zip(axes[0], shown, strict=True):
             colours = np.maximum(values[key], LEAST)
             picture = ax.scatter(lam, mu, s=190, marker="s", norm=norm, cmap="viridis_r", c=colours)
-            _box_axes(ax, lam, mu)
-            ax.set_title(f"{title}\n{np.nanmin(values[key]):.1e} to {np.nanmax(values[key]):.1e}")
+            span = f"{np.nanmin(values[key]):.1e} to {np.nanmax(values[key]):.1e}"
+            ax.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]", title=f"{title}\n{span}")
+            ax.margins(0.14)
+            for axis, places in ((ax.xaxis, lam), (ax.yaxis, mu)):
+                axis.set_ticks(sorted(set(places)), [f"{x:.3g}" for x in sorted(set(places))])
+                axis.set_ticks([], minor=True)
         axes[0, 0].set_ylabel(r"$\mu$ [Pa]")
         bar = figure.colorbar(picture, ax=axes[0].tolist(), label="relative error")
         few_ticks(bar.ax.yaxis)
         return save(figure, out_png)
-
-
-def _box_axes(ax: Any, lam: Sequence[float], mu: Sequence[float]) -> None:
-    ax.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]")
-    ax.margins(0.14)
-    for axis, values in ((ax.xaxis, lam), (ax.yaxis, mu)):
-        axis.set_major_locator(FixedLocator(sorted(set(values))))
-        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
-        axis.set_minor_locator(NullLocator())
 
 
 def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) -> tuple[Path, ...]:
@@ -85,18 +81,17 @@ def figure_greedy(certified: CertifiedModel, tolerance: float, out_png: Path) ->
         few_ticks(left.yaxis)
         left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
         places: dict[tuple[float, float], list[int]] = {}
-        for i, place in enumerate(certified.training["chosen"]):
-            places.setdefault((float(place[0]), float(place[1])), []).append(i + 1)
+        for i, (lam, mu) in enumerate(certified.training["chosen"], 1):
+            places.setdefault((float(lam), float(mu)), []).append(i)
         right.plot(*zip(*places, strict=True), "o", color=BLUE, ms=4)
-        for (a, b), numbers in places.items():
+        for place, numbers in places.items():
             text = ", ".join(map(str, numbers[:3])) + ("..." if len(numbers) > 3 else "")
-            right.annotate(text, (a, b), xytext=(3, 3), textcoords="offset points", fontsize=6.5)
+            right.annotate(text, place, xytext=(3, 3), textcoords="offset points", fontsize=6.5)
         right.set(xscale="log", yscale="log", xlabel=r"$\lambda$ [Pa]", ylabel=r"$\mu$ [Pa]", title="trained at")
         if box is not None:
             right.set(xlim=(box.lam[0] / 1.25, box.lam[1] * 1.5), ylim=(box.mu[0] / 1.4, box.mu[1] * 1.5))
-            right.plot(
-                [box.lam[i] for i in (0, 1, 1, 0, 0)], [box.mu[i] for i in (0, 0, 1, 1, 0)], color="#999999", lw=0.7
-            )
+            (a, b), (c, d) = box.lam, box.mu
+            right.plot([a, b, b, a, a], [c, c, d, d, c], color="#999999", lw=0.7)
         for axis in (right.xaxis, right.yaxis):
             few_ticks(axis)
         return save(figure, out_png)
@@ -109,25 +104,21 @@ def figure_sizes(check: BoxCheck, tolerance: float, out_png: Path) -> tuple[Path
         for size in check.sizes:
             values = np.array([t.effectivity for t in size.tested])
             values = values[np.isfinite(values)]
-            if not len(values):
-                continue
-            own = size is check.own
-            colour = GREEN if own else BLUE
-            left.plot([size.k] * 2, [values.min(), values.max()], color=colour, lw=3, alpha=0.45, solid_capstyle="butt")
-            left.plot(size.k, np.median(values), "_", color=colour, ms=11, mew=1.8)
-        left.set(yscale="log", xlabel="modes $k$ of the answer", ylabel="bound / true error")
+            if len(values):
+                colour, span = GREEN if size is check.own else BLUE, [values.min(), values.max()]
+                left.plot([size.k] * 2, span, color=colour, lw=3, alpha=0.45, solid_capstyle="butt")
+                left.plot(size.k, np.median(values), "_", color=colour, ms=11, mew=1.8)
+        title = f"green: the model as built, $k = {check.own.k}$, $k_2 = {check.own.k2}$"
+        left.set(yscale="log", xlabel="modes $k$ of the answer", ylabel="bound / true error", title=title)
         left.set_ylim(bottom=0.9)
         left.xaxis.set_major_locator(MaxNLocator(integer=True))
         left.axhline(1.0, color="#888888", lw=0.9)
-        left.set_title(f"green: the model as built, $k = {check.own.k}$, $k_2 = {check.own.k2}$")
         left.grid(axis="y", color="#e6e6e6", lw=0.5)
         few_ticks(left.yaxis)
         times = [1e3 * s.query for s in check.sizes]
         for key, label, colour, marker in KINDS:
-            values = np.array([s.largest(key) for s in check.sizes])
-            fine = np.isfinite(values)
-            right.plot(np.array(times)[fine], values[fine], ls="", marker=marker, color=colour, ms=4.5, mfc="none",
-                       label=label)  # fmt: skip
+            values = np.array([s.largest(key) for s in check.sizes])  # nan, which is not drawn, with one basis
+            right.plot(times, values, ls="", marker=marker, color=colour, ms=4.5, mfc="none", label=label)
         right.axvline(1e3 * check.full, color="#888888", lw=1.0, ls="-.", label="full run")
         right.axhline(tolerance, color=UNSTABLE, lw=0.9, ls="--", label=f"tolerance {tolerance:g}")
         for i, (time, size) in enumerate(zip(times, check.sizes, strict=True)):

@@ -33,13 +33,6 @@ def sizes_of(sweeps: Sequence[MethodSweep]) -> list[int]:
     return sorted({p.N for s in sweeps for p in s.points})
 
 
-def leaders(sweeps: Sequence[MethodSweep], key: str) -> list[tuple[MethodSweep, list[Point]]]:
-    """Best stable methods in the order of N, with their points in a row."""
-    best = [b for N in sizes_of(sweeps) if (b := leader(sweeps, N, key)) is not None]
-    groups = [list(group) for _, group in groupby(best, key=lambda b: b[0].method.key)]
-    return [(group[0][0], [p for _, p in group]) for group in groups]
-
-
 def findings(sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:
     """Who is best at which N in which measure, what structure buys, and whether the paper's ranking holds."""
     shown = [s for s in sweeps if s.points]
@@ -49,63 +42,56 @@ def findings(sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:
 def _best(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
     seen: dict[tuple[tuple[str, int], ...], str] = {}
     for key, name in MEASURES:
-        rows = leaders(sweeps, key)
-        if not rows:
-            continue
-        order = tuple((s.method.key, p.N) for s, points in rows for p in points)
+        best = [b for N in sizes_of(sweeps) if (b := leader(sweeps, N, key)) is not None]
+        order = tuple((s.method.key, p.N) for s, p in best)
         if order in seen:
             yield f"In {name} the same methods lead as in {seen[order]}."
-            continue
-        seen[order] = name
-        spans = [" to ".join(str(N) for N in sorted({points[0].N, points[-1].N})) for _, points in rows]
-        texts = [
-            f"{s.method.short_title} at N = {span} ({_value(points, key)})"
-            for (s, points), span in zip(rows, spans, strict=True)
-        ]
-        yield f"Least error of {name} among stable models: {'; '.join(texts)}."
+        elif best:
+            seen[order] = name
+            rows = [list(group) for _, group in groupby(best, key=lambda b: b[0].method.key)]
+            texts = [_span(row[0][0], [p for _, p in row], key) for row in rows]
+            yield f"Least error of {name} among stable models: {'; '.join(texts)}."
 
 
-def _value(points: Sequence[Point], key: str) -> str:
-    """The value at the N compared where it is among the points, else at the last."""
+def _span(s: MethodSweep, points: Sequence[Point], key: str) -> str:
+    """Method, its N, and the value at the N compared where it is among the points, else at the last."""
+    span = " to ".join(str(N) for N in sorted({points[0].N, points[-1].N}))
     p = next((p for p in points if p.N == COMPARED), points[-1])
-    value = f"{getattr(p, key):.1e}"
-    return value if len(points) == 1 else f"{value} at N = {p.N}"
+    at = f" at N = {p.N}" if len(points) > 1 else ""
+    return f"{s.method.short_title} at N = {span} ({getattr(p, key):.1e}{at})"
 
 
 def _stability(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
     for keeps, label in ((True, "that keep the structure"), (False, "that do not")):
         group = [s for s in sweeps if s.method.preserving == keeps]
-        total = sum(len(s.points) for s in group)
         bad = [(s.method.short_title, [p.N for p in s.points if not p.stable]) for s in group]
-        count = sum(len(sizes) for _, sizes in bad)
-        if not total:
-            continue
-        where = "; ".join(f"{title} at N = {_list(sizes)}" for title, sizes in bad if sizes)
-        yield f"Unstable models among the {total} {label}: " + (f"{count} ({where})." if count else "none.")
+        total, count = sum(len(s.points) for s in group), sum(len(sizes) for _, sizes in bad)
+        where = "; ".join(f"{title} at N = {', '.join(map(str, sizes))}" for title, sizes in bad if sizes)
+        if total:
+            yield f"Unstable models among the {total} {label}: " + (f"{count} ({where})." if count else "none.")
 
 
 def _structure(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
-    N = min(sizes_of(sweeps), key=lambda N: (abs(N - COMPARED), N), default=None)
-    groups = {
-        keeps: [(s, p) for s in sweeps if s.method.preserving == keeps for p in s.points if p.N == N and p.stable]
+    N = min(sizes_of(sweeps), key=lambda N: (abs(N - COMPARED), N))
+    groups = [
+        [(s, p) for s in sweeps if s.method.preserving == keeps for p in s.points if p.N == N and p.stable]
         for keeps in (True, False)
-    }
-    if N is None or not all(groups.values()):
+    ]
+    if not all(groups):
         return
-    energies = {keeps: [p.error_energy for _, p in group] for keeps, group in groups.items()}
+    kept, lost = ([p.error_energy for _, p in group] for group in groups)
     yield (
-        f"Error of the tissue's energy at N = {N}: {min(energies[True]):.1e} to {max(energies[True]):.1e} in models "
-        f"that keep the structure, {min(energies[False]):.1e} to {max(energies[False]):.1e} in stable models that do "
-        "not."
+        f"Error of the tissue's energy at N = {N}: {min(kept):.1e} to {max(kept):.1e} in models that keep the "
+        f"structure, {min(lost):.1e} to {max(lost):.1e} in stable models that do not."
     )
-    (kept, p), (lost, q) = (min(g, key=lambda b: b[1].error_deformation) for g in groups.values())
+    (s, p), (t, q) = (min(group, key=lambda b: b[1].error_deformation) for group in groups)
     tiny = np.finfo(float).tiny
     ratio = max(p.error_deformation, tiny) / max(q.error_deformation, tiny)
     verdict = f"structure {'costs' if ratio > 1 else 'gains'} a factor of {max(ratio, 1 / ratio):.1f}"
     yield (
         f"Least error of the deformation at N = {N}: {p.error_deformation:.1e} with structure "
-        f"({kept.method.short_title}), {q.error_deformation:.1e} without "
-        f"({lost.method.short_title}, stable at this N), so {verdict} here."
+        f"({s.method.short_title}), {q.error_deformation:.1e} without ({t.method.short_title}, stable at this N), so "
+        f"{verdict} here."
     )
 
 
@@ -133,24 +119,16 @@ def _statement(
     if not pairs:
         return
     holds = [N for N, (_, p), (_, q) in pairs if p.error < q.error]
-    fails = [N for N, (_, p), (_, q) in pairs if not p.error < q.error]
+    fails = [N for N, *_ in pairs if N not in holds]
     N, (s, p), (t, q) = min(pairs, key=lambda pair: (abs(pair[0] - COMPARED), pair[0]))
     verdict = (
         "this holds at every N" if not fails
         else "this holds at no N" if not holds
-        else f"this holds but for N = {_list(fails)}" if len(fails) < len(holds)
-        else f"this holds at N = {_list(holds)} only"
+        else f"this holds but for N = {', '.join(map(str, fails))}" if len(fails) < len(holds)
+        else f"this holds at N = {', '.join(map(str, holds))} only"
     )  # fmt: skip
+    left_title, right_title = (x.method.short_title + ("" if y.stable else ", unstable") for x, y in ((s, p), (t, q)))
     yield (
         f"The paper: among its six methods, {text}. Here, in its own error of the state, {verdict}; at N = {N}: "
-        f"{p.error:.1e} {one} ({s.method.short_title}{_grows(p)}), {q.error:.1e} {other} "
-        f"({t.method.short_title}{_grows(q)})."
+        f"{p.error:.1e} {one} ({left_title}), {q.error:.1e} {other} ({right_title})."
     )
-
-
-def _list(sizes: Sequence[int]) -> str:
-    return ", ".join(map(str, sizes))
-
-
-def _grows(point: Point) -> str:
-    return "" if point.stable else ", unstable"

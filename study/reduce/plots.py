@@ -20,7 +20,7 @@ from softgrasp.study.pictures import style
 from softgrasp.study.pictures.animation import Film, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import hands_at, seen, shadow, speed_up
-from softgrasp.study.reduce.result import MethodSweep, Point, nearest
+from softgrasp.study.reduce.result import MethodSweep, Point, by_error
 from softgrasp.study.reduce.views import Views
 
 TOP = 1.0  # errors above are drawn at the upper edge
@@ -42,6 +42,8 @@ LOOKS: dict[str, tuple[str, str, str]] = {  # colour by decomposition, dashes fo
 }
 SPARE = ((BROWN, "-", ">"), (BROWN, "--", "h"), (BROWN, ":", "X"), (BROWN, "-.", "p"))
 CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 4.0, "mew": 0.8, "alpha": 0.6}
+OTHERS: dict[str, Any] = {"ls": "", "marker": ".", "ms": 4, "color": "#c4c4c4"}
+FRONT: dict[str, Any] = {"color": style.OUTLINE, "lw": 1.6, "zorder": 2}
 FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
 QUANTITIES = (
     ("error_deformation", "error of the deformation"),
@@ -88,9 +90,8 @@ def of_paper(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
 
 def further_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
     """The others, after the best of the paper's at the N compared."""
-    old = [(s.points[i], s) for s in of_paper(sweeps) if (i := nearest(s.points)) is not None]
-    first = min(old, key=lambda f: f[0].error_deformation, default=None)
-    return ([] if first is None else [first[1]]) + [s for s in sweeps if s.method.key not in PAPER_METHODS and s.points]
+    best = [s for s, _ in by_error(of_paper(sweeps))[:1]]
+    return best + [s for s in sweeps if s.method.key not in PAPER_METHODS and s.points]
 
 
 def figure_errors(
@@ -98,11 +99,11 @@ def figure_errors(
 ) -> tuple[Path, ...]:
     """Errors against N, one below the other; a curve is dotted where its model is unstable, its name is at its end."""
     single, look = len(quantities) == 1, looks(sweeps)
-    place: dict[str, float] = {"bottom": 0.13, "top": 0.9} if single else {"bottom": 0.07, "top": 0.97, "hspace": 0.1}
     with style.paper_style():
         size = (style.COLUMN + 1.6, 3.4 if single else 6.4)
         figure, axes = plt.subplots(len(quantities), 1, figsize=size, sharex=True, squeeze=False)
-        figure.subplots_adjust(left=0.13, right=0.66, **place)
+        bottom, top = (0.13, 0.9) if single else (0.07, 0.97)
+        figure.subplots_adjust(left=0.13, right=0.66, bottom=bottom, top=top, hspace=0.1)
         for ax, (key, label) in zip(axes[:, 0], quantities, strict=True):
             ends = []
             for s in sweeps:
@@ -130,31 +131,28 @@ def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> t
     with style.paper_style():
         figure, axes = plt.subplots(2, 1, figsize=(style.COLUMN + 0.9, 5.6), layout="constrained")
         named: dict[str, Line2D] = {}
-        for ax, offline in zip(axes, (False, True), strict=True):
-            unit = 1.0 if offline else 1e3
+        kinds = ((0, 1e3, "online time of a run [ms]"), (1, 1.0, "offline + online time [s]"))
+        for ax, (offline, unit, xlabel) in zip(axes, kinds, strict=True):
             points = [
                 (unit * (p.time_online + offline * p.time_offline), min(getattr(p, key), TOP), s)
                 for s in sweeps for p in s.points if p.stable and np.isfinite(getattr(p, key))
             ]  # fmt: skip
-            ax.plot([t for t, _, _ in points], [e for _, e, _ in points], ls="", marker=".", ms=4, color="#c4c4c4")
             front = pareto(points)
-            ax.plot([t for t, _, _ in front], [e for _, e, _ in front], color=style.OUTLINE, lw=1.6, zorder=2)
+            for shown, mark in ((points, OTHERS), (front, FRONT)):
+                ax.plot([t for t, _, _ in shown], [e for _, e, _ in shown], **mark)
             for t, e, s in front:
                 colour, dashes, marker = look[s.method.key]
-                mark: dict[str, Any] = {"ls": "", "marker": marker, "ms": 5.0, "color": colour}
-                mark["mfc"] = colour if dashes == "-" else "white"
+                fill = colour if dashes == "-" else "white"
+                mark = {"ls": "", "marker": marker, "ms": 5.0, "color": colour, "mfc": fill}
                 ax.plot(t, e, **mark, zorder=3)
                 named[s.method.key] = Line2D([], [], label=s.method.short_title, **mark)
             ax.axvline(full * unit, **FULL)
-            ax.set_xscale("log")
+            ax.set(xscale="log", xlabel=xlabel, ylabel=QUANTITIES[0][1])
             style.log_axis(ax, 1.6 * TOP)
-            ax.set_ylabel(QUANTITIES[0][1])
             style.few_ticks(ax.xaxis)
-        axes[0].set_xlabel("online time of a run [ms]")
-        axes[1].set_xlabel("offline + online time [s]")
         rest = [
-            Line2D([], [], ls="", marker=".", ms=4, color="#c4c4c4", label="other stable models"),
-            Line2D([], [], color=style.OUTLINE, lw=1.6, label="Pareto front"),
+            Line2D([], [], label="other stable models", **OTHERS),
+            Line2D([], [], label="Pareto front", **FRONT),
             Line2D([], [], label="full run, prefactored", **FULL),
         ]
         figure.legend(handles=[*named.values(), *rest], loc="outside upper center", ncols=2)
@@ -184,13 +182,12 @@ def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ..
         for ax, group in zip(axes[0], groups, strict=True):
             for s in group:
                 colour, dashes, _ = look[s.method.key]
-                for j, values in enumerate(v for v in s.sigma if len(v) and v[0] > 0):
+                label, wide = s.method.short_title, 1.2
+                for values in (v for v in s.sigma if len(v) and v[0] > 0):
                     shown = np.maximum(values[:SHOWN_VALUES] / values[0], LOWEST)
-                    wide = 1.2 if j == 0 else 0.7
-                    label = s.method.short_title if j == 0 else None
                     ax.plot(np.arange(1, len(shown) + 1), shown, color=colour, ls=dashes, lw=wide, label=label)
-            ax.set_yscale("log")
-            ax.set_xlabel("number")
+                    label, wide = "", 0.7  # of the further parts
+            ax.set(yscale="log", xlabel="number")
             ax.legend(loc="upper right", handlelength=2.2, fontsize=6.5)
         axes[0, 0].set_ylabel(r"singular value over the first, $\sigma_i / \sigma_1$")
         return style.save(figure, out_png)
@@ -255,8 +252,7 @@ def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
     shot = make_shot(views.picture, views.full, views.times, views.table, None)
     figure, axes = make_axes(shot, len(views.reduced), captions=True, width=width, tallest=3.6)
     for ax, view in zip(axes, views.reduced, strict=True):
-        state = "" if view.stable else ", unstable"
-        ax.set_title(f"{view.title}{state}\ndeformation error {view.error:.1e}{note}", pad=3, fontsize=7)
+        ax.set_title(view.title + note, pad=3, fontsize=7)
     entries: list[Any] = [
         Patch(color=style.HAND, label="hand"),
         Line2D([], [], label="outline of the full model", **OUTLINE),

@@ -54,7 +54,7 @@ class MethodSweep:
 
     method: Method  # which
     points: tuple[Point, ...]  # one for every N
-    # some of them by the number of their point, see :func:`kept_points`. All would fill the memory.
+    # some of them by N, see :func:`kept_points`. All would fill the memory.
     models: dict[int, ReducedModel]
     sigma: tuple[np.ndarray, ...]  # singular values of every part of the decomposition
     # N in the scene that this basis cannot have, each with its reason
@@ -218,19 +218,25 @@ def reduce_result(full: FullRun, own: dict[str, Any], seconds: dict[str, float])
     )
 
 
-def nearest(points: Sequence[Point], N: int = COMPARED, stable: bool = True) -> int | None:
-    """Number of the point nearest to N, the smaller of two, among the stable ones or all."""
-    numbers = [i for i, p in enumerate(points) if p.stable or not stable]
-    return min(numbers, key=lambda i: (abs(points[i].N - N), points[i].N)) if numbers else None
+def nearest(points: Sequence[Point], N: int = COMPARED, stable: bool = True) -> Point | None:
+    """The point nearest to N, the smaller of two, among the stable ones or all."""
+    chosen = [p for p in points if p.stable or not stable]
+    return min(chosen, key=lambda p: (abs(p.N - N), p.N), default=None)
 
 
-def best(points: Sequence[Point]) -> int | None:
-    """Number of the stable point with the least error of the deformation."""
-    numbers = [i for i, p in enumerate(points) if p.stable and np.isfinite(p.error_deformation)]
-    return min(numbers, key=lambda i: points[i].error_deformation) if numbers else None
+def by_error(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, Point]]:
+    """Methods with their stable point nearest to the N compared, the least error of the deformation first."""
+    chosen = [(s, p) for s in sweeps if (p := nearest(s.points)) is not None]
+    return sorted(chosen, key=lambda c: np.nan_to_num(c[1].error_deformation, nan=np.inf))
+
+
+def best(points: Sequence[Point]) -> Point | None:
+    """The stable point with the least error of the deformation."""
+    chosen = [p for p in points if p.stable and np.isfinite(p.error_deformation)]
+    return min(chosen, key=lambda p: p.error_deformation, default=None)
 
 
 def kept_points(points: Sequence[Point]) -> set[int]:
-    """Points whose models are kept: the best stable one, and those that pictures and the parameter box compare."""
-    numbers = (best(points), nearest(points), nearest(points, LARGER), nearest(points, stable=False))
-    return {i for i in numbers if i is not None}
+    """N whose models are kept: of the best stable one, and of those that pictures and the parameter box compare."""
+    chosen = (best(points), nearest(points), nearest(points, LARGER), nearest(points, stable=False))
+    return {p.N for p in chosen if p is not None}

@@ -17,7 +17,7 @@ from softgrasp.reduction.archive import save
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.reduce import tables
 from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.result import N_NOTE, MethodSweep, ReductionStudy, best
+from softgrasp.study.reduce.result import N_NOTE, ReductionStudy, best
 from softgrasp.study.reduce.sweep import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.tables import Table
@@ -48,10 +48,7 @@ def run_reduce(
     tolerance: float | None = None,
     **flags: Unpack[Flags],
 ) -> dict[str, Any]:
-    """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective.
-
-    Raises SoftgraspError: with one sentence.
-    """
+    """Reduce a scene file by all its methods, or build one certified model, and write the results. Collective."""
     if tolerance is not None:
         overrides = [*overrides, f"reduction.tolerance={tolerance}", "reduction.train='greedy'"]
     session = Session("reduce", path, overrides, out, console, **flags)
@@ -68,8 +65,11 @@ def run_reduce(
     model, watch = session.model(scene), Stopwatch(session.comm)
     with session.progress(MofNCompleteColumn()) as bar:
         study, drawn = reduce_model(session, model, names, bar, watch)
+    chosen = [(s, p) for s in study.sweeps if (p := best(s.points)) is not None]
+    models = [out / "models" / f"{s.method.key}.h5" for s, _ in chosen]
     with watch.stage("models"):
-        models = save_models(out, study.sweeps)
+        for file, (s, p) in zip(models, chosen, strict=True):
+            save(s.models[p.N], file)
     result = study.result(watch.seconds)
 
     def page() -> Page:
@@ -120,17 +120,6 @@ def reduce_model(
     return ReductionStudy(full, sweeps, times, speeds, box, findings(sweeps), notes), drawn
 
 
-def save_models(out: Path, sweeps: Sequence[MethodSweep]) -> list[Path]:
-    """Write the best stable model of every method into ``out/models``. Collective."""
-    files = []
-    for s in sweeps:
-        i = best(s.points)
-        if i is not None:
-            files.append(out / "models" / f"{s.method.key}.h5")
-            save(s.models[i], files[-1])
-    return files
-
-
 def show(console: Console, study: ReductionStudy) -> None:
     """Print the tables."""
     energy, box = study.full.model.scene.reduction.energy, study.box
@@ -141,7 +130,7 @@ def show(console: Console, study: ReductionStudy) -> None:
         console.print(sentence, markup=False)
     for sizes, titles, reason in tables.refused_table(study.sweeps, narrow=True).rows:
         console.print(f"N = {sizes} refused for {titles}: {reason}.", markup=False)
-    _print(console, tables.time_table(study.speeds, narrow=True))
+    _print(console, tables.time_table(study, narrow=True))
     for note in study.speed_notes:
         console.print(note)
     if box.none:

@@ -20,7 +20,6 @@ from softgrasp.reduction.strain.training import Reference, Training, errors_of, 
 from softgrasp.study.reduce.result import FullTimes
 from softgrasp.study.shell.timing import median_seconds
 
-TITLES = {"own": "trained on the scene's run", "box": "trained over the box"}
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
 CELLS_AT = (14, 24)  # N at which tau is varied
 TAUS = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)
@@ -90,6 +89,11 @@ class StrainFamily:
     models: dict[int, StrainModel]  # those of ``points`` by N
     refused: dict[int, str]  # reason by N
 
+    @property
+    def title(self) -> str:
+        """How its models were trained."""
+        return "trained on the scene's run" if self.key == "own" else "trained over the box"
+
 
 @dataclass(frozen=True)
 class StrainStudy:
@@ -107,28 +111,19 @@ class StrainStudy:
 
 
 def measure_strain(model: Model, own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
-    """Train, test and time. Collective.
-
-    Raises SolverError: a run did not converge. ReductionError: the snapshots carry no model.
-    """
-    sizes = sizes_of(model)
+    """Train, test and time. Collective. Raises SolverError: a run failed. ReductionError: there is no model."""
+    options, hand = model.scene.reduction, 2 * model.system.layout.n_s
+    chosen = options.N if "N" in options.model_fields_set else SIZES
+    sizes = sorted({N for N in chosen if hand < N and N % 2 == 0})  # those that a model can have
     box_runs, held, none = _box_runs(model, own, say)
     first, near = model.system.materials[0], []
     for share in SHARES if _has_target(model) else ():
         target = [share * x for x in model.scene.motion.target or []]
         near.append(("motion", _full(model, (first.lam, first.mu), target)))
-    families = []
-    for key, runs, tests in (("own", [own], near), ("box", box_runs, held)):
-        if len(runs) > 1 or key == "own":
-            families.append(_family(key, model, runs, tests, sizes, say))
+    families = [_family("own", model, [own], near, sizes, say)]
+    if len(box_runs) > 1:
+        families.append(_family("box", model, box_runs, held, sizes, say))
     return StrainStudy(own, tuple(families), times, linear_error(model, own), none)
-
-
-def sizes_of(model: Model) -> list[int]:
-    """N of the scene, or :data:`SIZES`; those that no model can have are left out."""
-    options, hand = model.scene.reduction, 2 * model.system.layout.n_s
-    chosen = options.N if "N" in options.model_fields_set else SIZES
-    return sorted({N for N in chosen if hand < N and N % 2 == 0})
 
 
 def linear_error(model: Model, own: FullRun) -> float:
@@ -145,11 +140,10 @@ def linear_error(model: Model, own: FullRun) -> float:
 
 def _full(model: Model, place: Place, target: list[float] | None) -> FullRun:
     """A full run elsewhere; what fails says where. Collective."""
-    lam, mu = place
     try:
-        return run_at(model if target is None else moved_to(model, target), lam, mu)
+        return run_at(model if target is None else moved_to(model, target), *place)
     except SolverError as error:
-        where = f"lambda = {lam:g}, mu = {mu:g} Pa" + ("" if target is None else f", target {target}")
+        where = f"lambda = {place[0]:g}, mu = {place[1]:g} Pa" + ("" if target is None else f", target {target}")
         raise SolverError(
             f"full run at {where}: {error}; narrow reduction.lambda_range, mu_range or motions"
         ) from error
@@ -167,7 +161,10 @@ def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list
     if places:
         jobs += [("material", place, None) for place in tests if not np.allclose(place, here)]
     if targets:
-        jobs += [("motion", here, target) for target in _inside(model)]
+        corner = np.abs(np.array(model.scene.motion.target))
+        # evenly between the mirrored targets, the same at every call
+        spread = 2 * qmc.Halton(len(corner), scramble=False).random(MOTIONS + 1)[1:] - 1
+        jobs += [("motion", here, (0.95 * corner * point).tolist()) for point in spread]
     done: list[HeldOut] = []
     for i, (kind, place, target) in enumerate(jobs):
         say("full runs", i, len(jobs))
@@ -178,13 +175,6 @@ def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list
 def _has_target(model: Model) -> bool:
     motion = model.scene.motion
     return motion.drive == "motion" and motion.profile == "quintic" and any(motion.target or [])
-
-
-def _inside(model: Model) -> list[list[float]]:
-    """Targets between the mirrored ones, evenly spread; the same at every call."""
-    target = np.abs(np.array(model.scene.motion.target))
-    points = 2 * qmc.Halton(len(target), scramble=False).random(MOTIONS + 1)[1:] - 1
-    return [(0.95 * target * point).tolist() for point in points]
 
 
 def _family(
@@ -218,21 +208,24 @@ def _family(
                 curves.append(_measure(training, rom, held, _missed(rom, held, references)))
     if not points:
         raise ReductionError(f"no N of {list(sizes)} gives a model: {'; '.join(refused.values())}")
-    tests = tuple(_test(*h, {N: missed[N][j] for N in models}) for j, h in enumerate(held))
+    tests = []
+    for j, (kind, full) in enumerate(held):
+        first, target = full.model.system.materials[0], tuple(full.trajectory.q_s[-1].tolist())
+        tests.append(Test(kind, first.lam, first.mu, target, {N: missed[N][j] for N in models}))
     whole = (*curves, *points)
-    return StrainFamily(key, training.whole.box, len(runs), tuple(points), whole, tests, models, refused)
+    return StrainFamily(key, training.whole.box, len(runs), tuple(points), whole, tuple(tests), models, refused)
 
 
 def _measure(
     training: Training, rom: StrainModel, held: Sequence[HeldOut], missed: Sequence[float | None]
 ) -> StrainPoint:
     """Errors on training runs and on held-out ones, drift, times."""
-    pairs = list(zip(training.references, training.runs, strict=True))
-    done = [replay_strain(rom, run, outside=True) for _, run in pairs]
-    trained = errors_of([r.missed(x.a, x.v) for (r, _), x in zip(pairs, done, strict=True)])
+    done = [replay_strain(rom, run, outside=True) for run in training.runs]
+    trained = errors_of([r.missed(x.a, x.v) for r, x in zip(training.references, done, strict=True)])
     own = training.references[0].errors(done[0].a, done[0].v)
-    worst = {key: max((e for (kind, _), e in zip(held, missed, strict=True) if kind == key and e is not None),
-                      default=None) for key in ("material", "motion")}  # fmt: skip
+    worst: dict[str, list[float]] = {"material": [], "motion": []}
+    for (kind, _), error in zip(held, missed, strict=True):
+        worst[kind] += [] if error is None else [error]
     full, comm = training.runs[0], training.model.system.layout.comm
     small = rom.at(full.dt, outside=True)  # few cells may overshoot
     start = small.equilibrium() if full.model.scene.time.start == "equilibrium" else None
@@ -243,7 +236,7 @@ def _measure(
         error_own=own.z, error_own_velocity=own.v, error_own_energy_norm=own.energy_norm,
         error_training=trained.z, error_galerkin=rom.error_galerkin,
         floor=training.references[0].projection_error(rom.k),
-        error_materials=worst["material"], error_motions=worst["motion"],
+        error_materials=max(worst["material"], default=None), error_motions=max(worst["motion"], default=None),
         drift=max(run.energy_drift for run in done), evaluations=done[0].evaluations, engine=done[0].engine,
         time_offline=sum(rom.seconds.values()), time_setup=setup, time_online=online,
     )  # fmt: skip
@@ -260,8 +253,3 @@ def _missed(rom: StrainModel, held: Sequence[HeldOut], references: Sequence[Refe
         else:
             errors.append(reference.errors(run.a, run.v).z)
     return errors
-
-
-def _test(kind: str, full: FullRun, errors: dict[int, float | None]) -> Test:
-    first = full.model.system.materials[0]
-    return Test(kind, first.lam, first.mu, tuple(full.trajectory.q_s[-1].tolist()), errors)

@@ -17,7 +17,7 @@ from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
 from softgrasp.study.reduce.plots import FULL
-from softgrasp.study.reduce.strain_measure import CELLS_AT, TITLES, StrainPoint, StrainStudy
+from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainPoint, StrainStudy
 
 
 def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Path]:
@@ -36,12 +36,12 @@ def figure_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
     with style.paper_style():
         figure, (left, right) = plt.subplots(1, 2, figsize=(style.WIDTH, 3.4), sharey=True, layout="constrained")
         for f in study.families:
-            _pair(left, [p.N for p in f.points], f.points, colours[f.key], TITLES[f.key])
+            _pair(left, [p.N for p in f.points], f.points, colours[f.key], f.title)
             left.plot([p.N for p in f.points], [p.error_galerkin for p in f.points], ls=":", color=colours[f.key])
             for N, colour in zip(CELLS_AT, (style.GREEN, style.PURPLE), strict=True):
                 points = sorted((p for p in f.curves if p.N == N), key=lambda p: p.cells)
                 if f is study.families[-1] and points:
-                    _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {TITLES[f.key]}")
+                    _pair(right, [p.cells for p in points], points, colour, f"N = {N}, {f.title}")
                     right.axhline(points[0].error_galerkin, ls=":", color=colour)
         for ax, label in ((left, "$N$"), (right, "sampled cells")):
             ax.axhline(study.linear, **FULL)
@@ -70,20 +70,19 @@ def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: P
     height = min(4.0, 1.1 + wide / min(len(models), 2) * float(size[1] / size[0]) * 0.8)
     sampled = [np.unique(m.cells.cell, return_index=True) for m in models]
     weights = [m.cells.xi[first] for m, (_, first) in zip(models, sampled, strict=True)]  # xi = weight / vol
-    together = np.concatenate(weights)
-    norm, edge = LogNorm(float(together.min()), float(together.max())), style.OUTLINE
+    norm, edge = LogNorm(float(min(map(np.min, weights))), float(max(map(np.max, weights)))), style.OUTLINE
     with style.paper_style():
         figure, axes = plt.subplots(1, len(models), figsize=(wide, height), squeeze=False, layout="constrained")
         for ax, model, (cells, _), xi in zip(axes[0], models, sampled, weights, strict=True):
             colours = style.colour_map()(norm(xi))
             if picture.dimension == 2:
-                looks: list[tuple[Any, dict[str, Any]]] = [
-                    (flat[picture.cells], {"facecolors": "#f4f4f4", "edgecolors": "#d0d0d0", "lw": 0.3}),
-                    (flat[picture.cells[cells]], {"facecolors": colours, "edgecolors": edge, "lw": 0.5}),
-                    (hand_polygons(picture)[0], {"facecolors": style.HAND, "edgecolors": style.HAND, "lw": 0.3}),
+                looks: list[tuple[Any, Any, str, float]] = [
+                    (flat[picture.cells], "#f4f4f4", "#d0d0d0", 0.3),
+                    (flat[picture.cells[cells]], colours, edge, 0.5),
+                    (hand_polygons(picture)[0], style.HAND, style.HAND, 0.3),
                 ]
-                for order, (polygons, look) in enumerate(looks, 1):
-                    ax.add_collection(PolyCollection(list(polygons), zorder=order, **look))
+                for i, (polygons, inside, line, lw) in enumerate(looks, 1):
+                    ax.add_collection(PolyCollection(list(polygons), zorder=i, fc=inside, ec=line, lw=lw))
             else:
                 ax.add_collection(LineCollection(shadow(flat, picture.facets), colors=edge, linewidths=0.8))
                 x = seen(picture.points[picture.cells[cells]].mean(axis=1))
@@ -92,7 +91,6 @@ def figure_cells(picture: PictureMesh, models: Sequence[StrainModel], out_png: P
             ax.autoscale_view()
             ax.set_aspect("equal")
             ax.axis("off")
-        figure.colorbar(
-            ScalarMappable(norm, style.colour_map()), ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell"
-        )
+        scale = ScalarMappable(norm, style.colour_map())
+        figure.colorbar(scale, ax=list(axes[0]), shrink=0.7, label=r"weight $\xi$ of a cell")
         return tuple(style.save(figure, out_png))

@@ -16,14 +16,7 @@ from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
 from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.reduce.strain_measure import (
-    CELLS_AT,
-    TITLES,
-    StrainFamily,
-    StrainPoint,
-    StrainStudy,
-    measure_strain,
-)
+from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainFamily, StrainPoint, StrainStudy, measure_strain
 from softgrasp.study.reduce.sweep import measured_run
 from softgrasp.study.reduce.tables import TIMES, time_cells
 from softgrasp.study.report.page import Section, captioned
@@ -62,7 +55,6 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
             full, times = measured_run(model, lambda run: say("full run", run.reached, run.steps))
         with watch.stage("reduced"):
             study = measure_strain(model, full, times, say)
-    last = study.families[-1]
     folder = session.out / "models"
     models = {folder / f"{f.key}_N{N}.h5": rom for f in study.families for N, rom in f.models.items()}
     for path, rom in models.items():
@@ -73,56 +65,67 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         from softgrasp.study.reduce.strain_pictures import draw  # brings Matplotlib
 
         picture = gather_picture(model)
-    result = strain_result(study, watch.seconds)
+    told = sentences(study)
+    result = reduce_result(
+        study.full,
+        {
+            "finite_strain": {f.key: _family(study, f) for f in study.families},
+            "error_linear": study.linear,
+            "reason_for_none": study.none,
+            "findings": told,
+        },
+        study.times.to_json() | watch.seconds,
+    )
 
     def page() -> Page:
         files = draw(session.out, study, picture) if session.pictures else []
-        names = tuple(field.name for field in fields(StrainPoint))
+        title = f"{scene.name}: reduced models at finite strain, {study.families[-1].points[0].engine} stepper"
+        names = (field.name for field in fields(StrainPoint))
         rows = [(f.runs, *asdict(p).values()) for f in study.families for p in f.curves]
         points = {"points.csv": Table(("runs", *names), rows)}
-        title = f"{scene.name}: reduced models at finite strain, {last.points[0].engine} stepper"
         return Page(title, summary(study), sections(study, files), points, [*files, *models])
 
     for table in (error_table(study), time_table(study), cell_table(study)):
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))
-    for sentence in sentences(study):
+    for sentence in told:
         session.console.print(sentence, markup=False)
     list_files(session.console, session.write(scene, result, page))
     return result
 
 
-def strain_result(study: StrainStudy, seconds: dict[str, float]) -> dict[str, Any]:
-    """The keys of ``result.json``. Collective."""
-    families, pays = {}, ("again", "new", "break_even_runs")
-    for f in study.families:
-        speeds = [dict(zip(pays, study.speed_up(p), strict=True)) for p in f.points]
-        families[f.key] = {
-            "runs": f.runs,
-            "box": {key: np.asarray(value).tolist() for key, value in asdict(f.box).items()},
-            "points": [asdict(p) | {"speed_up": s} for p, s in zip(f.points, speeds, strict=True)],
-            "cells": [asdict(p) for p in f.curves],
-            "held_out": [asdict(t) for t in f.tests],
-            "refused": f.refused,
-        }
-    own = {
-        "finite_strain": families,
-        "error_linear": study.linear,
-        "reason_for_none": study.none,
-        "findings": sentences(study),
+def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
+    """Parts of the page."""
+    held = [test_table(f).section(title=f"Held-out runs, models {f.title}") for f in study.families if f.tests]
+    return [
+        error_table(study).section(NOTE),
+        Section("What holds", text="\n\n".join(sentences(study))),
+        Section("", figures=captioned(files, CAPTIONS)),
+        time_table(study).section(),
+        cell_table(study).section(),
+        *held,
+    ]
+
+
+def _family(study: StrainStudy, f: StrainFamily) -> dict[str, Any]:
+    """One entry of "finite_strain" in ``result.json``."""
+    names = ("again", "new", "break_even_runs")
+    return {
+        "runs": f.runs,
+        "box": {key: np.asarray(value).tolist() for key, value in asdict(f.box).items()},
+        "points": [asdict(p) | {"speed_up": dict(zip(names, study.speed_up(p), strict=True))} for p in f.points],
+        "cells": [asdict(p) for p in f.curves],
+        "held_out": [asdict(t) for t in f.tests],
+        "refused": f.refused,
     }
-    return reduce_result(study.full, own, study.times.to_json() | seconds)
 
 
 def error_table(study: StrainStudy) -> Table:
     """One line for each family and N."""
     header = ("runs", "N", "cells", "own", "energy", "all cells", "new material", "new motion", "drift")
     rows = [
-        (
-            f.runs, p.N, p.cells, f"{p.error_own:.1e}", f"{p.error_own_energy_norm:.1e}", f"{p.error_galerkin:.1e}",
-            _short(p.error_materials), _short(p.error_motions), f"{p.drift:.0e}",
-        )
-        for f in study.families
-        for p in f.points
+        (f.runs, p.N, p.cells, *map(_short, (p.error_own, p.error_own_energy_norm, p.error_galerkin)),
+         *map(_short, (p.error_materials, p.error_motions)), f"{p.drift:.0e}")
+        for f in study.families for p in f.points
     ]  # fmt: skip
     return Table(header, rows, "Errors")
 
@@ -131,10 +134,8 @@ def cell_table(study: StrainStudy) -> Table:
     """Error against the number of cells where tau was varied."""
     header = ("runs", "N", "tau", "cells", "own", "new material", "new motion", "run [ms]")
     rows = [
-        (
-            f.runs, p.N, f"{p.tau:.1e}", p.cells, f"{p.error_own:.1e}", _short(p.error_materials),
-            _short(p.error_motions), f"{1e3 * p.time_online:.2f}",
-        )
+        (f.runs, p.N, _short(p.tau), p.cells, *map(_short, (p.error_own, p.error_materials, p.error_motions)),
+         f"{1e3 * p.time_online:.2f}")
         for f in study.families
         for p in sorted((p for p in f.curves if p.N in CELLS_AT), key=lambda p: (p.N, -p.tau))
     ]  # fmt: skip
@@ -167,8 +168,8 @@ def _short(value: float | None) -> str:
 
 def sentences(study: StrainStudy) -> list[str]:
     """What the numbers say."""
-    full = study.full
-    law = full.model.system.points.law if full.model.system.points is not None else ""
+    full, points = study.full, study.full.model.system.points
+    law = "" if points is None else points.law
     lines = [
         f"Law: {law}. Linear elasticity misses the deformation of this scene by {100 * study.linear:.3g} %.",
         f"Full model: {len(full.trajectory.times) - 1} steps in {study.times.steps:.3g} s, factorisation "
@@ -178,14 +179,13 @@ def sentences(study: StrainStudy) -> list[str]:
     ]
     for f in study.families:
         lam, mu, load = f.box.lam[0], f.box.mu[0], np.abs(f.box.load).max(axis=1)
-        inside = (
-            f"lambda = {lam[0]:.4g}, mu = {mu[0]:.4g} Pa only" if f.key == "own" and lam[0] == lam[1] and mu[0] == mu[1]
-            else f"lambda in [{lam[0]:.4g}, {lam[1]:.4g}] and mu in [{mu[0]:.4g}, {mu[1]:.4g}] Pa"
-        )  # fmt: skip
-        reach = ", ".join(f"{x:.3g}" for x in load)
+        inside = f"lambda in [{lam[0]:.4g}, {lam[1]:.4g}] and mu in [{mu[0]:.4g}, {mu[1]:.4g}] Pa"
+        if f.key == "own" and lam[0] == lam[1] and mu[0] == mu[1]:
+            inside = f"lambda = {lam[0]:.4g}, mu = {mu[0]:.4g} Pa only"
         lines.append(
-            f"Models {TITLES[f.key]} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
-            f"accelerations of the hand up to {reach} by degree of freedom; they refuse what lies outside."
+            f"Models {f.title} ({f.runs} full run{'s' if f.runs > 1 else ''}) answer for {inside} and "
+            f"accelerations of the hand up to {', '.join(f'{x:.3g}' for x in load)} by degree of freedom; they refuse "
+            "what lies outside."
         )
         errors = {N: [e for t in f.tests if (e := t.errors.get(N)) is not None] for N in f.models}
         best = min(((statistics.median(e), N) for N, e in errors.items() if e), default=None)
@@ -205,15 +205,7 @@ def summary(study: StrainStudy) -> list[str]:
     again, new, _ = study.speed_up(p)
     return [
         f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
-        f"The most accurate reduced model, {TITLES[f.key]}, is {p.error_own:.2%} off with N = {p.N} columns and "
+        f"The most accurate reduced model, {f.title}, is {p.error_own:.2%} off with N = {p.N} columns and "
         f"{p.cells} sampled cells.",
         f"It runs {again:.3g} times as fast as the full model, and {new:.3g} times at a new parameter.",
     ]
-
-
-def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
-    """Parts of the page."""
-    parts = [error_table(study).section(NOTE), Section("What holds", text="\n\n".join(sentences(study)))]
-    parts += [Section("", figures=captioned(files, CAPTIONS)), time_table(study).section(), cell_table(study).section()]
-    parts += [test_table(f).section(title=f"Held-out runs, models {TITLES[f.key]}") for f in study.families if f.tests]
-    return parts

@@ -19,7 +19,7 @@ from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.bases.truncation import Truncation
-from softgrasp.reduction.errors import Comparison
+from softgrasp.reduction.errors import ModelComparison
 from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
@@ -36,6 +36,7 @@ from softgrasp.study.reduce.result import (
     Point,
     Speed,
     TestedModel,
+    by_error,
     kept_points,
     nearest,
 )
@@ -90,12 +91,11 @@ def bases_of(
     return (), None
 
 
-def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = None) -> Point:
+def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison | None = None) -> Point:
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
-    ``comparison``: of the largest model of the family; None prepares one for this model alone.
-
-    Raises ModelError: E or A is singular, so that the model has no run or no equilibrium to start in.
+    ``comparison``: of the largest model of the family; None prepares one for this model alone. Raises ModelError: E or
+    A is singular, so that the model has no run or no equilibrium to start in.
     """
     layout = full.model.system.layout
     comparison = comparison or comparison_of(model, full)
@@ -140,30 +140,19 @@ def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lam
         except ModelError as error:
             refused[basis.N] = error.reason
             continue
-        models[len(points) - 1] = model
-        models = {j: models[j] for j in models if j in kept_points(points)}
+        models[basis.N] = model
+        models = {N: models[N] for N in models if N in kept_points(points)}
     sigma, inner = (bases[0].sigma, bases[0].inner) if bases else ((), "")
     return MethodSweep(method, tuple(points), models, sigma, dict(sorted(refused.items())), kept, inner)
-
-
-def best_methods(sweeps: Sequence[MethodSweep]) -> list[MethodSweep]:
-    """The methods with the least deformation error of a stable model at the N that is compared."""
-
-    def error(s: MethodSweep, i: int) -> float:
-        value = s.points[i].error_deformation
-        return value if np.isfinite(value) else np.inf
-
-    order = [(error(s, i), k, s) for k, s in enumerate(sweeps) if (i := nearest(s.points)) is not None]
-    return [s for _, _, s in sorted(order)[:METHODS_TESTED]]
 
 
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
     scene, system, models = full.model.scene, full.model.system, []
     outputs = make_outputs(scene, system)
-    for s in best_methods(sweeps):
-        numbers = {nearest(s.points, N) for N in (COMPARED, LARGER)}
-        own = [s.models[i] for i in sorted(i for i in numbers if i is not None)]
+    for s, _ in by_error(sweeps)[:METHODS_TESTED]:
+        sizes = {p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}
+        own = [s.models[N] for N in sorted(sizes)]
         models += [TestedModel(s.method, False, model) for model in own]
         if states is None or not s.method.snapshots:
             continue
@@ -186,14 +175,9 @@ def errors_at(full: FullRun, models: Sequence[TestedModel]) -> tuple[float, ...]
 
 
 def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress = lambda done, of: None) -> BoxTests:
-    """Train, and test over the box. Collective.
-
-    Raises:
-        SolverError: a full run failed, or a factorisation did.
-        ResourceError: the snapshots do not fit.
-    """
+    """Train, and test over the box. Collective. Raises SolverError: a run failed. ResourceError: no memory."""
     scene = full.model
-    reason = outside(scene) or ("" if best_methods(sweeps) else "no method has a stable model")
+    reason = outside(scene) or ("" if by_error(sweeps) else "no method has a stable model")
     if reason:
         return BoxTests(none=reason)
     first, training, grid = scene.system.materials[0], training_of(scene), grid_of(scene)
@@ -232,11 +216,9 @@ def steps_seconds(run: Trajectory) -> float:
 
 def speed_of(sweep: MethodSweep, full: FullTimes) -> Speed | None:
     """Compare times; None for a method without points."""
-    i = nearest(sweep.points)
-    i = nearest(sweep.points, stable=False) if i is None else i
-    if i is None:
+    p = nearest(sweep.points) or nearest(sweep.points, stable=False)
+    if p is None:
         return None
-    p = sweep.points[i]
     return Speed(sweep.method, p, *full.against(p.time_offline, p.time_setup, p.time_online))
 
 

@@ -17,7 +17,7 @@ from softgrasp.study.reduce.result import (
     MethodSweep,
     Point,
     ReductionStudy,
-    Speed,
+    by_error,
     nearest,
 )
 from softgrasp.study.report.page import Section, captioned
@@ -81,31 +81,23 @@ def _size(p: Point) -> str:
 
 def error_table(sweeps: Sequence[MethodSweep], energy: float, narrow: bool = False) -> Table:
     """N by energy, errors at the N nearest to the one compared, least N for some errors, stability."""
-    header = ("method", share(energy), "N", "V_e", "deform.", "state", "energy", *LEVEL_NAMES, "stable N")
-    rows: list[tuple[str, ...]] = []
+    header = ("method", f"{100 * energy:g} %", "N", "V_e", "deform.", "state", "energy", *LEVEL_NAMES, "stable N")
+    rows = []
     for s in sweeps:
-        i = nearest(s.points, stable=False)
-        title, kept = title_of(s.method, narrow), "-" if s.N_energy is None else str(s.N_energy)
-        if i is None:
-            rows.append((title, kept, *[""] * 8, "refused" if s.refused else "no model"))
-            continue
-        p = s.points[i]
-        sizes = ["-" if (n := least_size(s.points, level)) is None else str(n) for level in LEVELS]
-        errors = [f"{value:.1e}" for value in (p.error_deformation, p.error, p.error_energy)]
-        size = (_size(p), "+".join(map(str, p.split)))
-        rows.append((title, kept, *size, *errors, *sizes, stability(s.points)))
+        p, cells = nearest(s.points, stable=False), ["" for _ in header[2:-1]]
+        if p is not None:
+            errors = (f"{value:.1e}" for value in (p.error_deformation, p.error, p.error_energy))
+            least = ("-" if (n := least_size(s.points, level)) is None else str(n) for level in LEVELS)
+            cells = [_size(p), "+".join(map(str, p.split)), *errors, *least]
+        stable = stability(s.points) if s.points else "refused" if s.refused else "no model"
+        rows.append((title_of(s.method, narrow), "-" if s.N_energy is None else str(s.N_energy), *cells, stable))
     return Table(header, rows, "Errors")
-
-
-def share(energy: float) -> str:
-    """A share of the energy in words."""
-    return f"{100 * energy:g} %"
 
 
 def error_note(energy: float) -> str:
     """What the columns of the first table hold; ``energy``: share of the scene."""
     return (
-        f"{share(energy)}: N that keeps this share of the energy of the snapshots. Then, at the N nearest to "
+        f"{100 * energy:g} %: N that keeps this share of the energy of the snapshots. Then, at the N nearest to "
         f"{COMPARED}, the relative errors of the deformation, of the state [q_s, v_s, q_e, v_e] (the paper's error) "
         "and of the energy, the same for every method; the least N of a stable model with an error of the deformation "
         f"up to {', '.join(LEVEL_NAMES)}; !: unstable."
@@ -116,33 +108,27 @@ def refused_table(sweeps: Sequence[MethodSweep], narrow: bool = False) -> Table:
     """N that were refused, the methods, and the one reason: methods and N that share it stand together."""
     groups: dict[tuple[str, str], list[str]] = {}
     for s in sweeps:
-        reasons: dict[str, list[int]] = {}
-        for N, reason in s.refused.items():
-            reasons.setdefault(reason, []).append(N)
-        for reason, sizes in reasons.items():
-            groups.setdefault((", ".join(map(str, sizes)), reason), []).append(title_of(s.method, narrow))
+        for reason in dict.fromkeys(s.refused.values()):
+            sizes = ", ".join(str(N) for N, why in s.refused.items() if why == reason)
+            groups.setdefault((sizes, reason), []).append(title_of(s.method, narrow))
     rows = [(sizes, "; ".join(titles), reason) for (sizes, reason), titles in groups.items()]
     return Table(("N", "method", "reason"), rows, "Refused")
 
 
 def summary(study: ReductionStudy) -> list[str]:
     """What came out, in three sentences."""
-    chosen = [(s.points[i], s) for s in study.sweeps if (i := nearest(s.points)) is not None]
-    if not chosen:
+    if not (chosen := by_error(study.sweeps)):
         return ["No method has a stable model."]
-    point, s = min(chosen, key=lambda pair: pair[0].error_deformation)
-    told = [
-        f"At N = {point.N} the most accurate stable model is {s.method.title}: its deformation is "
-        f"{point.error_deformation:.2%} off the full run."
-    ]
-    speed = next((v for v in study.speeds if v.method == s.method), None)
-    if speed is not None:
-        told.append(
-            f"It runs {speed.speedup_same_model:.3g} times as fast as the full model, and "
-            f"{speed.speedup_new_parameter:.3g} times at a new parameter."
-        )
+    s, point = chosen[0]
+    speed = next(v for v in study.speeds if v.method == s.method)
     held = [s for s in study.sweeps if s.points and all(p.stable for p in s.points)]
-    return [*told, f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried."]
+    return [
+        f"At N = {point.N} the most accurate stable model is {s.method.title}: its deformation is "
+        f"{point.error_deformation:.2%} off the full run.",
+        f"It runs {speed.speedup_same_model:.3g} times as fast as the full model, and "
+        f"{speed.speedup_new_parameter:.3g} times at a new parameter.",
+        f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried.",
+    ]
 
 
 def time_cells(
@@ -154,10 +140,10 @@ def time_cells(
     return *seconds, short(again, 3), short(new, 3), "never" if runs is None else str(math.ceil(runs))
 
 
-def time_table(speeds: Sequence[Speed], narrow: bool = False) -> Table:
+def time_table(study: ReductionStudy, narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
     rows = []
-    for s in speeds:
+    for s in study.speeds:
         p, pays = s.point, (s.speedup_same_model, s.speedup_new_parameter, s.break_even_runs)
         cells = time_cells(p.time_offline, p.time_setup, p.time_online, pays)
         rows.append((title_of(s.method, narrow), _size(p), *cells))
@@ -186,20 +172,6 @@ def box_note(box: BoxTests) -> str:
         f"{text} Bases: from the scene's run, or from {len(box.trained_at)} runs with as many snapshots altogether "
         f"(reduction.train); parameters that trained one are no tests."
     )
-
-
-def box_point_tables(box: BoxTests) -> list[tuple[int, Table]]:
-    """For each N every parameter, with a column for each basis."""
-    tables = []
-    for N in sorted({m.model.N for m in box.models}):
-        shown = [(i, m) for i, m in enumerate(box.models) if m.model.N == N]
-        names = [m.method.title + (", several runs" if m.several else "") for _, m in shown]
-        rows = [
-            (f"{p.lam:.4g}", f"{p.mu:.4g}", "trained" if p.trained else "test", *(p.errors[i] for i, _ in shown))
-            for p in box.points
-        ]
-        tables.append((N, Table(("lambda [Pa]", "mu [Pa]", "", *names), rows)))
-    return tables
 
 
 def inner_note(sweeps: Sequence[MethodSweep]) -> str:
@@ -233,20 +205,26 @@ def sections(study: ReductionStudy, files: Sequence[Path]) -> list[Section]:
         error_table(study.sweeps, energy).section(text),
         Section("What holds", text="\n\n".join(study.findings)),
         Section("", figures=captioned(files, CAPTIONS)),
-        time_table(study.speeds).section("\n\n".join(study.speed_notes)),
+        time_table(study).section("\n\n".join(study.speed_notes)),
     ]
     refused = refused_table(study.sweeps)
-    if refused.rows:
-        parts.append(refused.section())
-    return [*parts, *box_sections(study)]
+    parts += [refused.section()] if refused.rows else []
+    return [*parts, *box_sections(study.box)]
 
 
-def box_sections(study: ReductionStudy) -> list[Section]:
+def box_sections(box: BoxTests) -> list[Section]:
     """Errors at other parameters: a summary, and one table for each N with a column for each basis."""
-    box = study.box
     if box.none:
         return [Section("Other parameters", f"No tests at other parameters: {box.none}.")]
-    text = box_note(box)
-    text += " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
-    points = [table.section(f"All parameters, N = {N}.") for N, table in box_point_tables(box)]
-    return [box_table(box).section(text), *points]
+    text = " Undamped vibrations of slightly wrong frequency drift out of phase, so errors grow with the run."
+    parts = [box_table(box).section(box_note(box) + text)]
+    for N in sorted({m.model.N for m in box.models}):
+        shown = [(i, m) for i, m in enumerate(box.models) if m.model.N == N]
+        names = (m.method.title + (", several runs" if m.several else "") for _, m in shown)
+        rows = [
+            (f"{p.lam:.4g}", f"{p.mu:.4g}", "trained" if p.trained else "test", *(p.errors[i] for i, _ in shown))
+            for p in box.points
+        ]
+        table = Table(("lambda [Pa]", "mu [Pa]", "", *names), rows)
+        parts.append(table.section(f"All parameters, N = {N}."))
+    return parts

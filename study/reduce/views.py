@@ -11,8 +11,9 @@ from softgrasp.fem.fields.picture import PictureMesh, gather_picture, vertex_dis
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.registry import PAPER_METHODS
+from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.replay import FullRun, replay_linear
-from softgrasp.study.reduce.result import MethodSweep, nearest
+from softgrasp.study.reduce.result import MethodSweep, Point, by_error, nearest
 
 MODES = 4  # a method
 FRAMES = 30
@@ -23,9 +24,7 @@ MANY_VERTICES = 200_000  # above, no pictures of the body
 class View:
     """One reduced model for the eye."""
 
-    title: str  # method and N
-    stable: bool  # of the model
-    error: float  # of its deformation
+    title: str  # method, N and error of the deformation
     states: Array  # vertex displacements of its run at the frames, (k, n, d) [m]
 
 
@@ -43,17 +42,18 @@ class Views:
     modes: tuple[tuple[str, Array, bool], ...]
 
 
-def compared(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
+def compared(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, Point]]:
     """First of the paper's methods and best of all at the N compared."""
     first = [s for s in sweeps if s.method.key in PAPER_METHODS and s.points][:1]
-    chosen = [(s, i) for s in first if (i := nearest(s.points, stable=False)) is not None]
-    stable = [(s, i) for s in sweeps if (i := nearest(s.points)) is not None]
-    stable.sort(key=_error)
-    return chosen + [f for f in stable[:1] if f[0] not in first]
+    chosen = [(s, p) for s in first if (p := nearest(s.points, stable=False)) is not None]
+    return chosen + [c for c in by_error(sweeps)[:1] if c[0] not in first]
 
 
-def _error(chosen: tuple[MethodSweep, int]) -> float:
-    return chosen[0].points[chosen[1]].error_deformation
+def modes_of(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, Point]]:
+    """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
+    fixed = [c for c in by_error(sweeps) if c[0].method.fixed]
+    old, new = ([c for c in fixed if (c[0].method.key in PAPER_METHODS) == paper] for paper in (True, False))
+    return old[:1] + ([c for c in new if not c[0].method.snapshots] or new)[:1]
 
 
 def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> Views | None:
@@ -66,15 +66,17 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
     steps = snapshots.steps[chosen]
     full = vertex_displacement(model, snapshots.Z[:n, chosen], snapshots.q_s[:, chosen])
     views = []
-    for s, i in compared(sweeps):
-        point, reduced = s.points[i], s.models[i]
+    for s, point in compared(sweeps):
+        reduced = s.models[point.N]
         with np.errstate(all="ignore"):  # an unstable model may overflow
             motion = replay_linear(reduced, model, run, allow_unstable=True)
             z, _ = reduced.reconstruct(reduced.at(), motion.x[steps].T, motion.v_s[steps].T)
         states = vertex_displacement(model, np.nan_to_num(z), motion.q_s[steps].T)
         if states is not None:
-            views.append(View(f"{s.method.title}, $N$ = {point.N}", point.stable, point.error_deformation, states))
-    modes = [(s.method.title, _modes(model, s, i), s.method.frame == "absolute") for s, i in modes_of(sweeps)]
+            state = "" if point.stable else ", unstable"
+            title = f"{s.method.title}, $N$ = {point.N}{state}\ndeformation error {point.error_deformation:.1e}"
+            views.append(View(title, states))
+    modes = [(s.method.title, _modes(model, s.models[p.N]), s.method.frame == "absolute") for s, p in modes_of(sweeps)]
     if picture is None or full is None:
         return None
     table = np.column_stack([run.trajectory.times, run.trajectory.q_s])
@@ -82,22 +84,12 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
     return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
 
 
-def modes_of(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, int]]:
-    """The best method of the paper that keeps the hand apart, and Craig-Bampton or else the best beyond the paper."""
-    fixed = sorted(((s, i) for s in sweeps if s.method.fixed and (i := nearest(s.points)) is not None), key=_error)
-    old = [f for f in fixed if f[0].method.key in PAPER_METHODS][:1]
-    new = [f for f in fixed if f[0].method.key not in PAPER_METHODS]
-    new = ([f for f in new if not f[0].method.snapshots] or new)[:1]
-    return old + new
-
-
-def _modes(model: Model, s: MethodSweep, i: int) -> Array | None:
+def _modes(model: Model, rom: ReducedModel) -> Array | None:
     """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
     layout = model.system.layout
-    lift = s.models[i].lift
-    if lift is None:
+    if rom.lift is None:
         return None
-    Q = lift.L_q[:, 2 * layout.n_s :]
+    Q = rom.lift.L_q[:, 2 * layout.n_s :]
     largest = layout.comm.allreduce(np.abs(Q).max(axis=0, initial=0.0), np.maximum)
     kept = np.flatnonzero(largest > 1e-12 * largest.max(initial=0.0))[:MODES]
     shapes = vertex_displacement(model, Q[:, kept] / largest[kept], np.zeros((layout.n_s, len(kept))))

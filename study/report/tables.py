@@ -52,12 +52,7 @@ class Table:
         return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
     def terminal(self, *, wrap: Sequence[int] = (), width: int = 80) -> rich.table.Table:
-        """The table for a terminal: numbers to the right.
-
-        Args:
-            wrap: columns that may break between words, the first of them first.
-            width: of the terminal.
-        """
+        """The table for a terminal of some width: numbers to the right; ``wrap``: columns that may break, in order."""
         table = rich.table.Table(box=None, padding=(0, 1, 0, 0), title=self.title or None, title_justify="left")
         columns = [[name, *(shown(row[i]) for row in self.rows)] for i, name in enumerate(self.header)]
         widths = [max(map(len, cells)) for cells in columns]
@@ -67,12 +62,8 @@ class Table:
             widths[i] -= max(0, min(excess, widths[i] - max(map(len, words))))
         for i, name in enumerate(self.header):
             right = bool(self.rows) and all(number(row[i]) for row in self.rows)
-            table.add_column(
-                escape(name),
-                justify="right" if right else "left",
-                no_wrap=i not in wrap,
-                width=widths[i] if i in wrap else None,
-            )
+            fixed = widths[i] if i in wrap else None
+            table.add_column(escape(name), justify="right" if right else "left", no_wrap=i not in wrap, width=fixed)
         for row in self.rows:
             table.add_row(*(escape(shown(cell)) for cell in row))
         return table

@@ -12,7 +12,7 @@ import shutil
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,10 +48,6 @@ def _module(name: str) -> Any:
     return importlib.import_module(name)
 
 
-def _dotted(version: Sequence[int]) -> str:
-    return ".".join(map(str, version))
-
-
 def check_python() -> Check:
     """Python 3.12 or newer."""
     ok = sys.version_info >= (3, 12)
@@ -69,14 +65,15 @@ def check_petsc() -> Check:
     """PETSc with real double scalars."""
     petsc, np = _module("petsc4py.PETSc"), _module("numpy")
     scalar, integer = np.dtype(petsc.ScalarType), np.dtype(petsc.IntType)
-    value = f"{_dotted(petsc.Sys.getVersion())}, scalar {scalar.name}, {8 * integer.itemsize}-bit int"
+    version = ".".join(map(str, petsc.Sys.getVersion()))
+    value = f"{version}, scalar {scalar.name}, {8 * integer.itemsize}-bit int"
     ok = scalar == np.float64
     return Check("PETSc", ok, value, "" if ok else "Use a PETSc that was built with real double scalars.")
 
 
 def check_slepc() -> Check:
     """SLEPc."""
-    return Check("SLEPc", True, _dotted(_module("slepc4py.SLEPc").Sys.getVersion()))
+    return Check("SLEPc", True, ".".join(map(str, _module("slepc4py.SLEPc").Sys.getVersion())))
 
 
 def _family(text: str) -> str:

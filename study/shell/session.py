@@ -102,19 +102,13 @@ class Session:
     def write(
         self, scene: Scene, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True
     ) -> list[Path]:
-        """Write result.json and scene.toml, then pictures, tables and report.html on rank 0. Collective.
+        """Write result.json and scene.toml, then pictures, tables and report.html; the files on rank 0. Collective.
 
-        Files of the run before in this folder that are not written again are removed. On rank 0 ``result`` takes the
-        names of all files, and with ``clock`` the times ``total`` and ``pictures`` and the seconds of CPU.
+        ``page`` draws and composes the rest, on rank 0 only, so it must not communicate. Files of the run before in
+        this folder that are not written again are removed. On rank 0 ``result`` takes the names of all files, and with
+        ``clock`` the times ``total`` and ``pictures`` and the seconds of CPU.
 
-        Args:
-            scene: as it was run.
-            result: what result.json holds, equal on all ranks; rank 0 adds the wait for pictures and the CPU times.
-            page: draws and composes the rest; called on rank 0 only, so it must not communicate.
-            clock: add the times.
-
-        Returns:
-            The files, on rank 0. Raises OSError on all ranks: the folder cannot be written.
+        Raises OSError on all ranks: the folder cannot be written.
         """
         files: list[Path] = []
         with agree(self.comm):

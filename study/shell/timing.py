@@ -34,10 +34,7 @@ def warm(count: int) -> int:
 
 
 def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
-    """Call every method once a repeat, in rotated order, and keep what each returns. Collective if the methods are.
-
-    Noise of the machine then hits all methods alike, and none is always the first.
-    """
+    """Call every method once a repeat, in rotated order, so that noise hits all alike; what each returned."""
     samples: dict[str, list[float]] = {name: [] for name in methods}
     for i in range(repeats):
         for name in rotated(methods, i):

@@ -12,8 +12,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import Model, build
 from softgrasp.reduction.certified.model import Box, CertifiedModel
+from softgrasp.study.reduce.certify import BoxCheck, check_box, sizes_of
 from softgrasp.study.reduce.certify import tests_table as table_of
-from softgrasp.study.reduce.certify_check import BoxCheck, check_box, sizes_of
 from softgrasp.study.reduce.certify_plots import draw
 from tests.helpers.certified import KELVIN_VOIGT, error_to, full_at, ritz
 from tests.helpers.models import make_scene

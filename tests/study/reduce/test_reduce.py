@@ -129,7 +129,7 @@ def dense_error(against: FullRun, name: str, N: int) -> tuple[float, float]:
     system, snapshots = against.model.system, against.snapshots
     layout = system.layout
     swept = sweep(name, against, wanted(against, [N]))
-    model = swept.models[0]
+    model = swept.models[N]
     reduced = model.at()
     found = replay_linear(model, against.model, against, allow_unstable=True)
     T, G = gather_rows(layout, system.T), gather_rows(layout, system.G)
@@ -413,7 +413,7 @@ def test_dimension_counts_every_column_of_every_method(coarse: FullRun) -> None:
     for name in (*PAPER_METHODS, *FURTHER):
         swept = sweep(name, coarse, wanted(coarse, [10]))
         (p,) = swept.points
-        assert (p.N, swept.models[0].N, sum(p.split)) == (10, 10, p.N_tissue), name
+        assert (p.N, swept.models[10].N, sum(p.split)) == (10, 10, p.N_tissue), name
         assert p.N_tissue == (10 - hand if METHODS[name].fixed else 10), name
 
 

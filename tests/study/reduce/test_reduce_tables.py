@@ -26,10 +26,10 @@ def point(N: int, error: float, stable: bool = True, online: float = 1e-3) -> Po
 
 def test_choice_of_points() -> None:
     points = [point(4, 1e-1), point(12, 1e-3), point(14, 1e-9, stable=False), point(30, float("nan")), point(40, 1e-4)]
-    assert nearest(points) == 1
-    assert nearest(points, stable=False) == 2
-    assert best(points) == 4
-    assert kept_points(points) == {1, 2, 3, 4}  # nearest to 14, all and stable, nearest to 30, best
+    assert nearest(points) is points[1]
+    assert nearest(points, stable=False) is points[2]
+    assert best(points) is points[4]
+    assert kept_points(points) == {12, 14, 30, 40}  # nearest to 14, all and stable, nearest to 30, best
     assert least_size(points, 1e-2) == 12
     assert least_size(points, 1e-6) is None  # an unstable model does not count
     assert stability(points) == "not 14"
