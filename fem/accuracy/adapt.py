@@ -85,7 +85,7 @@ def _effectivity(old: Array, error: Array, new: Array) -> float:
     return float(np.clip(value, SEEN, MOST_ACCEPTED))
 
 
-def judged(model: Model) -> MeshEstimate:
+def estimated(model: Model) -> MeshEstimate:
     """The estimate of a model that was built without one, against the tolerance of its scene if it has one. Collective.
 
     Raises SolverError, SceneError, MeshError: see :func:`softgrasp.fem.accuracy.estimate.estimate`.

@@ -39,7 +39,7 @@ class MeshEstimate:
     omega: tuple[float, ...]
     time_error: float  # error of the time steps, relative like ``estimate`` [1]
     shift: float  # largest distance of the ends of the zone held from ``contact.box`` [m]
-    n_e: int  # tissue unknowns of the mesh judged
+    n_e: int  # tissue unknowns of the mesh that was estimated
     finer: int  # tissue unknowns of the mesh it was compared with
     by: str  # "order" (elements of the next order on the same cells) or "graded" (another mesh, which meets the zone)
     tolerance: float | None = None  # of the scene, or None

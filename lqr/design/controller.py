@@ -63,7 +63,7 @@ def certified_controller(design: Design, basis: BasisGains | None, order: int | 
     """See :func:`make_controller`; with gains that are there already. Collective.
 
     The states are [q_s, v_s, eta, eta'] with z = V eta, V the modes of the basis. The gain that the filter W'z of these
-    modes expands acts on them only, so that the small controller is the gain that was judged.
+    modes expands acts on them only, so that the small controller is the gain that was checked.
 
     Args:
         basis: the a-priori gains; None where there are none.
@@ -86,10 +86,10 @@ def certified_controller(design: Design, basis: BasisGains | None, order: int | 
         layout_hash(layout),
         {"scene": scene.name, "method": method, "N": plant.N},
     )
-    law = design.judge.law
+    law = design.gain_check.law
     if law is None or not law.every:  # the scene's own law acts within the step, which no robot can
         law = Sampling(controller.period, 1)
-    radius = design.judge.ticks.controller(controller, law)
+    radius = design.gain_check.ticks.controller(controller, law)
     if not radius.value < design.largest_radius:
         raise NoController(
             f"{loop_words(law)}, its loop has the spectral radius {radius.value:.3g}, which must be below 1"
@@ -122,5 +122,5 @@ def a_priori_shapes(design: Design, basis: BasisGains, N: int) -> Array:
 
 def blind(design: Design) -> bool:
     """Whether the optimal gain is one of the hand alone: the outputs see nothing of the tissue. Collective."""
-    K = design.judge.K
+    K = design.gain_check.K
     return norm(design.problem, Block(np.zeros_like(K.hand), K.tall)) <= ROUNDING * norm(design.problem, K)

@@ -16,7 +16,7 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
-from softgrasp.lqr.reduced.riccati import GainJudge
+from softgrasp.lqr.reduced.riccati import GainCheck
 from softgrasp.lqr.riccati import Method, choose, modal_lqr, solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality, ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
@@ -38,7 +38,7 @@ class Design:
     start: PlantState  # where it begins
     error: Block  # start minus target, one column
     diagnosis: Diagnosis  # what was known before the solve
-    judge: GainJudge  # compares gains with the optimal one
+    gain_check: GainCheck  # compares gains with the optimal one
     quality: LoopQuality  # closed loop of the full plant under the optimal gain
     modal: bool  # the gain controls some modes only
 
@@ -102,14 +102,14 @@ def design(
     with watch.stage("judge"):
         error = (start - target.state).block
         loop = ModalLoop(plant, min(SOME_MODES, plant.layout.n_e))
-        judge = GainJudge(plant, solution, error, loop, sampling(model))
-        quality = judge.quality(solution.gain)
+        gain_check = GainCheck(plant, solution, error, loop, sampling(model))
+        quality = gain_check.quality(solution.gain)
     if quality.certified and not quality.abscissa < 0 and not modal:
         raise SolverError(
             f"the gain leaves the closed loop with the spectral abscissa {quality.abscissa:.1e}/s, which must be "
             "negative; add damping, or try another control.method"
         )
-    result = Design(model, plant, solution, target, start, error, diagnosis, judge, quality, modal)
+    result = Design(model, plant, solution, target, start, error, diagnosis, gain_check, quality, modal)
     with watch.stage("judge"):
         _require_sampled(result)
     return result
@@ -139,11 +139,11 @@ def loop_words(law: Sampling) -> str:
 
 def _require_sampled(design: Design) -> None:
     """Refuse a held loop that is unstable, with a rate that is not. Collective."""
-    judge, radius, time = design.judge, design.quality.sampled, design.model.scene.time
-    law, largest = judge.law, design.largest_radius
+    gain_check, radius, time = design.gain_check, design.quality.sampled, design.model.scene.time
+    law, largest = gain_check.law, design.largest_radius
     if law is None or not law.every or radius is None or radius.value < largest:
         return
-    good = judge.ticks.stable_rate(judge.K, law, design.model.scene.time_end, largest)
+    good = gain_check.ticks.stable_rate(gain_check.K, law, design.model.scene.time_end, largest)
     advice = "no rate makes it stable"
     if good is not None:
         steps = "" if good.steps == time.steps else f" with time.steps = {good.steps}"

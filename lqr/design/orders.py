@@ -50,7 +50,7 @@ def orders(design: Design) -> tuple[list[int], str]:
     """Orders to try and, where judging a gain takes long, why they are few."""
     control, layout = design.model.scene.control, design.problem.layout
     every = list(ORDERS) if control is None else sorted(set(control.N))
-    dense = design.judge.loop.complete and layout.n_e > WHOLE_SPECTRUM
+    dense = design.gain_check.loop.complete and layout.n_e > WHOLE_SPECTRUM
     if (layout.states <= MANY_STATES and not dense) or len(every) <= FEW_ORDERS:
         return every, ""
     fast = [N for N in every if fast_order(layout.n_s) >= N]
@@ -63,7 +63,7 @@ def orders(design: Design) -> tuple[list[int], str]:
 def reduce_gains(
     design: Design, orders: Sequence[int], notify: Notify | None = None, names: Sequence[str] = tuple(BASES)
 ) -> tuple[BasisGains, ...]:
-    """Gains of the reduced Riccati equations over their orders, judged on the full plant. Collective.
+    """Gains of the reduced Riccati equations over their orders, checked on the full plant. Collective.
 
     Args:
         orders: of the reduced equations; those that a basis has not are left out.
@@ -79,7 +79,7 @@ def reduce_gains(
             continue
         reports = []
         for j, N in enumerate(family.orders(orders), 1):
-            reports.append(design.judge.report(family.at(N)))
+            reports.append(design.gain_check.report(family.at(N)))
             if notify is not None:
                 notify(i * len(orders) + j, len(names) * len(orders))
         bases.append(BasisGains(name, family, tuple(reports)))

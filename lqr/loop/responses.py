@@ -1,4 +1,4 @@
-"""What the open plant answers to one step of every input: all gains of a plant are judged with these few runs."""
+"""What the open plant answers to one step of every input: all gains of a plant are compared with these few runs."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
     frequencies between the last mode and the highest one, until the gain changes by less than the tolerance between
     two spaces, or the space holds all of the tissue. The small problem keeps the second-order form and the energy, so
     it is stable whenever the tissue is damped. The residual of such a solution is large although the gain is right; it
-    is reported, not judged.
+    is reported, not checked.
     """
 
     method = "galerkin"

@@ -15,7 +15,7 @@ from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
-from softgrasp.lqr.reduced.riccati import NAN, GainJudge, GainQuality, full_gain, project_plant
+from softgrasp.lqr.reduced.riccati import NAN, GainCheck, GainQuality, full_gain, project_plant
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
 
@@ -115,7 +115,7 @@ def retuned_gain(
     except ControlError as error:
         return RetunedGain(materials, reason=str(error))
     problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
-    judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
-    return judge.with_quality(
+    gain_check = GainCheck(problem, solve(problem), start, ModalLoop(problem, modes), law)
+    return gain_check.with_quality(
         RetunedGain(materials, tuned.seconds), full_gain(retuner.problem, retuner.basis, tuned.P_N)
     )

@@ -1,4 +1,4 @@
-"""The paper's reduced Riccati equations: project, solve, and judge the gain on the full plant."""
+"""The paper's reduced Riccati equations: project, solve, and check the gain on the full plant."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def gain_error(problem: RiccatiProblem, gain: Gain, gain_hat: Gain) -> float:
     return norm(problem, difference) / norm(problem, gain_to_absolute(system, K))
 
 
-class GainJudge:
+class GainCheck:
     """Compares reduced gains with the optimal one on the full plant.
 
     Args:
@@ -206,7 +206,7 @@ class GainJudge:
         if self.law is None:
             return quality
         if self.law.every:
-            return replace(quality, sampled=self.ticks.judge(K, self.law))
+            return replace(quality, sampled=self.ticks.radius_of(K, self.law))
         radius = SampledRadius(midpoint_radius(quality.poles, self.law.dt), quality.certified, quality.exact)
         return replace(quality, sampled=radius)
 

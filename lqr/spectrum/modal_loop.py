@@ -94,7 +94,7 @@ class ModalLoop:
         the cancellation of J(K_hat) - J(K).
 
         Args:
-            K: the gain to judge, transposed, hand-relative.
+            K: the gain to check, transposed, hand-relative.
             best: the optimal gain.
             x: start minus target, one column.
             optimal: J(K) from there.

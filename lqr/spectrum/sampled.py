@@ -124,7 +124,7 @@ class SampledLoop:
         self.loop = loop
         self.lowest: tuple[Array, Array] | None = None
 
-    def judge(self, K: Block, law: Sampling) -> SampledRadius:
+    def radius_of(self, K: Block, law: Sampling) -> SampledRadius:
         """Radius of a held loop under a gain, transposed, hand-relative. Collective."""
         answer = self._radius(self._parts(K), law)
         if answer.certified or self.n_e > DENSE_LIMIT:

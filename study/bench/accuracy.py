@@ -145,7 +145,8 @@ def measure(name: str, sets: list[str], exact: Array, cost: float) -> MeshPoint:
         name, model.system.layout.n_e, median(lambda: build(scene, comm=comm)), median(lambda: simulate(model)),
         off(deformation(full), exact), median(lambda: replay_linear(rom, model, full)),
         off(small.outputs - full.outputs_rigid, exact),
-        solution.seconds.get("total", sum(solution.seconds.values())), abs(feedback.judge.optimal - cost) / abs(cost),
+        solution.seconds.get("total", sum(solution.seconds.values())),
+        abs(feedback.gain_check.optimal - cost) / abs(cost),
         solution.counts.get("solves", 0), solution.residual,
     )  # fmt: skip
 
@@ -188,7 +189,7 @@ def main(
     """Measure every mesh and print the tables."""
     console = driver.open_console(150)
     exact = deformation(simulate(build(paper(graded(3, REFERENCE)), comm=MPI.COMM_WORLD)))
-    cost = controlled(graded(3, REFERENCE_COST)).judge.optimal
+    cost = controlled(graded(3, REFERENCE_COST)).gain_check.optimal
     reached, rows = [reach(goal, exact) for goal in ASKED], []
     for name, sets in meshes().items():
         rows.append(measure(name, sets, exact, cost))

@@ -143,7 +143,7 @@ def run_loops(design: Design, bases: Sequence[BasisGains], plan: LoopPlan, frame
 
 def pole_sets(study: ControlStudy) -> dict[str, np.ndarray]:
     """Poles with the optimal and the a-priori gain and without any, on the lowest modes. Collective."""
-    design, loop, basis = study.design, study.design.judge.loop, a_priori(study.bases)
+    design, loop, basis = study.design, study.design.gain_check.loop, a_priori(study.bases)
     K = design.gain.block
     sets = {
         "without feedback": loop.poles(K.times(np.zeros((K.columns, K.columns)))),
@@ -217,7 +217,7 @@ def _at(
         return solutions[key]
 
     try:
-        point = retuned_gain(tuner, materials, full, design.error, modes, design.judge.law)
+        point = retuned_gain(tuner, materials, full, design.error, modes, design.gain_check.law)
     except (ControlError, SolverError) as failed:  # the full solution, not the re-tuned one
         return RetunedGain(materials, reason=f"no reference: {failed}")
     if point.reason:

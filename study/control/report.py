@@ -56,7 +56,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
         ("method", solution.summary),
         ("rank, Newton steps, solves", ", ".join(counts)),
         ("true relative residual", f"{solution.residual:.1e}"),
-        ("optimal cost from the start", f"{study.design.judge.optimal:.6g}"),
+        ("optimal cost from the start", f"{study.design.gain_check.optimal:.6g}"),
         *_spectrum(study.design),
         ("gain, body displaced", displaced),
         ("gain, body moving", moving),
@@ -90,7 +90,7 @@ def result_rows(study: GainStudy, seconds: Mapping[str, float]) -> list[tuple[st
 
 def summary(study: GainStudy) -> list[str]:
     """What came out, in three sentences."""
-    design, optimal = study.design, study.design.judge.optimal
+    design, optimal = study.design, study.design.gain_check.optimal
     first = f"The Riccati equation is solved to the relative residual {design.solution.residual:.1e}."
     cost = f"The move costs {optimal:.4g} at least; the abscissa of its loop is {design.quality.abscissa:.3g} 1/s."
     if isinstance(study, ControlStudy):

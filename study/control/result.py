@@ -138,7 +138,7 @@ class GainStudy:
             "rank": solution.rank,
             **{key: solution.counts.get(key, 0) for key in ("newton_steps", "adi_steps", "solves")},
             "residual": solution.residual,
-            "optimal_cost": d.judge.optimal,
+            "optimal_cost": d.gain_check.optimal,
             "gain_translation": displaced.tolist(),
             "gain_rigid_velocity": moving.tolist(),
             "identity_translation": translation_defect(problem, solution),

@@ -19,7 +19,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Company:
-    """One effect judged beside all others that are advised."""
+    """One effect tried beside all others that are advised."""
 
     change: Change  # of the outputs when it alone is switched, the others as advised
     control: float | None  # the same under a force [1]; None when that is no question
@@ -108,7 +108,7 @@ class EffectResult:
     change: Change | None  # of the outputs of the run; None when not tried
     # change of the outputs when a force moves the hand; None when that is no question, or not needed to judge
     control: float | None
-    company: Company | None  # the same judged again beside all other advised effects; None when not tried
+    company: Company | None  # the same tried again beside all other advised effects; None when not tried
     cost: Cost | None  # None when not tried
     proof: OffProof | None  # for an effect that is off
 

@@ -140,7 +140,7 @@ class Experiments:
 
 @dataclass(frozen=True)
 class Together:
-    """All effects judged again."""
+    """All effects tried again."""
 
     on: tuple[str, ...]  # effects that are advised, those that cannot be tried as they are
     company: dict[str, Company]  # of each effect that was tried

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgrasp.fem.accuracy.adapt import judged
+from softgrasp.fem.accuracy.adapt import estimated
 from softgrasp.fem.accuracy.estimate import next_unknowns
 from softgrasp.fem.errors import SceneError, SoftgraspError
 
@@ -46,7 +46,7 @@ def estimate_error(model: Model, seconds: float, certify: bool) -> tuple[MeshEst
     if not certify and cost > max(CHEAP, seconds):
         return None, []
     try:
-        return judged(model), []
+        return estimated(model), []
     except SoftgraspError as error:
         if certify:
             raise

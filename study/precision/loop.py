@@ -108,7 +108,7 @@ class LoopSweep:
         return make_family(name, self.runs.problem, self.runs.design.solution.factor)
 
     def _exact(self, what: Feedback) -> Array:
-        return exact_outputs(self.runs, self.runs.design.judge.loop, self.gain(what), self.counts[0])
+        return exact_outputs(self.runs, self.runs.design.gain_check.loop, self.gain(what), self.counts[0])
 
     # --- reference
 
@@ -128,14 +128,14 @@ class LoopSweep:
 
         def measure() -> list[LoopReference]:
             design, most, best = self.runs.design, self.counts[0], Feedback()
-            true, loop, columns = self.exact(best, most), design.judge.loop, design.problem.columns
+            true, loop, columns = self.exact(best, most), design.gain_check.loop, design.problem.columns
             modes, error = len(loop.plant.omega), 0.0
             if not loop.complete:
                 coarse = exact_outputs(self.runs, ModalLoop(design.problem, modes // 2), self.gain(best), most)
                 error = errors_of(coarse, true, columns)[0]
             run = self._full(LoopSetting(best), most)[0]
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
-            return [LoopReference(error, modes, loop.complete, design.judge.optimal, rest)]
+            return [LoopReference(error, modes, loop.complete, design.gain_check.optimal, rest)]
 
         return self.cache.point("closed loop, reference", "loop", {"reference": self.counts}, LoopReference, measure)[0]
 
@@ -211,7 +211,7 @@ class LoopSweep:
 
         def measure() -> list[LoopPoint]:
             gain = what.gain
-            stable = not gain.basis or self.runs.design.judge.report(self.family(gain.basis).at(gain.N)).stable
+            stable = not gain.basis or self.runs.design.gain_check.report(self.family(gain.basis).at(gain.N)).stable
             return [self._point(what, steps, stable) for steps in self.counts]
 
         key = {"controller": what.label, "counts": self.counts, "repeats": self.runs.repeats}

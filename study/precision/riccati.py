@@ -109,7 +109,7 @@ class ControlRuns:
 
     @cached_property
     def design(self) -> Design:
-        """The optimal feedback as ``softgrasp control`` makes it, with its judge."""
+        """The optimal feedback as ``softgrasp control`` makes it, with its gain check."""
         return design(self.model, Stopwatch(self.layout.comm))
 
     @cached_property
@@ -265,7 +265,7 @@ def _family(runs: ControlRuns, name: str) -> list[ReducedRiccatiPoint]:
 
 def _order(runs: ControlRuns, family: BasisFamily, N: int, time_basis: float, before: float) -> ReducedRiccatiPoint:
     """One reduced equation: cost of its gain, median seconds to solve it, and those to project and lift. Collective."""
-    report = with_time(runs.problem, runs.design.judge.report(family.at(N)))
+    report = with_time(runs.problem, runs.design.gain_check.report(family.at(N)))
     seconds, lift = float("inf"), 0.0
     if not report.reason:
         solutions: list[ReducedRiccati] = []
@@ -291,7 +291,7 @@ def _reference(runs: ControlRuns) -> ReducedReference:
     solution = runs.design.solution
     other = runs.reference.other_than(solution.method)
     gap = gain_error(runs.problem, other.gain, solution.gain)
-    return ReducedReference(solution.summary, solution.residual, gap, runs.design.judge.optimal)
+    return ReducedReference(solution.summary, solution.residual, gap, runs.design.gain_check.optimal)
 
 
 def reduced_riccati_slopes(points: Sequence[ReducedRiccatiPoint], reference_error: float | None) -> list[Slope]:

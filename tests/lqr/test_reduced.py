@@ -21,7 +21,7 @@ from softgrasp.lqr.plant.operators import costates_to_absolute, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, energy_scaled, make_family
 from softgrasp.lqr.reduced.retune import Retuner, retuned_gain
-from softgrasp.lqr.reduced.riccati import GainJudge, full_gain, project_plant, reduce_riccati
+from softgrasp.lqr.reduced.riccati import GainCheck, full_gain, project_plant, reduce_riccati
 from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.models import (
@@ -143,7 +143,7 @@ def test_reduced_equation_is_the_papers(name: str) -> None:
     C = outputs_in_papers_order(problem)
     P_N = solve_scipy(V.T @ E @ V, V.T @ A @ V, V.T @ B, C @ V)
     P_hat = V @ P_N @ V.T
-    report = GainJudge(problem, solution, hand_start(problem, -TARGET)).report(family(name).at(N))
+    report = GainCheck(problem, solution, hand_start(problem, -TARGET)).report(family(name).at(N))
     error = np.linalg.norm(P - P_hat) / np.linalg.norm(P)
     assert abs(report.error_P - error) < 1e-6 * (1 + error)  # SciPy's accuracy
     K, K_hat = -B.T @ P @ E, -B.T @ P_hat @ E
@@ -169,11 +169,11 @@ def test_marks_come_from_the_spectrum_of_the_full_closed_loop() -> None:
     """Every abscissa equals that of E^-1 (A + B K_hat) by scikit-fem and LAPACK; stable and unstable ones occur."""
     _, problem, solution = plant()
     E, A, B, _ = matrices()
-    judge = GainJudge(problem, solution, hand_start(problem, -TARGET))
+    gain_check = GainCheck(problem, solution, hand_start(problem, -TARGET))
     seen = set()
     for name in ("pod", "pod_fixed_solid", "structured"):
         for N in family(name).orders(range(6, 37, 6)):
-            report = judge.report(family(name).at(N))
+            report = gain_check.report(family(name).at(N))
             if report.reason:
                 assert not report.stable
                 continue
@@ -188,9 +188,9 @@ def test_marks_come_from_the_spectrum_of_the_full_closed_loop() -> None:
 
 def test_a_gain_that_drives_away_is_marked_unstable() -> None:
     _, problem, solution = plant()
-    judge = GainJudge(problem, solution, hand_start(problem, -TARGET))
+    gain_check = GainCheck(problem, solution, hand_start(problem, -TARGET))
     away = Gain.of_block(solution.gain.block.times(-np.eye(2)))
-    good, bad = judge.quality(solution.gain), judge.quality(away)
+    good, bad = gain_check.quality(solution.gain), gain_check.quality(away)
     assert good.stable
     assert good.cost_excess == 0
     assert bad.abscissa > 0.1  # 0.43: no rounding
@@ -205,8 +205,8 @@ def test_the_road_of_large_scenes_says_the_same() -> None:
     """Certificate and lowest modes against all modes; without a certificate all modes decide."""
     _, problem, solution = plant()
     start = hand_start(problem, -TARGET)
-    whole = GainJudge(problem, solution, start)
-    large = GainJudge(problem, solution, start, ModalLoop(problem, 20))
+    whole = GainCheck(problem, solution, start)
+    large = GainCheck(problem, solution, start, ModalLoop(problem, 20))
     assert whole.loop.complete
     assert not large.loop.complete
     for name, N in (("pod", 12), ("pod", 20), ("structured", 8), ("pod_decomposed", 8)):
@@ -221,14 +221,14 @@ def test_cost_excess_against_a_dense_lyapunov_equation() -> None:
     """J(K_hat) and J(K) each by SciPy in absolute coordinates, from the scene's start."""
     _, problem, solution = plant()
     E, A, B, P = matrices()
-    judge = GainJudge(problem, solution, hand_start(problem, -TARGET))
+    gain_check = GainCheck(problem, solution, hand_start(problem, -TARGET))
     C, n_s = outputs_in_papers_order(problem), problem.layout.n_s
     x = np.zeros(len(E))
     x[:n_s] = -TARGET
     tissue = -np.tile(TARGET, problem.layout.n_e // 2)
     x[2 * n_s : 2 * n_s + problem.layout.n_e] = tissue
     optimal = x @ E.T @ P @ E @ x
-    assert abs(judge.optimal / optimal - 1) < 1e-10  # rounding of P
+    assert abs(gain_check.optimal / optimal - 1) < 1e-10  # rounding of P
     assert abs(np.sum((solution.factor.hand[:2].T @ TARGET) ** 2) / optimal - 1) < 1e-10  # rounding of P, as above
     for name, N in (("pod", 12), ("pod_decomposed", 8), ("structured", 6)):
         gain = reduce_riccati(problem, family(name).at(N)).gain
@@ -237,15 +237,16 @@ def test_cost_excess_against_a_dense_lyapunov_equation() -> None:
         Y = scipy.linalg.solve_continuous_lyapunov(F.T, -(C.T @ C + K.T @ K))
         excess = x @ Y @ x / optimal - 1
         assert excess > -1e-6  # cancellation, as below
-        assert abs(judge.quality(gain).cost_excess - excess) < 1e-6 * (1 + excess)  # cancellation in SciPy's numbers
+        near = 1e-6 * (1 + excess)  # cancellation in SciPy's numbers
+        assert abs(gain_check.quality(gain).cost_excess - excess) < near
 
 
 def test_structured_basis_needs_no_solution_and_converges() -> None:
     _, problem, solution = plant()
     nothing = Block(np.zeros((4, 0)), np.zeros((2 * problem.layout.n_local, 0)))
-    judge = GainJudge(problem, solution, hand_start(problem, -TARGET))
+    gain_check = GainCheck(problem, solution, hand_start(problem, -TARGET))
     modes = make_family("structured", problem, nothing)
-    reports = [judge.report(modes.at(N)) for N in (4, 8, 16, 32)]
+    reports = [gain_check.report(modes.at(N)) for N in (4, 8, 16, 32)]
     errors = [r.error_K for r in reports]
     assert all(r.stable for r in reports)
     assert errors[-1] < 1e-4 < 1e-2 < 1e3 * errors[0]  # measured: 7e-3, 4e-5, 2e-6, 8e-7
@@ -302,9 +303,9 @@ def test_orders_and_names_are_checked() -> None:
     with pytest.raises(ControlError, match=r"has no order N = 7; choose 4 to .* in steps of 2"):
         family("pod_decomposed").at(7)
     with pytest.raises(ControlError, match="the start is the target"):
-        GainJudge(problem, solution, hand_start(problem, [0, 0]))
-    judge = GainJudge(problem, solution, hand_start(problem, -TARGET))
-    nothing = judge.report(family("pod_fixed_solid").at(4))  # the hand alone, in absolute coordinates, is not seen
+        GainCheck(problem, solution, hand_start(problem, [0, 0]))
+    gain_check = GainCheck(problem, solution, hand_start(problem, -TARGET))
+    nothing = gain_check.report(family("pod_fixed_solid").at(4))  # the hand alone, in absolute coordinates, is not seen
     assert "not detectable" in nothing.reason
     assert not nothing.stable
 
@@ -315,14 +316,14 @@ def test_certified_abscissa_of_large_scenes(two_way: bool) -> None:
     _, problem, solution = plant(two_way)
     gain = solution.gain.block
     found = abscissa(problem, Gain.of_block(gain))
-    values = GainJudge(problem, solution, hand_start(problem, -TARGET)).loop.poles(gain)
+    values = GainCheck(problem, solution, hand_start(problem, -TARGET)).loop.poles(gain)
     inside = values[np.abs(values) <= found.radius]
     assert abs(found.value - inside.real.max()) < 1e-7  # tolerance 1e-9 of eigenvalues of size 10
     assert found.stable
     assert abs(found.value - values.real.max()) < 1e-7  # as above
     assert found.bound < 1
     # the true largest gain outside the circle stays below the bound
-    space = GainJudge(problem, solution, hand_start(problem, -TARGET)).loop
+    space = GainCheck(problem, solution, hand_start(problem, -TARGET)).loop
     k, one = space.gain(gain), np.eye(len(space.A))
     largest = max(
         np.linalg.norm(k @ np.linalg.solve(1j * w * one - space.A, space.B), 2)

@@ -11,7 +11,7 @@ import scipy.linalg
 import skfem
 from mpi4py import MPI
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance, judged
+from softgrasp.fem.accuracy.adapt import build_to_tolerance, estimated
 from softgrasp.fem.accuracy.estimate import cell_products, difference, estimate, indicators, next_order, prolong
 from softgrasp.fem.accuracy.small import reduced
 from softgrasp.fem.errors import SceneError
@@ -139,10 +139,10 @@ def test_passes_end_at_most_and_say_so(comm: MPI.Intracomm) -> None:
     data["tissue"]["refine"] = {"tolerance": 1e-2, "passes": 0}
     model = build_to_tolerance(Scene.model_validate(data), comm)
     assert model.accuracy is None  # the a-priori mesh
-    result = judged(model)
+    result = estimated(model)
     assert (result.tolerance, result.obstacle) == (1e-2, "")  # about met, which is no failure
     data["tissue"] |= {"refine": {"tolerance": 1e-2, "passes": 0, "most": 500}}
-    result = judged(build(Scene.model_validate(data), comm=comm))
+    result = estimated(build(Scene.model_validate(data), comm=comm))
     assert result.obstacle == "tissue.refine.passes = 0 allow no better mesh"
 
 

@@ -17,7 +17,7 @@ from softgrasp.lqr.loop.gap import DualityGap, duality_gaps
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import make_family
-from softgrasp.lqr.reduced.riccati import GainJudge, GainReport, reduce_riccati
+from softgrasp.lqr.reduced.riccati import GainCheck, GainReport, reduce_riccati
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.loop import CASES, Setup, setup
 from tests.helpers.models import local_rows, make_scene, same_everywhere
@@ -108,10 +108,10 @@ def test_reduced_gains_stay_below_their_bound() -> None:
     problem = make_problem(build(scene, comm=MPI.COMM_WORLD))
     solution = DenseRiccati().solve(problem)
     start = hand_start(problem, [-5.0, -3.0])
-    judge = GainJudge(problem, solution, start, ModalLoop(problem))
+    gain_check = GainCheck(problem, solution, start, ModalLoop(problem))
     family = make_family("structured", problem, solution.factor)
     gains = [reduce_riccati(problem, family.at(N)).gain for N in (4, 8, 12, 20)]
-    excess = np.array([judge.quality(gain).cost_excess for gain in gains])
+    excess = np.array([gain_check.quality(gain).cost_excess for gain in gains])
     assert 1e-12 < excess.min() < excess.max() < 1e-4  # above rounding, and a gain that is worth a bound
     alone = np.array(
         [duality_gaps(problem, [gain], start, 0.5, 600, solution.factor)[0].cost_excess_at_most for gain in gains]
@@ -133,8 +133,8 @@ def test_a_run_that_starts_at_its_target_costs_nothing_and_bounds_nothing() -> N
     case = setup("one_way")
     start, plan = hand_start(case.problem, [0.0, 0.0]), LoopPlan(DT, STEPS, settle=1.0)
     report = GainReport("structured", 4, 0.0, error_K=0.0, cost_excess=0.0, abscissa_full=-1.0, gain=case.gain)
-    (judged,) = with_bounds(case.problem, case.solution, [report], start, plan)
-    assert judged.cost_excess_at_most == np.inf
+    (bounded,) = with_bounds(case.problem, case.solution, [report], start, plan)
+    assert bounded.cost_excess_at_most == np.inf
 
 
 def test_a_gain_that_does_not_stabilise_has_no_bound() -> None:

@@ -62,11 +62,11 @@ def test_radius_is_that_of_the_dense_propagator(case: Setup, law: Sampling) -> N
     for factor in (0.1, 1.0, 12.0):
         K = block(case, factor * case.K)
         exact = radius(A_d, B_d, factor * case.K, law.delay)
-        found = whole.judge(K, law)
+        found = whole.radius_of(K, law)
         assert found.exact
         assert found.certified
         assert abs(found.value - exact) < 1e-9  # rounding of the eigenvalues of matrices with norms up to 1e3
-        kept = few.judge(K, law)
+        kept = few.radius_of(K, law)
         assert kept.certified, kept.reason
         assert (kept.value < 1) == (exact < 1)
         # the modes left out have a part of the gain, and where they decay slowest they are not in the value
@@ -93,7 +93,7 @@ def test_a_certificate_is_never_on_the_wrong_side() -> None:
             if found.certified:
                 assert (found.value < 1) == (exact < 1), (mode, size)
             seen.add((found.certified, exact < 1))
-            again = few.judge(block(case, K), law)
+            again = few.radius_of(block(case, K), law)
             assert again.certified
             assert again.stable == (exact < 1), (mode, size)
     assert {(True, True), (False, True), (False, False)} <= seen
@@ -127,7 +127,7 @@ def test_radius_tends_to_that_of_the_exponential() -> None:
     exact = radius(both[:n, :n], both[:n, n:], K, True)
     assert exact > 1.05
     loop, steps = SampledLoop(case.problem), np.array([8, 16, 32])
-    errors = [abs(loop.judge(block(case, K), Sampling(tick / k, int(k), True)).value - exact) for k in steps]
+    errors = [abs(loop.radius_of(block(case, K), Sampling(tick / k, int(k), True)).value - exact) for k in steps]
     order = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert abs(order - 2) < 0.1, f"order {order:.3f} of {errors}, 2 expected"  # next term at 8 steps
 
@@ -148,7 +148,7 @@ def test_the_simulation_grows_by_the_radius() -> None:
     """What the closed loop of the library really does, and the cost at which it stops."""
     case = setup("two_way")
     law, gain = Actuation(rate=2.5, delay=True), scaled(case.gain, 12.0)
-    found = SampledLoop(case.problem).judge(block(case, 12 * case.K), Sampling.of(law, 0.1))
+    found = SampledLoop(case.problem).radius_of(block(case, 12 * case.K), Sampling.of(law, 0.1))
     target, loop = hand_target(case.problem, aim(case)), ClosedLoop(case.problem, 0.1)
     run = loop.run(gain, target, 960, law)
     # after 100 ticks all but the two pairs of the hand are gone

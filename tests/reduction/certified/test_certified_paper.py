@@ -76,7 +76,7 @@ def parameters(random: int) -> list[tuple[float, float]]:
 
 
 @cache
-def judged(damping: str, part: int) -> dict[tuple[int, int], Array]:
+def certified_part(damping: str, part: int) -> dict[tuple[int, int], Array]:
     """True error, proved error and effectivity of the running maximum, both over the solution; asserts the bound."""
     model, whole = trained(damping)
     parts = {size: whole.with_sizes(*size) for size in DAMPINGS[damping][3]}
@@ -131,14 +131,14 @@ def test_greedy(damping: str, bound: float, runs: int, k: int) -> None:
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_the_bound_holds_over_the_box(damping: str, part: int) -> None:
     """125 parameters in five parts, three sizes each, every step."""
-    show(f"{damping} part {part}", judged(damping, part))
+    show(f"{damping} part {part}", certified_part(damping, part))
 
 
 @pytest.mark.slow
 @pytest.mark.ranks(2)
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_effectivity_over_the_box(damping: str) -> None:
-    each = [judged(damping, part) for part in range(PARTS)]
+    each = [certified_part(damping, part) for part in range(PARTS)]
     found = {size: np.vstack([rows[size] for rows in each]) for size in each[0]}
     show(damping, found)
     assert len(found[20, 20]) == 125

@@ -69,9 +69,9 @@ def test_a_gain_that_leaves_the_tissue_out_fails(
     """The gain for the hand is right to the last digit, the gain for the tissue is zero."""
     for method in (DenseRiccati, NewtonADI):
         monkeypatch.setattr(method, "solve", without_tissue(method.solve))
-    judged = [row for row in rows(True) if row.here.value is not None]
-    assert judged
-    assert [row.case for row in judged if row.ok] == []
+    measured = [row for row in rows(True) if row.here.value is not None]
+    assert measured
+    assert [row.case for row in measured if row.ok] == []
 
 
 def test_error_of_a_gain_is_that_of_its_worst_part() -> None:
