@@ -59,12 +59,11 @@ def rows_on_all(comm: MPI.Intracomm, local: NDArray[Any]) -> NDArray[Any]:
 def rows_on_root(comm: MPI.Intracomm, local: NDArray[Any]) -> NDArray[Any] | None:
     """Rows of all ranks, in their order, on rank 0; None elsewhere. Collective."""
     local = np.ascontiguousarray(local)
-    rows = comm.gather(len(local))
-    if rows is None:
-        comm.Gatherv(local, None)
-        return None
-    result = np.empty((sum(rows), *local.shape[1:]), dtype=local.dtype)
-    comm.Gatherv(local, [result, np.multiply(rows, math.prod(local.shape[1:]))])
+    rows, result, target = comm.gather(len(local)), None, None
+    if rows is not None:
+        result = np.empty((sum(rows), *local.shape[1:]), dtype=local.dtype)
+        target = [result, np.multiply(rows, math.prod(local.shape[1:]))]
+    comm.Gatherv(local, target)
     return result
 
 

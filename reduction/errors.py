@@ -152,7 +152,7 @@ def span_of(view: View, V: Array, system: BlockSystem, snapshots: Snapshots) -> 
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ModelComparison:
     """Errors of one model, or of a whole family of nested ones, against one full run."""
 
     model: ReducedModel  # model, small: the largest model of the family, at the parameter of the snapshots

@@ -16,7 +16,7 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction import online
 from softgrasp.reduction.bases.engines import factor
-from softgrasp.reduction.errors import Comparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
+from softgrasp.reduction.errors import ModelComparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
 from softgrasp.reduction.propagator import Propagator, propagator
@@ -121,10 +121,10 @@ def as_full(model: Model, run: Trajectory | FullRun) -> FullRun:
     return run if isinstance(run, FullRun) else full_run(model, run)
 
 
-def comparison_of(rom: ReducedModel, full: FullRun) -> Comparison:
+def comparison_of(rom: ReducedModel, full: FullRun) -> ModelComparison:
     """What errors of this model and of smaller ones of its family are computed from, at the materials of the run."""
     system = full.model.system
-    return Comparison(rom, rom.at(system.materials), system, full.snapshots, full.energy)
+    return ModelComparison(rom, rom.at(system.materials), system, full.snapshots, full.energy)
 
 
 def replay_inputs(rom: ReducedModel, small: SmallModel, full: FullRun) -> tuple[Propagator, dict[str, Any]]:

@@ -35,8 +35,7 @@ def build_to_tolerance(scene: Scene, comm: MPI.Intracomm, steps: bool = True) ->
 
     With ``passes = 0`` the mesh is the a-priori one, which nothing estimates here.
 
-    Args:
-        steps: whether the time steps have to carry the tolerance too: those of the scene's own run.
+    ``steps``: whether the time steps have to carry the tolerance too: those of the scene's own run.
 
     Raises:
         SceneError: the time step leaves more than the tolerance, or the scene cannot be built.

@@ -121,8 +121,7 @@ def difference(small: Small, other: Small, finer: Array | None = None) -> tuple[
 
     Outputs that are the hand's count only where there are no others.
 
-    Args:
-        finer: deformation (steps + 1, p) instead of that of the other's run.
+    ``finer``: deformation (steps + 1, p) instead of that of the other's run.
     """
     finer = other.run.deformation if finer is None else finer
     tissue = np.abs(small.C).max(axis=1) + np.abs(other.C).max(axis=1) > 0

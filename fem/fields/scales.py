@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.effects.catalog import EARTH, acceleration, ratios
+from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
+from softgrasp.fem.effects.gravity import EARTH, acceleration
 from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.assembly import layer_numbers
@@ -78,10 +79,7 @@ def slowest(system: BlockSystem, Z: Array) -> float:
 def measure_sag(model: Model, a: Array) -> tuple[Sag, Gradient]:
     """K_ee z = G g under the weight, and the gradient of z under G (g - a), with one factor. Collective.
 
-    Args:
-        a: largest acceleration of the hand, (n_s,).
-
-    Raises SolverError: the solve failed or missed its tolerance.
+    ``a``: largest acceleration of the hand, (n_s,). Raises SolverError: the solve failed or missed its tolerance.
     """
     scene, system = model.scene, model.system
     layout, d = system.layout, system.layout.dimension

@@ -126,8 +126,7 @@ def _xml(parts: dict[str, list[Field]], start: int) -> str:
 class Collection:
     """The files of a series against time, a whole ``.pvd`` file after each `add`; rank 0 only.
 
-    Args:
-        note: a remark kept in it; no "--".
+    ``note``: a remark kept in it; no "--".
     """
 
     END = b"</Collection>\n</VTKFile>\n"

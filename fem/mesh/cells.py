@@ -10,13 +10,9 @@ import re
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from softgrasp.fem.errors import MeshError
-from softgrasp.fem.mesh.check import FLAT, counted, longest_edges, place_text, signed_volumes
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
+from softgrasp.fem.mesh.check import FLAT, Floats, Integers, counted, longest_edges, place_text, signed_volumes
 
 STRAIGHT = 1e-5  # of the longest edge: above the 6 digits of text files, far below the error of the elements
 
@@ -32,7 +28,7 @@ _FACES: dict[str, tuple[tuple[int, ...], ...]] = {
     "pyramid": ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
 }
 _CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}
-_DIMENSIONS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "tetra": 3, "hexahedron": 3, "wedge": 3, "pyramid": 3}
+DIMENSIONS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "tetra": 3, "hexahedron": 3, "wedge": 3, "pyramid": 3}
 _FACE_SHAPES = {2: "line", 3: "triangle", 4: "quad"}
 _LAGRANGE = {"CURVE": "line", "QUADRILATERAL": "quad", "TETRAHEDRON": "tetra"}  # VTK's names where they differ
 _NODES: dict[str, Callable[[int], int]] = {  # nodes of the Lagrange cell of order p
@@ -56,11 +52,6 @@ def shape_of(kind: str) -> str | None:
         kind = _LAGRANGE.get(name, name.lower())
     known = re.fullmatch(r"([a-z]+)\d*", kind)
     return known[1] if known and known[1] in _FACES else None
-
-
-def dimension_of(shape: str) -> int:
-    """Topological dimension of a shape."""
-    return _DIMENSIONS[shape]
 
 
 def corners(cells: Integers, shape: str) -> Integers:
@@ -131,10 +122,10 @@ def simplices(cells: Integers, shape: str, turn: int = 0) -> tuple[Integers, Int
         simplices: shape (n, dimension + 1), oriented as the cells, those of one cell one after another.
         parents: the cell of each simplex, shape (n,).
     """
-    if cells.shape[1] == _DIMENSIONS[shape] + 1:
+    if cells.shape[1] == DIMENSIONS[shape] + 1:
         return cells, np.arange(len(cells))
     first = (cells.argmin(axis=1) + turn) % cells.shape[1]
-    pieces = [np.zeros((0, _DIMENSIONS[shape] + 1), dtype=np.int64)]
+    pieces = [np.zeros((0, DIMENSIONS[shape] + 1), dtype=np.int64)]
     parents = [np.zeros(0, dtype=np.int64)]
     for i in range(cells.shape[1]):
         rows = np.flatnonzero(first == i)
@@ -192,12 +183,10 @@ def cut_cells(points: Floats, cells: Integers, shape: str, name: str) -> tuple[I
 def check_interfaces(points: Floats, blocks: list[tuple[Integers, str]], name: str) -> None:
     """Refuse a mesh in which two triangles meet a quadrilateral face that `simplices` cuts by its other diagonal.
 
-    Args:
-        blocks: corner nodes and shape of the cells of each type.
-
-    Raises MeshError: there are such faces; the body would be open there.
+    ``blocks``: corner nodes and shape of the cells of each type. Raises MeshError: there are such faces; the body would
+    be open there.
     """
-    faces = [cells[:, face] for cells, shape in blocks if _DIMENSIONS[shape] == 3 for face in _FACES[shape]]
+    faces = [cells[:, face] for cells, shape in blocks if DIMENSIONS[shape] == 3 for face in _FACES[shape]]
     quads = [face for face in faces if face.shape[1] == 4]
     triangles = [face for face in faces if face.shape[1] == 3]
     if not quads or not triangles:

@@ -20,6 +20,8 @@ from softgrasp.fem.errors import MeshError
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
+Ints = npt.NDArray[np.int32]  # numbers and marks as DOLFINx has them
+Flags = npt.NDArray[np.bool_]
 
 FLAT = 1e-12  # volume over (longest edge)^d: far above round-off (1e-16), far below any usable cell
 
@@ -81,12 +83,18 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def components(cells: Integers, n_points: int) -> tuple[int, npt.NDArray[np.int32]]:
+def linked(one: Integers, other: Integers, n: int) -> tuple[int, Ints]:
+    """Number of the connected components of n items with these links, and the component of each item."""
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
+    count, labels = connected_components(graph.tocsr(), directed=False)
+    return count, labels
+
+
+def components(cells: Integers, n_points: int) -> tuple[int, Ints]:
     """Count the parts of a mesh that share no node, and label each cell with its part (from 0)."""
     rows = np.repeat(cells[:, 0], cells.shape[1] - 1)
     columns = cells[:, 1:].ravel()
-    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(n_points, n_points))
-    _, labels = connected_components(graph.tocsr(), directed=False)
+    _, labels = linked(rows, columns, n_points)
     used, parts = np.unique(labels[cells[:, 0]], return_inverse=True)
     return len(used), parts.astype(np.int32)
 
@@ -109,10 +117,10 @@ class Facets:
 
     nodes: Integers  # sorted nodes of each facet, shape ((d + 1) n_cells, d)
     cells: Integers  # the cell of each facet
-    same: npt.NDArray[np.bool_]  # whether a facet equals the next one, shape ((d + 1) n_cells - 1,)
+    same: Flags  # whether a facet equals the next one, shape ((d + 1) n_cells - 1,)
 
     @property
-    def outer(self) -> npt.NDArray[np.bool_]:
+    def outer(self) -> Flags:
         """The facets that bound one cell only."""
         pair = np.concatenate([[False], self.same, [False]])
         return np.asarray(~(pair[1:] | pair[:-1]))
@@ -132,8 +140,7 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 
     Two boundary nodes are at one place if |x - y| <= tolerance h, h the shortest edge of the boundary cells at both.
 
-    Args:
-        tolerance: share of h, < 1/2 [1].
+    ``tolerance``: share of h, < 1/2 [1].
     """
     owners = cells[np.unique(facets.cells[facets.outer])]
     h = np.full(len(points), np.inf)
@@ -149,9 +156,7 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
     one = nodes[np.repeat(near, [len(entry) for entry in lists])]
     other = nodes[np.concatenate([*lists, []]).astype(np.int64)]
     close = np.linalg.norm(points[one] - points[other], axis=1) <= tolerance * h[other]
-    n = len(points)
-    graph = coo_array((np.ones(int(close.sum()), dtype=np.int8), (one[close], other[close])), shape=(n, n))
-    _, labels = connected_components(graph.tocsr(), directed=False)
+    _, labels = linked(one[close], other[close], len(points))
     _, first = np.unique(labels, return_index=True)
     return np.asarray(first[labels], dtype=np.int64)
 
@@ -159,8 +164,7 @@ def doubled_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: fl
 def hanging_nodes(points: Floats, cells: Integers, facets: Facets, tolerance: float) -> Integers:
     """Boundary nodes inside a boundary facet, or an edge of one, that is not their own.
 
-    Args:
-        tolerance: largest distance from the facet over its longest edge, and least from its corners [1].
+    ``tolerance``: largest distance from the facet over its longest edge, and least from its corners [1].
     """
     faces, owners = facets.nodes[facets.outer], cells[facets.cells[facets.outer]]
     nodes = np.unique(faces)
@@ -226,22 +230,18 @@ class Parts:
     joints: Integers  # rows (shared node, part), sorted, shape (n, 2)
 
 
-def find_parts(
-    points: Floats, cells: Integers, facets: Facets, name: str
-) -> tuple[npt.NDArray[np.int32], Parts] | None:
+def find_parts(points: Floats, cells: Integers, facets: Facets, name: str) -> tuple[Ints, Parts] | None:
     """Label the cells of each facet-connected part from 0; None if the mesh is one part.
 
     Raises MeshError: a facet has more than two cells.
     """
-    n = len(cells)
     if (crowded := facets.same[1:] & facets.same[:-1]).any():
         place = points[facets.nodes[np.argmax(crowded)]].mean(axis=0)
         raise MeshError(
             f"{name} has facets with more than two cells, the first around {place_text(place)}: remove doubled cells."
         )
     one, other = facets.cells[:-1][facets.same], facets.cells[1:][facets.same]
-    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
-    count, labels = connected_components(graph.tocsr(), directed=False)
+    count, labels = linked(one, other, len(cells))
     if count == 1:
         return None
     total = np.bincount(labels, minlength=count)

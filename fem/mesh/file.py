@@ -12,16 +12,20 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, agree
 from softgrasp.fem.mesh.cells import (
+    DIMENSIONS,
     check_interfaces,
     check_straight,
     corners,
     cut_cells,
-    dimension_of,
     shape_of,
     simplices,
 )
 from softgrasp.fem.mesh.check import (
     SEAM,
+    Flags,
+    Floats,
+    Integers,
+    Ints,
     Parts,
     check_cells,
     doubled_nodes,
@@ -35,10 +39,6 @@ from softgrasp.fem.mesh.foreign import read_foreign
 from softgrasp.fem.mesh.tissue_mesh import Marks, Sets, TissueMesh, spread
 from softgrasp.fem.sealed import digest
 
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-Tags = npt.NDArray[np.int32]
-
 
 @dataclass(frozen=True)
 class MeshArrays:
@@ -46,10 +46,10 @@ class MeshArrays:
 
     points: Floats  # shape (n_points, d) [m]
     cells: Integers  # shape (n_cells, d + 1)
-    cell_tags: Tags | None  # one integer a cell, or None
+    cell_tags: Ints | None  # one integer a cell, or None
     facets: Integers  # tagged facets, shape (n_facets, d)
-    facet_tags: Tags | None  # one integer a tagged facet, or None
-    part_tags: Tags | None  # number of the facet-connected part of each cell, or None if there is one part only
+    facet_tags: Ints | None  # one integer a tagged facet, or None
+    part_tags: Ints | None  # number of the facet-connected part of each cell, or None if there is one part only
     parts: Parts | None  # what is known of these parts, or None
     facet_sets: Sets  # marks in ``facet_tags`` of each tag number and named set
     cell_sets: Sets  # marks in ``cell_tags`` of each tag number and named set
@@ -117,7 +117,7 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
     kinds = sorted({block.type for block in raw.cells})
     shapes = [shape_of(block.type) for block in raw.cells]
     filled = [shape for shape, block in zip(shapes, raw.cells, strict=True) if shape and len(block.data)]
-    dimension = max((dimension_of(shape) for shape in filled), default=0)
+    dimension = max((DIMENSIONS[shape] for shape in filled), default=0)
     if None in shapes or dimension < 2:
         raise MeshError(
             f"{path} holds cells of type {', '.join(kinds) or 'none'}: only triangles, quadrilaterals, tetrahedra, "
@@ -193,7 +193,7 @@ def _blocks(raw: meshio.Mesh, dimension: int) -> list[tuple[int, str, Integers]]
     return [
         (i, shape, np.asarray(block.data, dtype=np.int64))
         for i, block in enumerate(raw.cells)
-        if len(block.data) and (shape := shape_of(block.type)) and dimension_of(shape) == dimension
+        if len(block.data) and (shape := shape_of(block.type)) and DIMENSIONS[shape] == dimension
     ]
 
 
@@ -203,7 +203,7 @@ def _marked(
     cut: list[tuple[Integers, Integers]],
     tag_name: str | None,
     dimension: int,
-) -> tuple[Integers, Tags | None, Sets]:
+) -> tuple[Integers, Ints | None, Sets]:
     """The simplices of all blocks, one mark each, and the marks of each tag number and named set.
 
     The marks count from 0: tag numbers of a file may need more than the 32 bits of a mark.
@@ -247,7 +247,7 @@ def _placed(part: npt.NDArray[np.integer], place: dict[int, int]) -> Integers:
 
 def _named(
     raw: meshio.Mesh, blocks: list[tuple[int, str, Integers]], cut: list[tuple[Integers, Integers]]
-) -> dict[str, npt.NDArray[np.bool_]]:
+) -> dict[str, Flags]:
     """Which simplices each named set of the file holds, without the sets that hold none.
 
     A set must have one list of cells a block; others (sets of sets) are left out, and so are unknown names then.

@@ -34,8 +34,7 @@ def default_limit(path: Path) -> float:
 def read_foreign(path: Path, limit: float | None = None) -> meshio.Mesh:
     """Read a mesh file of any format of meshio.
 
-    Args:
-        limit: longest processor time for formats that may never end [s]; by size if None.
+    ``limit``: longest processor time for formats that may never end [s]; by size if None.
 
     Raises:
         ValueError: meshio's reason why it cannot read the file.

@@ -14,21 +14,26 @@ from typing import TYPE_CHECKING, Any
 
 import dolfinx.mesh
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
-from softgrasp.fem.mesh.check import FLAT, counted, find_parts, longest_edges, place_text, signed_volumes, sort_facets
-from softgrasp.fem.mesh.make import structured_mesh
+from softgrasp.fem.mesh.check import (
+    FLAT,
+    Floats,
+    Ints,
+    counted,
+    find_parts,
+    longest_edges,
+    place_text,
+    signed_volumes,
+    sort_facets,
+)
 from softgrasp.fem.mesh.singular import Ends
-from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread
+from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread, structured_mesh
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
 
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 
 MOST_LEVELS = 60  # each halves the longest edge at most; 2^-30 of a body is below any useful cell
 
@@ -36,10 +41,8 @@ MOST_LEVELS = 60  # each halves the longest edge at most; 2^-30 of a body is bel
 def bisect(whole: Whole, marked: Ints) -> Whole:
     """Split the marked cells, and others until no node hangs, through their longest edges [PC00].
 
-    Args:
-        marked: numbers of the cells to split, in the order of ``whole.simplices``.
-
-    Raises MeshError: a child would be flat to rounding.
+    ``marked``: numbers of the cells to split, in the order of ``whole.simplices``. Raises MeshError: a child would be
+    flat to rounding.
     """
     mesh, d = whole.mesh, whole.dimension
     for a, b in ((d, 1), (1, d), (d - 1, d), (d, d - 1)):
@@ -173,14 +176,14 @@ CLOSE = 0.1  # of the side: a line through a point of an output keeps this dista
 
 
 @dataclass(frozen=True)
-class Axis:
+class BoxAxis:
     """One axis of a box."""
 
     cuts: tuple[float, ...]  # coordinates that a line must meet, the sides first and last [m]
     ends: tuple[float, ...]  # those of them where the contact zone ends [m]
 
 
-def box_axes(scene: Scene) -> tuple[Axis, ...]:
+def box_axes(scene: Scene) -> tuple[BoxAxis, ...]:
     """What the lines of a structured box must meet.
 
     Lines meet the box of the contact zone, the boxes of layers and the points of outputs, and the zone ends at its
@@ -210,11 +213,11 @@ def box_axes(scene: Scene) -> tuple[Axis, ...]:
         cuts += inner([corner[axis] for layer in tissue.layers.values() for corner in layer.box or []])
         points = [o.point[axis] for o in (scene.control.outputs if scene.control else []) if o.point is not None]
         unique = merged([], sorted(cuts), SAME * length)
-        result.append(Axis(tuple(merged(unique, inner(points), CLOSE * length)), tuple(sorted(set(ends)))))
+        result.append(BoxAxis(tuple(merged(unique, inner(points), CLOSE * length)), tuple(sorted(set(ends)))))
     return tuple(result)
 
 
-def even_cells(axis: Axis, h: float) -> int:
+def even_cells(axis: BoxAxis, h: float) -> int:
     """Number of cells no longer than h between the cuts."""
     return sum(int(np.ceil((b - a) / h - SAME)) for a, b in pairwise(axis.cuts))
 

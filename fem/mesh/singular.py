@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
+from softgrasp.fem.mesh.check import Flags, Floats, Integers
+
 Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
 
 KINDS: tuple[Kind, ...] = ("re-entrant", "contact end", "held corner")  # by the number of sides held
@@ -48,8 +48,7 @@ class Ends:
 def expected_order(ends: Ends, order: int, graded: bool, edges: bool = False) -> float:
     """Order of the outputs in n_e^(1/d): 2 p on graded meshes, min(2 p, 2 alpha) on even ones.
 
-    Args:
-        edges: whether they do so by bisection in 3D, where small cells along an edge are many: at most 3.
+    ``edges``: whether they do so by bisection in 3D, where small cells along an edge are many: at most 3.
     """
     full = 2.0 * order
     if graded:
@@ -189,9 +188,7 @@ def _per_ridge(facets: Integers, ridges: Integers, d: int) -> Integers:
     return count
 
 
-def _layer_ends(
-    points: Floats, facets: Integers, ridges: Integers, inner: Integers, boundary: npt.NDArray[np.bool_], d: int
-) -> npt.NDArray[np.bool_]:
+def _layer_ends(points: Floats, facets: Integers, ridges: Integers, inner: Integers, boundary: Flags, d: int) -> Flags:
     """Where interfaces of layers reach the boundary, branch, or turn."""
     normals = np.zeros((len(ridges), d, d))  # sum of n n' of the facets at a ridge: of rank 1 where they are level
     if len(facets):

@@ -1,7 +1,8 @@
-"""The mesh of the tissue, whole on one rank or spread over all: cells, tags, parts, and how its file was read."""
+"""The mesh of the tissue, whole on one rank or spread over all: made, marked, and how its file was read."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,17 +10,16 @@ import basix.ufl
 import dolfinx.io
 import dolfinx.mesh
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx.graph import adjacencylist
 from mpi4py import MPI
 
-from softgrasp.fem.mesh.check import Parts
+from softgrasp.fem.errors import SceneError
+from softgrasp.fem.mesh.check import Floats, Integers, Ints, Parts
+from softgrasp.fem.scene.scene import Scene
 
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 Sets = dict[int | str, tuple[int, ...]]  # marks of each tag number and named set of a file
-Marks = dict[str, tuple[int, Integers, npt.NDArray[np.int32]]]  # dimension of entities, their nodes, one value each
+Marks = dict[str, tuple[int, Integers, Ints]]  # dimension of entities, their nodes, one value each
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Whole:
 
     mesh: dolfinx.mesh.Mesh  # on MPI.COMM_SELF
     source: str  # its name, for messages
-    cells: dict[str, npt.NDArray[np.int32]]  # one mark a cell by field of TissueMesh: cell_tags, layers
+    cells: dict[str, Ints]  # one mark a cell by field of TissueMesh: cell_tags, layers
     facets: dict[str, dolfinx.mesh.MeshTags]  # marks likewise: facet_tags, contact
     facet_sets: Sets = field(default_factory=dict)  # see TissueMesh
     cell_sets: Sets = field(default_factory=dict)
@@ -39,16 +39,16 @@ class Whole:
         return int(self.mesh.topology.dim)
 
     @property
-    def points(self) -> npt.NDArray[np.float64]:
+    def points(self) -> Floats:
         """Coordinates, (n_points, d) [m]."""
         return np.asarray(self.mesh.geometry.x[:, : self.dimension])
 
     @property
-    def simplices(self) -> npt.NDArray[np.int64]:
+    def simplices(self) -> Integers:
         """Nodes of the cells, (n_cells, d + 1)."""
         return np.asarray(cell_nodes(self.mesh), dtype=np.int64)
 
-    def facet_nodes(self, name: str) -> npt.NDArray[np.int64]:
+    def facet_nodes(self, name: str) -> Integers:
         """Nodes of the marked facets, (n, d)."""
         indices = self.facets[name].indices
         self.mesh.topology.create_connectivity(self.dimension - 1, self.dimension)
@@ -89,7 +89,7 @@ class TissueMesh:
         return np.asarray(self.mesh.geometry.x[cell_nodes(self.mesh)[: self.owned], : self.dimension])
 
 
-def cell_nodes(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
+def cell_nodes(mesh: dolfinx.mesh.Mesh) -> Ints:
     """Local node numbers of the cells, shape (n_cells, d + 1)."""
     geometry = mesh.geometry
     # DOLFINx 0.10 has no list of dofmaps, 0.11 warns of the single one
@@ -125,3 +125,62 @@ def spread(
         entities = adjacencylist(np.ascontiguousarray(local, dtype=np.int32))
         tags[name] = dolfinx.mesh.meshtags_from_entities(mesh, dimension, entities, here.astype(np.int32))
     return TissueMesh(mesh=mesh, dimension=d, **known, **tags)
+
+
+def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
+    """Build the mesh of a scene: structured if ``tissue.size`` is given, else from ``tissue.mesh``.
+
+    Collective.
+
+    Raises:
+        SceneError: neither a size nor a mesh file is given, or the cells do not fit the size.
+        MeshError: the mesh file cannot be read or its mesh cannot carry the model.
+    """
+    tissue = scene.tissue
+    if tissue.size:
+        if not tissue.cells:
+            raise SceneError("tissue.cells is missing: a tissue with a size needs one number of cells per side.")
+        return structured_mesh(comm, tissue.size, tissue.cells, tissue.origin)
+    if tissue.mesh is None:
+        raise SceneError("tissue.size and tissue.mesh are both missing: give one of them.")
+    from softgrasp.fem.mesh.file import read_mesh  # meshio is needed for mesh files only
+
+    path = scene.directory / tissue.mesh
+    result = read_mesh(comm, path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit)
+    scene._mesh_digest = result.digest  # the hash of the scene is of what was read, not of what the file says later
+    return result
+
+
+def structured_mesh(
+    comm: MPI.Intracomm,
+    size: Sequence[float],
+    cells: Sequence[int],
+    origin: Sequence[float] | None = None,
+) -> TissueMesh:
+    """Cut the box ``origin + [0, size]`` into regular triangles (2D) or tetrahedra (3D).
+
+    A rectangle of nx x ny cells has 2 nx ny triangles, a box 6 nx ny nz tetrahedra.
+
+    Collective.
+
+    Args:
+        size: side lengths, 2 or 3 positive numbers [m].
+        origin: lower corner [m]; zero if None or empty.
+
+    Raises SceneError: the lengths of ``size``, ``cells`` and ``origin`` differ or are not positive.
+    """
+    dimension = len(size)
+    low = np.asarray(origin if origin is not None and len(origin) else np.zeros(dimension), dtype=np.float64)
+    if dimension not in (2, 3) or len(cells) != dimension or len(low) != dimension:
+        raise SceneError(
+            f"tissue.size has {dimension}, tissue.cells {len(cells)} and tissue.origin {len(low)} entries: "
+            "give 2 entries each for a rectangle or 3 for a box."
+        )
+    if min(size) <= 0 or min(cells) < 1:
+        raise SceneError(f"tissue.size {list(size)} and tissue.cells {list(cells)} must be positive.")
+    corners = [low, low + np.asarray(size, dtype=np.float64)]
+    if dimension == 2:
+        mesh = dolfinx.mesh.create_rectangle(comm, corners, list(cells))
+    else:
+        mesh = dolfinx.mesh.create_box(comm, corners, list(cells))
+    return TissueMesh(mesh, dimension, "structured")

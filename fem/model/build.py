@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.effects.catalog import acceleration, hand_mass
-from softgrasp.fem.effects.catalog import operator as damping_operator
+from softgrasp.fem.effects.damping import operator as damping_operator
+from softgrasp.fem.effects.gravity import acceleration
+from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, make_mesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import check_memory, simplices
@@ -146,14 +146,6 @@ def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[Laye
     return tuple(result)
 
 
-def _scene_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
-    if scene.tissue.refine is None:
-        return make_mesh(comm, scene)
-    from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it
-
-    return refined_mesh(comm, scene)
-
-
 def build(
     scene: Scene | str | Path,
     overrides: Sequence[str] = (),
@@ -188,7 +180,11 @@ def build(
     if boxed:
         check_memory(scene, comm, run, len(boxed), simplices(boxed))
     with watch.stage("mesh"):
-        mesh = mesh or _scene_mesh(comm, scene)
+        if mesh is None and scene.tissue.refine is not None:
+            from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it
+
+            mesh = refined_mesh(comm, scene)
+        mesh = mesh or make_mesh(comm, scene)
     if not boxed:
         d = mesh.dimension
         check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)

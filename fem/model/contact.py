@@ -11,12 +11,9 @@ import numpy.typing as npt
 
 from softgrasp.fem.errors import MeshError, SceneError, agree
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.mesh.check import Parts, counted, place_text
+from softgrasp.fem.mesh.check import Flags, Floats, Ints, Parts, counted, place_text
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.scene.scene import Contact
-
-Ints = npt.NDArray[np.int32]
-Floats = npt.NDArray[np.float64]
 
 HINGE = 1e-12  # of C^T C: shared nodes nearer than 1e-6 of the part are one node
 MOST_LOOSE = 300  # a dense problem of at most 1800 unknowns
@@ -91,17 +88,14 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
             check_parts(parts, held > 0, tissue.source)
 
 
-def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
+def check_parts(parts: Parts, held: Flags, source: str) -> None:
     """Refuse parts that keep a free motion when those with contact facets are fixed.
 
     A part that hangs together through facets moves without strain as a rigid body only, u = R q, and a contact
     facet fixes it. The q of the other parts must agree at each shared node, C q = 0; a null vector of C^T C is
     a free motion.
 
-    Args:
-        held: whether a part has a contact facet, shape (n_parts,).
-
-    Raises MeshError: see `held_check`.
+    ``held``: whether a part has a contact facet, shape (n_parts,). Raises MeshError: see `held_check`.
     """
     groups = int(parts.groups.max()) + 1
     loose = np.setdiff1d(np.arange(groups), parts.groups[held])
@@ -130,7 +124,7 @@ def check_parts(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> None:
     )
 
 
-def _moving(parts: Parts, held: npt.NDArray[np.bool_], source: str) -> npt.NDArray[np.bool_]:
+def _moving(parts: Parts, held: Flags, source: str) -> Flags:
     """The parts that move in some null vector of C^T C."""
     d = parts.points.shape[1]
     free = np.flatnonzero(~held)
@@ -182,8 +176,7 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
     With (x, y, z) measured from the reference, the rotations are (-y, x) in 2D and (0, -z, y), (z, 0, -x),
     (-y, x, 0) in 3D.
 
-    Args:
-        reference: point the hand turns about, ``dimension`` entries [m].
+    ``reference``: point the hand turns about, ``dimension`` entries [m].
 
     Returns:
         R, shape (n_nodes * dimension, n_s), rows blocked by node.
@@ -241,7 +234,7 @@ def _present(sets: dict[int | str, tuple[int, ...]]) -> list[int | str]:
     return [*sorted(k for k in sets if isinstance(k, int)), *sorted(k for k in sets if isinstance(k, str))]
 
 
-def _inside(points: Floats, box: Any, tolerance: float, key: str) -> npt.NDArray[np.bool_]:
+def _inside(points: Floats, box: Any, tolerance: float, key: str) -> Flags:
     corners = np.asarray(box, dtype=np.float64)
     if corners.shape != (2, points.shape[1]):
         raise SceneError(

@@ -54,19 +54,14 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     for i, output in enumerate(entries):
         name = output.name or f"y{i + 1}"
         if output.kind == "hand":
-            result.append(_hand(system, name))
+            n_s, d = system.layout.n_s, system.layout.dimension
+            result.append(Output(name, hand_columns(n_s, d, name), np.zeros((0, n_s), int), 0.0, np.eye(n_s)))
         elif output.kind == "region":
             result.append(_region(system, name, np.asarray(output.box, dtype=float), i))
         else:
             _inside(system, output.point or [], i)
             result.append(_node(system, name, np.asarray(output.point, dtype=float)))
     return tuple(result)
-
-
-def _hand(system: BlockSystem, name: str) -> Output:
-    n_s = system.layout.n_s
-    columns = hand_columns(n_s, system.layout.dimension, name)
-    return Output(name, columns, np.zeros((0, n_s), int), 0.0, np.eye(n_s))
 
 
 def _node(system: BlockSystem, name: str, point: Array) -> Output:

@@ -13,8 +13,7 @@ from typing import Any
 def interruptible(speaks: bool = False) -> Iterator[list[bool]]:
     """Turn the first Ctrl-C into an entry of the list; a second one interrupts at once.
 
-    Args:
-        speaks: say on the standard error that the first one was seen.
+    ``speaks``: say on the standard error that the first one was seen.
     """
     flag: list[bool] = []
 

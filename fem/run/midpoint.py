@@ -25,7 +25,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
-from softgrasp.fem.solve.cholesky import held_operators
+from softgrasp.fem.solve.held import held_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
 from softgrasp.fem.system import BlockSystem
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -154,30 +153,12 @@ Force = Callable[[int, float, Array, Array], Array]
 """u = force(step, t_mid [s], q_s, v_s) [N, N m], hand state at the start of the step."""
 
 
-class Drive(Protocol):
-    """Solves the midpoint equation of one step for tissue and hand."""
-
-    q: Array
-    v: Array
-    c: Array
-    """Load l = G c of each step, (steps, n_s)."""
-
-    @property
-    def u(self) -> Array | None:
-        """Force applied in each step without the weight, (steps, n_s) [N, N m]; None when the motion is prescribed."""
-
-    def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
-        """Leave w and load of step n in ``midpoint``; fill row n + 1 of ``q`` and ``v``. Collective."""
-
-    def check(self, begin: int, end: int) -> None:
-        """Look at what moved the hand in these steps; SolverError unless it is finite."""
-
-
 class TableDrive:
-    """Hand known beforehand: load l = -G (a - g + alpha v) with alpha only when damping drags in space.
+    """Hand known beforehand: load l = G c, c = -(a - g + alpha v) with alpha only when damping drags in space.
 
-    Args:
-        force: that it comes from, (steps, n_s) [N, N m]; None when it is prescribed.
+    Attributes:
+        q, v, c: hand, (steps + 1, n_s), and load coefficients, (steps, n_s).
+        u: force behind it without the weight, (steps, n_s) [N, N m]; None when it is prescribed.
     """
 
     def __init__(self, system: BlockSystem, table: HandTable, force: Array | None = None) -> None:

@@ -19,7 +19,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.interrupt import interruptible
 from softgrasp.fem.run.midpoint import make_midpoint
-from softgrasp.fem.run.motion import Drive, Force, ForceDrive, TableDrive, force_taken, force_values, free_table
+from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
 from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
@@ -48,8 +48,7 @@ class RunOptions:
 class Run(Stepped):
     """One run in progress: the TS context and what it carries.
 
-    Args:
-        force: feedback force on the hand; None takes the scene's motion.
+    ``force``: feedback force on the hand; None takes the scene's motion.
 
     Attributes:
         name: of this run and those that it resumes, in no other run; its files carry it.
@@ -73,7 +72,7 @@ class Run(Stepped):
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
         self.points, self.regions = self._recorders()
-        self.drive: Drive = self._make_drive(force)
+        self.drive = self._make_drive(force)
         self.pulls = np.zeros((self.steps + 1, len(midpoint.pull())))
         self.milestones = set(np.linspace(0, self.steps, 11).round().astype(int).tolist())
         self.initial_energy = self.peak_energy = 0.0
@@ -93,7 +92,7 @@ class Run(Stepped):
             at += output.size
         return points, regions
 
-    def _make_drive(self, force: Force | None) -> Drive:
+    def _make_drive(self, force: Force | None) -> TableDrive | ForceDrive:
         scene, system = self.model.scene, self.model.system
         if force is None and (scene.motion.drive == "motion" or not system.two_way):
             return TableDrive(system, *free_table(system, scene, self.dt))

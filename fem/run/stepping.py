@@ -1,4 +1,4 @@
-"""PETSc TS takes the midpoint steps of a run, in segments; the forward run and the closed loop share it."""
+"""PETSc TS takes the midpoint steps of a run in segments; the forward run and the closed loop share it."""
 
 from __future__ import annotations
 
@@ -61,7 +61,9 @@ class Stepped(ABC):
         n = self.reached
         self.solve_step(n)
         if n == self.check_at:
-            self._check()
+            begin = time.perf_counter()
+            self.residual = self.midpoint.residual()
+            self.checking += time.perf_counter() - begin
         new = self.store.target(n + 1)
         self.midpoint.advance(self.state, new)
         self.state = new
@@ -108,11 +110,6 @@ class Stepped(ABC):
         self.advance_to(ts, step)
         self.check_at = -1  # a run may be taken back to its start
         return self.residual
-
-    def _check(self) -> None:
-        begin = time.perf_counter()
-        self.residual = self.midpoint.residual()
-        self.checking += time.perf_counter() - begin
 
 
 def make_ts(run: Stepped) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Annotated, Literal
 
 import numpy as np
@@ -12,22 +13,10 @@ from softgrasp.fem.scene.tissue import Box, Label, Positive, Section, check_box
 Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 
 
-_KINDS = ("", "_cotangent_lift", "_svd_like")
-BASES = (
-    *(
-        f"{name}{frame}"
-        for name in ("global_pod", "pod_fixed", "componentwise_pod", "componentwise_pod_fixed")
-        for frame in ("", "_relative")
-    ),
-    *(
-        f"psd{kind}{fixed}{coordinates}{frame}"
-        for kind in _KINDS
-        for fixed in ("", "_fixed")
-        for coordinates in ("", "_qv")
-        for frame in ("", "_relative")
-    ),
-    "craig_bampton",
-)
+_FRAMES = ("", "_relative")
+_PODS = ("global_pod", "pod_fixed", "componentwise_pod", "componentwise_pod_fixed")
+_PSD = (("psd",), ("", "_cotangent_lift", "_svd_like"), ("", "_fixed"), ("", "_qv"), _FRAMES)
+BASES = (*map("".join, product(_PODS, _FRAMES)), *map("".join, product(*_PSD)), "craig_bampton")
 """Names of :mod:`softgrasp.reduction.bases.registry`, here because scenes are read without what builds bases."""
 
 

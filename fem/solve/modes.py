@@ -24,8 +24,7 @@ def lowest_modes(system: BlockSystem, k: int) -> tuple[Array, Array]:
     complement catches copies of multiple eigenvalues that one Krylov space cannot see. The sign of a mode does not
     depend on the rank count. Collective.
 
-    Args:
-        k: number of modes, 1 <= k <= n_e.
+    ``k``: number of modes, 1 <= k <= n_e.
 
     Returns:
         omega [1/s], ascending, (k,), on every rank; Phi, local rows (n_local, k), no ghosts.

@@ -52,10 +52,8 @@ def solve_columns(
 
     Factored once; columns of zeros cost nothing.
 
-    Args:
-        rtol: of cg, where no direct solver fits.
-
-    Raises SolverError: the factorisation fails, or the solution has a large residual.
+    ``rtol``: of cg, where no direct solver fits. Raises SolverError: the factorisation fails, or the solution has a
+    large residual.
     """
     name = solver or choose_solver(layout, few=True)[0]
     static = make_solver(A.copy(), name, layout, "softgrasp_static_", rtol, reproducible)

@@ -31,8 +31,7 @@ def compiled() -> Any:
 class Kernel:
     """Points of one rank with their nodes.
 
-    Args:
-        lam, mu: in every point [Pa], (Q,).
+    ``lam``, ``mu``: in every point [Pa], (Q,).
 
     Attributes:
         J: det F at the end of the step tried last, (Q,).
@@ -79,8 +78,7 @@ class Kernel:
 class Body:
     """Points with materials; vectors have the distribution of the columns of B.
 
-    Args:
-        pattern: of the tangents; None: that of B'AB, which on some ranks has fewer columns of other ranks than K_ee.
+    ``pattern``: of the tangents; None: that of B'AB, which on some ranks has fewer columns of other ranks than K_ee.
 
     Attributes:
         rounding: what rounding in the stress mu F leaves of a force [N], in the norm of all rows.
@@ -149,10 +147,8 @@ class Body:
     def refuse(self, start: Start, comm: MPI.Intracomm | None) -> None:
         """Refuse a state that the law does not describe: an inverted cell, or one pressed too far. Collective.
 
-        Args:
-            comm: ranks that share the points; None where each has them all.
-
-        Raises SolverError: the message names law, cell, J and stretch.
+        ``comm``: ranks that share the points; None where each has them all. Raises SolverError: the message names law,
+        cell, J and stretch.
         """
         J, place = self.lowest(1 + start.j, comm)
         least, where = self._least_stretch(start, comm) if self.law.least_stretch else (1.0, place)

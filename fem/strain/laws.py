@@ -116,8 +116,11 @@ class Law(ABC):
         """Stress P of the discrete gradient from H_0 to H_0 + 2 half and J_1, (Q,); None where some J_1 forbids it."""
 
 
-class Volumetric(Law):
-    """W = mu/2 (|F|^2 - d) + g(J)."""
+class NeoHooke(Law):
+    """W = mu/2 (|F|^2 - d) + g(J), g(J) = -mu ln J + lam/2 (ln J)^2, or with lam/2 (J - 1)^2 where quadratic."""
+
+    def __init__(self, name: LawName, quadratic: bool) -> None:
+        self.name, self.quadratic = name, quadratic
 
     def energy(self, H: Array, lam: Array, mu: Array) -> Array:
         """See :class:`Law`: mu/2 (|H|^2 + 2 tr H - 2 j) + (g(J) + mu j), where both terms are of second order."""
@@ -164,60 +167,28 @@ class Volumetric(Law):
         F += C
         return F, new
 
-    @abstractmethod
     def volume_energy(self, j: Array, lam: Array) -> Array:
         """g(J) + mu ln J."""
+        return np.asarray(lam / 2 * j * j if self.quadratic else lam / 2 * np.log1p(j) ** 2)
 
-    @abstractmethod
     def slopes(self, j: Array, lam: Array, mu: Array) -> tuple[Array, Array]:
         """g'(J) and g''(J)."""
-
-    @abstractmethod
-    def quotient(self, log: Array, start: Start, dj: Array, dl: Array, lam: Array, mu: Array) -> Array:
-        """(g(J_1) - g(J_0)) / dj with dj = J_1 - J_0, given ``log``, that of ln J, and dl = ln J_1/J_0, scratch."""
-
-
-class NeoHooke(Volumetric):
-    """g(J) = -mu ln J + lam/2 (ln J)^2."""
-
-    name: LawName = "neo-hooke"
-
-    def volume_energy(self, j: Array, lam: Array) -> Array:
-        """See :class:`Volumetric`."""
-        return np.asarray(lam / 2 * np.log1p(j) ** 2)
-
-    def slopes(self, j: Array, lam: Array, mu: Array) -> tuple[Array, Array]:
-        """See :class:`Volumetric`."""
-        J, p = 1 + j, lam * np.log1p(j) - mu
+        J = 1 + j
+        if self.quadratic:
+            return lam * j - mu / J, lam + mu / (J * J)
+        p = lam * np.log1p(j) - mu
         return p / J, (lam - p) / (J * J)
 
     def quotient(self, log: Array, start: Start, dj: Array, dl: Array, lam: Array, mu: Array) -> Array:
-        """See :class:`Volumetric`."""
+        """(g(J_1) - g(J_0)) / dj with dj = J_1 - J_0, given ``log``, that of ln J, and dl = ln J_1/J_0, scratch."""
+        if self.quadratic:
+            return np.asarray(lam * (start.j + dj / 2) - mu * log)
         dl *= 0.5
         dl += start.log
         dl *= lam
         dl -= mu
         dl *= log
         return dl
-
-
-class QuadraticNeoHooke(Volumetric):
-    """g(J) = -mu ln J + lam/2 (J - 1)^2."""
-
-    name: LawName = "neo-hooke-quadratic"
-
-    def volume_energy(self, j: Array, lam: Array) -> Array:
-        """See :class:`Volumetric`."""
-        return np.asarray(lam / 2 * j * j)
-
-    def slopes(self, j: Array, lam: Array, mu: Array) -> tuple[Array, Array]:
-        """See :class:`Volumetric`."""
-        J = 1 + j
-        return lam * j - mu / J, lam + mu / (J * J)
-
-    def quotient(self, log: Array, start: Start, dj: Array, dl: Array, lam: Array, mu: Array) -> Array:
-        """See :class:`Volumetric`."""
-        return np.asarray(lam * (start.j + dj / 2) - mu * log)
 
 
 class StVenantKirchhoff(Law):
@@ -292,5 +263,7 @@ def _turned(F: Array, i: int, k: int) -> Array:
     return result
 
 
-LAWS: dict[LawName, Law] = {law.name: law for law in (NeoHooke(), QuadraticNeoHooke(), StVenantKirchhoff())}
+LAWS: dict[LawName, Law] = {
+    law.name: law for law in (NeoHooke("neo-hooke", False), NeoHooke("neo-hooke-quadratic", True), StVenantKirchhoff())
+}
 """The laws by the name that a scene gives them; the first is the default."""

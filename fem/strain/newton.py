@@ -102,24 +102,14 @@ class Pairs:
         return np.asarray(x + b @ self.dx)
 
 
+@dataclass(frozen=True)
 class QuasiNewton:
-    """Iterations that share their pairs, as the steps of a run do.
+    """Iterations that share their pairs, as the steps of a run do."""
 
-    Args:
-        residual: R(x) and |R|, infinite or NaN where there is none.
-        solve: about S^-1 q for the tangent S factored last.
-        renew: factor the tangent at x; whether that worked.
-        pairs: of the iterations so far.
-    """
-
-    def __init__(
-        self,
-        residual: Callable[[Array], tuple[Array, float]],
-        solve: Callable[[Array], Array],
-        renew: Callable[[Array], bool],
-        pairs: Pairs,
-    ) -> None:
-        self.residual, self.solve, self.renew, self.pairs = residual, solve, renew, pairs
+    residual: Callable[[Array], tuple[Array, float]]  # R(x) and |R|, infinite or NaN where there is none
+    solve: Callable[[Array], Array]  # about S^-1 q for the tangent S factored last
+    renew: Callable[[Array], bool]  # factor the tangent at x; whether that worked
+    pairs: Pairs  # of the iterations so far
 
     def find(self, x: Array, target: float) -> Root:
         """From x until |R| <= target: a correction is halved while R is none or grows fourfold."""

@@ -77,8 +77,7 @@ def make_gradient(comm: MPI.Intracomm, gradients: Array, nodes: Ints, columns: t
 def whole_points(points: Points, comm: MPI.Intracomm, columns: Ints | None = None) -> Points:
     """All points on this rank alone, the columns of B in another order. Collective.
 
-    Args:
-        columns: number of each column in the layout's order; None keeps it.
+    ``columns``: number of each column in the layout's order; None keeps it.
     """
     every = whole_copy(points.B)
     B = to_scipy(every)

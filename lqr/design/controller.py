@@ -12,8 +12,9 @@ from softgrasp.lqr.design.feedback import Design, loop_words
 from softgrasp.lqr.design.orders import BasisGains, fast_order, orders, reduce_gains
 from softgrasp.lqr.loop.controller import Controller, layout_hash
 from softgrasp.lqr.loop.small import galerkin, m_orthonormal
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.reduced.riccati import norm
 from softgrasp.lqr.spectrum.modal_loop import SampledRadius

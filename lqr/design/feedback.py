@@ -12,7 +12,8 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.lqr.design.scene import actuation, problem, sampling, scene_target
 from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.plant.gain import Block, Gain, PlantState
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainJudge

@@ -1,4 +1,4 @@
-"""Reduced gains of a scene: every basis at several orders, how long their loops run, bounds on what they cost."""
+"""Reduced gains of a scene: every basis at several orders, which are good, and proved bounds on what they cost."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.loop.gap import Notify as Notify
 from softgrasp.lqr.loop.gap import duality_gaps
+from softgrasp.lqr.loop.responses import Notify as Notify
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Block, Gain
-from softgrasp.lqr.plant.operators import outputs
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_family
 from softgrasp.lqr.reduced.riccati import GainQuality, GainReport
@@ -23,8 +24,6 @@ MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by
 WHOLE_SPECTRUM = 500  # n_e from which the Schur form of all modes for every gain takes seconds, so few orders are tried
 FEW_ORDERS = 3
 ORDERS = (4, 6, 8, 10, 12, 16, 20, 30, 40)  # of a scene without a [control] table
-SETTLED = 6.0  # time constants of the slower hand pole after which 0.3 % of the way are left
-LONGEST = 20  # times the steps of the scene that a run without [control] may take to settle
 
 
 @dataclass(frozen=True)
@@ -92,45 +91,6 @@ def best_gains(bases: Sequence[BasisGains], layout: BlockLayout) -> list[GainRep
     limits = {A_PRIORI: fast_order(layout.n_s)}
     best = [report for b in bases if (report := b.best(limits.get(b.name))) is not None]
     return best if layout.states <= MANY_STATES else [r for r in best if r.method == A_PRIORI]
-
-
-@dataclass(frozen=True)
-class LoopPlan:
-    """How long the loop runs."""
-
-    dt: float  # time step [s]
-    steps: int  # number
-    settle: float  # time after which a rigid body under this gain is at the target [s]
-    note: str = ""  # why the scene's own end is not taken, or that it is too early; else empty
-
-
-def plan(design: Design, own_end: bool) -> LoopPlan:
-    """Steps of the closed loop, from the poles of the hand alone: M_s q'' = K_s [q; q'].
-
-    ``own_end``: keep the end of the scene; else take as many steps as the move needs.
-    """
-    scene, n_s = design.model.scene, design.problem.layout.n_s
-    dt, steps = scene.time_end / scene.time.steps, scene.time.steps
-    A = np.zeros((2 * n_s, 2 * n_s))
-    A[:n_s, n_s:] = np.eye(n_s)
-    A[n_s:] = np.linalg.solve(design.problem.M_s, design.gain.K_s)
-    slowest = -float(np.linalg.eigvals(A).real.max())
-    settle = SETTLED / slowest if slowest > 0 else scene.time_end
-    needed = int(np.ceil(settle / dt))
-    if needed <= steps:
-        return LoopPlan(dt, steps, settle)
-    if own_end:
-        note = f"the loop ends at t = {scene.time_end:g} s, but this gain needs about {settle:.2g} s; raise "
-        return LoopPlan(dt, steps, settle, note + "time.end, or control.Q for a faster move")
-    longer = min(needed, LONGEST * steps)
-    note = f"the loop runs {longer} steps to t = {longer * dt:.3g} s; at t = {scene.time_end:g} s it would still move"
-    return LoopPlan(dt, longer, settle, note)
-
-
-def largest_cost(design: Design, plan: LoopPlan) -> float:
-    """A thousand times what the optimal loop and one that does nothing would pay. Collective."""
-    y = outputs(design.problem, design.error)[:, 0]
-    return 1e3 * (design.judge.optimal + plan.dt * plan.steps * float(y @ design.problem.Q @ y))
 
 
 def with_bounds[Figures: GainQuality](

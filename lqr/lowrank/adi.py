@@ -10,11 +10,12 @@ import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, Complex, on_root
+from softgrasp.lqr.lowrank.adjoint import Right, Solution, closed_adjoint, mass_right
 from softgrasp.lqr.lowrank.compress import compress, gram
-from softgrasp.lqr.lowrank.plant import Plant, Right, Solution, closed_adjoint, mass_right
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import WINDOW, ShiftQueue
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 
 SQUEEZE = 480  # columns of Z from which it is compressed on the way: memory of a large scene
 SHARE = 0.02  # of the tolerance that one compression on the way may use up

@@ -8,8 +8,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
-from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import damp
 from softgrasp.reduction.bases.engines import triangle
 

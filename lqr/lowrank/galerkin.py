@@ -15,7 +15,7 @@ from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import shift_range
 from softgrasp.lqr.lowrank.solver import Iterate, LowRankSolver
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import normalising
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve

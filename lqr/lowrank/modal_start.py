@@ -13,8 +13,8 @@ from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.care import FAST_RESIDUAL, StateSpace, fast_solution, lyapunov, riccati_residual, solve_reduced
 from softgrasp.lqr.dense.modal import TissueMatrices, assemble_space, in_energy
 from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY, ControlError
-from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import damp
 
 MODES = 30

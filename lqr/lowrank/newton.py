@@ -16,14 +16,15 @@ from softgrasp.fem.errors import CheckpointError, SolverError, agree
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.fem.sealed import digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 from softgrasp.lqr.lowrank.adi import SHARE, AdiSweep, FactorColumns, adi_step, sweep_norms
+from softgrasp.lqr.lowrank.adjoint import Right, make_right
 from softgrasp.lqr.lowrank.compress import triangular
 from softgrasp.lqr.lowrank.modal_start import ModalStart, modal_start
-from softgrasp.lqr.lowrank.plant import Plant, Right, make_right
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
 from softgrasp.lqr.lowrank.solver import STOP, Iterate, LowRankSolver
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY
-from softgrasp.lqr.plant.gain import Block
 
 FORMAT = 4
 LINE_SEARCH = 0.5  # of the residual before: a Newton step that leaves more is shortened

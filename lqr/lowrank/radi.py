@@ -11,14 +11,15 @@ import numpy as np
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.lowrank.adi import GROWTH, SHARE, FactorColumns, LowRankSweep
+from softgrasp.lqr.lowrank.adjoint import Right, Solution, make_right, mass_right
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.lowrank.modal_start import ModalStart, modal_start
-from softgrasp.lqr.lowrank.plant import Plant, Right, Solution, make_right, mass_right
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import ShiftQueue, shift_range
 from softgrasp.lqr.lowrank.solver import STOP, Iterate, LowRankSolver
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import MODAL_KEY
-from softgrasp.lqr.plant.gain import Block
 
 
 def radi_columns(plant: Plant, s: complex, V: Solution) -> tuple[Block, Array, Array, float]:

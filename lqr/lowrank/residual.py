@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, times_columns
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ROWS = 4_000  # rows of U that are reduced at a time

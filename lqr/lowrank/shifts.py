@@ -10,8 +10,9 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, total
-from softgrasp.lqr.lowrank.plant import Plant, Right
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.lowrank.adjoint import Right
+from softgrasp.lqr.lowrank.plant import Plant
+from softgrasp.lqr.plant.block import Block
 
 WINDOW = 10  # blocks of Z whose Ritz values give the next shifts
 EARLY = 1  # shifts still to come when the next are chosen: another core or rank can factor ahead meanwhile

@@ -15,7 +15,8 @@ from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue, make_shifted
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution, SolverName
 
 Progress = Callable[[dict[str, float]], None]

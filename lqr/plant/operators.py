@@ -18,7 +18,7 @@ import numpy as np
 
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 

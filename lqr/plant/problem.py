@@ -11,7 +11,8 @@ from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import BlockSystem
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
 
 SolverName = Literal["dense", "newton_adi", "radi", "galerkin", "modal_lqr"]
 

@@ -17,8 +17,8 @@ from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.lqr.dense.modal import ModalPlant, closed_loop_rates, lowest_plant
 from softgrasp.lqr.lowrank.compress import gram, triangular
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Block
 from softgrasp.lqr.plant.operators import costates_to_absolute, costates_to_relative, states_to_relative
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.reduction.bases.engines import EPS, factor, small_svd

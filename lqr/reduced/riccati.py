@@ -1,20 +1,18 @@
-"""The paper's reduced Riccati equations: project, solve, judge the gain on the full plant, re-tune it."""
+"""The paper's reduced Riccati equations: project, solve, and judge the gain on the full plant."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, on_root, times_columns, total
-from softgrasp.fem.system import LayerMaterial
+from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import StateSpace, solve_reduced
 from softgrasp.lqr.lowrank.compress import gram, triangular
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import (
     costates_to_absolute,
     descriptor,
@@ -31,7 +29,6 @@ from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoo
 from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radius
 
 NAN = float("nan")
-Materials = tuple[LayerMaterial, ...]
 
 
 @dataclass(frozen=True)
@@ -237,102 +234,3 @@ class GainJudge:
             report, gain=gain, error_K=gain_error(self.problem, self.gain, gain), cost_excess=quality.cost_excess,
             abscissa_full=quality.abscissa, certified=quality.certified, sampled=quality.sampled,
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """Gain for one setting of the materials."""
-
-    P_N: Array  # (N, N), in the retuner's scaled basis
-    K_N: Array  # gain on reduced states, u = K_N x_N, (n_s, N)
-    seconds: float  # to combine the components and solve the equation
-
-
-class Retuner:
-    """A_N = A_0 + sum_layers sum_{mu, lambda} theta (A_j + beta A'_j), A_j = -W_v'K_j U_z, A'_j = -W_v'K_j U_v.
-
-    K_ee and D_ee are affine in the Lame constants; E, B, C and the rigid extension T do not depend on them. Nothing of
-    the size of the tissue is touched in :meth:`solve`. Collective to make, not collective to use.
-
-    ``problem``: the plant at the reference materials; ``basis``: the basis built there.
-    """
-
-    def __init__(self, problem: RiccatiProblem, basis: RiccatiBasis) -> None:
-        self.problem = problem
-        self.basis = basis = energy_scaled(problem, basis)
-        self.reference: Materials = problem.system.materials
-        self.matrices = project_plant(problem, basis)
-        comm, n = problem.layout.comm, problem.layout.n_local
-        W_v, U_z, U_v = basis.W.tall[n:], basis.U.tall[:n], basis.U.tall[n:]
-        self.parts: list[tuple[tuple[Array, Array], tuple[Array, Array]]] = []
-        for layer in problem.system.layers:
-            pairs = []
-            for component in (layer.K_mu, layer.K_lambda):
-                elastic, viscous = (total(comm, W_v.T @ times_columns(component.ee, U)) for U in (U_z, U_v))
-                pairs.append((-elastic, -viscous))
-            self.parts.append((pairs[0], pairs[1]))
-        self.A_0 = self.matrices.A - self._stiffness(self.reference)
-
-    def _stiffness(self, materials: Materials) -> Array:
-        result = np.zeros_like(self.matrices.A)
-        for (mu, lam), m in zip(self.parts, materials, strict=True):
-            result += m.mu * (mu[0] + m.beta * mu[1]) + m.lam * (lam[0] + m.beta * lam[1])
-        return result
-
-    def at(self, materials: Materials) -> StateSpace:
-        """The reduced equation for other Lame constants and viscosities.
-
-        Raises ControlError: the number of layers or a density differs from the reference.
-        """
-        if len(materials) != len(self.reference):
-            raise ControlError(f"{len(materials)} materials are given; the body has {len(self.reference)} layers")
-        for old, new in zip(self.reference, materials, strict=True):
-            if new.rho != old.rho:
-                raise ControlError(f"rho = {new.rho:g} differs from {old.rho:g}; re-tuning covers lambda, mu and beta")
-        return replace(self.matrices, A=self.A_0 + self._stiffness(materials))
-
-    def solve(self, materials: Materials) -> Tuned:
-        """Combine, solve, gain.
-
-        Raises ControlError: the setting is refused, or its reduced equation has no stabilising solution.
-        """
-        begin = time.perf_counter()
-        m = self.at(materials)
-        P_N = solve_reduced(m)
-        K_N = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
-        return Tuned(P_N, K_N, time.perf_counter() - begin)
-
-
-@dataclass(frozen=True)
-class RetunedGain(GainQuality):
-    """The gain at one setting of the box, against the full Riccati solution there."""
-
-    materials: Materials  # of all layers
-    seconds: float = NAN  # of the re-tuning
-
-
-def retuned_gain(
-    retuner: Retuner,
-    materials: Materials,
-    solve: Callable[[RiccatiProblem], RiccatiSolution],
-    start: Block,
-    modes: int | None = None,
-    law: Sampling | None = None,
-) -> RetunedGain:
-    """Error of the re-tuned gain at one setting of the box. Collective.
-
-    Args:
-        solve: full solver, the reference.
-        start: start minus target of hand and tissue, one column.
-        modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
-        law: instants of the loop; None judges the continuous law alone.
-    """
-    try:
-        tuned = on_root(retuner.problem.layout.comm, lambda: retuner.solve(materials))
-    except ControlError as error:
-        return RetunedGain(materials, reason=str(error))
-    problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
-    judge = GainJudge(problem, solve(problem), start, ModalLoop(problem, modes), law)
-    return judge.with_quality(
-        RetunedGain(materials, tuned.seconds), full_gain(retuner.problem, retuner.basis, tuned.P_N)
-    )

@@ -12,8 +12,9 @@ from softgrasp.fem.petsc import PETSc, combine, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.compress import gram
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import EPS, ControlError
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import damp, descriptor
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound

@@ -11,7 +11,7 @@ import scipy.linalg
 from softgrasp.fem.petsc import Array, on_root, total
 from softgrasp.lqr.dense.care import block_eigenvalues, lyapunov
 from softgrasp.lqr.dense.modal import ModalPlant, TissueMatrices, dense_modes, gather_tissue, lowest_plant
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each

@@ -12,7 +12,7 @@ from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifts import shift_range
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, ModalLoop, SampledRadius

@@ -9,7 +9,7 @@ from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.modal_start import plant_modes
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
 

@@ -10,7 +10,7 @@ coordinates a basis can be orthonormal and symplectic at once only if the weight
 K^-1 in place of M^-1. The rate c [1/s or s] makes both halves of the snapshots equally large, whatever the units are.
 
 Euclidean products of q and p compare lengths with momenta, whose nodal entries shrink with the mesh. Errors of
-[q_s, p_s, q_e, p_e] (:meth:`softgrasp.reduction.errors.Comparison.state_error`) on the paper's forward scene, solid
+[q_s, p_s, q_e, p_e] (:meth:`softgrasp.reduction.errors.ModelComparison.state_error`), the paper's forward scene, solid
 modes fixed, N = 18: 14 vectors beside the hand's four:
 
     basis                            euclidean    mass     energy

@@ -11,17 +11,7 @@ from typing import Any
 import typer
 from mpi4py import MPI
 
-from softgrasp.study.bench import (
-    accuracy,
-    bases,
-    certified,
-    forward,
-    forward_rows,
-    meshes,
-    riccati,
-    riccati_rows,
-    switches,
-)
+from softgrasp.study.bench import accuracy, bases, certified, forward, forward_rows, meshes, riccati, switches
 from softgrasp.study.shell.ending import run_command
 
 COMMANDS = {
@@ -29,7 +19,7 @@ COMMANDS = {
     "accuracy": accuracy, "certified": certified,
 }  # fmt: skip
 WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
-    "forward": forward_rows.measure_row, "riccati": riccati_rows.measure_row, "bases": bases.measure,
+    "forward": forward_rows.measure_row, "riccati": riccati.measure_row, "bases": bases.measure,
     "switches": switches.measure,
 }  # fmt: skip
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +24,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.lqr.design.feedback import Design, design
 from softgrasp.reduction.reduce import reduce_linear
 from softgrasp.reduction.replay import full_run, replay_linear
-from softgrasp.study.bench.driver import Goal, goal_rows, open_console, show_goals, table_of, write_bench
+from softgrasp.study.bench import driver
+from softgrasp.study.bench.driver import Goal, cpu_seconds
 from softgrasp.study.report.origin import machine
 from softgrasp.study.shell.session import list_files
 
@@ -47,7 +47,7 @@ keep the machine quiet."""
 
 
 @dataclass(frozen=True)
-class Row:
+class MeshPoint:
     """One mesh: unknowns; seconds of mesh and assembly, of factor and steps, of a reduced run, of P; errors."""
 
     mesh: str
@@ -64,7 +64,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Reached:
+class TolerancePoint:
     """One tolerance: mesh, estimate and bound over the true error, error of the corrected outputs over it; seconds."""
 
     tolerance: float
@@ -123,12 +123,7 @@ def off(y: Array, exact: Array) -> float:
 
 def median(task: Callable[[], object]) -> float:
     """Seconds of the processor that a task takes, the median of repeats after a first one."""
-    times = []
-    for _ in range(REPEATS + 1):
-        begin = time.process_time()
-        task()
-        times.append(time.process_time() - begin)
-    return statistics.median(times[1:])
+    return statistics.median([cpu_seconds(task) for _ in range(REPEATS + 1)][1:])
 
 
 def controlled(sets: list[str]) -> Design:
@@ -137,30 +132,25 @@ def controlled(sets: list[str]) -> Design:
     return design(model, Stopwatch(MPI.COMM_WORLD))
 
 
-def measure(name: str, sets: list[str], exact: Array, cost: float) -> Row:
+def measure(name: str, sets: list[str], exact: Array, cost: float) -> MeshPoint:
     """One row, against deformation (steps + 1, d) [m] and cost of the references. Collective."""
     comm, scene = MPI.COMM_WORLD, paper(sets)
     model = build(scene, comm=comm)
     full = simulate(model)
     rom = reduce_linear(model, [full_run(model, full)], METHOD, N)
     small = replay_linear(rom, model, full)
-    found = controlled(sets)
-    return Row(
-        name,
-        model.system.layout.n_e,
-        median(lambda: build(scene, comm=comm)),
-        median(lambda: simulate(model)),
-        off(deformation(full), exact),
-        median(lambda: replay_linear(rom, model, full)),
+    feedback = controlled(sets)
+    solution = feedback.solution
+    return MeshPoint(
+        name, model.system.layout.n_e, median(lambda: build(scene, comm=comm)), median(lambda: simulate(model)),
+        off(deformation(full), exact), median(lambda: replay_linear(rom, model, full)),
         off(small.outputs - full.outputs_rigid, exact),
-        found.solution.seconds.get("total", sum(found.solution.seconds.values())),
-        abs(found.judge.optimal - cost) / abs(cost),
-        found.solution.counts.get("solves", 0),
-        found.solution.residual,
-    )
+        solution.seconds.get("total", sum(solution.seconds.values())), abs(feedback.judge.optimal - cost) / abs(cost),
+        solution.counts.get("solves", 0), solution.residual,
+    )  # fmt: skip
 
 
-def reach(goal: float, exact: Array) -> Reached:
+def reach(goal: float, exact: Array) -> TolerancePoint:
     """What ``tissue.refine.tolerance`` reaches with quadratic elements, whatever the steps leave. Collective."""
     comm, first, scene = MPI.COMM_WORLD, paper(graded(2, goal)), paper(graded(2, goal, ""))
 
@@ -168,23 +158,17 @@ def reach(goal: float, exact: Array) -> Reached:
         return build_to_tolerance(scene, comm, steps=False)
 
     model = whole()
-    run, found = simulate(model), model.accuracy
-    assert found is not None
+    run, estimate = simulate(model), model.accuracy
+    assert estimate is not None
     error = off(deformation(run), exact)
-    return Reached(
-        goal,
-        found.n_e,
-        found.passes,
-        error,
-        found.estimate / error,
-        found.bound / error,
-        off(found.corrected(run.outputs) - run.outputs_rigid, exact) / error,
-        median(lambda: simulate(build(first, comm=comm))),
-        median(lambda: simulate(whole())),
-    )
+    return TolerancePoint(
+        goal, estimate.n_e, estimate.passes, error, estimate.estimate / error, estimate.bound / error,
+        off(estimate.corrected(run.outputs) - run.outputs_rigid, exact) / error,
+        median(lambda: simulate(build(first, comm=comm))), median(lambda: simulate(whole())),
+    )  # fmt: skip
 
 
-def goals(rows: list[Row], reached: list[Reached]) -> list[Goal]:
+def goals(rows: list[MeshPoint], reached: list[TolerancePoint]) -> list[Goal]:
     """What was to be reached."""
     result = [
         Goal("solves of a Riccati equation, graded", max(r.solves for r in rows if "graded" in r.mesh), SOLVES),
@@ -202,20 +186,20 @@ def main(
     out: Annotated[Path, typer.Option(help="folder of accuracy.json, .csv and .md")] = Path("out/bench"),
 ) -> None:
     """Measure every mesh and print the tables."""
-    console = open_console(150)
+    console = driver.open_console(150)
     exact = deformation(simulate(build(paper(graded(3, REFERENCE)), comm=MPI.COMM_WORLD)))
     cost = controlled(graded(3, REFERENCE_COST)).judge.optimal
     reached, rows = [reach(goal, exact) for goal in ASKED], []
     for name, sets in meshes().items():
         rows.append(measure(name, sets, exact, cost))
         console.print(f"{name}: n_e = {rows[-1].n_e}, error {rows[-1].error:.2e}", style="dim")
-    content: dict[str, Any] = {"rows": [asdict(row) for row in rows], "reached": [asdict(r) for r in reached]}
-    table = table_of(content["rows"], COLUMNS, "error of the deformation against time")
-    tolerances = table_of(content["reached"], COLUMNS_REACHED, "what tissue.refine.tolerance reaches")
+    content: dict[str, Any] = {"rows": driver.as_rows(rows), "reached": driver.as_rows(reached)}
+    table = driver.table_of(rows, COLUMNS, "error of the deformation against time")
+    tolerances = driver.table_of(reached, COLUMNS_REACHED, "what tissue.refine.tolerance reaches")
     for part in (table, tolerances):
         console.print(part.terminal())
     aims = goals(rows, reached)
-    show_goals(console, aims)
-    content |= {"goals": goal_rows(aims), "version": package_version(), "machine": machine()}
+    driver.show_goals(console, aims)
+    content |= {"goals": driver.goal_rows(aims), "version": package_version(), "machine": machine()}
     markdown = f"{table.markdown()}\n{tolerances.markdown()}"
-    list_files(console, write_bench(out, "accuracy", content, table, markdown))
+    list_files(console, driver.write_bench(out, "accuracy", content, table, markdown))

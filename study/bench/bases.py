@@ -130,47 +130,38 @@ def right_down_to(sigma: Array, true: Array, tolerance: float) -> float:
     return float(true[count - 1] / true[0]) if count else float("inf")
 
 
-Answer = tuple[Array, NDArray[Any]]
+SingularPair = tuple[Array, NDArray[Any]]  # all sigma, leading columns of U
 
 
-def methods_for(comm: MPI.Intracomm, n: int, m: int) -> dict[str, tuple[Callable[[], Answer], Array]]:
+def methods_for(comm: MPI.Intracomm, n: int, m: int) -> dict[str, tuple[Callable[[], SingularPair], Array]]:
     """Every engine as a call that returns sigma and local U, with the true singular values. Collective."""
     X = known_matrix(comm, n, m, False)
     half = known_matrix(comm, n, m // 2, True)
     beside = np.asfortranarray(np.hstack([half.real, half.imag]))
 
-    def pod(engine: Any, k: int | None) -> Callable[[], Answer]:
-        def call() -> Answer:
-            f = factor(comm, X, engine, k)
-            u, s, _ = small_svd(comm, f.R)
-            return f.scale * s, f.Q @ u[:, :KEPT]
+    def pod(engine: Any, k: int | None = None) -> SingularPair:
+        f = factor(comm, X, engine, k)
+        u, s, _ = small_svd(comm, f.R)
+        return f.scale * s, f.Q @ u[:, :KEPT]
 
-        return call
+    def psd(engine: Any) -> SingularPair:
+        f = factor(comm, beside, engine)
+        u, s, _ = small_svd(comm, f.R[:, : m // 2] + 1j * f.R[:, m // 2 :])
+        return f.scale * s, f.Q @ u[:, :KEPT]
 
-    def psd(engine: Any) -> Callable[[], Answer]:
-        def call() -> Answer:
-            f = factor(comm, beside, engine)
-            u, s, _ = small_svd(comm, f.R[:, : m // 2] + 1j * f.R[:, m // 2 :])
-            return f.scale * s, f.Q @ u[:, :KEPT]
-
-        return call
-
-    def peer(A: NDArray[Any]) -> Callable[[], Answer]:
-        def call() -> Answer:
-            u, s, _ = np.linalg.svd(A, full_matrices=False)
-            return s, u[:, :KEPT]
-
-        return call
+    def peer(A: NDArray[Any]) -> SingularPair:
+        u, s, _ = np.linalg.svd(A, full_matrices=False)
+        return s, u[:, :KEPT]
 
     true, true_half = spectrum_of(m), spectrum_of(m // 2)
-    result = {name: (pod(name, None), true) for name in ("tsqr", "gram")}
-    result["svd"] = pod("svd", min(KEPT, m // 3 - 1)), true
+    result: dict[str, tuple[Callable[[], SingularPair], Array]]
+    result = {name: (partial(pod, name), true) for name in ("tsqr", "gram")}
+    result["svd"] = partial(pod, "svd", min(KEPT, m // 3 - 1)), true
     if n <= SCALAPACK_LIMIT:
-        result["svd_all"] = pod("svd", None), true
-    result |= {f"psd_{name}": (psd(name), true_half) for name in ("tsqr", "gram")}
+        result["svd_all"] = partial(pod, "svd"), true
+    result |= {f"psd_{name}": (partial(psd, name), true_half) for name in ("tsqr", "gram")}
     if comm.size == 1 and n <= NUMPY_LIMIT:
-        result["numpy"] = peer(X), true
-        result["psd_numpy"] = peer(half), true_half
+        result |= {"numpy": (partial(peer, X), true), "psd_numpy": (partial(peer, half), true_half)}
     return result
 
 

@@ -8,7 +8,8 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,14 +40,8 @@ class Failure:
 def launch_worker(name: str, spec: Row, ranks: int, limit: float = 3600.0) -> Row:
     """Run ``python -m softgrasp.study.bench worker NAME SPEC``, so that no row inherits memory or caches from another.
 
-    Args:
-        name: of the benchmark.
-        spec: arguments of the function that measures, fit for JSON.
-        ranks: MPI ranks.
-        limit: longest time [s].
-
-    Returns:
-        ``points`` measured until the end, or until the ``error`` that came before it.
+    ``spec``: arguments of the function that measures, fit for JSON; ``limit``: longest time [s]. Returns the ``points``
+    measured until the end, or until the ``error`` that came before it.
     """
     mpiexec = find_mpiexec()
     if mpiexec is None:
@@ -128,6 +123,13 @@ def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
         return None
     x, y = np.log(np.array(points)).T
     return float(np.polyfit(x, y, 1)[0])
+
+
+def cpu_seconds(call: Callable[[], object]) -> float:
+    """Seconds of the processor that a call takes."""
+    begin = time.process_time()
+    call()
+    return time.process_time() - begin
 
 
 def number(value: float | None) -> str:

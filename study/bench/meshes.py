@@ -23,7 +23,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
 from softgrasp.study.bench.driver import Curve, growth, loglog, parse_list
-from softgrasp.study.reduce.sweep import sweep
+from softgrasp.study.reduce.measure import sweep
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
 from softgrasp.study.report.tables import Table

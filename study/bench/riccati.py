@@ -1,31 +1,60 @@
-"""What the large Riccati equation costs, as table, JSON, CSV, figure: ``python -m softgrasp.study.bench riccati``."""
+"""What the large Riccati equation costs, beside other codes: ``python -m softgrasp.study.bench riccati``."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
+import numpy as np
+import scipy.linalg
 import typer
+from mpi4py import MPI
 from pydantic import TypeAdapter
 from rich.console import Console
 
-from softgrasp.fem.errors import CheckpointError
+from softgrasp.fem.errors import CheckpointError, SoftgraspError
+from softgrasp.fem.model.build import build
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.lqr.dense.modal import factor_psd
+from softgrasp.lqr.dense.paper import paper_form
+from softgrasp.lqr.design.scene import problem as make_problem
+from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
+from softgrasp.lqr.lowrank.newton import NewtonADI
+from softgrasp.lqr.lowrank.radi import RADI
+from softgrasp.lqr.lowrank.residual import residual
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
+from softgrasp.lqr.plant.operators import costates_to_relative, gain_to_absolute
+from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, Goal, number
-from softgrasp.study.bench.riccati_rows import STAGES, RiccatiPoint
 from softgrasp.study.report.files import write_json
+from softgrasp.study.report.origin import peak_memory_mb
+from softgrasp.study.shell.timing import repeated
 
 SIZES = "10,20,40,80,160"
-EVERY = ("newton_adi", "radi", "galerkin")
 LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
 PEER_LIMIT = {"scipy": 10, "slycot": 10, "pymor": 40}  # nx; minutes beyond
 LIMITS = {("newton_adi", 10): 0.2, ("newton_adi", 80): 20.0, ("galerkin", 10): 0.03, ("galerkin", 80): 4.0}  # [s]
 LARGE_SECONDS, LARGE_MB = 900.0, 24 * 1024
 RESIDUAL, GAIN = 1e-10, 1e-6
+METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
+REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
+STAGES = {
+    "factor": ("factor",),
+    "solve": ("solve",),
+    "shifts": ("start", "shifts"),
+    "dense": ("small", "products", "compress"),
+    "residual": ("residual",),
+}
 HELP = f"""Measure the large Riccati equation of the paper's control scene and print one table.
 
 Every row is a program of its own under mpiexec: Newton-ADI, RADI and structured Galerkin on nx x 2 nx cells. Columns:
@@ -46,7 +75,133 @@ COLUMNS = {
 CSV = {name: name for name in ("nx", "states", "ranks", "method", "solves", "newton_steps", "rank", "seconds")}
 CSV |= {name: name for name in ("residual", "gain_difference", "memory_mb", "memory_base_mb")}
 CSV |= {f"{name}_s": f"split.{name}" for name in STAGES}
+
+
+@dataclass(frozen=True)
+class RiccatiPoint:
+    """One method on nx x 2 nx cells; a peer has fewer numbers."""
+
+    nx: int
+    ranks: int
+    method: str
+    states: int
+    seconds: float  # median
+    rank: int  # of Z
+    residual: float  # relative, recomputed from Z
+    gain_difference: float | None  # relative, to the gain of the first method
+    split: dict[str, float] = field(default_factory=dict)  # seconds by stage
+    solves: int = 0
+    newton_steps: int = 0
+    # memory_mb, memory_base_mb: peak of all ranks, and that before the first method [MiB]
+    memory_mb: float = 0.0
+    memory_base_mb: float = 0.0
+
+
 Rows = list[RiccatiPoint | Failure]
+
+
+def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
+    """The paper's control problem on nx x 2 nx cells. Collective."""
+    changes = [f"tissue.cells=[{nx}, {2 * nx}]", f"effects.damping.beta={beta!r}"]
+    return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm=comm))
+
+
+def measure(nx: int, beta: float, methods: Sequence[str], repeats: int) -> Iterator[RiccatiPoint | Failure]:
+    """All methods on nx x 2 nx cells; gains are compared with the first one. Collective.
+
+    ``beta`` is the Kelvin-Voigt time [s].
+    """
+    comm = MPI.COMM_WORLD
+    problem = problem_for(comm, nx, beta)
+    base = peak_memory_mb(comm)
+    reference: Gain | None = None
+    for name in methods:
+        solved: list[RiccatiSolution] = []
+        solve = partial(lambda name, to: to.append(METHODS[name]().solve(problem)), name, solved)
+        try:
+            seconds = float(np.median(repeated(comm, solve, repeats, REPEAT_SECONDS)))
+        except SoftgraspError as error:
+            yield Failure(f"nx = {nx}, {name}", comm.size, str(error))
+            continue
+        s = solved[-1]
+        yield RiccatiPoint(
+            nx, comm.size, name, problem.layout.states, seconds, s.rank, s.residual,
+            None if reference is None else gain_error(problem, reference, s.gain),
+            {part: sum(s.seconds.get(key, 0.0) for key in keys) for part, keys in STAGES.items()},
+            s.counts["solves"], s.counts["newton_steps"], peak_memory_mb(comm), base,
+        )  # fmt: skip
+        reference = reference or s.gain
+
+
+class PaperPlant(NamedTuple):
+    """E x' = A x + B u and y = C x in the paper's own sparse form, weighted by Q and R."""
+
+    E: Any
+    A: Any
+    B: Array
+    C: Array
+    Q: Array
+    R: Array
+
+
+def scipy_solver(plant: PaperPlant) -> Callable[[], Array]:
+    """SciPy's dense solver: X."""
+    E, A, B, C, Q, R = plant
+    return lambda: scipy.linalg.solve_continuous_are(A.toarray(), B, C.T @ Q @ C, R, e=E.toarray())
+
+
+def slycot_solver(plant: PaperPlant) -> Callable[[], Array]:
+    """SLICOT's SG02AD through slycot: X."""
+    slycot = importlib.import_module("slycot")
+    E, A, B, C, Q, R = plant
+    n, m = B.shape
+    options = ("C", "B", "N", "U", "Z", "N", "S", "R", n, m, len(C))
+    return lambda: slycot.sg02ad(*options, A.toarray(), E.toarray(), B, C.T @ Q @ C, R, np.zeros((n, m)))[1]
+
+
+def pymor_solver(plant: PaperPlant) -> Callable[[], Array]:
+    """The low-rank RADI of pyMOR: Z with X = Z Z^T."""
+    from pymor.core.logger import set_log_levels
+    from pymor.operators.numpy import NumpyMatrixOperator
+    from pymor.solvers.matrix_equations.equations import RiccatiEquation
+    from pymor.solvers.matrix_equations.radi import RADIRiccatiSolver
+
+    set_log_levels({"pymor": "ERROR"})
+    A, E = NumpyMatrixOperator(plant.A), NumpyMatrixOperator(plant.E)
+    weighted = scipy.linalg.sqrtm(plant.Q).real @ plant.C
+    b, c = A.source.from_numpy(plant.B), A.source.from_numpy(weighted.T)
+    equation = RiccatiEquation(A, E, b, c, R=plant.R, trans=True)
+    return lambda: RADIRiccatiSolver().solve(equation).to_numpy()
+
+
+PEERS = {"scipy": scipy_solver, "slycot": slycot_solver, "pymor": pymor_solver}
+
+
+def measure_peer(nx: int, beta: float, peer: str) -> Iterator[RiccatiPoint | Failure]:
+    """One peer on the paper's matrices against our Newton-ADI, on one rank."""
+    problem = problem_for(MPI.COMM_WORLD, nx, beta)
+    reference, s = NewtonADI().solve(problem).gain, 2 * problem.layout.n_s
+    try:
+        plant = PaperPlant(*paper_form(problem), problem.Q, problem.R)
+        solve = PEERS[peer](plant)
+        begin = time.perf_counter()
+        Z = solve()
+        seconds = time.perf_counter() - begin
+        if peer != "pymor":
+            Z = factor_psd(Z)
+        K = -np.linalg.solve(plant.R, (plant.B.T @ Z) @ (plant.E.T @ Z).T).T
+        relative = costates_to_relative(problem.system, Block(Z[:s], Z[s:]))
+        gain = Gain.of_block(gain_to_absolute(problem.system, Block(K[:s], K[s:]), -1))
+    except Exception as error:  # a peer's failure is a result of the comparison
+        yield Failure(f"{peer}, nx = {nx}", 1, f"failed, {type(error).__name__}: {error}"[:200])
+        return
+    accuracy = residual(problem, relative), gain_error(problem, reference, gain)
+    yield RiccatiPoint(nx, 1, peer, problem.layout.states, seconds, relative.columns, *accuracy)
+
+
+def measure_row(**arguments: Any) -> Iterator[RiccatiPoint | Failure]:
+    """The points that the launcher asks for. Collective."""
+    return (measure_peer if "peer" in arguments else measure)(**arguments)
 
 
 @dataclass
@@ -65,11 +220,7 @@ class Record:
         return driver.of(RiccatiPoint, self.rows)
 
     def resume(self) -> None:
-        """Take over what an earlier run with the same damping has measured.
-
-        Raises:
-            CheckpointError: the file is not one of these.
-        """
+        """Take what an earlier run with this damping has measured. Raises CheckpointError: not such a file."""
         adapter = TypeAdapter(list[RiccatiPoint])
         try:
             old = json.loads(self.file.read_text()) if self.file.is_file() else {}
@@ -143,7 +294,7 @@ def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoin
 
     fewest = min((p.ranks for p in points), default=1)
     curves: list[driver.Curve] = []
-    for name, colour in zip(EVERY, (BLUE, GREEN, ORANGE), strict=True):
+    for name, colour in zip(METHODS, (BLUE, GREEN, ORANGE), strict=True):
         own = [(p.states, p.seconds) for p in points if p.method == name and p.ranks == fewest]
         curves.append((name, own, {"color": colour}))
     for name, mark, colour in (("scipy", "s", HAND), ("slycot", "^", HAND), ("pymor", "x", PURPLE)):
@@ -156,7 +307,9 @@ def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoin
 
 def collect(console: Console, meshes: list[int], ranks: list[int], repeats: int, large: bool, record: Record) -> None:
     """Launch all workers one after the other, the largest last."""
-    jobs: list[tuple[int, int, tuple[str, ...], int]] = [(nx, k, EVERY, repeats) for nx in meshes for k in ranks]
+    jobs: list[tuple[int, int, tuple[str, ...], int]] = [
+        (nx, k, tuple(METHODS), repeats) for nx in meshes for k in ranks
+    ]
     if large:
         jobs.append((LARGEST, LARGEST_RANKS, ("newton_adi", "galerkin"), 1))
     kept = [record.kept(*job[:3]) for job in jobs]

@@ -6,7 +6,7 @@ import itertools
 import operator
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -42,8 +42,7 @@ from softgrasp.reduction.propagator import propagator
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure
 from softgrasp.study.bench.forward_rows import DT, bench_scene, cells_for
-from softgrasp.study.bench.riccati_rows import problem_for
-from softgrasp.study.report.tables import Table
+from softgrasp.study.bench.riccati import problem_for
 from softgrasp.study.shell.timing import interleave, medians, timed
 
 BATCH = 100  # models of a batch
@@ -83,6 +82,11 @@ class SwitchPoint:
     ranks: int
     first: float  # first, second: median seconds
     second: float
+
+    @property
+    def ratio(self) -> float:
+        """Above 1 the first is the faster one."""
+        return self.second / self.first
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,6 @@ def batch(setup: Setup) -> Iterator[SwitchPoint]:
         ]
         size = sum(p.block.nbytes for p in many)
         together = partial(under, softgrasp.reduction.online, "TOGETHER", 2**62, run_batch, many, DT, force)
-
         alone = partial(lambda many: [run(p, None, force) for p in many], many)
         limit = f"TOGETHER = {softgrasp.reduction.online.TOGETHER / 1e6:g} MB"
         yield setup.compare("batch", limit, f"{BATCH} models, N = {N}, {size / 1e6:.1f} MB", (together, alone))
@@ -215,7 +218,7 @@ def product(setup: Setup) -> Iterator[SwitchPoint]:
         for k, storage in itertools.product((10, 30, 120), ("rows", "columns")):
             X = np.asarray(rng.standard_normal((n, k)), order="C" if storage == "rows" else "F")
             calls = (partial(times_columns, A, X), partial(operator.matmul, rows, X), partial(by_petsc, A, X))
-            ways = zip(("ours", "SciPy", "PETSc"), (partial(cpu_seconds, call) for call in calls), strict=True)
+            ways = zip(("ours", "SciPy", "PETSc"), (partial(mean_seconds, call) for call in calls), strict=True)
             seconds = medians(interleave(dict(ways), 3 * setup.repeats))
             for way in ("SciPy", "PETSc"):
                 setting = f"n_e = {n}, {k} columns by {storage}"
@@ -227,27 +230,18 @@ def by_petsc(A: PETSc.Mat, X: Array) -> Any:
     return under(softgrasp.fem.petsc, "BLOCK_COLUMNS", X.shape[1] + 1, times_columns, A, np.asfortranarray(X))
 
 
-def cpu_seconds(call: Callable[[], Any]) -> float:
+def mean_seconds(call: Callable[[], Any]) -> float:
     """Mean CPU seconds of a call after one that is not counted: it pays for the pages that the way before left cold."""
     call()
-    begin = time.process_time()
-    for _ in range(CALLS):
-        call()
-    return (time.process_time() - begin) / CALLS
+    return driver.cpu_seconds(lambda: [call() for _ in range(CALLS)]) / CALLS
 
 
 def finite(setup: Setup) -> Iterator[SwitchPoint]:
     """Whole runs with linear elasticity and with finite strain, CPU seconds. One rank."""
 
     def run_of(changes: list[str]) -> Callable[[], float]:
-        model = build(load_scene_collective(setup.comm, shipped_scenes()["paper_forward"], changes), comm=setup.comm)
-
-        def seconds() -> float:
-            begin = time.process_time()
-            simulate(model)
-            return time.process_time() - begin
-
-        return seconds
+        scene = load_scene_collective(setup.comm, shipped_scenes()["paper_forward"], changes)
+        return partial(driver.cpu_seconds, partial(simulate, build(scene, comm=setup.comm)))
 
     for nx in (15, 60):
         cells = f"tissue.cells=[{nx}, {2 * nx}]"
@@ -289,18 +283,16 @@ SWITCHES: dict[str, Callable[[Setup], Iterator[SwitchPoint]]] = {
     "product": product, "finite": finite,
 }  # fmt: skip
 SERIAL = ("batch", "start", "dense", "product", "finite")
-HEADER = ("switch", "constant", "size", "ranks", "first s", "second s", "second / first")
+COLUMNS = {
+    "switch": "switch", "constant": "limit", "size": "setting", "ranks": "ranks", "first s": "first .3g",
+    "second s": "second .3g", "second / first": "ratio .2f",
+}  # fmt: skip
+CSV = {f.name: f.name for f in fields(SwitchPoint)}
 
 
 def measure(switch: str, repeats: int, large: bool) -> Iterator[SwitchPoint]:
     """The points of one switch. Collective."""
     return SWITCHES[switch](Setup(MPI.COMM_WORLD, repeats, large))
-
-
-def table_of(points: list[SwitchPoint]) -> Table:
-    """The one table."""
-    cells = [(*astuple(p)[:4], f"{p.first:.3g}", f"{p.second:.3g}", f"{p.second / p.first:.2f}") for p in points]
-    return Table(HEADER, cells, "two methods around the sizes of a switch, median seconds")
 
 
 def main(
@@ -323,7 +315,7 @@ def main(
             spec = {"switch": name, "repeats": repeats, "large": large}
             rows += driver.measure(console, SwitchPoint, "switches", spec, k, name)
     points, failed = driver.of(SwitchPoint, rows), driver.failures(rows)
-    console.print(table_of(points).terminal())
+    title = "two methods around the sizes of a switch, median seconds"
+    console.print(driver.table_of(points, COLUMNS, title).terminal())
     content = {"command": "bench_switches", "rows": driver.as_rows(points), "failed": driver.as_rows(failed)}
-    table = Table(tuple(f.name for f in fields(SwitchPoint)), [astuple(point) for point in points])
-    driver.list_bench(console, driver.write_bench(out, "bench_switches", content, table), failed)
+    driver.list_bench(console, driver.write_bench(out, "bench_switches", content, driver.table_of(points, CSV)), failed)

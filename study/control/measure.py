@@ -16,18 +16,10 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.controller import CertifiedController, NoController, certified_controller
+from softgrasp.lqr.design.duration import LoopPlan, largest_cost
 from softgrasp.lqr.design.feedback import Design
-from softgrasp.lqr.design.orders import (
-    BasisGains,
-    LoopPlan,
-    Notify,
-    best_gains,
-    fast_order,
-    largest_cost,
-    reduce_gains,
-    with_bounds,
-)
-from softgrasp.lqr.design.scene import finite_problem
+from softgrasp.lqr.design.linearise import finite_problem
+from softgrasp.lqr.design.orders import BasisGains, Notify, best_gains, fast_order, reduce_gains, with_bounds
 from softgrasp.lqr.loop.controller import Controller, save_gain
 from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
@@ -36,7 +28,8 @@ from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import rest
 from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
-from softgrasp.lqr.reduced.riccati import GainReport, Materials, RetunedGain, Retuner, retuned_gain
+from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
+from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.modal_loop import SOME_MODES
 from softgrasp.reduction.parameters import grid_of, materials_at, outside

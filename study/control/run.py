@@ -15,12 +15,14 @@ from rich.progress import Progress, TaskProgressColumn
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.scene.control import Loop
+from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, plan, reduce_gains
-from softgrasp.lqr.design.scene import finite_problem, linearised, with_control
+from softgrasp.lqr.design.linearise import finite_problem, linearised
+from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
+from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.reduced.bases import A_PRIORI
-from softgrasp.study.control import measure, tables
+from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
 from softgrasp.study.pictures.beside import beside
 from softgrasp.study.pictures.frames import Frames
@@ -70,17 +72,17 @@ def run_control(
 
     def page() -> Page:
         if not isinstance(study, ControlStudy):
-            parts = [Section("Result", rows=tables.result_rows(study, seconds))]
-            return Page(f"{model.scene.name}: optimal gain", tables.summary(study), parts, {}, saved, " --gain-only")
+            parts = [Section("Result", rows=report.result_rows(study, seconds))]
+            return Page(f"{model.scene.name}: optimal gain", report.summary(study), parts, {}, saved, " --gain-only")
         pictures: list[Path] = []
         if session.pictures and study.retuned:
             from softgrasp.study.control.plots import figure_retune  # brings Matplotlib
 
             pictures += figure_retune(study.retuned, out / "retune.png")
         pictures += drawn()
-        parts, files = tables.sections(study, seconds, pictures), [*pictures, *fields, *saved]
+        parts, files = report.sections(study, seconds, pictures), [*pictures, *fields, *saved]
         title = f"{model.scene.name}: optimal feedback"
-        return Page(title, tables.summary(study), parts, tables.csv_tables(study), files)
+        return Page(title, report.summary(study), parts, report.csv_tables(study), files)
 
     list_files(console, session.write(model.scene, result, page))
     if session.comm.rank == 0 and restart is not None:
@@ -202,6 +204,6 @@ def show(console: Console, study: GainStudy, seconds: dict[str, float], said: st
     if isinstance(study, ControlStudy):
         for sentence in (*study.findings, *(note for note in study.notes if note != said)):
             console.print(f"note: {sentence}", soft_wrap=True, markup=False)
-    console.print(pairs(tables.result_rows(study, seconds)))
+    console.print(pairs(report.result_rows(study, seconds)))
     if isinstance(study, ControlStudy) and study.bases:
-        console.print(tables.best_table(study.bases).terminal(wrap=[0], width=console.width))
+        console.print(report.best_table(study.bases).terminal(wrap=[0], width=console.width))

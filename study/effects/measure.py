@@ -7,6 +7,7 @@ PETSc counts the operations of a step, and every matrix, vector and array that a
 from __future__ import annotations
 
 import gc
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -246,11 +247,9 @@ def read_table(text: str) -> dict[str, int]:
     """Class and number of creations from the text of PETSc's log."""
     counts: Counter[str] = Counter()
     table = f"\n{text}".partition("\nObject Type")[2].partition("\n===")[0]
-    for line in table.splitlines():
-        parts = line.rsplit(None, 2)
-        if len(parts) == 3 and parts[1].isdigit() and parts[2].isdigit() and parts[0].strip() != OWN:
-            counts[parts[0].strip()] += int(parts[1])  # one row a stage
-    return dict(counts)
+    for name, creations in re.findall(r"^ *(\S.*?) +(\d+) +\d+ *$", table, re.MULTILINE):  # one row a stage
+        counts[name] += int(creations) if name != OWN else 0
+    return dict(+counts)
 
 
 @contextmanager
@@ -287,14 +286,11 @@ def ends(samples: Array, share: float = 0.0) -> tuple[float, float]:
 
 def cost_of(with_: MeasuredScene, without: MeasuredScene, noise: float) -> Cost:
     """The differences of two cases; ``noise`` is what a step of one scene differs from itself by."""
-
-    def added(stage: str) -> Array:
-        return np.asarray(np.array(with_.seconds[stage]) - np.array(without.seconds[stage]))
-
-    assembly, setup, step = added("assembly"), added("setup"), added("step")
+    assembly, setup, step = (
+        np.array(with_.seconds[stage]) - np.array(without.seconds[stage]) for stage in ("assembly", "setup", "step")
+    )
     shares = step / np.array(without.seconds["step"])
     more, less = sum(with_.bytes.values()), sum(without.bytes.values())
-    low, high = ends(shares)
     return Cost(
         assembly=float(np.median(assembly)),
         setup=float(np.median(setup)),
@@ -302,8 +298,8 @@ def cost_of(with_: MeasuredScene, without: MeasuredScene, noise: float) -> Cost:
         setup_range=ends(setup),
         step=float(np.median(step)),
         step_relative=float(np.median(shares)),
-        step_low=low,
-        step_high=high,
+        step_low=float(shares.min()),
+        step_high=float(shares.max()),
         step_noise=noise,
         step_quartiles=ends(shares, 0.25),
         flops=with_.flops - without.flops,

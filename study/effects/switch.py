@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.effects.catalog import EARTH
+from softgrasp.fem.effects.gravity import EARTH
 from softgrasp.fem.scene.scene import Scene
 
 TRIAL_ZETA = 0.01  # ratio of the first mode; silicone and passive tissue lie above, so it is a careful guess

@@ -301,12 +301,8 @@ def _change_in_words(change: float) -> str:
 
 
 def _cost_in_words(cost: Cost) -> str:
-    parts = []
-    if cost.flops_relative > 0:
-        parts.append(f"{percent(cost.flops_relative)} to the operations of a step")
-    if cost.memory_relative > 0:
-        parts.append(f"{percent(cost.memory_relative)} to the memory")
-    return " and ".join(parts)
+    shares = (cost.flops_relative, "operations of a step"), (cost.memory_relative, "memory")
+    return " and ".join(f"{percent(share)} to the {what}" for share, what in shares if share > 0)
 
 
 # --- whether linear elements are enough

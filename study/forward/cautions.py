@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.effects.catalog import linear_error
+from softgrasp.fem.effects.finite_strain import linear_error
 from softgrasp.fem.fields.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total

@@ -19,7 +19,8 @@ import scipy.linalg
 
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.care import care, lyapunov
-from softgrasp.lqr.dense.modal import DenseRiccati, assemble_space, dense_modes, gather_tissue, paper_form
+from softgrasp.lqr.dense.modal import DenseRiccati, assemble_space, dense_modes, gather_tissue
+from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.diagnosis import diagnose
 from softgrasp.lqr.lowrank.newton import NewtonADI

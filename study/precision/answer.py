@@ -6,8 +6,7 @@ import re
 from collections.abc import Sequence
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.fit import usable
+from softgrasp.study.precision.fit import series_of, usable
 from softgrasp.study.precision.forward import to_point
 from softgrasp.study.precision.full import FullRuns
 from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RunPoint
@@ -66,11 +65,7 @@ def seconds_text(value: float | None) -> str:
 
 
 def advice(shares: dict[str, float]) -> str:
-    """What to refine first: that which carries the largest share of an error.
-
-    Args:
-        shares: of space, time and maybe reduction.
-    """
+    """What to refine first: that of space, time and maybe reduction which carries the largest share of an error."""
     largest = max(shares, key=lambda name: shares[name])
     better = {
         "space": "a smaller tissue.refine.tolerance",
@@ -85,16 +80,11 @@ class Answers:
     """Answers for one study; ``measured`` are the points that were made for them. Its methods are collective."""
 
     def __init__(
-        self,
-        scene: Scene,
-        runs: FullRuns,
-        truth: Truth,
-        forward: Sequence[ForwardPoint],
-        reduced: Sequence[ReducedPoint],
+        self, runs: FullRuns, truth: Truth, forward: Sequence[ForwardPoint], reduced: Sequence[ReducedPoint]
     ) -> None:
-        self.scene, self.runs, self.truth = scene, runs, truth
+        self.scene, self.runs, self.truth = runs.scene, runs, truth
         self.forward, self.reduced = forward, reduced
-        self.predictor = Predictor(scene, forward, runs.dimension)
+        self.predictor = Predictor(runs.scene, forward, runs.dimension)
         self.measured: list[RunPoint] = []
 
     def meets(self, point: RunPoint, tolerance: float) -> bool:
@@ -148,15 +138,12 @@ class Answers:
     def _models_on(self, setting: Setting, full: ForwardPoint, tolerance: float) -> list[Choice]:
         """Reduced models of the fastest basis on another mesh, or the second; N as the scene's own mesh predicts it."""
         room = tolerance - self.truth.error - full.error
-        expected: dict[str, ReducedPoint] = {}
-        for p in sorted(usable(self.reduced), key=lambda p: p.seconds):
-            if p.error_outputs_full <= SAFETY * room:
-                expected.setdefault(p.series, p)
+        fit = [p for p in usable(self.reduced) if p.error_outputs_full <= SAFETY * room]
         choices: list[Choice] = []
-        reduced, run = ReducedRuns(self.scene, setting, self.runs, self.truth), self.runs.run(setting)
-        for name, own in list(expected.items())[:2]:
+        reduced = ReducedRuns(setting, self.runs, self.truth)
+        for own in _two_bases(fit, "seconds"):
             sizes = [n for n in sorted(self.scene.reduction.N) if n >= own.N][: MORE + 1]
-            points = reduced.points(name, sizes, run)
+            points = reduced.points(own.series, sizes)
             self.measured += points
             predicted = full.error + own.error_outputs_full, own.seconds
             choices += [self.choice(p, predicted) for p in points if self.meets(p, tolerance)]
@@ -170,11 +157,8 @@ class Answers:
         fit = [p for p in usable(self.reduced) if p.p99 <= budget]
         if full is None or not fit or full.error >= min(p.error for p in fit):
             return []
-        best: dict[str, ReducedPoint] = {}
-        for p in sorted(fit, key=lambda p: p.error_outputs_full):
-            best.setdefault(p.series, p)
-        reduced, run = ReducedRuns(self.scene, full.setting, self.runs, self.truth), self.runs.run(full.setting)
-        points = [q for name, p in list(best.items())[:2] for q in reduced.points(name, [p.N], run)]
+        reduced = ReducedRuns(full.setting, self.runs, self.truth)
+        points = [q for p in _two_bases(fit, "error_outputs_full") for q in reduced.points(p.series, [p.N])]
         self.measured += points
         return points
 
@@ -301,6 +285,12 @@ class Answers:
 
 def _fits(full: ForwardPoint) -> bool:
     return 2 * full.n_e * full.steps <= SNAPSHOTS
+
+
+def _two_bases(points: Sequence[ReducedPoint], attribute: str) -> list[ReducedPoint]:
+    """The points with the least of an attribute, of the two bases where it is least."""
+    lines = series_of(sorted(points, key=lambda p: getattr(p, attribute)))
+    return [line[0] for line in lines.values()][:2]
 
 
 def _prediction(choice: Choice) -> str:

@@ -25,19 +25,14 @@ FORMAT = 3  # of the cached files
 
 
 class Cache:
-    """Frozen dataclasses by hash, each file one list of a class.
+    """Frozen dataclasses by hash in a folder, each file one list of a class.
 
     The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
-    of ranks and the version. Collective.
-
-    Args:
-        folder: where the files are.
-        comm: ranks.
-        scene: the study's scene.
+    of ranks and the version. The guard is asked before a point. Collective.
     """
 
-    def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene) -> None:
-        self.folder, self.comm = folder, comm
+    def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene, guard: Guard | None = None) -> None:
+        self.folder, self.comm, self.guard = folder, comm, guard or Guard(comm)
         self.scene = ""  # rank 0 looks for the files
         with agree(comm):
             if comm.rank == 0:
@@ -49,6 +44,13 @@ class Cache:
         whole = {"scene": self.scene, "ranks": self.comm.size, "version": package_version(), "format": FORMAT} | key
         digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
         return self.folder / f"{kind}-{digest[:20]}.json"
+
+    def point[T](
+        self, label: str, kind: str, key: dict[str, Any], of: type[T], measure: Callable[[], Sequence[T]]
+    ) -> list[T]:
+        """:meth:`get` of a point with a label, unless the study is stopped before it."""
+        self.guard.next(label)
+        return self.get(kind, key, of, measure)
 
     def get[T](self, kind: str, key: dict[str, Any], of: type[T], measure: Callable[[], Sequence[T]]) -> list[T]:
         """The cached values of a class, or the measured ones, which are then kept; both as they come out of JSON."""

@@ -25,30 +25,20 @@ class Slope:
     expected: float | None = None  # exponent of the theory, where there is one
 
 
-def seconds_of(point: WorkPoint) -> float:
-    """What a point costs [s]."""
-    return point.seconds
-
-
-def error_of(point: WorkPoint) -> float:
-    """What a point leaves."""
-    return point.error
-
-
 def usable[P: WorkPoint](points: Sequence[P]) -> list[P]:
     """Points that may be used and have a finite error and time."""
     return [p for p in points if p.ok and np.isfinite(p.error) and np.isfinite(p.seconds) and p.seconds > 0]
 
 
-def pareto[P: WorkPoint](
-    points: Sequence[P], x: Callable[[P], float] = seconds_of, y: Callable[[P], float] = error_of
-) -> list[P]:
-    """Points that no other beats in x and y at once, by x; less than :data:`GAIN` counts as none."""
+def pareto[P: WorkPoint](points: Sequence[P], x: str = "seconds", y: str = "error") -> list[P]:
+    """Points that no other beats in the attributes x and y at once, by x; less than :data:`GAIN` counts as none."""
     front: list[P] = []
-    good = (p for p in points if p.ok and np.isfinite(y(p)) and np.isfinite(x(p)) and x(p) > 0)
-    for p in sorted(good, key=lambda p: (x(p), y(p))):
-        if not front or y(p) < (1 - GAIN) * y(front[-1]):
-            front.append(p)
+    lowest = float("inf")
+    good = [(getattr(p, x), getattr(p, y), p) for p in points if p.ok]
+    good = [(a, b, p) for a, b, p in good if np.isfinite(a) and np.isfinite(b) and a > 0]
+    for _, value, p in sorted(good, key=lambda row: row[:2]):
+        if value < (1 - GAIN) * lowest:
+            front, lowest = [*front, p], value
     return front
 
 
@@ -61,16 +51,25 @@ def series_of[P: WorkPoint](points: Sequence[P], name: Callable[[P], str] | None
 
 
 def slope(
-    question: str,
-    series: str,
+    line: Sequence[WorkPoint],
     against: str,
-    x: Sequence[float],
-    y: Sequence[float],
+    x: str,
+    y: str,
+    series: str = "",
     expected: float | None = None,
+    root: int = 1,
 ) -> list[Slope]:
-    """The slope of y against x; nothing where they do not tell one."""
-    power = power_law(x, y)
-    return [] if power is None else [Slope(question, series, against, power, len(x), expected)]
+    """The slope of one attribute y against another, x^(1 / root), over a line; nothing where they do not tell one."""
+    power = power_law([getattr(p, x) ** (1 / root) for p in line], [getattr(p, y) for p in line])
+    if power is None:
+        return []
+    return [Slope(line[0].question, series or line[0].series, against, power, len(line), expected)]
+
+
+def slopes(points: Sequence[WorkPoint], *relations: tuple[str, str, str]) -> tuple[Slope, ...]:
+    """Of every series of usable points and relation: what against what in words, and the attributes x and y."""
+    lines = series_of([p for p in points if p.ok]).values()
+    return tuple(s for line in lines for relation in relations for s in slope(line, *relation))
 
 
 def power_law(x: Sequence[float], y: Sequence[float]) -> float | None:

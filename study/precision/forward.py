@@ -8,9 +8,8 @@ from dataclasses import replace
 from softgrasp.fem.mesh.singular import Ends, expected_order
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, series_of, slope
-from softgrasp.study.precision.full import FullRuns
+from softgrasp.study.precision.full import FullRuns, TimedRun, errors_of
 from softgrasp.study.precision.points import ForwardPoint
-from softgrasp.study.precision.probe import TimedRun, errors_of
 from softgrasp.study.precision.result import Question, Truth
 from softgrasp.study.precision.settings import (
     GOALS,
@@ -151,14 +150,10 @@ def forward_slopes(
     for name, line in on_meshes(points).items():
         graded = line[0].refine != "off"
         last = [p for p in line if p.error > CLEAR * truth.error][0 if graded else -FINEST :]
-        errors = [p.error for p in last]
         theory = -expected[line[0].order, graded]
-        h = [p.n_e ** (1 / d) for p in last]
-        slopes += slope("forward", name, f"error against n_e^(1/{d})", h, errors, theory)
-        slopes += slope("forward", name, "error against seconds", [p.seconds for p in last], errors)
+        slopes += slope(last, f"error against n_e^(1/{d})", "n_e", "error", name, theory, root=d)
+        slopes += slope(last, "error against seconds", "seconds", "error", name)
     for steps in {line[0].setting.family: line[-FINEST:] for line in over_steps(points).values()}.values():
-        changes, counts = [p.error_time or 0.0 for p in steps], [p.steps for p in steps]
-        slopes += slope("forward", steps[0].series, "change in time against steps", counts, changes, -2)
+        slopes += slope(steps, "change in time against steps", "steps", "error_time", expected=-2)
     runs = [p for p in points if p.series != "solver"]
-    sizes, per_step = [p.n_e for p in runs], [p.per_step for p in runs]
-    return slopes + slope("forward", "all", "seconds of a step against unknowns", sizes, per_step)
+    return slopes + slope(runs, "seconds of a step against unknowns", "n_e", "per_step", "all")

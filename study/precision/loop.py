@@ -24,7 +24,7 @@ from softgrasp.lqr.design.orders import fast_order, orders
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
-from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory, SmallPlant, galerkin
+from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import BasisFamily, make_family
@@ -77,13 +77,9 @@ class LoopSetting:
 
 
 def step_counts(shares: Sequence[float], steps: int, n_e: int = 1, most: float = np.inf) -> list[int]:
-    """Whole multiples and parts of the scene's steps that nest, most first.
+    """Whole multiples and parts of the scene's steps that nest, most first, as the shares are.
 
-    Args:
-        shares: multiples and parts, most first.
-        steps: of the scene.
-        n_e: unknowns.
-        most: unknowns times steps that a run may have; the scene's own and fewer steps always may.
+    Only the scene's own and fewer steps may have more unknowns n_e times steps than ``most``.
     """
     whole = [round(steps * s) for s in shares if float(steps * s).is_integer()]
     return [n for n in whole if n >= LEAST_STEPS and (n <= steps or n * n_e <= most)]
@@ -93,9 +89,6 @@ class LoopSweep:
     """Closed loops of one scene; gains and reference are made when the first point is not in the cache. Collective.
 
     Limits and delay of the scene's loop are left out: the law is linear.
-
-    Args:
-        runs: the control problem.
     """
 
     def __init__(self, runs: ControlRuns) -> None:
@@ -144,8 +137,7 @@ class LoopSweep:
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
             return [LoopReference(error, modes, loop.complete, design.judge.optimal, rest)]
 
-        self.runs.guard.next("closed loop, reference")
-        return self.cache.get("loop", {"reference": self.counts}, LoopReference, measure)[0]
+        return self.cache.point("closed loop, reference", "loop", {"reference": self.counts}, LoopReference, measure)[0]
 
     # --- controllers
 
@@ -196,17 +188,12 @@ class LoopSweep:
             loop.destroy()
         return first, means
 
-    def _reduced_plant(self, what: Feedback) -> tuple[SmallPlant, Array]:
-        """The reduced plant of an a-priori gain, and the gain on it."""
-        problem, n_s, n = self.runs.problem, self.layout.n_s, self.layout.n_local
-        V = self.family(what.basis).at(what.N).U.tall[n:, -((what.N - 2 * n_s) // 2) :]
-        plant, shapes = galerkin(problem, V)
-        return plant, shapes.reduce_gain(problem, self.gain(what))
-
     def _reduced(self, what: LoopSetting, steps: int) -> tuple[ReducedLoopTrajectory, list[float]]:
-        """Runs of the reduced plant on rank 0."""
-        plant, K = self._reduced_plant(what.gain)
-        design, problem, n_s = self.runs.design, self.runs.problem, self.layout.n_s
+        """Runs of the reduced plant of an a-priori gain on rank 0."""
+        design, problem, n_s, n = self.runs.design, self.runs.problem, self.layout.n_s, self.layout.n_local
+        V = self.family(what.gain.basis).at(what.gain.N).U.tall[n:, -((what.gain.N - 2 * n_s) // 2) :]
+        plant, shapes = galerkin(problem, V)
+        K = shapes.reduce_gain(problem, self.gain(what.gain))
         start = plant.rest_at(np.zeros(n_s))[0]
         if self.scene.time.start != "equilibrium":
             start[2 * n_s :] = 0.0
@@ -227,9 +214,8 @@ class LoopSweep:
             stable = not gain.basis or self.runs.design.judge.report(self.family(gain.basis).at(gain.N)).stable
             return [self._point(what, steps, stable) for steps in self.counts]
 
-        self.runs.guard.next(f"closed loop, {what.label}")
         key = {"controller": what.label, "counts": self.counts, "repeats": self.runs.repeats}
-        return self.cache.get("loop", key, LoopPoint, measure)
+        return self.cache.point(f"closed loop, {what.label}", "loop", key, LoopPoint, measure)
 
     def _point(self, what: LoopSetting, steps: int, stable: bool) -> LoopPoint:
         """Errors, cost and seconds of one controller and step."""
@@ -261,16 +247,11 @@ class LoopSweep:
         )  # fmt: skip
 
 
-def largest(values: Array, columns: Columns) -> float:
-    """Largest distance of any output at any instant [m]; values (m, p)."""
-    return float(farthest(values, np.zeros(values.shape[1]), columns).max())
-
-
 def errors_of(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
-    """Largest error over the largest value, of each half of the columns (m, 2 p)."""
-    p = true.shape[1] // 2
-    halves = (slice(0, p), slice(p, 2 * p))
-    return tuple(largest(values[:, h] - true[:, h], columns) / largest(true[:, h], columns) for h in halves)  # type: ignore[return-value]
+    """Largest error of any output at any instant over the largest value, of each half of the columns (m, 2 p)."""
+    still = np.zeros(true.shape[1] // 2)
+    gaps, sizes = ([farthest(half, still, columns).max() for half in np.hsplit(v, 2)] for v in (values - true, true))
+    return float(gaps[0] / sizes[0]), float(gaps[1] / sizes[1])
 
 
 def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -> Array:
@@ -316,8 +297,7 @@ def ask_loop(runs: ControlRuns) -> Question:
 def loop_slopes(points: Sequence[LoopPoint]) -> list[Slope]:
     """Order in time of every controller on the full plant, against the same gain without time step."""
     slopes: list[Slope] = []
-    for name, line in series_of([p for p in points if p.ok and not p.reduced_plant]).items():
+    for line in series_of([p for p in points if p.ok and not p.reduced_plant]).values():
         last = sorted(line, key=lambda p: -p.steps)[:FINEST]
-        errors = [p.error_time for p in last]
-        slopes += slope("loop", name, "error in time against steps", [p.steps for p in last], errors)
+        slopes += slope(last, "error in time against steps", "steps", "error_time")
     return slopes

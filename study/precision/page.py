@@ -11,9 +11,9 @@ import rich.table
 from mpi4py import MPI
 from rich.console import Console
 
+from softgrasp.study.precision import plots
 from softgrasp.study.precision.answer import seconds_text
-from softgrasp.study.precision.control_plots import figure_loop, figure_reduced_riccati, figure_riccati
-from softgrasp.study.precision.plots import figure_budget, figure_forward, figure_reduced, figure_series
+from softgrasp.study.precision.full import TimedRun
 from softgrasp.study.precision.points import (
     CONTROL,
     TITLES,
@@ -25,7 +25,6 @@ from softgrasp.study.precision.points import (
     Request,
     RiccatiPoint,
 )
-from softgrasp.study.precision.probe import TimedRun
 from softgrasp.study.precision.result import LoopReference, RiccatiReference, WorkStudy
 from softgrasp.study.precision.tables import (
     CAPTIONS,
@@ -37,7 +36,7 @@ from softgrasp.study.precision.tables import (
     reference_text,
     slope_table,
 )
-from softgrasp.study.reduce.sweep import PAPER_FULL, PAPER_REDUCED
+from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
 from softgrasp.study.report.equation import controlled
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
@@ -112,20 +111,20 @@ def draw(study: WorkStudy, budget: float | None, out: Path) -> list[Path]:
     references = {name: question.reference for name, question in study.questions.items()}
     if forward and study.truth is not None:
         slopes, png = study.questions["forward"].slopes, out / "work_forward.png"
-        files += figure_forward(forward, slopes, study.truth.error, paper == "forward", png)
+        files += plots.figure_forward(forward, slopes, study.truth.error, paper == "forward", png)
     if reduced and isinstance(full := references["reduced"], TimedRun):
-        files += figure_reduced(reduced, full.seconds, paper == "forward", out / "work_reduced.png")
+        files += plots.figure_reduced(reduced, full.seconds, paper == "forward", out / "work_reduced.png")
     if bases:
-        files += figure_series(bases, "time of the basis [s]", "left of the snapshots", out / "work_bases.png")
+        files += plots.figure_series(bases, "time of the basis [s]", "left of the snapshots", out / "work_bases.png")
     if riccati and isinstance(tight := references["riccati"], RiccatiReference):
-        files += figure_riccati(riccati, tight.error, paper == "control", out / "work_riccati.png")
+        files += plots.figure_riccati(riccati, tight.error, paper == "control", out / "work_riccati.png")
     if small_riccati:
-        files += figure_reduced_riccati(small_riccati, paper == "control", out / "work_reduced_riccati.png")
+        files += plots.figure_reduced_riccati(small_riccati, paper == "control", out / "work_reduced_riccati.png")
     if loop and isinstance(optimal := references["loop"], LoopReference):
-        files += figure_loop(loop, optimal.error, out / "work_loop.png")
+        files += plots.figure_loop(loop, optimal.error, out / "work_loop.png")
     if budget is not None:
         every = [*forward, *reduced, *study.measured_for_the_answers]
-        files += figure_budget(every, budget, out / "work_budget.png")
+        files += plots.figure_budget(every, budget, out / "work_budget.png")
     return files
 
 
@@ -184,9 +183,8 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
     ]
     truth = study.truth
     if truth is not None:
-        parts = (("space", truth.space), ("time", truth.time), ("mixed", truth.mixed))
         rows = [(f"error estimate, {name}", f"{a:.1e} of the deformation, {b:.1e} of the displacement")
-                for name, (a, b) in parts]  # fmt: skip
+                for name, (a, b) in truth.parts.items()]  # fmt: skip
         rows.append(("runs behind it", "; ".join(s.label for s in truth.settings)))
         sections.append(Section("Reference", text=truth.note, rows=rows))
     for budget in study.error_budgets:

@@ -127,28 +127,16 @@ def balanced(label: str, parts: Sequence[Part], missing: Sequence[tuple[str, str
 
 
 def error_budget(
-    scene: Scene,
-    predictor: Predictor,
-    setting: Setting,
-    forward: Sequence[ForwardPoint],
-    model: ReducedPoint | None,
-    reduced: Sequence[ReducedPoint],
-    riccati: Sequence[RiccatiPoint],
-    skipped: dict[str, str],
+    predictor: Predictor, setting: Setting, points: Sequence[WorkPoint], skipped: dict[str, str]
 ) -> ErrorBudget:
-    """Parts of a setting of the full model, and of a reduced model and the feedback that go with it.
+    """Parts of a setting of the full model that was run, and of the reduced model and the feedback that go with it.
 
-    Args:
-        scene: the study's scene.
-        predictor: of errors and times.
-        setting: of the full model, run.
-        forward: points of the diagram, for the solvers.
-        model: reduced model that goes with it, or None.
-        reduced: the models it is chosen from.
-        riccati: points of the Riccati equation.
-        skipped: questions without points, with the reason.
+    The points are those of all questions; skipped are questions without points, with the reason.
     """
-    now, steps = predictor.predict(setting), ceil(setting.steps * 2**0.5)
+    forward = [p for p in points if isinstance(p, ForwardPoint)]
+    reduced = [p for p in points if isinstance(p, ReducedPoint)]
+    riccati = [p for p in points if isinstance(p, RiccatiPoint)]
+    scene, now, steps = predictor.scene, predictor.predict(setting), ceil(setting.steps * 2**0.5)
     space, time = predictor.space_error(setting), predictor.time_error(setting.steps)
     other = [replace(p.setting, steps=setting.steps, solver="auto") for p in predictor.candidates()]
     finer = [p for p in map(predictor.predict, dict.fromkeys(other)) if p.error - time <= space / 2]
@@ -158,7 +146,7 @@ def error_budget(
              cost=mesh.seconds / now.seconds if mesh else None),
         Part("the time step", time, halved_by=f"{steps} steps",
              cost=predictor.predict(replace(setting, steps=steps)).seconds / now.seconds),
-        *_halved("the reduced model", model, reduced, lambda p: p.error_outputs_full),
+        *_halved("the reduced model", companion(now.error, reduced), reduced, lambda p: p.error_outputs_full),
         *_solver(scene, forward),
         *_halved("the Riccati equation", _tight(scene, riccati), riccati, lambda p: p.error),
     ]  # fmt: skip

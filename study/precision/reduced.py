@@ -17,7 +17,6 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.engines import ENGINES, EngineName, Factor, factor, small_svd
 from softgrasp.reduction.bases.registry import METHODS, possible_sizes
 from softgrasp.reduction.bases.states import States
@@ -26,14 +25,13 @@ from softgrasp.reduction.online import Stepper, prepared, run
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator
 from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs
-from softgrasp.study.precision.fit import Slope, series_of, slope
-from softgrasp.study.precision.full import FullRuns
+from softgrasp.study.precision.fit import slopes
+from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
-from softgrasp.study.precision.probe import Series, TimedRun, errors_of
 from softgrasp.study.precision.result import Question, Truth
-from softgrasp.study.precision.settings import Setting, own_setting
+from softgrasp.study.precision.settings import Setting
+from softgrasp.study.reduce.measure import bases_of, chosen_methods, measure
 from softgrasp.study.reduce.result import Point
-from softgrasp.study.reduce.sweep import bases_of, chosen_methods, measure
 from softgrasp.study.shell.timing import repeated
 
 CALLS = 2_000  # single steps of a reduced model that are timed
@@ -56,10 +54,11 @@ class TimedModel(Point):
 
 
 class ReducedRuns:
-    """Reduced models of one mesh and step; the full run is made when the cache lacks a point. Collective."""
+    """Reduced models of one mesh and step; the full run is made again when the cache lacks a point. Collective."""
 
-    def __init__(self, scene: Scene, setting: Setting, runs: FullRuns, truth: Truth) -> None:
-        self.scene, self.setting, self.runs, self.truth = scene, setting, runs, truth
+    def __init__(self, setting: Setting, runs: FullRuns, truth: Truth) -> None:
+        self.scene, self.setting, self.runs, self.truth = runs.scene, setting, runs, truth
+        self.timed = runs.run(setting)  # the full run behind the models, without its snapshots
         self._full: tuple[FullRun, Probe, Model] | None = None
 
     def full(self) -> tuple[FullRun, Probe, Model]:
@@ -74,9 +73,8 @@ class ReducedRuns:
             self._full = (full_run(fresh, simulate(fresh)), probe, fresh)
         return self._full
 
-    def points(self, name: str, sizes: Sequence[int], full: TimedRun) -> list[ReducedPoint]:
-        """Every N of one basis. ``full`` is the full run behind it."""
-        self.runs.guard.next(f"{METHODS[name].title}, {self.setting.label}")
+    def points(self, name: str, sizes: Sequence[int]) -> list[ReducedPoint]:
+        """Every N of one basis."""
         section = self.scene.reduction.model_copy(update={"N": list(sizes)})
         key = {
             "method": name, "N": list(sizes), "inner": section.inner, "engine": section.engine,
@@ -93,10 +91,12 @@ class ReducedRuns:
             shared = comparison_of(models[-1], against) if models else None  # the largest holds the others
             return [_timed_model(m, measure(m, against, shared), against, probe) for m in models]
 
-        models = self.runs.cache.get("reduced", key, TimedModel, sweep)
-        return [self._point(name, model, full) for model in models]
+        label = f"{METHODS[name].title}, {self.setting.label}"
+        models = self.runs.cache.point(label, "reduced", key, TimedModel, sweep)
+        return [self._point(name, model) for model in models]
 
-    def _point(self, name: str, model: TimedModel, full: TimedRun) -> ReducedPoint:
+    def _point(self, name: str, model: TimedModel) -> ReducedPoint:
+        full = self.timed
         series = Series(model.times, model.values, full.dimension)
         finite = bool(np.isfinite(series.values).all())
         lost = (float("inf"), float("inf"))
@@ -142,25 +142,21 @@ def _steps(model: ReducedModel, against: FullRun) -> Array:
     return stamps
 
 
-def ask_reduced(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Question:
-    """All bases of the scene at all N, on the scene's own mesh and step, whose full run is given. Collective.
+def ask_reduced(reduced: ReducedRuns) -> Question:
+    """All bases of the scene at all N. Collective.
 
     Raises:
         BasisError: a basis is unknown.
         SolverError: a solve or a factorisation failed.
     """
-    reduced = ReducedRuns(scene, own_setting(scene), runs, truth)
-    points = [p for name in chosen_methods(scene.reduction) for p in reduced.points(name, scene.reduction.N, full)]
-    slopes: list[Slope] = []
-    for name, line in series_of([p for p in points if p.ok]).items():
-        orders = [p.N for p in line]
-        slopes += slope("reduced", name, "error against N", orders, [p.error_outputs_full for p in line])
-        slopes += slope("reduced", name, "online seconds against N", orders, [p.seconds for p in line])
-    return Question(tuple(points), tuple(slopes), full)
+    section = reduced.scene.reduction
+    points = [p for name in chosen_methods(section) for p in reduced.points(name, section.N)]
+    relations = ("error against N", "N", "error_outputs_full"), ("online seconds against N", "N", "seconds")
+    return Question(tuple(points), slopes(points, *relations), reduced.timed)
 
 
-def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Question:
-    """Every engine at several tolerances on the snapshots of the scene's own run. Collective.
+def ask_bases(reduced: ReducedRuns) -> Question:
+    """Every engine at several tolerances on the snapshots of the full run. Collective.
 
     The error is what the basis leaves of the snapshots, |X - U U' X|_F / |X|_F, measured and not read off the engine's
     own singular values; the time is that of factoring and making the vectors, the median of repeats.
@@ -168,25 +164,22 @@ def ask_bases(scene: Scene, runs: FullRuns, truth: Truth, full: TimedRun) -> Que
     Raises:
         SolverError: a solve or a factorisation failed.
     """
-    reduced, comm = ReducedRuns(scene, own_setting(scene), runs, truth), runs.cache.comm
+    cache, repeats = reduced.runs.cache, reduced.runs.repeats
     points: list[BasisPoint] = []
     for engine in ENGINES:
-        runs.guard.next(f"engine {engine}")
-        key = {"engine": engine, "setting": reduced.setting.parameters, "repeats": scene.study.repeats}
+        key = {"engine": engine, "setting": reduced.setting.parameters, "repeats": repeats}
 
         def sweep(engine: EngineName = engine) -> list[BasisPoint]:
             X = reduced.full()[0].snapshots.Z
-            if X.size * comm.size > WIDEST and engine == "svd":
+            if X.size * cache.comm.size > WIDEST and engine == "svd":
                 return []
-            return _factored(comm, X, engine, scene.study.repeats)
+            return _factored(cache.comm, X, engine, repeats)
 
-        points += runs.cache.get("basis", key, BasisPoint, sweep)
-    slopes: list[Slope] = []
-    for name, line in series_of([p for p in points if p.ok]).items():
-        columns = [p.columns for p in line]
-        slopes += slope("bases", name, "left of the snapshots against vectors", columns, [p.error for p in line])
-        slopes += slope("bases", name, "seconds against vectors", columns, [p.seconds for p in line])
-    return Question(tuple(points), tuple(slopes), full)
+        points += cache.point(f"engine {engine}", "basis", key, BasisPoint, sweep)
+    left = "left of the snapshots against vectors", "columns", "error"
+    return Question(
+        tuple(points), slopes(points, left, ("seconds against vectors", "columns", "seconds")), reduced.timed
+    )
 
 
 def _factored(comm: MPI.Intracomm, X: Array, engine: EngineName, repeats: int) -> list[BasisPoint]:

@@ -8,8 +8,8 @@ from typing import Any
 
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import Slope, pareto
+from softgrasp.study.precision.full import Series, TimedRun
 from softgrasp.study.precision.points import ReducedPoint, RunPoint, WorkPoint
-from softgrasp.study.precision.probe import Series, TimedRun
 from softgrasp.study.precision.settings import Setting
 from softgrasp.study.report.files import to_json
 
@@ -33,14 +33,19 @@ class Truth:
     note: str  # one sentence or more
 
     @property
+    def parts(self) -> dict[str, tuple[float, float]]:
+        """Of the estimate, by name."""
+        return {"space": self.space, "time": self.time, "mixed": self.mixed}
+
+    @property
     def error(self) -> float:
         """Estimated relative error of the deformation."""
-        return self.space[0] + self.time[0] + self.mixed[0]
+        return sum(part[0] for part in self.parts.values())
 
     @property
     def error_displacement(self) -> float:
         """Estimated relative error of the displacement."""
-        return self.space[1] + self.time[1] + self.mixed[1]
+        return sum(part[1] for part in self.parts.values())
 
     def range_of(self, error: float) -> tuple[float, float]:
         """Between what the true error of a setting lies, when so much was measured against this reference."""
@@ -49,8 +54,7 @@ class Truth:
     @property
     def largest_part(self) -> str:
         """Name of the part that carries most of the error: space, time or mixed."""
-        parts = {"space": self.space[0], "time": self.time[0], "mixed": self.mixed[0]}
-        return max(parts, key=lambda name: parts[name])
+        return max(self.parts, key=lambda name: self.parts[name][0])
 
     @property
     def need(self) -> str:
@@ -60,8 +64,7 @@ class Truth:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
-            "note": self.note, "error": self.error, "error_displacement": self.error_displacement,
-            "space": self.space, "time": self.time, "mixed": self.mixed,
+            "note": self.note, "error": self.error, "error_displacement": self.error_displacement, **self.parts,
             "settings": [s.label for s in self.settings],
         }  # fmt: skip
 

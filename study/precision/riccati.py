@@ -10,6 +10,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -29,7 +30,7 @@ from softgrasp.lqr.riccati import Method, solve
 from softgrasp.study.control.measure import with_time
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
 from softgrasp.study.control.result import report_dict
-from softgrasp.study.precision.cache import Cache, Guard
+from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import CONTROL, ReducedRiccatiPoint, RiccatiPoint
 from softgrasp.study.precision.result import Question, ReducedReference, RiccatiReference
@@ -54,15 +55,10 @@ class GainReference:
     tolerances: dict[str, float]  # that they reached
     error: float  # relative difference of their gains; nan when only one method got through
 
-    def judge_of(self, method: str) -> RiccatiSolution:
+    def other_than(self, method: str) -> RiccatiSolution:
         """The solution that a method is compared with: of another method, where there is one."""
         others = [s for name, s in self.solutions.items() if name != method]
         return (others or list(self.solutions.values()))[0]
-
-    @property
-    def names(self) -> list[str]:
-        """Methods and tolerances in words."""
-        return [f"{TITLES[name]} to {tol:.0e}" for name, tol in self.tolerances.items()]
 
 
 @dataclass(frozen=True)
@@ -73,17 +69,13 @@ class Refusal:
 
 
 class ControlRuns:
-    """The control problem of a scene; solutions are made when the first point is not in the cache. Collective.
+    """The control problem on the scene's own mesh; solutions are made when the first point is not in the cache.
 
-    Args:
-        model: the scene's own mesh.
-        cache: of measured points.
-        guard: asked before each of them.
-        named: questions of ``--question``, which are answered at any size.
+    Questions that are named are answered at any size. Collective.
     """
 
-    def __init__(self, model: Model, cache: Cache, guard: Guard, named: Sequence[str] = ()) -> None:
-        self.model, self.cache, self.guard, self.named = model, cache, guard, named
+    def __init__(self, model: Model, cache: Cache, named: Sequence[str] = ()) -> None:
+        self.model, self.cache, self.named = model, cache, named
         self.scene, self.layout = model.scene, model.system.layout
         self.repeats = self.scene.study.repeats
         self.large = self.layout.n_e > LARGE[self.layout.dimension]
@@ -122,49 +114,44 @@ class ControlRuns:
 
     @cached_property
     def reference(self) -> GainReference:
-        """The tightest solutions of two methods.
+        """The tightest solutions of Newton-ADI and RADI; others stand in for one that fails.
 
         Raises:
             SolverError: no method reaches any of :data:`TIGHT`.
         """
-        return make_reference(self.problem)
+        problem = self.problem
+        solutions: dict[str, RiccatiSolution] = {}
+        tolerances: dict[str, float] = {}
+        for name in self.methods:
+            for tol in TIGHT:
+                try:
+                    solutions[name], tolerances[name] = solve(problem, name, tol), tol
+                    break
+                except (SolverError, ResourceError):  # rounding, or it does not converge here
+                    continue
+            if len(solutions) == 2:
+                break
+        if not solutions:
+            raise SolverError("no method solves the Riccati equation of this scene to 1e-8; add damping")
+        gains = [s.gain for s in solutions.values()]
+        error = gain_error(problem, gains[0], gains[1]) if len(gains) == 2 else float("nan")
+        return GainReference(solutions, tolerances, error)
+
+    @property
+    def methods(self) -> list[Method]:
+        """The dense one is left out of a large plant."""
+        return [m for m in METHODS if m != "dense" or self.layout.states <= DENSE_MOST]
 
     def reference_names(self) -> RiccatiReference:
         """Names and error of the reference, from the cache when they are there."""
 
         def measure() -> list[RiccatiReference]:
             tight = self.reference
-            residuals = tuple(s.residual for s in tight.solutions.values())
-            return [RiccatiReference(tuple(tight.names), tight.error, residuals)]
+            names = tuple(f"{TITLES[name]} to {tol:.0e}" for name, tol in tight.tolerances.items())
+            return [RiccatiReference(names, tight.error, tuple(s.residual for s in tight.solutions.values()))]
 
-        self.guard.next("Riccati reference")
-        return self.cache.get("riccati", {"reference": list(TIGHT)}, RiccatiReference, measure)[0]
-
-
-def make_reference(problem: RiccatiProblem) -> GainReference:
-    """The tightest solutions of Newton-ADI and RADI; others stand in for one that fails. Collective.
-
-    Raises:
-        SolverError: no method reaches any tolerance.
-    """
-    solutions: dict[str, RiccatiSolution] = {}
-    tolerances: dict[str, float] = {}
-    for name in METHODS:
-        for tol in TIGHT:
-            if name == "dense" and problem.layout.states > DENSE_MOST:
-                break
-            try:
-                solutions[name], tolerances[name] = solve(problem, name, tol), tol
-                break
-            except (SolverError, ResourceError):  # rounding, or it does not converge here
-                continue
-        if len(solutions) == 2:
-            break
-    if not solutions:
-        raise SolverError("no method solves the Riccati equation of this scene to 1e-8; add damping")
-    gains = [s.gain for s in solutions.values()]
-    error = gain_error(problem, gains[0], gains[1]) if len(gains) == 2 else float("nan")
-    return GainReference(solutions, tolerances, error)
+        key = {"reference": list(TIGHT)}
+        return self.cache.point("Riccati reference", "riccati", key, RiccatiReference, measure)[0]
 
 
 def tolerances_of(method: str, large: bool) -> tuple[float, ...]:
@@ -176,8 +163,7 @@ def tolerances_of(method: str, large: bool) -> tuple[float, ...]:
 
 def settings_of(runs: ControlRuns) -> list[tuple[Method, float]]:
     """Methods with their tolerances."""
-    fit = [m for m in METHODS if m != "dense" or runs.layout.states <= DENSE_MOST]
-    return [(m, tol) for m in fit for tol in tolerances_of(m, runs.large)]
+    return [(m, tol) for m in runs.methods for tol in tolerances_of(m, runs.large)]
 
 
 def ask_riccati(runs: ControlRuns) -> Question:
@@ -191,20 +177,16 @@ def ask_riccati(runs: ControlRuns) -> Question:
     reference, points = runs.reference_names(), []
     for method, tol in settings_of(runs):
         label = TITLES[method] if method == "dense" else f"{TITLES[method]}, tolerance {tol:g}"
-        runs.guard.next(label)
         key = {"method": method, "tolerance": tol, "repeats": runs.repeats}
 
-        def measure(method: Method = method, tol: float = tol, label: str = label) -> list[RiccatiPoint]:
-            return [_measure(runs, method, tol, label)]
-
-        points += runs.cache.get("riccati", key, RiccatiPoint, measure)
+        points += runs.cache.point(label, "riccati", key, RiccatiPoint, partial(_measure, runs, method, tol, label))
     return Question(tuple(points), tuple(riccati_slopes(points, reference.error)), reference)
 
 
-def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> RiccatiPoint:
+def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> list[RiccatiPoint]:
     """Gain error, true residual, counts and median seconds of one solver at one tolerance. Collective."""
     problem = runs.problem
-    tight = runs.reference.judge_of(method).gain
+    tight = runs.reference.other_than(method).gain
     solutions: list[RiccatiSolution] = []
     repeats = 1 if runs.large else runs.repeats
 
@@ -215,16 +197,16 @@ def _measure(runs: ControlRuns, method: Method, tol: float, label: str) -> Ricca
         times = repeated(runs.layout.comm, once, repeats, REPEAT_SECONDS)
     except (SolverError, ResourceError) as error:
         lost = float("inf")
-        return RiccatiPoint(method, label, lost, lost, False, method=method, tolerance=tol,
-                            reason=str(error), residual=lost)  # fmt: skip
+        return [RiccatiPoint(method, label, lost, lost, False, method=method, tolerance=tol, reason=str(error),
+                             residual=lost)]  # fmt: skip
     (solution,) = solutions
-    counts = solution.counts
-    return RiccatiPoint(
+    counts: dict[str, Any] = {
+        name: solution.counts.get(name, 0) for name in ("newton_steps", "solves", "factorisations")
+    }
+    return [RiccatiPoint(
         method, label, statistics.median(times), gain_error(problem, tight, solution.gain), method=method,
-        tolerance=tol, residual=solution.residual, repeats=len(times), rank=solution.rank,
-        newton_steps=counts.get("newton_steps", 0), solves=counts.get("solves", 0),
-        factorisations=counts.get("factorisations", 0),
-    )  # fmt: skip
+        tolerance=tol, residual=solution.residual, repeats=len(times), rank=solution.rank, **counts,
+    )]  # fmt: skip
 
 
 def above(error: float | None) -> float:
@@ -237,12 +219,10 @@ def riccati_slopes(points: Sequence[RiccatiPoint], reference_error: float | None
     slopes: list[Slope] = []
     for name, line in series_of([p for p in points if p.ok]).items():
         clear = [p for p in line if p.error > above(reference_error)]
-        tolerances, errors = [p.tolerance for p in clear], [p.error for p in clear]
-        slopes += slope("riccati", name, "gain error against tolerance", tolerances, errors)
+        slopes += slope(clear, "gain error against tolerance", "tolerance", "error")
         if name != "galerkin":  # which bounds the change of its gain
-            residuals = [p.residual for p in line]
-            slopes += slope("riccati", name, "residual against tolerance", [p.tolerance for p in line], residuals)
-            slopes += slope("riccati", name, "seconds against residual", residuals, [p.seconds for p in line])
+            slopes += slope(line, "residual against tolerance", "tolerance", "residual")
+            slopes += slope(line, "seconds against residual", "residual", "seconds")
     return slopes
 
 
@@ -258,13 +238,13 @@ def ask_reduced_riccati(runs: ControlRuns) -> Question:
     Raises:
         SolverError: the full equation cannot be solved.
     """
-    runs.guard.next("gain of reference")
-    reference = runs.cache.get("reduced_riccati", {"reference": True}, ReducedReference, lambda: [_reference(runs)])[0]
+    kind, once = "reduced_riccati", {"reference": True}
+    (reference,) = runs.cache.point("gain of reference", kind, once, ReducedReference, lambda: [_reference(runs)])
     points: list[ReducedRiccatiPoint] = []
     for name in BASES:
-        runs.guard.next(f"reduced Riccati equation, {BASIS_TITLES.get(name, name)}")
+        label = f"reduced Riccati equation, {BASIS_TITLES.get(name, name)}"
         key = {"basis": name, "N": list(runs.scene.control.N) if runs.scene.control else [], "repeats": runs.repeats}
-        points += runs.cache.get("reduced_riccati", key, ReducedRiccatiPoint, lambda name=name: _family(runs, name))  # type: ignore[misc]
+        points += runs.cache.point(label, kind, key, ReducedRiccatiPoint, partial(_family, runs, name))
     return Question(tuple(points), tuple(reduced_riccati_slopes(points, reference.error)), reference)
 
 
@@ -309,7 +289,7 @@ def _order(runs: ControlRuns, family: BasisFamily, N: int, time_basis: float, be
 def _reference(runs: ControlRuns) -> ReducedReference:
     """What the reduced gains are compared with, and its distance to the tightest solution of another method."""
     solution = runs.design.solution
-    other = runs.reference.judge_of(solution.method)
+    other = runs.reference.other_than(solution.method)
     gap = gain_error(runs.problem, other.gain, solution.gain)
     return ReducedReference(solution.summary, solution.residual, gap, runs.design.judge.optimal)
 
@@ -320,11 +300,10 @@ def reduced_riccati_slopes(points: Sequence[ReducedRiccatiPoint], reference_erro
     The cost is least at the optimal gain, so that its excess is of second order in the error of the gain.
     """
     clear = [p for p in points if p.ok and p.error > above(reference_error)]
-    question, slopes = "reduced_riccati", []
-    for name, line in series_of(clear).items():
+    slopes: list[Slope] = []
+    for line in series_of(clear).values():
         if len(line) > 2:
-            slopes += slope(question, name, "gain error against N", [p.N for p in line], [p.error for p in line])
+            slopes += slope(line, "gain error against N", "N", "error")
     near = [p for p in clear if p.error < 1]
-    excess = [p.cost_excess for p in near]
-    slopes += slope(question, "all", "excess cost against gain error", [p.error for p in near], excess)
-    return slopes + slope(question, "all", "seconds against N", [p.N for p in clear], [p.seconds for p in clear])
+    slopes += slope(near, "excess cost against gain error", "error", "cost_excess", "all")
+    return slopes + slope(clear, "seconds against N", "N", "seconds", "all")

@@ -22,17 +22,16 @@ from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
 from softgrasp.study.precision.cache import Cache, Guard
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
-from softgrasp.study.precision.full import FullRuns
+from softgrasp.study.precision.full import FullRuns, find_places
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
-from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RiccatiPoint, RunPoint
-from softgrasp.study.precision.predict import Predictor, companion, error_budget
-from softgrasp.study.precision.probe import find_places
-from softgrasp.study.precision.reduced import ask_bases, ask_reduced
+from softgrasp.study.precision.points import CONTROL, ForwardPoint, ReducedPoint, Request, RunPoint
+from softgrasp.study.precision.predict import Predictor, error_budget
+from softgrasp.study.precision.reduced import ReducedRuns, ask_bases, ask_reduced
 from softgrasp.study.precision.result import Answer, ErrorBudget, Question, Truth, WorkStudy
 from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, ask_riccati, settings_of
 from softgrasp.study.precision.settings import own_setting, variant
 from softgrasp.study.precision.truth import LADDER, make_truth
-from softgrasp.study.reduce.sweep import chosen_methods
+from softgrasp.study.reduce.measure import chosen_methods
 from softgrasp.study.shell.session import Session
 
 FULL_SNAPSHOTS = 3e8  # entries; beyond them the scene's own run is too large for reduced models in memory
@@ -55,15 +54,8 @@ def run_study(
     Points are kept in ``out/cache``; the same command after an interruption goes on from there.
 
     Args:
-        path: scene file.
-        out: folder of the results.
-        overrides: arguments of ``--set``.
-        console: for the tables.
-        tolerance: relative error of the deformation to answer for, or None.
-        budget: seconds of a step to answer for, or None.
-        questions: arguments of ``--question``, see :class:`softgrasp.study.precision.points.Request`; None for all.
-        quiet: no progress bar.
-        empty: remove what an earlier run has left in the folder.
+        path, out, overrides, console, quiet, empty: see :class:`softgrasp.study.shell.session.Session`.
+        tolerance, budget, questions: see :class:`softgrasp.study.precision.points.Request`.
 
     Raises:
         SoftgraspError: with one sentence.
@@ -104,9 +96,9 @@ def study_scene(
     names = request.questions
     model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
     guard = Guard(comm, progress)
-    store = Cache(cache, comm, scene)
-    runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store, guard)
-    control = ControlRuns(model, store, guard, request.names)
+    store = Cache(cache, comm, scene, guard)
+    runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store)
+    control = ControlRuns(model, store, request.names)
     refused = control.refused() if set(names) & set(CONTROL) else ""
     questions = {name: Question(skipped=refused) for name in names if name in CONTROL}
     truth: Truth | None = None
@@ -115,12 +107,12 @@ def study_scene(
     with interruptible(False) as guard.stop:
         guard.count = count_points(scene, control, [name for name in names if not (refused and name in CONTROL)])
         if set(names) - set(CONTROL):
-            truth = make_truth(scene, runs, request.tolerance)
+            truth = make_truth(runs, request.tolerance)
             questions |= forward_questions(model, runs, truth, names)
-            answers, measured = answer(scene, runs, truth, questions, request)
+            answers, measured = answer(runs, truth, questions, request)
         if not refused:
             questions |= control_questions(control, names)
-    budgets = error_budgets(scene, runs, questions, answers, measured) if "forward" in questions else ()
+    budgets = error_budgets(scene, runs.dimension, questions, answers, measured) if "forward" in questions else ()
     return WorkStudy(
         scene=scene,
         truth=truth,
@@ -135,31 +127,31 @@ def study_scene(
 
 def forward_questions(model: Model, runs: FullRuns, truth: Truth, names: Sequence[str]) -> dict[str, Question]:
     """Full model, reduced models, and bases. Collective."""
-    questions, scene = {}, runs.scene
+    questions = {}
     if "forward" in names:
         questions["forward"] = ask_forward(runs, truth, scene_ends(runs.cache.comm, model.space.mesh, model.scene))
     asks = {"reduced": ask_reduced, "bases": ask_bases}
     if not set(names) & set(asks):
         return questions
-    full = runs.run(own_setting(scene))
+    reduced = ReducedRuns(own_setting(runs.scene), runs, truth)
     reason = "the snapshots of the scene's own run would not fit in memory"
-    fits = 2.0 * full.n_e * full.steps <= FULL_SNAPSHOTS
+    fits = 2.0 * reduced.timed.n_e * reduced.timed.steps <= FULL_SNAPSHOTS
     return questions | {
-        name: ask(scene, runs, truth, full) if fits else Question(reference=full, skipped=reason)
+        name: ask(reduced) if fits else Question(reference=reduced.timed, skipped=reason)
         for name, ask in asks.items()
         if name in names
     }
 
 
 def answer(
-    scene: Scene, runs: FullRuns, truth: Truth, questions: dict[str, Question], request: Request
+    runs: FullRuns, truth: Truth, questions: dict[str, Question], request: Request
 ) -> tuple[list[Answer], list[RunPoint]]:
     """Answers to the tolerance and the budget, and the points that were measured for them. Collective."""
     if request.tolerance is None and request.budget is None:
         return [], []
     points = [p for name in ("forward", "reduced") for p in questions[name].points]
     forward = [p for p in points if isinstance(p, ForwardPoint)]
-    answers = Answers(scene, runs, truth, forward, [p for p in points if isinstance(p, ReducedPoint)])
+    answers = Answers(runs, truth, forward, [p for p in points if isinstance(p, ReducedPoint)])
     by_tolerance = [] if request.tolerance is None else [answers.tolerance(request.tolerance)]
     by_budget = [] if request.budget is None else [answers.budget(request.budget)]
     return by_tolerance + by_budget, answers.measured
@@ -167,24 +159,18 @@ def answer(
 
 def error_budgets(
     scene: Scene,
-    runs: FullRuns,
+    dimension: int,
     questions: dict[str, Question],
     answers: Sequence[Answer],
     measured: Sequence[RunPoint],
 ) -> tuple[ErrorBudget, ...]:
     """Of the scene's own setting, and of the one that answers a tolerance."""
     points = [*measured, *(p for question in questions.values() for p in question.points)]
-    forward = [p for p in points if isinstance(p, ForwardPoint)]
-    reduced = [p for p in points if isinstance(p, ReducedPoint)]
-    riccati = [p for p in points if isinstance(p, RiccatiPoint)]
     skipped = {name: question.skipped for name, question in questions.items() if question.skipped}
-    predictor = Predictor(scene, forward, runs.dimension)
-    asked = [a.full.point.setting for a in answers if a.kind == "tolerance" and a.full is not None]
-    result = []
-    for setting in dict.fromkeys([own_setting(scene), *asked]):
-        model = companion(predictor.predict(setting).error, reduced)
-        result.append(error_budget(scene, predictor, setting, forward, model, reduced, riccati, skipped))
-    return tuple(result)
+    predictor = Predictor(scene, [p for p in points if isinstance(p, ForwardPoint)], dimension)
+    answered = [a.full.point.setting for a in answers if a.kind == "tolerance" and a.full is not None]
+    settings = dict.fromkeys([own_setting(scene), *answered])
+    return tuple(error_budget(predictor, setting, points, skipped) for setting in settings)
 
 
 def control_questions(control: ControlRuns, names: Sequence[str]) -> dict[str, Question]:

@@ -103,14 +103,7 @@ def least_steps(scene: Scene) -> int:
 
 
 def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: Sequence[float] | None = None) -> Scene:
-    """The scene under another setting.
-
-    Args:
-        scene: the scene.
-        setting: mesh, order, steps and solver.
-        snapshots: where they go.
-        reference: point that the hand turns about, which by default moves a little with the mesh.
-    """
+    """The scene under another setting; the reference that the hand turns about moves a little with the mesh else."""
 
     def edit(table: dict[str, Any]) -> None:
         tissue = table["tissue"]
@@ -201,11 +194,6 @@ def few_steps(scene: Scene) -> int:
 
 
 def contraction(changes: list[float], growth: float) -> float:
-    """By what errors fall from mesh to mesh: as the last changes of the solution do, one alone like 1 / n_e.
-
-    Args:
-        changes: of the solution from mesh to mesh.
-        growth: of the unknowns in the last of them.
-    """
+    """By what errors fall from mesh to mesh: as the last changes of the solution do, one alone like 1 / that of n_e."""
     ratio = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else 1 / growth
     return float(np.clip(ratio, FASTEST, SLOWEST))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Any
 
@@ -34,25 +34,6 @@ from softgrasp.study.precision.result import (
 from softgrasp.study.precision.riccati import TITLES as METHOD_TITLES
 from softgrasp.study.report.tables import Table
 
-HEADERS: dict[str, tuple[str, ...]] = {
-    "forward": (
-        "setting", "unknowns", "deform. error", "displ. error", "assembly [s]", "factor [s]", "step [us]",
-        "run [s]", "front",
-    ),
-    "reduced": (
-        "setting", "N", "deform. error", "state error", "deform. error with the mesh", "online [s]",
-        "from nothing [s]", "front",
-    ),
-    "bases": ("engine", "tolerance", "vectors", "left of the snapshots", "|U'U - I|", "time [s]", "front"),
-    "riccati": ("method", "tolerance", "gain error", "residual", "rank", "solves", "time [s]", "front"),
-    "reduced_riccati": (
-        "basis", "N", "gain error", "excess cost", "abscissa [1/s]", "equation [ms]", "from nothing [s]", "front",
-    ),
-    "loop": (
-        "controller", "steps", "deform. error", "displ. error", "error in time", "error of the cost",
-        "step [us]", "run [s]", "front",
-    ),
-}  # fmt: skip
 SERIES_TITLES: dict[str, dict[str, str]] = {
     "reduced": {key: method.title for key, method in METHODS.items()},
     "riccati": METHOD_TITLES,
@@ -60,55 +41,66 @@ SERIES_TITLES: dict[str, dict[str, str]] = {
 }
 
 
-def error_outputs(point: ReducedPoint) -> float:
-    """Error against the full run on the same mesh and steps."""
-    return point.error_outputs_full
-
-
 def front_of(points: Sequence[WorkPoint]) -> list[WorkPoint]:
     """The Pareto front; of reduced models, that of the error against their own full run."""
-    return [*pareto([p for p in points if isinstance(p, ReducedPoint)], y=error_outputs)] or pareto(points)
+    return [*pareto([p for p in points if isinstance(p, ReducedPoint)], y="error_outputs_full")] or pareto(points)
 
 
-def question_table(name: str, points: Sequence[WorkPoint], front_only: bool = False) -> Table:
-    """Points of a question; the front alone needs no column that marks it."""
-    front = front_of(points)
-    if front_only:
-        return Table(HEADERS[name][:-1], [_cells(p) for p in front], f"{TITLES[name]}, Pareto front")
-    marks = ["*" if p in front else "" if p.ok else _why(p) for p in points]
-    best = [i for i, p in enumerate(points) if p in front]
-    return Table(HEADERS[name], [(*_cells(p), mark) for p, mark in zip(points, marks, strict=True)], best=best)
-
-
-def _cells(p: WorkPoint) -> tuple[Any, ...]:
-    """A row without its mark; what is not finite is a dash."""
-    cells: tuple[Any, ...]
-    title = SERIES_TITLES.get(p.question, {}).get(p.series, p.series)
-    match p:
-        case ForwardPoint():
-            times = p.assembly, p.factor, 1e6 * p.per_step, p.seconds
-            cells = p.label, p.n_e, _error(p), p.error_displacement, *times
-        case ReducedPoint():
-            cells = title, p.N, p.error_outputs_full, p.error_full, _error(p), p.seconds, p.scratch
-        case BasisPoint():
-            cells = title, p.tolerance, p.columns, p.error, p.orthonormality, p.seconds
-        case RiccatiPoint():
-            tolerance = None if p.series == "dense" else p.tolerance
-            cells = title, tolerance, p.error, p.residual, p.rank, p.solves, p.seconds
-        case ReducedRiccatiPoint():
-            cells = title, p.N, p.error, p.cost_excess, p.abscissa_full, 1e3 * p.seconds, p.scratch
-        case LoopPoint():
-            errors = p.error, p.error_displacement, p.error_time, p.cost_error
-            cells = title, p.steps, *errors, 1e6 * p.per_step, p.seconds
-        case _:
-            raise TypeError(f"no table of {type(p).__name__}")
-    return tuple("-" if c is None or (isinstance(c, float) and not np.isfinite(c)) else c for c in cells)
+def _title(p: WorkPoint) -> str:
+    return SERIES_TITLES.get(p.question, {}).get(p.series, p.series)
 
 
 def _error(point: RunPoint) -> float | str:
     """The error, or below what it is where that of the reference is the larger one."""
     low, high = point.error_range
     return f"< {high:.2g}" if low == 0 and np.isfinite(high) else point.error
+
+
+# Of every question: the columns with the attribute, or the function, that gives their cells.
+COLUMNS: dict[str, dict[str, str | Callable[[Any], Any]]] = {
+    "forward": {
+        "setting": "label", "unknowns": "n_e", "deform. error": _error, "displ. error": "error_displacement",
+        "assembly [s]": "assembly", "factor [s]": "factor", "step [us]": lambda p: 1e6 * p.per_step,
+        "run [s]": "seconds",
+    },
+    "reduced": {
+        "setting": _title, "N": "N", "deform. error": "error_outputs_full", "state error": "error_full",
+        "deform. error with the mesh": _error, "online [s]": "seconds", "from nothing [s]": "scratch",
+    },
+    "bases": {
+        "engine": _title, "tolerance": "tolerance", "vectors": "columns", "left of the snapshots": "error",
+        "|U'U - I|": "orthonormality", "time [s]": "seconds",
+    },
+    "riccati": {
+        "method": _title, "tolerance": lambda p: None if p.series == "dense" else p.tolerance, "gain error": "error",
+        "residual": "residual", "rank": "rank", "solves": "solves", "time [s]": "seconds",
+    },
+    "reduced_riccati": {
+        "basis": _title, "N": "N", "gain error": "error", "excess cost": "cost_excess",
+        "abscissa [1/s]": "abscissa_full", "equation [ms]": lambda p: 1e3 * p.seconds, "from nothing [s]": "scratch",
+    },
+    "loop": {
+        "controller": _title, "steps": "steps", "deform. error": "error", "displ. error": "error_displacement",
+        "error in time": "error_time", "error of the cost": "cost_error", "step [us]": lambda p: 1e6 * p.per_step,
+        "run [s]": "seconds",
+    },
+}  # fmt: skip
+
+
+def question_table(name: str, points: Sequence[WorkPoint], front_only: bool = False) -> Table:
+    """Points of a question; what is not finite is a dash. The front alone needs no column that marks it."""
+    front, columns = front_of(points), COLUMNS[name]
+
+    def cells(p: WorkPoint) -> tuple[Any, ...]:
+        row = [getattr(p, column) if isinstance(column, str) else column(p) for column in columns.values()]
+        return tuple("-" if c is None or (isinstance(c, float) and not np.isfinite(c)) else c for c in row)
+
+    if front_only:
+        return Table(tuple(columns), [cells(p) for p in front], f"{TITLES[name]}, Pareto front")
+    marks = ["*" if p in front else "" if p.ok else _why(p) for p in points]
+    best = [i for i, p in enumerate(points) if p in front]
+    rows = [(*cells(p), mark) for p, mark in zip(points, marks, strict=True)]
+    return Table((*columns, "front"), rows, best=best)
 
 
 def _why(p: WorkPoint) -> str:
@@ -201,12 +193,7 @@ def paper_of(scene: Scene) -> str:
 
 
 def reference_text(question: Question, paper: bool) -> str:
-    """What the points of a question about feedback are compared with, and the paper's numbers.
-
-    Args:
-        question: answered.
-        paper: the scene is the paper's.
-    """
+    """What the points of a question about feedback are compared with, and in its own scene the paper's numbers."""
     match question.reference:
         case RiccatiReference() as r:
             apart = "no second method converged, so that its own error is not known"

@@ -21,8 +21,7 @@ import numpy as np
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.full import FullRuns
-from softgrasp.study.precision.probe import Series, TimedRun, largest
+from softgrasp.study.precision.full import FullRuns, Series, TimedRun, largest
 from softgrasp.study.precision.result import Truth
 from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits
 
@@ -39,14 +38,15 @@ ROUGH = 0.05  # error of a reference that is worth a warning
 STILL = 1e-12  # of the displacement: an output that moves less against the hand moves with it
 
 
-def make_truth(scene: Scene, runs: FullRuns, tolerance: float | None = None) -> Truth:
+def make_truth(runs: FullRuns, tolerance: float | None = None) -> Truth:
     """Run graded meshes until the finest is good enough or too large for the next, then more steps. Collective.
 
     Raises:
         SolverError: a run failed.
         SceneError: the outputs move with the hand, so that there is no deformation to measure.
     """
-    d, few, base = runs.dimension, few_steps(scene), scene.time.steps
+    scene, d = runs.scene, runs.dimension
+    few, base = few_steps(scene), scene.time.steps
     aim = FINEST[d] if tolerance is None else min(FINEST[d], ROOM * tolerance)
     meshes: dict[Setting, TimedRun] = {}
     for goal in LADDER:
@@ -67,13 +67,7 @@ def make_truth(scene: Scene, runs: FullRuns, tolerance: float | None = None) -> 
 
 
 def combine(scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half: TimedRun, fine: TimedRun) -> Truth:
-    """y* and its error estimate from the runs.
-
-    Args:
-        scene: the study's scene.
-        meshes: runs with few steps, coarse to fine.
-        middle: of them, the mesh of the other two.
-        half, fine: with twice and four times the scene's steps.
+    """y* and its error estimate: runs with few steps on meshes, coarse to fine, and two with more on the middle one.
 
     Raises:
         SceneError: the outputs move with the hand.

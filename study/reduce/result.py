@@ -62,18 +62,6 @@ class MethodSweep:
     N_energy: int | None = None  # N that keeps the scene's share of the energy; None without snapshots
     inner: str = ""  # inner product of the bases
 
-    @property
-    def about(self) -> dict[str, Any]:
-        """One entry of "about" in ``result.json``."""
-        return {
-            "title": self.method.title,
-            "paper": self.method.paper,
-            "structure_preserving": self.method.preserving,
-            "inner": self.inner,
-            "N_energy": self.N_energy,
-            "N_refused": {N: f"N = {N}: {reason}" for N, reason in self.refused.items()},
-        }
-
 
 @dataclass(frozen=True)
 class TestedModel:
@@ -193,7 +181,17 @@ class ReductionStudy:
             {
                 "N_means": N_NOTE,
                 "methods": {s.method.key: [asdict(p) for p in s.points] for s in self.sweeps},
-                "about": {s.method.key: s.about for s in self.sweeps},
+                "about": {
+                    s.method.key: {
+                        "title": s.method.title,
+                        "paper": s.method.paper,
+                        "structure_preserving": s.method.preserving,
+                        "inner": s.inner,
+                        "N_energy": s.N_energy,
+                        "N_refused": {N: f"N = {N}: {reason}" for N, reason in s.refused.items()},
+                    }
+                    for s in self.sweeps
+                },
                 "findings": self.findings,
                 "speed": [speed.to_json() for speed in self.speeds],
                 "speed_notes": self.speed_notes,

@@ -15,10 +15,10 @@ from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
 from softgrasp.study.pictures.beside import beside
-from softgrasp.study.reduce import tables
+from softgrasp.study.reduce import report
 from softgrasp.study.reduce.findings import findings
+from softgrasp.study.reduce.measure import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
 from softgrasp.study.reduce.result import N_NOTE, ReductionStudy, best
-from softgrasp.study.reduce.sweep import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
@@ -59,7 +59,7 @@ def run_reduce(
 
         return run_certify(session, scene)
     if scene.effects.finite_strain is not None:
-        from softgrasp.study.reduce.strain_run import run_strain  # models of another kind
+        from softgrasp.study.reduce.strain import run_strain  # models of another kind
 
         return run_strain(session, scene)
     model, watch = session.model(scene), Stopwatch(session.comm)
@@ -74,9 +74,9 @@ def run_reduce(
 
     def page() -> Page:
         files = drawn()
-        points = {"points.csv": tables.point_table(study)}
-        parts = tables.sections(study, files)
-        return Page(f"{scene.name}: reduced models", tables.summary(study), parts, points, [*files, *models])
+        points = {"points.csv": report.point_table(study)}
+        parts = report.sections(study, files)
+        return Page(f"{scene.name}: reduced models", report.summary(study), parts, points, [*files, *models])
 
     show(console, study)
     list_files(console, session.write(scene, result, page))
@@ -121,23 +121,23 @@ def reduce_model(
 
 
 def show(console: Console, study: ReductionStudy) -> None:
-    """Print the tables."""
+    """Print tables and sentences."""
     energy, box = study.full.model.scene.reduction.energy, study.box
-    _print(console, tables.error_table(study.sweeps, energy, narrow=True))
-    note = f"{tables.error_note(energy)} fixed: with fixed solid modes. {N_NOTE} {tables.inner_note(study.sweeps)}"
+    _print(console, report.error_table(study.sweeps, energy, narrow=True))
+    note = f"{report.error_note(energy)} fixed: with fixed solid modes. {N_NOTE} {report.inner_note(study.sweeps)}"
     console.print(note, style="dim", markup=False)
     for sentence in study.findings:
         console.print(sentence, markup=False)
-    for sizes, titles, reason in tables.refused_table(study.sweeps, narrow=True).rows:
+    for sizes, titles, reason in report.refused_table(study.sweeps, narrow=True).rows:
         console.print(f"N = {sizes} refused for {titles}: {reason}.", markup=False)
-    _print(console, tables.time_table(study, narrow=True))
+    _print(console, report.time_table(study, narrow=True))
     for note in study.speed_notes:
         console.print(note)
     if box.none:
         console.print(f"no errors at other parameters: {box.none}")
     else:
-        console.print(tables.box_note(box), markup=False)
-        _print(console, tables.box_table(box, narrow=True))
+        console.print(report.box_note(box), markup=False)
+        _print(console, report.box_table(box, narrow=True))
 
 
 def _print(console: Console, table: Table) -> None:

@@ -66,7 +66,7 @@ class StrainPoint:
 
 
 @dataclass(frozen=True)
-class Test:
+class HeldOutTest:
     """A full run that trained no model of its family."""
 
     kind: str  # "material" or "motion", whichever is new
@@ -85,7 +85,7 @@ class StrainFamily:
     runs: int  # full runs that trained them
     points: tuple[StrainPoint, ...]  # with tau from the model on all cells, one for each N
     curves: tuple[StrainPoint, ...]  # those, and others of some N with given tau
-    tests: tuple[Test, ...]  # held-out runs
+    tests: tuple[HeldOutTest, ...]  # held-out runs
     models: dict[int, StrainModel]  # those of ``points`` by N
     refused: dict[int, str]  # reason by N
 
@@ -211,7 +211,7 @@ def _family(
     tests = []
     for j, (kind, full) in enumerate(held):
         first, target = full.model.system.materials[0], tuple(full.trajectory.q_s[-1].tolist())
-        tests.append(Test(kind, first.lam, first.mu, target, {N: missed[N][j] for N in models}))
+        tests.append(HeldOutTest(kind, first.lam, first.mu, target, {N: missed[N][j] for N in models}))
     whole = (*curves, *points)
     return StrainFamily(key, training.whole.box, len(runs), tuple(points), whole, tuple(tests), models, refused)
 

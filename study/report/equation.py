@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from softgrasp.fem.effects.catalog import layered
+from softgrasp.fem.effects.damping import layered
 from softgrasp.fem.scene.scene import Scene
 
 PLAIN = (  # pattern of LaTeX, what a terminal shows

@@ -14,7 +14,8 @@ from softgrasp.fem.columns import OutputColumn
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.lqr.loop.actuation import Actuation
-from softgrasp.lqr.plant.gain import Block, Gain, PlantState
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import rest
 from tests.helpers.models import gather_matrix, gather_rows, gather_states, local_rows, make_scene

@@ -17,7 +17,7 @@ from softgrasp.fem.scene.file import load_scene
 from softgrasp.lqr.dense.care import StateSpace
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from tests.helpers.models import CUBE, LAYERS, gather_rows, make_scene
 

@@ -17,8 +17,9 @@ from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.care import care, riccati_schur
 from softgrasp.lqr.dense.modal import DenseRiccati, relative_space
 from softgrasp.lqr.design.scene import problem as make_problem
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import (
     costates_to_absolute,
     costates_to_relative,

@@ -14,12 +14,14 @@ from softgrasp.fem.model.build import Model, build
 from softgrasp.lqr.dense.care import fast_solution, solve_reduced
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import costates_to_absolute, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import BASES, BasisFamily, energy_scaled, make_family
-from softgrasp.lqr.reduced.riccati import GainJudge, Retuner, full_gain, project_plant, reduce_riccati, retuned_gain
+from softgrasp.lqr.reduced.retune import Retuner, retuned_gain
+from softgrasp.lqr.reduced.riccati import GainJudge, full_gain, project_plant, reduce_riccati
 from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from tests.helpers.models import (

@@ -15,7 +15,8 @@ from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.design.scene import with_control
 from softgrasp.lqr.lowrank.modal_start import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.riccati import solve
 from softgrasp.lqr.spectrum.certificate import abscissa

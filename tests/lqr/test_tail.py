@@ -12,7 +12,7 @@ from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.system import BlockSystem, Damping, LayerMaterial
 from softgrasp.lqr.dense.care import StateSpace
 from softgrasp.lqr.dense.modal import relative_space
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.tail import Tail, why_no_bound
 

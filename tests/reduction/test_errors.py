@@ -11,7 +11,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.reduction.errors import Comparison, full_energy
+from softgrasp.reduction.errors import ModelComparison, full_energy
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import run
 from tests.helpers.models import Array, gather_matrix, gather_rows, gather_states
@@ -56,7 +56,7 @@ def test_errors_against_dense_matrices(comm: MPI.Intracomm, whole: bool) -> None
         rom = reduced(model, leading(large, 3))
         small = rom.at()
         largest = rom if whole else reduced(model, large)
-        comparison = Comparison(largest, largest.at(), system, snapshots, energy)
+        comparison = ModelComparison(largest, largest.at(), system, snapshots, energy)
         own = run(small, dt, force_of(model), allow_unstable=True)
         errors = comparison.errors(rom, small, own)
         q_s, v_s = own.q_s[::3].T, own.v_s[::3].T
@@ -82,7 +82,7 @@ def test_a_model_outside_the_family_is_refused(comm: MPI.Intracomm) -> None:
     snapshots = simulate(model).snapshots
     basis = symplectic_basis(model.system.layout, 3, "relative", True)
     rom, other = reduced(model, basis), reduced(model, replace(basis, V_q=basis.V_p, V_p=basis.V_q))
-    comparison = Comparison(rom, rom.at(), model.system, snapshots, full_energy(model.system, snapshots.Z))
+    comparison = ModelComparison(rom, rom.at(), model.system, snapshots, full_energy(model.system, snapshots.Z))
     with pytest.raises(ModelError, match="shows more"):
         comparison.projection_error("deformation", other, other.at())
 
@@ -92,7 +92,7 @@ def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
     snapshots: Any = simulate(model).snapshots
     rom = reduced(model, whole_basis(model.system.layout, "qp", "absolute", True))
     small = rom.at()
-    comparison = Comparison(rom, small, model.system, snapshots, full_energy(model.system, snapshots.Z))
+    comparison = ModelComparison(rom, small, model.system, snapshots, full_energy(model.system, snapshots.Z))
     errors = comparison.errors(rom, small, run(small, step_of(model), force_of(model)))
     # rounding of 30 steps in other coordinates
     assert max(errors.error, errors.error_canonical, errors.error_deformation, errors.error_energy) < 1e-9

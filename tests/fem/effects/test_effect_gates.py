@@ -10,8 +10,10 @@ import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.effects import EFFECTS, Problem
-from softgrasp.fem.effects.catalog import acceleration, hand_mass, operator, ratios
+from softgrasp.fem.effects.damping import operator, ratios
 from softgrasp.fem.effects.gate import Gradient, Sag
+from softgrasp.fem.effects.gravity import acceleration
+from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.fields.scales import damping_ratios, measure, measure_sag, rigid_inertia
 from softgrasp.fem.model.build import build

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.fields.series import CellStress, SeriesWriter
+from softgrasp.fem.fields.series import SeriesWriter
+from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import note_of
 from tests.fem.fields.test_fields import EXACT, hand_of, make_model, turned
 

@@ -8,7 +8,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError
-from softgrasp.fem.mesh.make import make_mesh
+from softgrasp.fem.mesh.tissue_mesh import make_mesh
 from softgrasp.fem.model import memory
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import check_memory, free_bytes, need, simplices

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from skfem.helpers import ddot, div, sym_grad
 
 from softgrasp.fem.layout import BlockLayout
-from softgrasp.fem.mesh.make import structured_mesh
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh, structured_mesh
 from softgrasp.fem.model.assembly import Inventory, _bilinear, assemble, discretise
 from softgrasp.fem.model.build import build
 from softgrasp.fem.petsc import PETSc

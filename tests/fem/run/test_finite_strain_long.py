@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softgrasp.fem.effects.catalog import linear_error
+from softgrasp.fem.effects.finite_strain import linear_error
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.fields.scales import gradient
 from softgrasp.fem.model.build import Model, build

@@ -12,7 +12,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import total
 from softgrasp.lqr.design.feedback import Design, design
-from softgrasp.lqr.design.scene import finite_problem, linearised
+from softgrasp.lqr.design.linearise import finite_problem, linearised
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import overshoot
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory

@@ -10,10 +10,12 @@ from mpi4py import MPI
 
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
-from softgrasp.lqr.design.orders import LoopPlan, with_bounds
+from softgrasp.lqr.design.duration import LoopPlan
+from softgrasp.lqr.design.orders import with_bounds
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.loop.gap import DualityGap, duality_gaps
-from softgrasp.lqr.plant.gain import Block, Gain
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.reduced.bases import make_family
 from softgrasp.lqr.reduced.riccati import GainJudge, GainReport, reduce_riccati
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop

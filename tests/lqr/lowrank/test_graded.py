@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import Interrupted, MeshError, SceneError
 from softgrasp.fem.mesh.grading import bisect
-from softgrasp.fem.mesh.make import structured_mesh
+from softgrasp.fem.mesh.tissue_mesh import structured_mesh
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.model.refined import marked
 from softgrasp.fem.run.simulate import RunOptions, simulate

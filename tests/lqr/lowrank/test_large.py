@@ -16,9 +16,10 @@ from softgrasp.fem.errors import CheckpointError, ResourceError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.design.scene import problem as make_problem
+from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import Iteration, NewtonADI, load_state
-from softgrasp.lqr.lowrank.plant import Plant, Right
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.shifted import factor_bytes, make_shifted
 from softgrasp.lqr.plant.checks import ControlError

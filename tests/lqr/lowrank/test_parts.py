@@ -14,15 +14,16 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.dense.modal import relative_space
+from softgrasp.lqr.lowrank.adjoint import closed_adjoint, make_right
 from softgrasp.lqr.lowrank.compress import compress
 from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin, frequencies
 from softgrasp.lqr.lowrank.modal_start import modal_start, plant_modes
 from softgrasp.lqr.lowrank.newton import NewtonADI, best_step, mixed_residual
-from softgrasp.lqr.lowrank.plant import Plant, closed_adjoint, make_right
+from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.shifted import GatheredTissue, make_shifted
 from softgrasp.lqr.lowrank.shifts import ShiftRange, choose_shifts, energy_products, ritz_pairs
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import gather_matrix, gather_rows, local_rows
 from tests.helpers.riccati import SCENE, problem_of

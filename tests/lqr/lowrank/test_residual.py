@@ -11,7 +11,7 @@ from softgrasp.fem.petsc import Array
 from softgrasp.lqr.dense.modal import DenseRiccati, dense_residual, relative_space
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.lowrank.residual import residual
-from softgrasp.lqr.plant.gain import Block
+from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from tests.helpers.models import LAYERS, make_scene
 

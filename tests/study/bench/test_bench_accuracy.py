@@ -19,7 +19,7 @@ def test_tolerance_keeps_what_was_asked(monkeypatch: pytest.MonkeyPatch) -> None
     assert 0.4 <= found.estimate <= 1.1
     assert found.bound >= 1
     assert found.corrected <= 0.6
-    row = bench.Row("graded, P2", found.n_e, 0.1, 0.1, found.error, 0.1, 0.1, 1.0, 1e-6, 61, 1e-11)
+    row = bench.MeshPoint("graded, P2", found.n_e, 0.1, 0.1, found.error, 0.1, 0.1, 1.0, 1e-6, 61, 1e-11)
     missed = [goal.text for goal in bench.goals([row], [found]) if not goal.ok and "seconds" not in goal.text]
     assert missed == ["solves of a Riccati equation, graded"]  # 61 > 60
     assert found.time_run <= found.time_all

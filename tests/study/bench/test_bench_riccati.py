@@ -12,8 +12,7 @@ from rich.console import Console
 from softgrasp.fem.errors import CheckpointError
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, failures, of
-from softgrasp.study.bench.riccati import Record, collect, collect_peers, peer_line
-from softgrasp.study.bench.riccati_rows import RiccatiPoint
+from softgrasp.study.bench.riccati import Record, RiccatiPoint, collect, collect_peers, peer_line
 
 pytestmark = pytest.mark.serial
 

@@ -14,7 +14,7 @@ import softgrasp.reduction.online
 from softgrasp.study.bench import driver
 from softgrasp.study.bench import switches as bench_switches
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.switches import Setup, SwitchPoint, product, start, table_of
+from softgrasp.study.bench.switches import COLUMNS, Setup, SwitchPoint, product, start
 from softgrasp.study.shell.processes import IN_MPI_JOB
 
 
@@ -26,7 +26,7 @@ def test_rows_compare_two_methods_and_leave_the_constants_alone(comm: MPI.Intrac
     assert all(row.first > 0 and row.second > 0 and row.ranks == 1 for row in rows)
     assert rows[0].limit == f"FEW_MODES = {before[0]}"
     assert before == (softgrasp.lqr.lowrank.modal_start.FEW_MODES, softgrasp.reduction.online.TOGETHER)
-    assert len(table_of(rows).rows) == 4
+    assert len(driver.table_of(rows, COLUMNS).rows) == 4
 
 
 @pytest.mark.serial

@@ -34,9 +34,9 @@ from softgrasp.study.precision import truth as wp_truth
 from softgrasp.study.precision.answer import advice, parse_budget, parse_tolerance
 from softgrasp.study.precision.fit import interpolate, pareto, power_law, usable
 from softgrasp.study.precision.forward import step_counts, too_slow
+from softgrasp.study.precision.full import find_places, largest, run_probed
 from softgrasp.study.precision.points import ForwardPoint, Request, WorkPoint
 from softgrasp.study.precision.predict import balanced
-from softgrasp.study.precision.probe import find_places, largest, run_probed
 from softgrasp.study.precision.result import Part, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
 from softgrasp.study.precision.settings import (

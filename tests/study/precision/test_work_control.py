@@ -21,10 +21,10 @@ from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.riccati import gain_error
 from softgrasp.lqr.riccati import solve
-from softgrasp.study.precision import control_plots as work_control_plots
 from softgrasp.study.precision import loop as wp_loop
+from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import riccati as wp_riccati
-from softgrasp.study.precision.cache import Cache, Guard
+from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.loop import step_counts
 from softgrasp.study.precision.points import CONTROL, LoopPoint, ReducedRiccatiPoint, Request, RiccatiPoint
 from softgrasp.study.precision.result import Question, RiccatiReference, WorkStudy
@@ -49,7 +49,7 @@ ALL = ",".join(CONTROL)
 def _rough() -> Iterator[None]:
     """No test looks at a time, or at more than the existence of a picture."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(work_control_plots, "save", rough_save)
+        patch.setattr(work_plots, "save", rough_save)
         patch.setattr(wp_loop, "SHARES", (8.0, 4.0, 2.0))
         patch.setattr(wp_loop, "BURST_SECONDS", 0.0)
         patch.setattr(wp_riccati, "REPEAT_SECONDS", 0.0)
@@ -283,7 +283,7 @@ def test_large_scenes_are_asked_by_name_only(
 ) -> None:
     monkeypatch.setattr(wp_riccati, "LARGE", {2: 10, 3: 10})
     model, store = build(make_scene(SMALL), comm=comm), Cache(mpi_tmp_path, comm, make_scene(SMALL))
-    runs = [wp_riccati.ControlRuns(model, store, Guard(comm), names) for names in ((), ("riccati",))]
+    runs = [wp_riccati.ControlRuns(model, store, names) for names in ((), ("riccati",))]
     assert "--question" in runs[0].refused()
     assert runs[1].refused() == ""
     assert wp_riccati.tolerances_of("radi", runs[1].large) == wp_riccati.FEW_TOLERANCES

@@ -19,8 +19,8 @@ from softgrasp.study.precision import full as wp_full
 from softgrasp.study.precision import reduced as wp_reduced
 from softgrasp.study.precision import settings as wp_meshes
 from softgrasp.study.precision import truth as wp_truth
+from softgrasp.study.precision.full import find_places, run_probed
 from softgrasp.study.precision.points import Request
-from softgrasp.study.precision.probe import find_places, run_probed
 from softgrasp.study.precision.run import study_scene
 from softgrasp.study.precision.settings import Setting, own_setting, variant
 from tests.helpers.models import Array, graded_model

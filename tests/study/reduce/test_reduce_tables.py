@@ -7,9 +7,9 @@ from pathlib import Path
 
 from softgrasp.reduction.bases.registry import METHODS, PAPER_METHODS
 from softgrasp.study.reduce.findings import findings
+from softgrasp.study.reduce.measure import FURTHER, chosen_methods
+from softgrasp.study.reduce.report import error_table, least_size, stability
 from softgrasp.study.reduce.result import MethodSweep, Point, best, kept_points, nearest
-from softgrasp.study.reduce.sweep import FURTHER, chosen_methods
-from softgrasp.study.reduce.tables import error_table, least_size, stability
 from tests.helpers.models import make_scene
 
 PAPER = Path(__file__).parents[3] / "demos" / "scenes" / "paper_forward.toml"

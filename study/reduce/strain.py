@@ -15,10 +15,10 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
+from softgrasp.study.reduce.measure import measured_run
+from softgrasp.study.reduce.report import TIMES, time_cells
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainFamily, StrainPoint, StrainStudy, measure_strain
-from softgrasp.study.reduce.sweep import measured_run
-from softgrasp.study.reduce.tables import TIMES, time_cells
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files

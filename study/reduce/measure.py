@@ -19,7 +19,7 @@ from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.bases.truncation import Truncation
-from softgrasp.reduction.errors import Comparison
+from softgrasp.reduction.errors import ModelComparison
 from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
@@ -91,7 +91,7 @@ def bases_of(
     return (), None
 
 
-def measure(model: ReducedModel, full: FullRun, comparison: Comparison | None = None) -> Point:
+def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison | None = None) -> Point:
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
     ``comparison``: of the largest model of the family; None prepares one for this model alone. Raises ModelError: E or

@@ -1,0 +1,42 @@
+"""Gravity: a uniform acceleration, which needs no operator but the coupling G."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from softgrasp.fem.effects.gate import Effect, Gate, Problem
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.scene.scene import Scene
+
+EARTH = 9.81  # [m/s2], assumed when the scene leaves gravity off
+
+
+def acceleration(scene: Scene, n_s: int) -> Array | None:
+    """Free fall in the hand's degrees of freedom, g = [g_1 .. g_d, 0 ..] (n_s,) [m/s2]; None when off."""
+    gravity = scene.effects.gravity
+    if gravity is None:
+        return None
+    return np.pad(np.asarray(gravity.g, dtype=float), (0, n_s - len(gravity.g)))
+
+
+class GravityEffect(Effect):
+    """Body force rho g: f_e = G g, for K_ee T + K_es = 0 makes falling the same as accelerating the hand."""
+
+    name = "gravity"
+    term = "f_e = G g, as the load -G (q_s'' - g)"
+    cost = "Gravity takes no operator and no work in a step: G multiplies q_s'' - g instead of q_s''."
+    threshold = 0.01
+
+    def gate(self, problem: Problem) -> Gate:
+        """Gradient of the static displacement under the weight, bending included; `fem.fields.sag` solves for it."""
+        off, sag, length = problem.scene.effects.gravity is None, problem.sag, problem.length
+        number = sag.gradient.typical
+        bends = f"sag by {sag.largest:.2g} m, {sag.largest / length:.2g} of its length {length:.3g} m"
+        steep = f"|grad z| is {sag.gradient.largest:.2g} at most"
+        begin = (
+            f"Off; in SI units and with g = {EARTH} the tissue would" if off else "Under its weight the tissue would"
+        )
+        holds = "holds" if sag.gradient.linear else f"does not hold, {sag.gradient.share:.0%} of the body is above 0.1"
+        sentence = f"{begin} {bends}, by linear elasticity; {steep}: the theory {holds}."
+        proviso = "if its numbers are in SI units" if off else ""
+        return Gate(number, "|grad z| of its sag", self.threshold, number > self.threshold, sentence, proviso)

@@ -1,0 +1,130 @@
+"""What the open plant answers to one step of every input: all gains of a plant are judged with these few runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.fft
+
+from softgrasp.fem.petsc import Array, total
+from softgrasp.lqr.loop.drive import OpenDrive
+from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopRun
+from softgrasp.lqr.plant.block import Block
+from softgrasp.lqr.plant.gain import PlantState
+from softgrasp.lqr.plant.problem import RiccatiProblem
+from softgrasp.lqr.plant.target import Target
+
+Notify = Callable[[int, int], None]
+TOGETHER = 32  # states behind one product with the functionals
+
+
+@dataclass(frozen=True)
+class Responses:
+    """f_n = W'x_n = free_n + sum_{k < n} kernel_{n-k} u_k of E x' = A x + B u, by the midpoint rule."""
+
+    dt: float  # step [s]
+    kernel: Array  # W'x at the grid points after u_0 = e_j, at rest before, (steps + 1, f, n_s)
+    free: Array  # W'x from the start without input, (steps + 1, f)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return len(self.free) - 1
+
+    def part(self, columns: slice) -> Responses:
+        """Some of the functionals."""
+        return Responses(self.dt, self.kernel[:, columns], self.free[:, columns])
+
+    def at_midpoints(self) -> Responses:
+        """W'x_mid of step n = free_n + sum_{k <= n} kernel_{n-k} u_k, for n < steps."""
+        return Responses(self.dt, (self.kernel[1:] + self.kernel[:-1]) / 2, (self.free[1:] + self.free[:-1]) / 2)
+
+
+def causal(kernel: Array, x: Array) -> Array:
+    """sum_{k <= n} kernel_{n-k} x_k for every n by FFT; kernel (steps, a, b), x (steps, b)."""
+    steps = len(x)
+    size = scipy.fft.next_fast_len(2 * steps, real=True)
+    both = np.einsum("wab,wb->wa", scipy.fft.rfft(kernel, size, axis=0), scipy.fft.rfft(x, size, axis=0))
+    return np.asarray(scipy.fft.irfft(both, size, axis=0)[:steps])
+
+
+def feedback_inputs(law: Responses) -> Array:
+    """u_n = K x_mid of every step, from the responses of K' at the midpoints; (steps, n_s).
+
+    Row by row of (I - kernel_0) u_n = free_n + sum_{k < n} kernel_{n-k} u_k.
+    """
+    steps, n_s = law.free.shape
+    inverse = np.linalg.inv(np.eye(n_s) - law.kernel[0])
+    backwards = np.ascontiguousarray(law.kernel[::-1].transpose(1, 0, 2)).reshape(n_s, steps * n_s)
+    u = np.zeros((steps, n_s))
+    past, end = u.reshape(-1), (steps - 1) * n_s
+    with np.errstate(over="ignore", invalid="ignore"):  # of a gain that does not stabilise
+        for n in range(steps):
+            u[n] = inverse @ (law.free[n] + backwards[:, end - n * n_s : end] @ past[: n * n_s])
+    return u
+
+
+def responses(
+    problem: RiccatiProblem, W: Block, start: Block, dt: float, steps: int, notify: Notify | None = None
+) -> Responses:
+    """One factor and n_s runs of the full plant, one more where the start moves by itself. Collective.
+
+    Args:
+        W: functionals as columns of the size of the state.
+        start: x(0) as a difference to a state of rest, one column.
+        notify: called with the number of steps done and in all.
+
+    Raises SolverError: a solve failed.
+    """
+    n_s, n = problem.layout.n_s, problem.layout.n_local
+    # differences of two states feel no gravity
+    problem = replace(problem, system=replace(problem.system, gravity=None, hand_weight=False))
+    rest = PlantState(np.zeros(n_s), np.zeros(n_s), np.zeros(n), np.zeros(n))
+    begin = PlantState(*(part[:, 0] for part in start.parts))
+    inputs = np.zeros((n_s + 1, steps, n_s))
+    inputs[range(n_s), 0, range(n_s)] = 1.0
+    runs = [(rest, u) for u in inputs[:n_s]]
+    still = total(problem.layout.comm, np.array([np.abs(start.tall).sum()]))[0] == 0 and not begin.v_s.any()
+    if not still:
+        runs.append((begin, inputs[-1]))
+    loop, values = ClosedLoop(problem, dt), list[Array]()
+
+    def progress(run: Any) -> None:
+        if notify is not None:
+            notify(len(values) * steps + run.reached, len(runs) * steps)
+
+    try:
+        for state, u in runs:
+            values.append(_Record(loop, W, state, u, LoopOptions(progress=progress)).values())
+    finally:
+        loop.destroy()
+    # a body displaced rigidly stays there
+    free = np.tile(start.hand[:, 0] @ W.hand, (steps + 1, 1)) if still else values[-1]
+    return Responses(dt, np.stack(values[:n_s], axis=-1), free)
+
+
+class _Record(LoopRun):
+    """A run under given inputs that keeps W'x of every step."""
+
+    def __init__(self, loop: ClosedLoop, W: Block, start: PlantState, inputs: Array, options: LoopOptions) -> None:
+        self.W = W
+        self.values_here = np.zeros((len(inputs) + 1, W.columns))
+        self.recent = np.zeros((len(W.tall), TOGETHER), order="F")
+        target = Target(start, np.zeros(inputs.shape[1]), np.zeros(len(loop.problem.C_s)))
+        super().__init__(loop, OpenDrive(loop.plant, inputs), start, len(inputs), options, target)
+
+    def record(self, n: int) -> None:
+        """Keep the state until there are enough of them for one product."""
+        place = n % TOGETHER
+        self.recent[:, place] = self.state.array
+        if place == TOGETHER - 1 or n == self.steps:
+            np.matmul(self.recent[:, : place + 1].T, self.W.tall, out=self.values_here[n - place : n + 1])
+
+    def values(self) -> Array:
+        """Run, and W'x at the grid points, (steps + 1, f). Collective."""
+        self.execute()
+        hand = np.hstack([self.drive.q, self.drive.v])
+        return np.asarray(total(self.problem.layout.comm, self.values_here) + hand @ self.W.hand)
