@@ -22,34 +22,8 @@ from matplotlib.tri import Triangulation
 
 from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.study.pictures.shapes import (
-    AZIMUTH,
-    chained,
-    contact_centre,
-    facet_normals,
-    hand_polygons,
-    hands_at,
-    interfaces,
-    moved,
-    overlap,
-    seen,
-    shadow,
-    subdivision,
-    view_direction,
-)
-from softgrasp.study.pictures.style import (
-    COLUMN,
-    HAND,
-    OUTLINE,
-    STEPS,
-    TARGET,
-    WIDTH,
-    colour_map,
-    length_unit,
-    paper_style,
-    save,
-    segments,
-)
+from softgrasp.study.pictures import shapes, style
+from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, save, segments
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
@@ -82,7 +56,7 @@ class Shot:
 
 def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None) -> Shot:
     """Prepare the views of a move; see `figure_move` for the arguments."""
-    hands, given = hands_at(table, times), np.asarray([] if target is None else target, dtype=np.float64)
+    hands, given = shapes.hands_at(table, times), np.asarray([] if target is None else target, dtype=np.float64)
     aim = None if target is None else np.pad(given, (0, picture.n_s - len(given)))
     relative = [np.linalg.norm(u - picture.rigid(q), axis=1).max() for u, q in zip(states, hands, strict=True)]
     largest = float(max(relative))
@@ -90,16 +64,16 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
         largest = 0.0
     unit = length_unit(largest)
     norm = mpl.colors.Normalize(0.0, unit[0] * largest)
-    polygons, grip = hand_polygons(picture) if picture.dimension == 2 else ([], contact_centre(picture))
+    polygons, grip = shapes.hand_polygons(picture) if picture.dimension == 2 else ([], shapes.contact_centre(picture))
     path = grip + table[:, 1:] @ np.vstack([picture.rigid(unit, grip[None, :]) for unit in np.eye(picture.n_s)])
     boxes = [_box(picture.points + u) for u in states] + [_box(path)]
-    boxes += [_box(np.vstack(moved(picture, polygons, q))) for q in hands if polygons]
+    boxes += [_box(np.vstack(shapes.moved(picture, polygons, q))) for q in hands if polygons]
     if aim is not None:
-        boxes += [_box(p) for p in moved(picture, [picture.points, *polygons], aim)]
+        boxes += [_box(p) for p in shapes.moved(picture, [picture.points, *polygons], aim)]
     low, high = _box(np.vstack(boxes))
     lines = [] if aim is None else _outline(picture, picture.points + picture.rigid(aim))
-    edges = np.vstack([picture.facets, interfaces(picture)]) if picture.dimension == 2 else np.zeros((0, 2), dtype=int)
-    return Shot(picture, hands, path, norm, unit, low, high, polygons, edges, lines)
+    edges = [picture.facets, shapes.interfaces(picture)] if picture.dimension == 2 else [np.zeros((0, 2), dtype=int)]
+    return Shot(picture, hands, path, norm, unit, low, high, polygons, np.vstack(edges), lines)
 
 
 def figure_move(
@@ -120,7 +94,8 @@ def figure_move(
     states = states.astype(np.float64)
     shot = make_shot(picture, states, times, table, target)
     with paper_style():
-        apart = len(states) > 1 and (picture.dimension == 3 or overlap(picture, states))  # in 3D captions meet bodies
+        meet = picture.dimension == 3 or shapes.overlap(picture, states)  # in 3D captions meet bodies
+        apart = len(states) > 1 and meet
         groups = [[i] for i in range(len(states))] if apart else [list(range(len(states)))]
         figure, axes = make_axes(shot, len(groups), captions=True)
         for ax, group in zip(axes, groups, strict=True):
@@ -142,8 +117,8 @@ def draw_scene(ax: Any, shot: Shot, states: Array, times: Array | None, hands: A
         else:
             _draw_3d(ax, shot, u, q)
         if times is not None:
-            whole = np.vstack([picture.points + u, *moved(picture, shot.hand, q)])
-            _caption(ax, shot, _box(seen(whole)), _time(times[i]))
+            whole = np.vstack([picture.points + u, *shapes.moved(picture, shot.hand, q)])
+            _caption(ax, shot, _box(shapes.seen(whole)), _time(times[i]))
 
 
 def make_axes(
@@ -157,7 +132,7 @@ def make_axes(
     solid, many = shot.picture.dimension == 3, panels > 1
     span = np.maximum(shot.high - shot.low, 1e-3 * float((shot.high - shot.low).max()))
     flat = span[0] > 2.2 * span[1]
-    width = width or (WIDTH if many or flat else COLUMN)
+    width = width or (style.WIDTH if many or flat else style.COLUMN)
     tallest = tallest or (3.9 if many else 2.8)
     corner = _free_corner(shot) if solid else ""
     left, right, bottom = (0.1 if corner else 0.9, 0.72, 0.05) if solid else (0.56, 0.72, 0.42)
@@ -171,8 +146,8 @@ def make_axes(
         free = np.array([width - left - right - GAP * (shape[1] - 1), tallest - (GAP + title) * (shape[0] - 1)])
         return float(((free / shape[::-1] - pads.sum(axis=0)) / span).min())
 
-    shapes = [(r, -(-panels // r)) for r in range(1, panels + 1) if panels % r == 0]
-    rows, columns = max(shapes, key=scale_of)
+    grids = [(r, -(-panels // r)) for r in range(1, panels + 1) if panels % r == 0]
+    rows, columns = max(grids, key=scale_of)
     scale = scale_of((rows, columns))
     low, high = shot.low - pads[0] / scale, shot.high + pads[1] / scale
     w, h = (high - low) * scale
@@ -183,14 +158,14 @@ def make_axes(
         ax = figure.add_axes((x / size[0], y / size[1], w / size[0], h / size[1]))
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.append(ax)
-        ax.plot(*seen(shot.path).T, ls=DASHES, color=OUTLINE, lw=0.9, zorder=1)
+        ax.plot(*shapes.seen(shot.path).T, ls=DASHES, color=style.OUTLINE, lw=0.9, zorder=1)
         for line in shot.aim:
-            ax.plot(*line.T, ls=DOTS, color=TARGET, lw=1.3, zorder=5)
+            ax.plot(*line.T, ls=DOTS, color=style.TARGET, lw=1.3, zorder=5)
         if solid:
             ax.set_axis_off()
             continue
-        ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=STEPS))
-        ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=STEPS))
+        ax.xaxis.set_major_locator(MaxNLocator(int(np.clip(w / 0.5, 2, 6)), steps=style.STEPS))
+        ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(h / 0.4, 2, 6)), steps=style.STEPS))
         ax.tick_params(labelbottom=i // columns == rows - 1, labelleft=i % columns == 0)
         ax.set_xlabel("$x$ [m]" if i // columns == rows - 1 else "")
         ax.set_ylabel("$y$ [m]" if i % columns == 0 else "")
@@ -214,7 +189,7 @@ def colour_bar(figure: Any, axes: list[Any], shot: Shot) -> None:
     label = f"{words} [{shot.unit[1]}]"
     bar = figure.colorbar(mpl.cm.ScalarMappable(shot.norm, colour_map()), cax=place, label=label)
     bar.outline.set_linewidth(0.5)
-    bar.ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(height / inch / 0.35, 2, 6)), steps=STEPS))
+    bar.ax.yaxis.set_major_locator(MaxNLocator(int(np.clip(height / inch / 0.35, 2, 6)), steps=style.STEPS))
 
 
 def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
@@ -222,13 +197,13 @@ def legend(figure: Any, axes: list[Any], shot: Shot) -> None:
     entries: list[Any] = []
     filled = len(shot.picture.cells) <= MANY_CELLS
     if shot.hand or filled:
-        entries.append(Patch(color=HAND, label="hand" if shot.hand else "held by the hand"))
+        entries.append(Patch(color=style.HAND, label="hand" if shot.hand else "held by the hand"))
     if filled and not shot.norm.vmax > 0:
         entries.append(Patch(color=colour_map()(0.0), label="tissue, not deformed"))
     if np.ptp(shot.path, axis=0).max() > 0:
-        entries.append(Line2D([], [], ls=DASHES, color=OUTLINE, lw=0.9, label="path of the hand"))
+        entries.append(Line2D([], [], ls=DASHES, color=style.OUTLINE, lw=0.9, label="path of the hand"))
     if shot.aim:
-        entries.append(Line2D([], [], ls=DOTS, color=TARGET, lw=1.3, label="target"))
+        entries.append(Line2D([], [], ls=DOTS, color=style.TARGET, lw=1.3, label="target"))
     title = LINE if axes[0].get_title() else 0.0
     top = max(ax.get_position().y1 for ax in axes) + (0.05 + title) / figure.get_figheight()
     figure.legend(
@@ -243,7 +218,7 @@ def _time(t: float) -> str:
 
 def _upright(shot: Shot) -> bool:
     """Whether the hand goes more up or down than sideways in the picture."""
-    along, up = np.ptp(seen(shot.path), axis=0)
+    along, up = np.ptp(shapes.seen(shot.path), axis=0)
     return bool(up > along)
 
 
@@ -255,7 +230,7 @@ def _caption(ax: Any, shot: Shot, box: Array, text: str) -> None:
         return
     left, right = ax.get_xlim()
     half = CAPTION / 2 * (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
-    middle, way = float(box[:, 0].mean()), seen(shot.path[-1] - shot.path[0])
+    middle, way = float(box[:, 0].mean()), shapes.seen(shot.path[-1] - shot.path[0])
     # The body next to it and lower lies to the left if the hand goes up to the right: keep off it.
     middle = max(middle, box[0, 0] + half) if way.prod() > 0 else middle
     middle = min(middle, box[1, 0] - half) if way.prod() < 0 else middle
@@ -266,7 +241,7 @@ def _caption(ax: Any, shot: Shot, box: Array, text: str) -> None:
 
 def _free_corner(shot: Shot) -> str:
     """The left corner that the bodies leave free: "top", "bottom" or "" for none."""
-    way = seen(shot.path[-1] - shot.path[0])
+    way = shapes.seen(shot.path[-1] - shot.path[0])
     if abs(float(way[0])) < 0.5 * float((shot.high - shot.low)[0]):
         return ""
     return "top" if way.prod() > 0 else "bottom"
@@ -277,7 +252,7 @@ def _tripod(figure: Any, size: tuple[float, float], scale: float, top: bool) -> 
     length = 0.55 / scale  # [m], rounded down to 1, 2 or 5 times a power of ten
     power = 10.0 ** np.floor(np.log10(length))
     length = power * max(m for m in (1, 2, 5) if m * power <= length * 1.001)
-    ends = seen(length * np.eye(3))
+    ends = shapes.seen(length * np.eye(3))
     low = np.minimum(ends.min(axis=0), 0.0)
     extent = np.maximum(ends.max(axis=0), 0.0) - low
     y = size[1] - 0.25 - scale * extent[1] if top else 0.4
@@ -302,10 +277,10 @@ def name_layers(ax: Any, shot: Shot, u: Array, *, inside: bool = False) -> None:
     room = (low[0] - left, right - high[0])
     inch = (right - left) / (ax.get_position().width * ax.figure.get_figwidth())
     place, align = (low[0] - 0.06 * inch, "right") if room[0] > room[1] else (high[0] + 0.06 * inch, "left")
-    look: dict[str, Any] = {"color": OUTLINE}
+    look: dict[str, Any] = {"color": style.OUTLINE}
     if inside or max(room) < CAPTION * inch:
         place, align = (low[0] + high[0]) / 2, "center"
-        look = {"color": HAND, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
+        look = {"color": style.HAND, "path_effects": [withStroke(linewidth=2.0, foreground="white")]}
     heights = x[:, 1][picture.cells].mean(axis=1)
     for i, name in enumerate(picture.names):
         ax.text(place, heights[picture.layers == i].mean(), name, ha=align, va="center", zorder=6, **look)
@@ -313,15 +288,15 @@ def name_layers(ax: Any, shot: Shot, u: Array, *, inside: bool = False) -> None:
 
 def _box(x: Array) -> Array:
     """Lower and upper corner of points in the plane of the picture, shape (2, 2)."""
-    flat = seen(x)
+    flat = shapes.seen(x)
     return np.stack([flat.min(axis=0), flat.max(axis=0)])
 
 
 def _outline(picture: PictureMesh, x: Array) -> list[Array]:
     """Closed lines around a body with its vertices at x, each (k, 2) [m]."""
     if picture.dimension == 2:
-        return [x[line] for line in chained(picture.facets)]
-    return shadow(seen(x), picture.facets)
+        return [x[line] for line in shapes.chained(picture.facets)]
+    return shapes.shadow(shapes.seen(x), picture.facets)
 
 
 def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
@@ -331,39 +306,39 @@ def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
         look: dict[str, Any] = {"cmap": colour_map(), "norm": shot.norm, "rasterized": True, "zorder": 2}
         body = TriMesh(Triangulation(x[:, 0], x[:, 1], picture.cells), array=shot.values(u, q), **look)
         ax.add_collection(body, autolim=False)
-    ax.add_collection(segments(x[shot.edges], edgecolors=OUTLINE, linewidths=0.5, zorder=3), autolim=False)
-    hand = moved(picture, shot.hand, q)
-    ax.add_collection(PolyCollection(hand, facecolors=HAND, edgecolors=HAND, linewidths=0.3, zorder=4), autolim=False)
+    ax.add_collection(segments(x[shot.edges], edgecolors=style.OUTLINE, linewidths=0.5, zorder=3), autolim=False)
+    hand = PolyCollection(shapes.moved(picture, shot.hand, q), color=style.HAND, linewidths=0.3, zorder=4)
+    ax.add_collection(hand, autolim=False)
 
 
 def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     picture = shot.picture
     x = picture.points + u
     if len(picture.cells) > MANY_CELLS:
-        lines = LineCollection(_outline(picture, x), colors=OUTLINE, linewidths=0.6, zorder=3)
+        lines = LineCollection(_outline(picture, x), colors=style.OUTLINE, linewidths=0.6, zorder=3)
         ax.add_collection(lines, autolim=False)
         return
     faces, colours = _paint(shot, u, q)
     look: dict[str, Any] = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.5, "joinstyle": "round"}
-    ax.add_collection(PolyCollection(list(seen(faces)), zorder=2, rasterized=True, **look), autolim=False)
+    ax.add_collection(PolyCollection(list(shapes.seen(faces)), zorder=2, rasterized=True, **look), autolim=False)
 
 
 def _paint(shot: Shot, u: Array, q: Array) -> tuple[Array, Array]:
     """Visible boundary of one instant from back to front, (m, 3, 3) [m], and its shaded colours (m, 3)."""
-    picture, view = shot.picture, view_direction()
+    picture, view = shot.picture, shapes.view_direction()
     code = np.array([1, len(picture.points), len(picture.points) ** 2])
     held = np.isin(np.sort(picture.facets, axis=1) @ code, np.sort(picture.contact, axis=1) @ code)
     corners = (picture.points + u)[picture.facets]
-    normals = facet_normals(corners)
+    normals = shapes.facet_normals(corners)
     front = normals @ view > 0
-    weights = subdivision(int(np.clip(np.sqrt(4000 / len(corners)), 1, 4)))
+    weights = shapes.subdivision(int(np.clip(np.sqrt(4000 / len(corners)), 1, 4)))
     faces = np.einsum("sck,fkd->fscd", weights, corners[front])
     values = shot.values(u, q)[picture.facets[front]] @ weights.mean(axis=1).T
     rgb = colour_map()(shot.norm(values))[..., :3]
-    turn = np.radians(AZIMUTH - 35.0)
+    turn = np.radians(shapes.AZIMUTH - 35.0)
     light = np.array([0.6 * np.cos(turn), 0.6 * np.sin(turn), 0.8])
     lit = np.clip(normals[front] @ light, 0.0, 1.0)[:, None, None]
-    dark = np.array(mpl.colors.to_rgb(HAND)) + 0.14 * lit
+    dark = np.array(mpl.colors.to_rgb(style.HAND)) + 0.14 * lit
     rgb = np.where(held[front][:, None, None], dark, rgb * (0.75 + 0.25 * lit))
     faces, rgb = faces.reshape(-1, 3, 3), rgb.reshape(-1, 3)
     order = np.argsort(faces.mean(axis=1) @ view)

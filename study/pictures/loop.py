@@ -18,29 +18,19 @@ from matplotlib.lines import Line2D
 
 from softgrasp.fem.columns import AXES, Array, Columns, farthest
 from softgrasp.fem.fields.picture import PictureMesh
+from softgrasp.study.pictures import style
 from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.shapes import pick_instants
-from softgrasp.study.pictures.style import (
-    COLUMN,
-    CYCLE,
-    OUTLINE,
-    SKY,
-    TARGET,
-    WIDTH,
-    few_ticks,
-    length_unit,
-    paper_style,
-    save,
-)
+from softgrasp.study.pictures.style import few_ticks, length_unit, paper_style, save
 
 Poles = npt.NDArray[np.complex128]
 Runs = Mapping[str, tuple[Array, Array]]
-COLOURS = (*CYCLE, "#E69F00", SKY, "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six
+COLOURS = (*style.CYCLE, "#E69F00", style.SKY, "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "^", "s", "D", "v", "P")
 FLOOR = 1e-16  # smallest distance to the target that a double of order one can show
 BESIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "handlelength": 1.6}  # hides nothing
-AIM: dict[str, Any] = {"color": TARGET, "lw": 1.0, "ls": (0, (1, 1.2))}
+AIM: dict[str, Any] = {"color": style.TARGET, "lw": 1.0, "ls": (0, (1, 1.2))}
 LIMIT: dict[str, Any] = {"color": "#999999", "lw": 0.8, "ls": (0, (4, 2))}
 MANY_POINTS = 4000  # a line of more points is thinned, in print they coincide
 
@@ -88,7 +78,7 @@ def figure_histories(
     panels = [*_output_panels(runs, columns, aim), *_input_panels(runs, limits, dimension)]
     with paper_style():
         rows = len(panels) + (aim is not None)
-        figure, axes = plt.subplots(rows, 1, figsize=(WIDTH * 0.8, 1.15 + 1.5 * rows), layout="constrained")
+        figure, axes = plt.subplots(rows, 1, figsize=(style.WIDTH * 0.8, 1.15 + 1.5 * rows), layout="constrained")
         for ax, panel in zip(axes, panels, strict=False):
             for look, values in zip(_looks(), panel.values, strict=False):
                 _lines(ax, times, values, look)
@@ -106,14 +96,14 @@ def figure_histories(
             # the last swings have no later ones to be compared with
             keep = slice(0, max(2, int(0.97 * len(times))), _every(len(times)))
             for look, (y, _) in zip(_looks(), runs.values(), strict=False):
-                axes[-1].semilogy(times[keep], still_to_come(y, aim, columns)[keep], color=OUTLINE, **look)
+                axes[-1].semilogy(times[keep], still_to_come(y, aim, columns)[keep], color=style.OUTLINE, **look)
             axes[-1].set_ylabel("distance to target,\nlargest from then on [m]")
             axes[-1].set_xlim(0.0, float(times[-1]))
             axes[-2].set_xlabel("time [s], the move only")
         axes[-1].set_xlabel("time [s]")
         if len(runs) > 1:
             shown = zip(cycle(STYLES), runs, strict=False)
-            entries = [Line2D([], [], color=OUTLINE, ls=style, label=name) for style, name in shown]
+            entries = [Line2D([], [], color=style.OUTLINE, ls=dashes, label=name) for dashes, name in shown]
             axes[-1].legend(
                 handles=entries, **(BESIDE if aim is not None else {**BESIDE, "bbox_to_anchor": (1.0, 0.5)})
             )
@@ -213,8 +203,8 @@ def figure_decay(poles: Mapping[str, Poles], out_png: Path, *, noise: float = 0.
     left, right = (frequencies.min(), frequencies.max()) if len(frequencies) else (1.0, 10.0)
     axis_strip = left / 2.5
     with paper_style():
-        figure, ax = plt.subplots(figsize=(COLUMN + 1, 3.3), layout="constrained")
-        for (name, p), colour, marker in zip(sets.items(), cycle(CYCLE), cycle(MARKERS), strict=False):
+        figure, ax = plt.subplots(figsize=(style.COLUMN + 1, 3.3), layout="constrained")
+        for (name, p), colour, marker in zip(sets.items(), cycle(style.CYCLE), cycle(MARKERS), strict=False):
             x = np.where(swings(p), np.abs(p.imag), axis_strip)
             fine = -p.real > noise
             lost = int((~fine).sum())
@@ -225,7 +215,7 @@ def figure_decay(poles: Mapping[str, Poles], out_png: Path, *, noise: float = 0.
         ax.set(xscale="log", yscale="log", ylim=(low, high), xlim=(axis_strip / 1.4, right * 1.3))
         if not swings(together).all():
             ax.axvline(np.sqrt(axis_strip * left), color="#bbbbbb", lw=0.6)
-            ax.text(axis_strip, high, "real", ha="center", va="bottom", fontsize=8, color=OUTLINE)
+            ax.text(axis_strip, high, "real", ha="center", va="bottom", fontsize=8, color=style.OUTLINE)
         ax.set_xlabel(r"frequency $|\mathrm{Im}\,p|$ [1/s]")
         ax.set_ylabel(r"decay rate $-\mathrm{Re}\,p$ [1/s]")
         few_ticks(ax.xaxis)

@@ -9,17 +9,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from softgrasp.study.pictures.style import (
-    BLUE,
-    COLUMN,
-    CYCLE,
-    ORANGE,
-    UNSTABLE,
-    few_ticks,
-    length_unit,
-    paper_style,
-    save,
-)
+from softgrasp.study.pictures import style
+from softgrasp.study.pictures.style import few_ticks, length_unit, paper_style, save
 from softgrasp.study.query.answer import CertifiedAnswer, QueryResult
 
 LEAST = 1e-16  # of an error that is drawn
@@ -32,7 +23,7 @@ def figure_answer(answer: CertifiedAnswer, out: Path) -> tuple[Path, ...]:
         rows = 1 if run is None or answer.full else 3
         heights = [1.5, 1.3, 0.8][-rows:]
         figure, axes = plt.subplots(
-            rows, 1, figsize=(COLUMN, 0.4 + 1.2 * sum(heights)), layout="constrained", height_ratios=heights,
+            rows, 1, figsize=(style.COLUMN, 0.4 + 1.2 * sum(heights)), layout="constrained", height_ratios=heights,
             squeeze=False,
         )  # fmt: skip
         if rows == 3:
@@ -41,7 +32,7 @@ def figure_answer(answer: CertifiedAnswer, out: Path) -> tuple[Path, ...]:
             factor, unit = length_unit(float(np.abs(y).max(initial=0.0)))
             (top,), (below,) = axes[:2]
             below.sharex(top)
-            for i, (name, colour) in enumerate(zip(names, CYCLE, strict=False)):
+            for i, (name, colour) in enumerate(zip(names, style.CYCLE, strict=False)):
                 bound = np.maximum.accumulate(c.outputs.values[:, i])
                 band = factor * (y[:, i] - bound), factor * (y[:, i] + bound)
                 top.fill_between(run.times, *band, color=colour, alpha=0.25, lw=0)
@@ -68,12 +59,13 @@ def _three(ax: Any, answer: CertifiedAnswer) -> None:
     low = 0.2 * min(finite, default=1e-3)
     for i, (_, value) in enumerate(errors):
         proof = i == 2 and c.proved
+        colour = style.BLUE if proof else style.ORANGE
         if value is not None and np.isfinite(value):
-            ax.barh(i, value - low, left=low, color=BLUE if proof else "none", ec=BLUE if proof else ORANGE, height=0.6)
+            ax.barh(i, value - low, left=low, color=colour if proof else "none", ec=colour, height=0.6)
     ax.set_yticks(range(3), [name if value is not None else f"{name}: not known" for name, value in errors])
     ax.set(xscale="log", xlim=(low, 3 * max(finite, default=1.0)), xlabel="relative error")
     if c.tolerance is not None:
-        ax.axvline(c.tolerance, color=UNSTABLE, lw=0.9, ls="--")
+        ax.axvline(c.tolerance, color=style.UNSTABLE, lw=0.9, ls="--")
         ax.set_title(f"dashed: the tolerance {c.tolerance:g} of the reduction", loc="right")
     few_ticks(ax.xaxis)
 
@@ -84,12 +76,12 @@ def figure_batch(answers: QueryResult, file: Path) -> tuple[Path, ...]:
     errors = np.array([a.certificate.reduction for a in answers.each])
     shown, refused = np.isfinite(errors) & (errors > 0), np.array([a.run is None for a in answers.each])
     with paper_style():
-        figure, ax = plt.subplots(figsize=(COLUMN, 2.8), layout="constrained")
+        figure, ax = plt.subplots(figsize=(style.COLUMN, 2.8), layout="constrained")
         if shown.any():
             norm = LogNorm(0.9 * errors[shown].min(), 1.1 * errors[shown].max())
             points = ax.scatter(lam[shown], mu[shown], c=errors[shown], norm=norm, cmap="viridis_r", s=28)
             few_ticks(figure.colorbar(points, label="relative error of the reduction").ax.yaxis)
-        ax.plot(lam[refused], mu[refused], "x", color=UNSTABLE, ms=8)
+        ax.plot(lam[refused], mu[refused], "x", color=style.UNSTABLE, ms=8)
         if answers.model.box is not None:
             (a, b), (c, d) = answers.model.box.lam, answers.model.box.mu
             ax.plot([a, b, b, a, a], [c, c, d, d, c], color="#999999", lw=0.7)
