@@ -99,7 +99,7 @@ def distribute(comm: MPI.Intracomm, whole: Whole | None) -> TissueMesh:
 
 
 # mu < alpha / p with alpha about 1/2 gives elements of order p their full order; below it the cells next to the end
-# shrink so fast that the floor, not mu, decides where they stop.
+# shrink so fast that the smallest size, not mu, decides where they stop.
 BISECTION = {1: 0.45, 2: 0.15, 3: 0.1}
 LINES = {1: 0.45, 2: 0.3, 3: 0.2}
 STEEPEST = 50.0  # largest over smallest distance of lines: the aspect of cells, and the digits that solves lose by it
@@ -109,18 +109,18 @@ SAMPLES = 400
 
 @dataclass(frozen=True)
 class SizeField:
-    """h(r) = max(floor, h0 min(1, r / R)^(1 - mu)) at the distance r from the nearest end."""
+    """h(r) = max(smallest, h0 min(1, r / R)^(1 - mu)) at the distance r from the nearest end."""
 
     ends: Ends  # the singular ends
     h0: float  # size far from them [m]
     radius: float  # R [m]
     mu: float  # grading [1]; 1 is uniform
-    floor: float  # smallest size [m]
+    smallest: float  # smallest size [m]
 
     def __call__(self, x: Floats) -> Floats:
         """Size at points (n, d), (n,) [m]."""
         r = np.minimum(self.ends.distance(x), self.radius)
-        return np.maximum(self.h0 * (r / self.radius) ** (1 - self.mu), min(self.floor, self.h0))
+        return np.maximum(self.h0 * (r / self.radius) ** (1 - self.mu), min(self.smallest, self.h0))
 
 
 def graded_line(cuts: Sequence[float], ends: Sequence[float], n: int, mu: float, radius: float) -> Floats:

@@ -1,6 +1,6 @@
 """The mesh that `[tissue.refine]` describes: graded before any solve, the same for every rank count.
 
-    h(r) = max(floor, h0 min(1, r / R)^(1 - mu)),  R = half the shortest side of the body,
+    h(r) = max(smallest, h0 min(1, r / R)^(1 - mu)),  R = half the shortest side of the body,
 
 with r the distance from the nearest end of the contact zone, re-entrant corner or corner of a layer.
 """
@@ -175,8 +175,8 @@ def graded(whole: Whole, scene: Scene, refine: Refine, aim: float | None) -> Who
         h0 = float(np.median(edges))
         sizes = SizeField(ends_of(whole, scene), h0, max(short / 2, h0), mu, DEEPEST[d] * h0)
     else:
-        across, mu, floor = aims(refine, scene.tissue.order, d, aim)
-        sizes = SizeField(ends_of(whole, scene), np.sqrt(d) * short / across, short / 2, mu, floor * short)
+        across, mu, smallest = aims(refine, scene.tissue.order, d, aim)
+        sizes = SizeField(ends_of(whole, scene), np.sqrt(d) * short / across, short / 2, mu, smallest * short)
     return bisect_to(whole, sizes, SLACK, refine.most)
 
 

@@ -128,7 +128,7 @@ static void update(int k, double *J, const double *p, const double *y, double *J
 }
 
 /* Solve one step from the guess in w; 0 when it does not converge. */
-static int solve(Body *b, const double *S, const double *h, double tol, double floor, double *scale, double *J,
+static int solve(Body *b, const double *S, const double *h, double tol, double rounding, double *scale, double *J,
                  double *w, double *at, long *restarts) {
   const int k = b->k, most = 15;
   double *R = at, *Rt = at + k, *p = at + 2 * k, *y = at + 3 * k, *wt = at + 4 * k, *more = at + 5 * k;
@@ -138,7 +138,7 @@ static int solve(Body *b, const double *S, const double *h, double tol, double f
   }
   double size = norm(k, R);
   *scale = fmax(*scale, *scale > 0 ? norm(k, h) : fmax(norm(k, h), size)); /* at rest h is zero */
-  const double goal = fmax(tol * *scale, floor);
+  const double goal = fmax(tol * *scale, rounding);
   for (int it = 0, renewed = 0; !(size <= goal); it++) {
     double share, found = 0;
     int good = 0;
@@ -165,7 +165,8 @@ static int solve(Body *b, const double *S, const double *h, double tol, double f
 
 /* counts: evaluations, restarts, point with J <= 0 of a failure. Returns 0, step + 1 that failed, or -1 without memory. */
 int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight, const double *lam,
-                    const double *mu, const double *S, double s, const double *load, int steps, double tol, double floor,
+                    const double *mu, const double *S, double s, const double *load, int steps, double tol,
+                    double rounding,
                     double *J, double *A, double *V, long *counts) {
   const int n = d * d, chunks = p / LANES;
   Lane *lanes = calloc((size_t)((n + 2) * chunks + k), sizeof(Lane));
@@ -181,7 +182,7 @@ int softgrasp_march(int law, int d, int k, int p, const double *B, const double 
     if (d == 2) begin_as(&b, 2, a);
     else begin_as(&b, 3, a);
     for (int i = 0; i < k; i++) h[i] = s * v[i] + load[t * k + i], w[i] = 2 * old[i] - older[i];
-    if (!solve(&b, S, h, tol, floor, &scale, J, w, at, counts + 1)) failed = t + 1;
+    if (!solve(&b, S, h, tol, rounding, &scale, J, w, at, counts + 1)) failed = t + 1;
     for (int i = 0; i < k; i++) {
       a1[i] = a[i] + 2 * w[i], v1[i] = 2 * s * w[i] - v[i];
       older[i] = old[i], old[i] = w[i];

@@ -26,7 +26,7 @@ from softgrasp.reduction.strain.cells import Potential
 SOURCE = Path(__file__).with_name("stepper.c")
 DECLARATION = """int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight,
   const double *lam, const double *mu, const double *S, double s, const double *load, int steps, double tol,
-  double floor, double *J, double *A, double *V, long *counts);"""
+  double rounding, double *J, double *A, double *V, long *counts);"""
 MOST, HALVINGS, RENEWALS = 15, 10, 3  # iterations before a fresh tangent, halvings of a correction, fresh tangents
 GROWTH = 4.0  # of the residual, above which a correction is refused
 
@@ -122,7 +122,7 @@ class _March:
     def __init__(self, problem: StrainProblem, tol: float, J: Array) -> None:
         self.potential, self.S, self.s, self.tol, self.J = problem.potential, problem.S, 2 / problem.dt, tol, J
         self.h = np.zeros(len(J))
-        self.scale, self.floor, self.counts = 0.0, problem.potential.rounding, [0, 0, -1]
+        self.scale, self.rounding, self.counts = 0.0, problem.potential.rounding, [0, 0, -1]
 
     def run(self, load: Array, A: Array, V: Array) -> tuple[int, list[int]]:
         old = older = np.zeros(len(self.J))
@@ -154,7 +154,7 @@ class _March:
         size, h = np.linalg.norm(R), np.linalg.norm(self.h)
         self.scale = max(self.scale, h if self.scale > 0 else max(h, size))  # at rest h is zero
         iteration, renewed = 0, 0
-        while not size <= max(self.tol * self.scale, self.floor):
+        while not size <= max(self.tol * self.scale, self.rounding):
             iteration += 1
             correction = None if iteration % MOST == 0 else self._correct(w, R, -(self.J @ R), renewed > 0)
             if correction is None:
