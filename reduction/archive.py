@@ -154,27 +154,27 @@ def write_model(
     Collective with a lift, whose rows every rank adds in turn; ``small`` writes the arrays. Raises OSError.
     """
     comm = MPI.COMM_SELF if lift is None else lift.layout.comm
-    partial = path.with_name(path.name + ".part")
+    unfinished = path.with_name(path.name + ".part")
     try:
         with agree(comm):
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with h5py.File(partial, "w") as file:
+                with h5py.File(unfinished, "w") as file:
                     file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
                     small(file)
         for rank in range(comm.size):
             # one file, one writer at a time: the file library here is not a parallel one
             with agree(comm):
                 if lift is not None and comm.rank == rank:
-                    _write_rows(lift, partial)
+                    _write_rows(lift, unfinished)
         with agree(comm):
             if comm.rank == 0:
-                with h5py.File(partial, "r+") as file:
+                with h5py.File(unfinished, "r+") as file:
                     seal(file)
-                partial.replace(path)
+                unfinished.replace(path)
     finally:  # of a file that was not written whole
         if comm.rank == 0:
-            partial.unlink(missing_ok=True)
+            unfinished.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -163,7 +163,10 @@ class ModelComparison:
     _spans: dict[View, Span] = field(default_factory=dict, repr=False)
 
     def span(self, view: View) -> Span:
-        """Snapshots in what the largest model shows; factored at the first call. Collective."""
+        """Snapshots in what the largest model shows; factored at the first call. Collective.
+
+        Raises ModelError: the model holds no basis on the mesh.
+        """
         if view not in self._spans:
             V = shown_rows(view, self.model, self.small, self.system)
             self._spans[view] = span_of(view, V, self.system, self.snapshots)

@@ -51,6 +51,7 @@ def run(
     They equal the full model's steps [HLW06], so that structure and errors carry over; many are taken in one product.
 
     Args:
+        model: small model, or a propagator made beforehand.
         dt: step [s]; needed without a propagator made beforehand.
         force: u on the hand at the step midpoints, (steps, n_s) [N, N m].
         hand: q_s and v_s of a prescribed hand, (steps + 1, n_s) each, instead of a force.

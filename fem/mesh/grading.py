@@ -132,6 +132,7 @@ def graded_line(cuts: Sequence[float], ends: Sequence[float], n: int, mu: float,
     Args:
         cuts: sorted coordinates, the first and last bound the line [m].
         ends: those towards which distances fall [m].
+        n: number of cells; raised to the number of stretches.
         mu: grading, 0 < mu <= 1 [1].
         radius: R [m].
     """
@@ -223,7 +224,10 @@ def even_cells(axis: BoxAxis, h: float) -> int:
 
 
 def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: float, radius: float) -> TissueMesh:
-    """The structured box with lines at all cuts that crowd towards the ends; mu = 1: even between cuts. Collective."""
+    """The structured box with lines at all cuts that crowd towards the ends; mu = 1: even between cuts. Collective.
+
+    ``mu``, ``radius``: see :func:`graded_line`.
+    """
     axes, tissue = box_axes(scene), scene.tissue
     lines = [graded_line(a.cuts, a.ends, n, mu, radius) for a, n in zip(axes, cells, strict=True)]
     box = structured_mesh(comm, tissue.size or [], [len(line) - 1 for line in lines], tissue.origin)

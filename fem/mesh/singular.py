@@ -109,6 +109,8 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
     """Ends of the contact zone, re-entrant corners or edges, and corners of layer interfaces.
 
     Args:
+        points: shape (n_points, d) [m].
+        cells: simplices, shape (n_cells, d + 1).
         held: contact facets, shape (n, d).
         layers: number of the layer of each cell, shape (n_cells,).
         nu: Poisson's ratio of each cell [1], shape (n_cells,).

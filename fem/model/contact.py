@@ -176,6 +176,7 @@ def rigid_modes(points: Floats, dimension: int, rotation: bool, reference: npt.A
     With (x, y, z) measured from the reference, the rotations are (-y, x) in 2D and (0, -z, y), (z, 0, -x),
     (-y, x, 0) in 3D.
 
+    ``points``: coordinates, (n_nodes, 2 or 3) [m];
     ``reference``: point the hand turns about, ``dimension`` entries [m].
 
     Returns:

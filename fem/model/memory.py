@@ -60,7 +60,7 @@ def simplices(cells: list[int]) -> int:
 
 
 def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: bool) -> Need:
-    """Estimate the memory of a model and, if it will run, of its steps."""
+    """Estimate the memory of a model of ``cells`` triangles or tetrahedra and, if it will ``run``, of its steps."""
     kind, d = (dimension, scene.tissue.order), dimension
     n_e = max(int(kind[1] ** d / math.factorial(d) * cells * d), 1)  # p^d / d! nodes a cell in large regular meshes
     n_s = d + (d * (d - 1) // 2 if scene.effects.rotation else 0)

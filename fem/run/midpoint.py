@@ -97,6 +97,7 @@ class TissueMidpoint:
     the state.
 
     Args:
+        dt: step [s].
         rtol: tolerance of an iterative solver.
         reproducible: see :func:`softgrasp.fem.solve.solvers.factor_on_every_rank`.
 

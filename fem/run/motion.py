@@ -43,6 +43,7 @@ def read_csv(path: Path, columns: int, end: float | None = None, key: str = "mot
     """Read times (steps,) and values (steps, columns) of a trajectory.
 
     Args:
+        columns: degrees of freedom of the hand.
         end: of the run [s]; None takes the file as long as it is, from 0 on.
         key: who names the file, for the messages.
 
@@ -301,6 +302,7 @@ def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float
             differs where a step is divided, (steps, 2 n_s).
         v: velocity of the hand, (steps + 1, n_s).
         c: load of each step, -(a - g + alpha v_mid), (steps, n_s).
+        dt: step [s].
     """
     s = 2 / dt
     turn = np.where(np.arange(len(pulls) + 1) % 2 == 0, 1.0, -1.0)[:, None]

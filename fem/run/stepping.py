@@ -20,6 +20,7 @@ class Stepped(ABC):
     """A run whose steps TS counts.
 
     Args:
+        dt: step [s].
         midpoint: factored step.
         store: where the states go.
         solver: name and reason.

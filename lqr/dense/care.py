@@ -99,7 +99,7 @@ def care(A: Array, B: Array, C: Array, Q: Array, R: Array, E: Array | None = Non
 
 
 def care_of(space: StateSpace) -> DenseSolution:
-    """See :func:`care`."""
+    """See :func:`care`. Raises ControlError: there is no stabilising solution."""
     return care(space.A, space.B, space.C, space.Q, space.R, space.E)
 
 

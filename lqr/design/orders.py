@@ -47,7 +47,7 @@ def fast_order(n_s: int) -> int:
 
 
 def orders(design: Design) -> tuple[list[int], str]:
-    """Orders to try and, where judging a gain takes long, why they are few."""
+    """Orders to try and, where checking a gain takes long, why they are few."""
     control, layout = design.model.scene.control, design.problem.layout
     every = list(ORDERS) if control is None else sorted(set(control.N))
     dense = design.gain_check.loop.complete and layout.n_e > WHOLE_SPECTRUM

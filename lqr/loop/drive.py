@@ -50,7 +50,7 @@ class PlantStep:
 
     @cached_property
     def finite(self) -> FiniteStep:
-        """Of a pushed hand that feels a tissue of finite strain."""
+        """The step of a pushed hand that feels a tissue of finite strain, made at its first use. Collective then."""
         return FiniteStep(self, None)
 
 

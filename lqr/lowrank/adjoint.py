@@ -23,6 +23,11 @@ class Right(Block):
         """W alone (views)."""
         return Block(self.hand, self.tall[: 2 * len(self.tall) // 3])
 
+    @property
+    def parts(self) -> tuple[Array, Array, Array, Array]:
+        """Rows q_s, v_s, z and v_z of W (views)."""
+        return self.block.parts
+
     def plus(self, E_V: Right, small: Array) -> Right:
         """W + E'V small."""
         return Right(self.hand + E_V.hand @ small, self.tall + E_V.tall @ small)

@@ -53,7 +53,8 @@ class LowRankSolver[Start](ABC):
 
         Raises:
             ControlError: weights or data are refused, no damping, not stabilisable or not detectable.
-            SolverError: not converged within the bounds, or the true residual is more than twice the tolerance.
+            SolverError: not converged within the bounds, or, where ``by_residual``, the true residual is more than
+                twice the tolerance.
             CheckpointError: the restart file belongs to another run.
         """
         begin = time.perf_counter()

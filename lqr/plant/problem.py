@@ -1,4 +1,4 @@
-"""The linear-quadratic problem of a hand that carries tissue, as operators in hand-relative coordinates."""
+"""The linear-quadratic problem of a hand that carries tissue, hand-relative, its solution, and what holds exactly."""
 
 from __future__ import annotations
 

@@ -51,8 +51,8 @@ class BasisFamily:
     """Nested bases of one method."""
 
     name: str  # key of BASES
-    smallest: int  # order that exists
-    largest: int
+    smallest: int  # least order that exists
+    largest: int  # largest order that exists
     step: int  # distance of orders that exist
     sigma: tuple[Array, ...]  # singular values the truncation is chosen from, one array per POD
     make: Callable[[int], RiccatiBasis]  # the basis of order N

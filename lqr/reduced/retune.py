@@ -108,7 +108,7 @@ def retuned_gain(
         solve: full solver, the reference.
         start: start minus target of hand and tissue, one column.
         modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
-        law: instants of the loop; None judges the continuous law alone.
+        law: instants of the loop; None checks the continuous law alone.
     """
     try:
         tuned = on_root(retuner.problem.layout.comm, lambda: retuner.solve(materials))

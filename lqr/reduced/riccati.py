@@ -146,7 +146,7 @@ class GainCheck:
         solution: the Riccati solution of the full plant.
         start: start minus target of hand and tissue, hand-relative, one column.
         loop: the full closed loop; made here when None.
-        law: instants of the loop; None judges the continuous law alone.
+        law: instants of the loop; None checks the continuous law alone.
     """
 
     def __init__(

@@ -173,8 +173,10 @@ class SampledLoop:
         ``K``: as it would be saved; ``law``: instants of the plant; one tick is the controller's period.
         """
         loop = self._modes() if self.problem.system.two_way else None
-        space = K.plant if loop is None else loop.plant.space
-        A, B = np.split(np.linalg.solve(space.E, np.hstack([space.A, space.B])), [len(space.A)], axis=1)
+        if loop is None:
+            A, B = np.split(np.linalg.solve(K.plant.E, np.hstack([K.plant.A, K.plant.B])), [len(K.plant.A)], axis=1)
+        else:
+            A, B = loop.A, loop.B
         return replace(on_root(self.comm, lambda: _carried(A, B, K, law)), exact=loop is None or loop.complete)
 
     def _modes(self) -> ModalLoop:

@@ -1,4 +1,4 @@
-"""All bases by key: what each is, what the paper calls it, and how to make one or a whole sweep."""
+"""All bases by key: what each is, what the paper calls it, how to make one or a sweep; and Craig-Bampton's own."""
 
 from __future__ import annotations
 

@@ -31,6 +31,7 @@ def nnls(G: Array, b: Array, tau: float) -> Weights:
     """Columns added by largest gradient G'(b - G x) until |G x - b| <= tau |b|, x >= 0 throughout. Serial.
 
     Each round solves the normal equations of the columns in use by Cholesky; what turns negative leaves again.
+    ``G``: (m, n); ``b``: (m,); ``tau``: relative residual to reach, at least 1e-6 [1].
 
     Raises:
         ReductionError: tau is too small, or no non-negative weights reach it.

@@ -1,4 +1,4 @@
-"""Training of reduced models at finite strain from full runs: basis, Galerkin's model on all cells, sampled cells.
+"""Training of reduced models at finite strain from full runs: basis, Galerkin's model on all cells, samples, errors.
 
 Basis: cotangent lift (Phi, M Phi) with z = Phi a and Phi' M Phi = I [PM16]. Cells by energy-conserving sampling and
 weighting [FCA15]: xi >= 0, most of them zero, with
