@@ -1,4 +1,4 @@
-"""Scene to model: mesh, blocks, materials and effects that the scene names, and what is known of the error of its mesh."""
+"""Scene to model: mesh, blocks, materials and effects that the scene names, and the error of its mesh as estimated."""
 
 from __future__ import annotations
 
