@@ -135,11 +135,11 @@ def measure(nx: int, repeats: int) -> Iterator[AnswerCost]:
 
 
 def goals_of(rows: list[AnswerCost]) -> list[Goal]:
-    """What was asked for: of queries, which have all three numbers, and of the proof beside the steps of one basis."""
+    """What was asked for: of queries and of two bases, and of the proof of one basis beside its run in state space."""
     goals = []
     for r in rows:
         name = f"nx = {r.cells}, {r.answer}"
-        if r.share is not None and r.answer.endswith(STEP):
+        if r.share is not None and (r.answer.endswith(STEP) or r.answer == f"{K} + {K2}"):
             goals.append(Goal(f"{name}: share of the proof", r.share, SHARE))
         if r.of_stepped is not None:
             goals.append(Goal(f"{name}: proof over the run in state space", r.of_stepped, SHARE))

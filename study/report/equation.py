@@ -54,10 +54,11 @@ class Equation:
         lines = []
         for title, rows in (("in blocks:", self.blocks), ("stepped as:", self.stepped)):
             wide = 1 + max(len(name) for name, _, _ in rows)
+            lines.append(title)
             for name, *sides in rows:
                 left, right = (" + ".join(terms).replace("+ -", "-") for terms in sides)
                 lines.append(f"  {name + ':':<{wide}} {left} = {right}")
-            lines.insert(-len(rows), title)
+            lines.append("")
         return [*lines, "with:", *(f"  {text}" for text in self.where)]
 
 

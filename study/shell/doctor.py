@@ -89,7 +89,7 @@ def check_launcher() -> Check:
     if path is None:
         return Check("mpiexec", False, "none", f"Put the mpiexec of {linked} on PATH, or `pip install mpich`.")
 
-    def wrong(launcher: str) -> bool:  # one we cannot name (srun wrapper, vendor MPI) is judged by the launch alone
+    def wrong(launcher: str) -> bool:  # one we cannot name (srun wrapper, vendor MPI) is checked by the launch alone
         return "unknown" not in (launcher, linked) and launcher != linked
 
     launcher = _family(run_limited([path, "--version"], LAUNCH_LIMIT)[1])
