@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -166,6 +167,12 @@ def test_refused_with_one_sentence(path: Path, overrides: list[str], sentence: s
     assert sentence in message
     assert "\n" not in message or "\n" in overrides[0]
     assert message.startswith((f"{path}: ", "--set "))
+
+
+@pytest.mark.parametrize(("value", "others"), [("{stepps=5}", ""), ("{stepps=5, end=0}", "; and 1 more")])
+def test_a_misspelled_key_is_not_missing_too(value: str, others: str) -> None:
+    with pytest.raises(SceneError, match=re.escape(f"did you mean time.steps?{others}") + "$"):
+        load_scene(PAPER, [f"time={value}"])
 
 
 def test_semidefinite_output_weight_is_allowed() -> None:
