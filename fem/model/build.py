@@ -23,7 +23,7 @@ from softgrasp.fem.model.memory import check_memory, simplices
 from softgrasp.fem.model.outputs import Output, make_outputs
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene, check_dimension
 from softgrasp.fem.system import BlockSystem, LayerBlocks, LayerMaterial, coupling, tissue_matrices
 
 
@@ -185,8 +185,9 @@ def build(
 
             mesh = refined_mesh(comm, scene)
         mesh = mesh or make_mesh(comm, scene)
+    d = mesh.dimension
+    check_dimension(scene, d)  # of a mesh file it was unknown before
     if not boxed:
-        d = mesh.dimension
         check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)
     with watch.stage("assembly"):
         space = discretise(mesh, scene)

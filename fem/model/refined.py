@@ -32,6 +32,7 @@ from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, make_mesh
 from softgrasp.fem.model.assembly import cells_of_layers
 from softgrasp.fem.model.contact import contact_facets
+from softgrasp.fem.petsc import on_root
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -118,8 +119,8 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
         aim *= SHRINK
     if refine.contact == "inherit":
         return whole
-    tags, marks = ({k: v for k, v in marks.items() if k.endswith("_tags")} for marks in (whole.cells, whole.facets))
-    return replace(whole, cells=tags, facets=marks)  # zone and layers are selected again
+    cells, facets = ({k: v for k, v in marks.items() if k.endswith("_tags")} for marks in (whole.cells, whole.facets))
+    return replace(whole, cells=cells, facets=facets)  # zone and layers are selected again
 
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
@@ -209,15 +210,14 @@ def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
 
     Raises MeshError: the mesh file cannot be read again.
     """
-    ends: Ends | None = None
-    with agree(comm):
-        if comm.rank == 0:
-            whole = tissue.whole
-            if whole is None or "contact" not in whole.facets:
-                whole = marked(_even(scene, scene.tissue.cells), scene)
-            ends = ends_of(whole, scene)
-    result: Ends = comm.bcast(ends)
-    return result
+
+    def ends() -> Ends:
+        whole = tissue.whole
+        if whole is None or "contact" not in whole.facets:
+            whole = marked(_even(scene, scene.tissue.cells), scene)
+        return ends_of(whole, scene)
+
+    return on_root(comm, ends)
 
 
 def _even(scene: Scene, cells: list[int] | None) -> TissueMesh:
