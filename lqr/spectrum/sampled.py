@@ -129,7 +129,7 @@ class SampledLoop:
         answer = self._radius(self._parts(K), law)
         if answer.certified or self.n_e > DENSE_LIMIT:
             return answer
-        self.loop = ModalLoop(self.problem, DENSE_LIMIT)
+        self.modes(whole=True)
         return self._radius(self._parts(K), law)
 
     def stable_rate(self, K: Block, law: Sampling, end: float, most: float = 1.0) -> StableRate | None:
@@ -172,25 +172,25 @@ class SampledLoop:
 
         ``K``: as it would be saved; ``law``: instants of the plant; one tick is the controller's period.
         """
-        loop = self._modes() if self.problem.system.two_way else None
+        loop = self.modes() if self.problem.system.two_way else None
         if loop is None:
             A, B = np.split(np.linalg.solve(K.plant.E, np.hstack([K.plant.A, K.plant.B])), [len(K.plant.A)], axis=1)
         else:
             A, B = loop.A, loop.B
         return replace(on_root(self.comm, lambda: _carried(A, B, K, law)), exact=loop is None or loop.complete)
 
-    def _modes(self) -> ModalLoop:
-        """All modes as far as they fit, else the lowest. Collective."""
-        fits = self.n_e <= self.kept or (self.coupled and self.n_e <= DENSE_LIMIT)
-        if self.loop is None or (fits and not self.loop.complete):
-            self.loop = ModalLoop(self.problem, DENSE_LIMIT if fits else self.kept)
+    def modes(self, whole: bool = False) -> ModalLoop:
+        """All modes where ``whole`` or where they have to be and fit, else the lowest; kept for later. Collective."""
+        whole = whole or self.n_e <= self.kept or (self.coupled and self.n_e <= DENSE_LIMIT)
+        if self.loop is None or (whole and not self.loop.complete):
+            self.loop = ModalLoop(self.problem, DENSE_LIMIT if whole else self.kept)
         return self.loop
 
     def _parts(self, K: Block) -> _Parts:
         """Modes kept and gain on them. Collective."""
         whole = self.loop is not None and self.loop.complete
         if whole or self.coupled or self.n_e <= self.kept:
-            loop, reason = self._modes(), ""
+            loop, reason = self.modes(), ""
             if not loop.complete:
                 reason = f"damping couples the modes, and {self.n_e} are too many to take all"
             return _Parts(loop.A, loop.B, loop.gain(K), loop.complete, reason=reason)

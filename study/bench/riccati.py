@@ -25,15 +25,13 @@ from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.lqr.dense.modal import factor_psd
 from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
-from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
-from softgrasp.lqr.lowrank.newton import NewtonADI
-from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
+from softgrasp.lqr.riccati import Method, make_solver
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, Goal, number
 from softgrasp.study.report.files import write_json
@@ -46,7 +44,7 @@ PEER_LIMIT = {"scipy": 10, "slycot": 10, "pymor": 40}  # nx; minutes beyond
 LIMITS = {("newton_adi", 10): 0.2, ("newton_adi", 80): 20.0, ("galerkin", 10): 0.03, ("galerkin", 80): 4.0}  # [s]
 LARGE_SECONDS, LARGE_MB = 900.0, 24 * 1024
 RESIDUAL, GAIN = 1e-10, 1e-6
-METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
+METHODS: tuple[Method, ...] = ("newton_adi", "radi", "galerkin")
 REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
 STAGES = {
     "factor": ("factor",),
@@ -106,7 +104,7 @@ def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
     return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm=comm))
 
 
-def measure(nx: int, beta: float, methods: Sequence[str], repeats: int) -> Iterator[RiccatiPoint | Failure]:
+def measure(nx: int, beta: float, methods: Sequence[Method], repeats: int) -> Iterator[RiccatiPoint | Failure]:
     """All methods on nx x 2 nx cells; gains are compared with the first one. Collective.
 
     ``beta`` is the Kelvin-Voigt time [s].
@@ -117,7 +115,7 @@ def measure(nx: int, beta: float, methods: Sequence[str], repeats: int) -> Itera
     reference: Gain | None = None
     for name in methods:
         solved: list[RiccatiSolution] = []
-        solve = partial(lambda name, to: to.append(METHODS[name]().solve(problem)), name, solved)
+        solve = partial(lambda solver, to: to.append(solver.solve(problem)), make_solver(name), solved)
         try:
             seconds = float(np.median(repeated(comm, solve, repeats, REPEAT_SECONDS)))
         except SoftgraspError as error:
@@ -180,7 +178,7 @@ PEERS = {"scipy": scipy_solver, "slycot": slycot_solver, "pymor": pymor_solver}
 def measure_peer(nx: int, beta: float, peer: str) -> Iterator[RiccatiPoint | Failure]:
     """One peer on the paper's matrices against our Newton-ADI, on one rank."""
     problem = problem_for(MPI.COMM_WORLD, nx, beta)
-    reference, s = NewtonADI().solve(problem).gain, 2 * problem.layout.n_s
+    reference, s = make_solver("newton_adi").solve(problem).gain, 2 * problem.layout.n_s
     try:
         plant = PaperPlant(*paper_form(problem), problem.Q, problem.R)
         solve = PEERS[peer](plant)
@@ -297,9 +295,9 @@ def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoin
     for name, colour in zip(METHODS, (BLUE, GREEN, ORANGE), strict=True):
         own = [(p.states, p.seconds) for p in points if p.method == name and p.ranks == fewest]
         curves.append((name, own, {"color": colour}))
-    for name, mark, colour in (("scipy", "s", HAND), ("slycot", "^", HAND), ("pymor", "x", PURPLE)):
-        ran = [p for p in peers if p.method == name]
-        label = f"{name} (residual to {max((p.residual for p in ran), default=0.0):.0e})"
+    for peer, mark, colour in (("scipy", "s", HAND), ("slycot", "^", HAND), ("pymor", "x", PURPLE)):
+        ran = [p for p in peers if p.method == peer]
+        label = f"{peer} (residual to {max((p.residual for p in ran), default=0.0):.0e})"
         look = {"color": colour, "ls": "", "marker": mark, "ms": 5}
         curves.append((label, [(p.states, p.seconds) for p in ran], look))
     return driver.loglog(path, curves, "states 2n", "time [s]", f"{fewest} rank(s), median")
@@ -307,9 +305,7 @@ def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoin
 
 def collect(console: Console, meshes: list[int], ranks: list[int], repeats: int, large: bool, record: Record) -> None:
     """Launch all workers one after the other, the largest last."""
-    jobs: list[tuple[int, int, tuple[str, ...], int]] = [
-        (nx, k, tuple(METHODS), repeats) for nx in meshes for k in ranks
-    ]
+    jobs: list[tuple[int, int, tuple[Method, ...], int]] = [(nx, k, METHODS, repeats) for nx in meshes for k in ranks]
     if large:
         jobs.append((LARGEST, LARGEST_RANKS, ("newton_adi", "galerkin"), 1))
     kept = [record.kept(*job[:3]) for job in jobs]
