@@ -35,7 +35,7 @@ from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.contact import contact_facets
-from softgrasp.fem.petsc import Array, times_columns
+from softgrasp.fem.petsc import Array, rows_on_root, times_columns
 from softgrasp.fem.scene.tissue import Refine
 
 if TYPE_CHECKING:
@@ -195,11 +195,9 @@ def marked_cells(small: Small, finer: Small, factor: float) -> npt.NDArray[np.in
     eta = indicators(small, finer)
     topology = small.model.space.mesh.mesh.topology
     original = np.asarray(topology.original_cell_index)[: len(eta)]
-    comm = small.model.system.layout.comm
-    parts = comm.gather((original, eta))
-    if parts is None:
+    cells, values = (rows_on_root(small.model.system.layout.comm, part) for part in (original, eta))
+    if cells is None or values is None:
         return None
-    cells, values = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     values = np.round(values / (values.max() or 1.0), DIGITS)  # rounding must not choose, nor the number of ranks
     largest = np.sort(values)[::-1]
     total = np.cumsum(largest)

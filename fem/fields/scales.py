@@ -7,7 +7,6 @@ import numpy as np
 from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
 from softgrasp.fem.effects.gravity import EARTH, acceleration
-from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
@@ -25,7 +24,7 @@ def gradient(model: Model, z: Array) -> Gradient:
     """Gradient of a displacement z against the hand, local rows (n_local,) [m]. Collective."""
     space, d = model.space, model.space.mesh.dimension
     comm, x = space.layout.comm, space.mesh.vertices
-    nodal = FullField(model).fill(z, np.zeros(space.layout.n_s)).x.array.reshape(-1, d)
+    nodal = space.nodal(z).x.array.reshape(-1, d)
     u = nodal[space.V.dofmap.list[: len(x), : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
     edges = x[:, 1:] - x[:, :1]
     size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))

@@ -64,6 +64,14 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     return tuple(result)
 
 
+def output_columns(outputs: Sequence[Output], n_local: int) -> Array:
+    """C' of all outputs, y = C z + C_s q_s: local rows (n_local, p), Fortran order."""
+    C = np.zeros((n_local, sum(o.size for o in outputs)), order="F")
+    for j, (output, c) in enumerate((o, c) for o in outputs for c in range(o.size)):
+        C[output.dofs[:, c], j] = output.weight
+    return C
+
+
 def _node(system: BlockSystem, name: str, point: Array) -> Output:
     layout = system.layout
     d = layout.dimension

@@ -44,7 +44,7 @@ ACROSS = {2: {1: 32.0, 2: 3.5, 3: 3.0}, 3: {1: 8.0, 2: 1.8, 3: 2.0}}
 MORE = {1: 0.0, 2: 0.7, 3: 0.0}  # cells beside these, for coarse meshes: with them the first estimate meets 1e-2
 LINES_ACROSS = {2: {1: 24.0, 2: 8.0, 3: 5.0}, 3: {1: 16.0, 2: 6.0, 3: 4.0}}
 # Smallest cell over tolerance times shortest side: what an end costs is about proportional to it.
-FLOOR = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
+SMALLEST = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
 DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a tolerance: edges in 3D fill a body quickly
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
 
@@ -54,7 +54,7 @@ def aims(refine: Refine, order: int, d: int, tolerance: float) -> tuple[float, f
     p = min(order, 3)
     mu = refine.grading if isinstance(refine.grading, float) else BISECTION[p]
     across = MORE[p] + ACROSS[d][p] * (1e-2 / tolerance) ** (1 / (2 * p))
-    return across, mu, FLOOR[d][p] * tolerance
+    return across, mu, SMALLEST[d][p] * tolerance
 
 
 def by_lines(scene: Scene) -> bool:
