@@ -243,18 +243,15 @@ def cell_products(model: Model, X: Array) -> Array:
     lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[layer].T
     cells = len(layer)
     element = V.element.basix_element
-    shape = basix.CellType.triangle if d == 2 else basix.CellType.tetrahedron
-    points, weights = basix.make_quadrature(shape, max(2 * (element.degree - 1), 1))
-    D = element.tabulate(1, points)[1 : d + 1, :, :, 0]
-    x = tissue.vertices
-    J = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
-    inverse, scale = np.linalg.inv(J), np.abs(np.linalg.det(J))[:, None] * weights * model.scene.tissue.thickness
-    u = np.zeros((cells, D.shape[2], d, X.shape[1]))
+    points, weights = basix.make_quadrature(element.cell_type, max(2 * (element.degree - 1), 1))
+    scale = np.abs(np.linalg.det(tissue.edges))[:, None] * weights * model.scene.tissue.thickness
+    dofs = V.dofmap.list[:cells]
+    u = np.zeros((*dofs.shape, d, X.shape[1]))
     for j in range(X.shape[1]):
-        u[..., j] = model.space.nodal(X[:, j]).x.array.reshape(-1, d)[V.dofmap.list[:cells]]
+        u[..., j] = model.space.nodal(X[:, j]).x.array.reshape(-1, d)[dofs]
     E = np.zeros((cells, X.shape[1], X.shape[1]))
     for q in range(len(weights)):  # one point at a time: gradients of all at once would be large
-        gradient = np.einsum("an,cab,cnik->cibk", D[:, q], inverse, u, optimize=True)
+        gradient = np.einsum("cnb,cnik->cibk", model.space.gradients(points[q : q + 1])[:, 0], u, optimize=True)
         strain = (gradient + np.swapaxes(gradient, 1, 2)) / 2
         flat = strain.reshape(cells, d * d, -1)
         trace = np.einsum("ciik->ck", strain)

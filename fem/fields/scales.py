@@ -23,10 +23,9 @@ SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to cou
 def gradient(model: Model, z: Array) -> Gradient:
     """Gradient of a displacement z against the hand, local rows (n_local,) [m]. Collective."""
     space, d = model.space, model.space.mesh.dimension
-    comm, x = space.layout.comm, space.mesh.vertices
+    comm, edges = space.layout.comm, space.mesh.edges
     nodal = space.nodal(z).x.array.reshape(-1, d)
-    u = nodal[space.V.dofmap.list[: len(x), : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
-    edges = x[:, 1:] - x[:, :1]
+    u = nodal[space.V.dofmap.list[: len(edges), : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
     size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))
     volume = np.abs(np.linalg.det(edges))
     parts = np.array([volume[size > SMALL_STRAIN].sum(), volume.sum(), volume @ size**2])

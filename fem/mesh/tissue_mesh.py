@@ -98,6 +98,12 @@ class TissueMesh:
         """Coordinates of the vertices of the owned cells, (owned, d + 1, d) [m]."""
         return np.asarray(self.mesh.geometry.x[cell_nodes(self.mesh)[: self.owned], : self.dimension])
 
+    @property
+    def edges(self) -> Floats:
+        """Edges from the first vertex of the owned cells to the others, one a row, (owned, d, d) [m]."""
+        x = self.vertices
+        return x[:, 1:] - x[:, :1]
+
 
 def cell_nodes(mesh: dolfinx.mesh.Mesh) -> Ints:
     """Local node numbers of the cells, shape (n_cells, d + 1)."""
