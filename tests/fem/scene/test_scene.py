@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import build
 from softgrasp.fem.scene import materials
 from softgrasp.fem.scene.file import load_scene, load_scene_collective, resolved_toml, shipped_scenes
 from softgrasp.fem.scene.scene import check_dimension, scene_schema
@@ -246,6 +247,10 @@ def test_dimension_of_a_mesh_scene_is_checked_later() -> None:
     check_dimension(scene, 3)
     with pytest.raises(SceneError, match=r"effects.gravity.g has a vector of 3 entries; it must have 2"):
         check_dimension(scene, 2)
+    for key, value in (("motion.target", "[0.3, 0.2]"), ("hand.reference", "[0, 0]"), ("effects.gravity.g", "[0, 1]")):
+        wrong = load_scene(PILLOW, [f"{key}={value}", "tissue.order=1", "tissue.refine=false"])
+        with pytest.raises(SceneError, match=f"{key} has a vector of 2 entries; it must have 3 in this 3D scene"):
+            build(wrong)
 
 
 def test_hash_sees_values_and_mesh_contents_but_not_names(tmp_path: Path) -> None:
