@@ -44,7 +44,7 @@ class WholeRun:
 
 
 @dataclass(frozen=True)
-class ForwardPoint:
+class ForwardCost:
     """One mesh on so many ranks; what a large run leaves out is empty."""
 
     problem: str
@@ -241,7 +241,7 @@ def measure(
     whole: bool = False,
     peers: bool = True,
     problem: str = "",
-) -> ForwardPoint:
+) -> ForwardCost:
     """One point, each number taken ``repeats`` times. Collective.
 
     One repeat takes about ``repeat_seconds``; ``whole``: also the paper's 600 steps; ``peers``: SciPy and pyMOR too.
@@ -252,14 +252,14 @@ def measure(
     model, samples, memory, pace = _builds(comm, bench_scene(comm, dimension, cells, PAPER_STEPS), repeats)
     k = int(np.clip(repeat_seconds / pace, 3, 50_000))
     stepped = replace(model, scene=bench_scene(comm, dimension, cells, repeats * (k + warm(k)) + 10))
-    return ForwardPoint(
+    return ForwardCost(
         **_sizes(model, cells), problem=problem, large=False, seconds=medians(samples), memory_mb=memory,
         memory_base_mb=base, repeats=repeats, steps_per_repeat=k, **_steps(comm, stepped, k, repeats, peers),
         whole=_whole(comm, model, cells, PAPER_STEPS, repeats) if whole else None,
     )  # fmt: skip
 
 
-def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int, problem: str = "") -> ForwardPoint:
+def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int, problem: str = "") -> ForwardCost:
     """A large scene once, from the mesh to the end, nothing stored. Collective."""
     cells = cells_for(dimension, size)
     base = peak_memory_mb(comm)
@@ -268,7 +268,7 @@ def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int, pr
     run = simulate(model)
     seconds = {name: run.seconds[name] for name in ("mesh", "assembly", "factor")}
     seconds["total"] = comm.allreduce(time.perf_counter() - begin, MPI.MAX)
-    return ForwardPoint(
+    return ForwardCost(
         **_sizes(model, cells), problem=problem, large=True, seconds=seconds, memory_mb=peak_memory_mb(comm),
         memory_base_mb=base, repeats=1, steps_per_repeat=steps, step_us={"ts": 1e6 * run.seconds["steps"] / steps},
         drift=run.energy_drift, drift_steps=steps, residual=run.residuals[1], solver=run.solver[0],
@@ -281,6 +281,6 @@ def _sizes(model: Model, cells: list[int]) -> dict[str, Any]:
     return names | {"cells": cells}
 
 
-def measure_row(*, large: bool, **arguments: Any) -> list[ForwardPoint]:
+def measure_row(*, large: bool, **arguments: Any) -> list[ForwardCost]:
     """The point that :mod:`softgrasp.study.bench.forward` asks for. Collective."""
     return [(measure_large if large else measure)(MPI.COMM_WORLD, **arguments)]

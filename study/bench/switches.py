@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import operator
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -254,14 +253,12 @@ def _two(
     setup: Setup, model: Model, ways: Sequence[tuple[SolverName, Any]], head: str, limit: str
 ) -> Iterator[SwitchPoint]:
     """Set-up and step with two solvers."""
-    system, comm = model.system, setup.comm
+    system = model.system
     setting = f"{system.layout.dimension}D, n_e = {system.layout.n_e}"
-    seconds, midpoints = [], []
+    seconds, midpoints = [], list[TissueMidpoint]()
     for name, reproducible in ways:
-        comm.Barrier()
-        begin = time.perf_counter()
-        midpoints.append(TissueMidpoint(system, DT, name, reproducible=reproducible))
-        seconds.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
+        make = partial(TissueMidpoint, system, DT, name, reproducible=reproducible)
+        seconds.append(timed(setup.comm, lambda: midpoints.append(make())))  # noqa: B023  (called at once)
     yield setup.point(f"{head}set-up", limit, setting, *seconds)
     c = np.ones(system.layout.n_s)
     states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in midpoints]
