@@ -103,7 +103,7 @@ def least_steps(scene: Scene) -> int:
 
 
 def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: Sequence[float] | None = None) -> Scene:
-    """The scene under another setting. Without ``reference`` the point that the hand turns about moves with the mesh."""
+    """The scene under another setting; ``reference``: where the hand turns, by default where the mesh puts it [m]."""
 
     def edit(table: dict[str, Any]) -> None:
         tissue = table["tissue"]
