@@ -18,7 +18,7 @@ from softgrasp.fem import _stack as _stack  # threads and MPI before anything nu
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import load_scene, shipped_scenes
+from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
@@ -65,7 +65,7 @@ def block(n_e: int, steps: int, method: str, N: int) -> Scene:
     """The paper's block with about n_e tissue unknowns, 4 nx^2 on nx x 2 nx cells."""
     nx = max(4, round(math.sqrt(n_e / 4)))
     keys = [f"tissue.cells=[{nx}, {2 * nx}]", f"time.steps={steps}", f"output.every={max(1, steps // KEPT)}"]
-    return load_scene(shipped_scenes()["paper_forward"], [*keys, f"reduction={{methods=['{method}'], N=[{N}]}}"])
+    return load_scene("paper_forward", [*keys, f"reduction={{methods=['{method}'], N=[{N}]}}"])
 
 
 def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
