@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.effects.gate import Effect, Gate, Problem
+from softgrasp.fem.effects.gate import SMALL_SHARE, Effect, Gate, Problem
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
 
@@ -32,7 +32,7 @@ class GravityEffect(Effect):
         off, sag, length = problem.scene.effects.gravity is None, problem.sag, problem.length
         number = sag.gradient.typical
         bends = f"sag by {sag.largest:.2g} m, {sag.largest / length:.2g} of its length {length:.3g} m"
-        steep = f"|grad z| is {sag.gradient.largest:.2g} at most"
+        steep = f"|grad z| is at most {number:.2g} in {1 - SMALL_SHARE:.0%} of the body"
         begin = (
             f"Off; in SI units and with g = {EARTH} the tissue would" if off else "Under its weight the tissue would"
         )

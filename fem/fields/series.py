@@ -11,11 +11,10 @@ import dolfinx.plot
 import numpy as np
 
 from softgrasp.fem.disk import check_room
-from softgrasp.fem.errors import agree
 from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import Collection, Field, Grid, write_vtu
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, on_root
 
 KINDS = {(2, 1): 5, (2, 2): 22, (2, 3): 69, (3, 1): 10, (3, 2): 24, (3, 3): 71}  # (d, order): VTK's kind of cell
 
@@ -59,9 +58,7 @@ class SeriesWriter:
     def __init__(self, model: Model, directory: str | Path, name: str = "fields") -> None:
         space, d = model.space, model.space.layout.dimension
         self.comm, self.directory, self.d = space.layout.comm, Path(directory), d
-        with agree(self.comm):
-            if self.comm.rank == 0:
-                self.directory.mkdir(parents=True, exist_ok=True)
+        on_root(self.comm, lambda: self.directory.mkdir(parents=True, exist_ok=True))
         self.rename(name)
         self.full, self.stress = FullField(model), CellStress(model)
         rows, _, points = dolfinx.plot.vtk_mesh(space.V)
@@ -104,17 +101,18 @@ class SeriesWriter:
         whole = [Field("TimeValue", "s", np.array([t])), Field("hand", "m", np.asarray(q_s, dtype=np.float64))]
         fields = [*points, *cells, *(field for part in self.grid.fields().values() for field in part)]
         needed = self.comm.reduce(sum(field.values.nbytes for field in fields)) or 0  # one file, so rank 0 asks for all
-        with agree(self.comm):
-            if self.comm.rank == 0 and self.written == 0:
-                self.folder.mkdir(exist_ok=True)
-                self.list = Collection(self.file, self.run)
+        if self.written == 0:
+            on_root(self.comm, self._begin)
         path = self.folder / f"{self.written:06}.vtu"
         check_room(self.comm, [path], needed, reserve)
         write_vtu(self.comm, path, self.grid, points, cells, whole)
-        with agree(self.comm):
-            if self.comm.rank == 0:
-                self.list.add(t, path)
+        on_root(self.comm, lambda: self.list.add(t, path))
         self.written += 1
+
+    def _begin(self) -> None:
+        """Make the folder and the list; rank 0 only."""
+        self.folder.mkdir(exist_ok=True)
+        self.list = Collection(self.file, self.run)
 
     def _fields(self, z: Array, v: Array, q_s: Array, v_s: Array | None) -> tuple[list[Field], list[Field]]:
         u = self.full.fill(z, q_s).x.array.reshape(-1, self.d)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from softgrasp.fem.errors import agree
-from softgrasp.fem.petsc import Array
+from softgrasp.fem.petsc import Array, on_root
 
 HEAD = '<?xml version="1.0"?>\n<VTKFile type="{}" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
 TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "u1": "UInt8"}
@@ -96,9 +96,7 @@ def write_vtu(
     contents = [(begin + start, own)]
     if comm.rank == 0:
         contents += [(0, head + shared), (begin + length, b"\n</AppendedData>\n</VTKFile>\n")]
-    with agree(comm):
-        if comm.rank == 0:
-            path.unlink(missing_ok=True)
+    on_root(comm, lambda: path.unlink(missing_ok=True))
     try:
         file = MPI.File.Open(comm, str(path), MPI.MODE_CREATE | MPI.MODE_WRONLY)
         try:

@@ -125,6 +125,11 @@ class Facets:
         pair = np.concatenate([[False], self.same, [False]])
         return np.asarray(~(pair[1:] | pair[:-1]))
 
+    @property
+    def pairs(self) -> tuple[Integers, Integers]:
+        """The two cells of each inner facet."""
+        return self.cells[:-1][self.same], self.cells[1:][self.same]
+
 
 def sort_facets(cells: Integers) -> Facets:
     """The facets of simplices, shape (n_cells, d + 1)."""
@@ -240,8 +245,7 @@ def find_parts(points: Floats, cells: Integers, facets: Facets, name: str) -> tu
         raise MeshError(
             f"{name} has facets with more than two cells, the first around {place_text(place)}: remove doubled cells."
         )
-    one, other = facets.cells[:-1][facets.same], facets.cells[1:][facets.same]
-    count, labels = linked(one, other, len(cells))
+    count, labels = linked(*facets.pairs, len(cells))
     if count == 1:
         return None
     total = np.bincount(labels, minlength=count)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -26,7 +26,6 @@ from softgrasp.fem.mesh.check import (
     Floats,
     Integers,
     Ints,
-    Parts,
     check_cells,
     doubled_nodes,
     doubled_text,
@@ -36,29 +35,8 @@ from softgrasp.fem.mesh.check import (
     sort_facets,
 )
 from softgrasp.fem.mesh.foreign import read_foreign
-from softgrasp.fem.mesh.tissue_mesh import Marks, Sets, TissueMesh, spread
+from softgrasp.fem.mesh.tissue_mesh import Marks, MeshArrays, Sets, TissueMesh, spread
 from softgrasp.fem.sealed import digest
-
-
-@dataclass(frozen=True)
-class MeshArrays:
-    """A simplex mesh in arrays, before distribution."""
-
-    points: Floats  # shape (n_points, d) [m]
-    cells: Integers  # shape (n_cells, d + 1)
-    cell_tags: Ints | None  # one integer a cell, or None
-    facets: Integers  # tagged facets, shape (n_facets, d)
-    facet_tags: Ints | None  # one integer a tagged facet, or None
-    part_tags: Ints | None  # number of the facet-connected part of each cell, or None if there is one part only
-    parts: Parts | None  # what is known of these parts, or None
-    facet_sets: Sets  # marks in ``facet_tags`` of each tag number and named set
-    cell_sets: Sets  # marks in ``cell_tags`` of each tag number and named set
-    notes: tuple[str, ...] = ()  # warnings, one sentence each
-
-    def digest(self) -> str:
-        """SHA-256 of coordinates, cells, tags and sets, which some formats spread over several files; 64 hex digits."""
-        sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (self.cell_sets, self.facet_sets)]
-        return digest(self.points, self.cells, self.cell_tags, self.facets, self.facet_tags, *sets)
 
 
 def _text(sets: Sets) -> str:
@@ -99,16 +77,7 @@ def read_mesh(
     with agree(comm):
         if comm.rank == 0:
             arrays = load_arrays(path, scale, repair, seam, limit)
-    if arrays is None:
-        return spread(comm, None, {}, {})
-    d, cells = arrays.points.shape[1], arrays.cells
-    entities = {"facet_tags": (d - 1, arrays.facets), "cell_tags": (d, cells), "part_tags": (d, cells)}
-    marks: Marks = {
-        name: (*where, tags) for name, where in entities.items() if (tags := getattr(arrays, name)) is not None
-    }
-    known = {name: getattr(arrays, name) for name in ("parts", "facet_sets", "cell_sets", "notes")}
-    known |= {"source": path.name, "digest": arrays.digest()}
-    return spread(comm, (arrays.points, cells), marks, known)
+    return spread(comm, arrays)
 
 
 def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limit: float | None = None) -> MeshArrays:
@@ -157,9 +126,17 @@ def load_arrays(path: Path, scale: float, repair: bool, seam: float = SEAM, limi
         sides = sort_facets(cells)
     notes += hanging_text(points, hanging_nodes(points, cells, sides, seam), str(path))
     part_tags, parts = find_parts(points, cells, sides, str(path)) or (None, None)
-    return MeshArrays(
-        points, cells, cell_tags, facets, facet_tags, part_tags, parts, facet_sets, cell_sets, tuple(notes)
-    )
+    marks: Marks = {
+        "facet_tags": (dimension - 1, facets, facet_tags),
+        "cell_tags": (dimension, cells, cell_tags),
+        "part_tags": (dimension, cells, part_tags),
+    }
+    # some formats spread coordinates, cells, tags and sets over several files
+    sets = [np.frombuffer(_text(each).encode(), dtype=np.uint8) for each in (cell_sets, facet_sets)]
+    text = digest(points, cells, cell_tags, facets, facet_tags, *sets)
+    known: dict[str, Any] = {"source": path.name, "parts": parts, "notes": tuple(notes), "digest": text}
+    known |= {"facet_sets": facet_sets, "cell_sets": cell_sets}
+    return MeshArrays(points, cells, marks, known)
 
 
 def _read(path: Path, limit: float | None) -> meshio.Mesh:

@@ -29,7 +29,7 @@ from softgrasp.fem.mesh.check import (
     sort_facets,
 )
 from softgrasp.fem.mesh.singular import Ends
-from softgrasp.fem.mesh.tissue_mesh import Marks, TissueMesh, Whole, spread, structured_mesh
+from softgrasp.fem.mesh.tissue_mesh import Marks, MeshArrays, TissueMesh, Whole, spread, structured_mesh
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -87,15 +87,17 @@ def distribute(comm: MPI.Intracomm, whole: Whole | None) -> TissueMesh:
 
     ``mesh.topology.original_cell_index`` of the result counts the cells as ``whole.simplices`` does.
     """
-    if whole is None:
-        return spread(comm, None, {}, {})
+    return replace(spread(comm, None if whole is None else _arrays(whole)), whole=whole)
+
+
+def _arrays(whole: Whole) -> MeshArrays:
     points, cells, d = whole.points, whole.simplices, whole.dimension
     marks: Marks = {name: (d, cells, values) for name, values in whole.cells.items()}
     marks |= {name: (d - 1, whole.facet_nodes(name), tags.values) for name, tags in whole.facets.items()}
     known: dict[str, Any] = {name: getattr(whole, name) for name in ("source", "facet_sets", "cell_sets")}
     if (parts := find_parts(points, cells, sort_facets(cells), whole.source)) is not None:
         marks["part_tags"], known["parts"] = (d, cells, parts[0]), parts[1]
-    return replace(spread(comm, (points, cells), marks, known), whole=whole)
+    return MeshArrays(points, cells, marks, known)
 
 
 # mu < alpha / p with alpha about 1/2 gives elements of order p their full order; below it the cells next to the end

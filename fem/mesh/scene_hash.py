@@ -31,7 +31,7 @@ def _mesh_digest(scene: Scene) -> str:
 
     tissue = scene.tissue
     path = scene.path(str(tissue.mesh))
-    return load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit).digest()
+    return str(load_arrays(path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit).known["digest"])
 
 
 def _bytes(scene: Scene, name: str, key: str) -> bytes:

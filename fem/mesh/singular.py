@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 
-from softgrasp.fem.mesh.check import Flags, Floats, Integers
+from softgrasp.fem.mesh.check import Flags, Floats, Integers, sort_facets
 
 Kind = Literal["contact end", "re-entrant", "held corner", "layer end"]
 
@@ -116,20 +116,14 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
         nu: Poisson's ratio of each cell [1], shape (n_cells,).
     """
     d = points.shape[1]
-    facets = np.sort(np.concatenate([np.delete(cells, i, axis=1) for i in range(d + 1)]), axis=1)
-    owner = np.tile(np.arange(len(cells)), d + 1)
-    unique, inverse, count = np.unique(facets, axis=0, return_inverse=True, return_counts=True)
-    inverse = inverse.ravel()
-    outside = count == 1
-    least, largest = np.full(len(unique), len(layers) + 1), np.full(len(unique), -2)
-    np.minimum.at(least, inverse, layers[owner])
-    np.maximum.at(largest, inverse, layers[owner])
-    between = ~outside & (least != largest)
+    facets = sort_facets(cells)
+    outer, (one, other) = facets.nodes[facets.outer], facets.pairs
+    between = facets.nodes[:-1][facets.same][layers[one] != layers[other]]
     code = np.array([len(points) ** k for k in range(d)], dtype=np.int64)
-    clamped = outside & np.isin(unique @ code, np.sort(held, axis=1) @ code)
+    clamped = np.isin(outer @ code, np.sort(held, axis=1) @ code)
     ridges, angle = _angles(points, cells)
-    on = {name: _per_ridge(unique[mask], ridges, d) for name, mask in
-          (("held", clamped), ("free", outside & ~clamped), ("inner", between))}  # fmt: skip
+    parts = {"held": outer[clamped], "free": outer[~clamped], "inner": between}
+    on = {name: _per_ridge(part, ridges, d) for name, part in parts.items()}
     ratio = np.zeros(len(ridges))
     for corner in combinations(range(d + 1), d - 1):
         np.maximum.at(ratio, _find(ridges, np.sort(cells[:, list(corner)], axis=1)), nu)
@@ -148,7 +142,7 @@ def singular_ends(points: Floats, cells: Integers, held: Integers, layers: Integ
             chosen.append(i)
             alphas.append(cache[key])
             kinds.append(KINDS[sides])
-    for i in np.flatnonzero(_layer_ends(points, unique[between], ridges, on["inner"], boundary, d)).tolist():
+    for i in np.flatnonzero(_layer_ends(points, between, ridges, on["inner"], boundary, d)).tolist():
         if i not in chosen:
             chosen.append(i)
             alphas.append(0.5)

@@ -19,7 +19,17 @@ from softgrasp.fem.mesh.check import Floats, Integers, Ints, Parts
 from softgrasp.fem.scene.scene import Scene
 
 Sets = dict[int | str, tuple[int, ...]]  # marks of each tag number and named set of a file
-Marks = dict[str, tuple[int, Integers, Ints]]  # dimension of entities, their nodes, one value each
+Marks = dict[str, tuple[int, Integers, Ints | None]]  # dimension of entities, their nodes, one value each or None
+
+
+@dataclass(frozen=True)
+class MeshArrays:
+    """A simplex mesh in arrays, on one rank."""
+
+    points: Floats  # shape (n_points, d) [m]
+    cells: Integers  # shape (n_cells, d + 1)
+    marks: Marks  # mesh tags by field of TissueMesh
+    known: dict[str, Any]  # other fields of TissueMesh
 
 
 @dataclass(frozen=True)
@@ -88,6 +98,12 @@ class TissueMesh:
         """Coordinates of the vertices of the owned cells, (owned, d + 1, d) [m]."""
         return np.asarray(self.mesh.geometry.x[cell_nodes(self.mesh)[: self.owned], : self.dimension])
 
+    @property
+    def edges(self) -> Floats:
+        """Edges from the first vertex of the owned cells to the others, one a row, (owned, d, d) [m]."""
+        x = self.vertices
+        return x[:, 1:] - x[:, :1]
+
 
 def cell_nodes(mesh: dolfinx.mesh.Mesh) -> Ints:
     """Local node numbers of the cells, shape (n_cells, d + 1)."""
@@ -96,29 +112,25 @@ def cell_nodes(mesh: dolfinx.mesh.Mesh) -> Ints:
     return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)
 
 
-def spread(
-    comm: MPI.Intracomm, body: tuple[Floats, Integers] | None, marks: Marks, known: dict[str, Any]
-) -> TissueMesh:
-    """Distribute points and simplices from rank 0. Collective.
-
-    Args:
-        body: points (n_points, d) [m] and cells (n_cells, d + 1) on rank 0, None elsewhere.
-        marks: mesh tags by field of the result; empty elsewhere.
-        known: its other fields; empty elsewhere.
-    """
-    facts = 0 if body is None else body[0].shape[1], {name: mark[0] for name, mark in marks.items()}, known
+def spread(comm: MPI.Intracomm, arrays: MeshArrays | None) -> TissueMesh:
+    """Distribute a mesh from rank 0, None elsewhere. Collective."""
+    facts = None
+    if arrays is not None:
+        kept = {name: mark[0] for name, mark in arrays.marks.items() if mark[2] is not None}
+        facts = arrays.points.shape[1], kept, arrays.known
     d, dimensions, known = comm.bcast(facts)
-    points, cells = body or (np.zeros((0, d)), np.zeros((0, d + 1), dtype=np.int64))
+    if arrays is None:
+        marks: Marks = {k: (n, np.zeros((0, n + 1), np.int64), np.zeros(0, np.int32)) for k, n in dimensions.items()}
+        arrays = MeshArrays(np.zeros((0, d)), np.zeros((0, d + 1), np.int64), marks, known)
     shape = {2: "triangle", 3: "tetrahedron"}[d]
     domain = ufl.Mesh(basix.ufl.element("Lagrange", shape, 1, shape=(d,)))
-    mesh = dolfinx.mesh.create_mesh(comm, cells, domain, points.copy())
+    mesh = dolfinx.mesh.create_mesh(comm, arrays.cells, domain, arrays.points.copy())
     tags = {}
     for name, dimension in dimensions.items():
         for a, b in ((dimension, 0), (dimension, d)):
             mesh.topology.create_entities(a)
             mesh.topology.create_connectivity(a, b)
-        nothing = np.zeros((0, dimension + 1), dtype=np.int64), np.zeros(0, dtype=np.int32)
-        nodes, values = marks[name][1:] if name in marks else nothing
+        _, nodes, values = arrays.marks[name]
         local, here = dolfinx.io.distribute_entity_data(
             mesh, dimension, np.ascontiguousarray(nodes), np.ascontiguousarray(values, dtype=np.int32)
         )

@@ -53,6 +53,11 @@ class Discretisation:
         result.x.scatter_forward()
         return result
 
+    def gradients(self, at: Array) -> Array:
+        """Gradients of the shape functions at points (q, d) of the reference cell, (owned cells, q, nodes, d) [1/m]."""
+        table = self.V.element.basix_element.tabulate(1, at)[1:, :, :, 0]  # (d, q, nodes)
+        return np.asarray(np.einsum("kqa,cjk->cqaj", table, np.linalg.inv(self.mesh.edges)))
+
 
 def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
     """Build the space and the block dof maps. Collective.
@@ -223,22 +228,18 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
     from softgrasp.fem.strain.points import Points, make_gradient  # only scenes with finite strain pay for it
 
     d, V, order = space.mesh.dimension, space.V, scene.tissue.order
-    x, cells = space.mesh.vertices, space.mesh.owned
-    shape = basix.CellType.triangle if d == 2 else basix.CellType.tetrahedron
-    element = basix.create_element(basix.ElementFamily.P, shape, order, basix.LagrangeVariant.gll_warped)
+    edges, cells = space.mesh.edges, space.mesh.owned
     # exact for K(0), all weights positive
-    at, weights = basix.make_quadrature(shape, 1 if order == 1 else 2 * order)
-    table = element.tabulate(1, at)[1:, :, :, 0]  # (d, points, nodes)
-    edges = x[:, 1:] - x[:, :1]  # rows are the columns of dX/dxi
-    gradients = np.einsum("kqa,cjk->cqaj", table, np.linalg.inv(edges))
+    at, weights = basix.make_quadrature(V.element.basix_element.cell_type, 1 if order == 1 else 2 * order)
     volume = np.abs(np.linalg.det(edges)) * scene.tissue.thickness
     vol = (volume[:, None] * weights).ravel()
     layer = layer_numbers(space.mesh, scene)[1]
     first = space.mesh.mesh.topology.index_map(d).local_range[0]
     layout, each = space.layout, len(weights)
-    B = make_gradient(layout.comm, gradients, _free_nodes(space)[V.dofmap.list[:cells]], (layout.n_local, layout.n_e))
+    nodes = _free_nodes(space)[V.dofmap.list[:cells]]
+    B = make_gradient(layout.comm, space.gradients(at), nodes, (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
-    places = (x[:, None, 0] + at @ edges).reshape(-1, d)
+    places = (space.mesh.vertices[:, :1] + at @ edges).reshape(-1, d)
     return Points(B, vol, np.repeat(layer, each), cell, places, d, effect.law, effect.tol)
 
 

@@ -19,11 +19,11 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, make_mesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
-from softgrasp.fem.model.memory import check_memory, simplices
-from softgrasp.fem.model.outputs import Output, make_outputs
+from softgrasp.fem.model.memory import box_simplices, check_memory
+from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
-from softgrasp.fem.scene.scene import Scene
+from softgrasp.fem.scene.scene import Scene, check_dimension
 from softgrasp.fem.system import BlockSystem, LayerBlocks, LayerMaterial, coupling, tissue_matrices
 
 
@@ -106,6 +106,11 @@ class Model:
         return make_outputs(self.scene, self.system)
 
     @property
+    def output_columns(self) -> Array:
+        """C' of all outputs, y = C z + C_s q_s: local rows (n_local, p). Collective."""
+        return output_columns(self.outputs, self.system.layout.n_local)
+
+    @property
     def scene_hash(self) -> str:
         """See :func:`softgrasp.fem.mesh.scene_hash.scene_hash`."""
         return scene_hash(self.scene)
@@ -178,15 +183,16 @@ def build(
     watch, inventory = Stopwatch(comm), Inventory()
     boxed = scene.tissue.cells if mesh is None and scene.tissue.refine is None else None
     if boxed:
-        check_memory(scene, comm, run, len(boxed), simplices(boxed))
+        check_memory(scene, comm, run, len(boxed), box_simplices(boxed))
     with watch.stage("mesh"):
         if mesh is None and scene.tissue.refine is not None:
             from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it
 
             mesh = refined_mesh(comm, scene)
         mesh = mesh or make_mesh(comm, scene)
+    d = mesh.dimension
+    check_dimension(scene, d)  # of a mesh file it was unknown before
     if not boxed:
-        d = mesh.dimension
         check_memory(scene, comm, run, d, mesh.mesh.topology.index_map(d).size_global)
     with watch.stage("assembly"):
         space = discretise(mesh, scene)

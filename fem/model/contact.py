@@ -9,10 +9,11 @@ import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
 
-from softgrasp.fem.errors import MeshError, SceneError, agree
+from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.check import Flags, Floats, Ints, Parts, counted, place_text
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh
+from softgrasp.fem.petsc import on_root
 from softgrasp.fem.scene.scene import Contact
 
 HINGE = 1e-12  # of C^T C: shared nodes nearer than 1e-6 of the part are one node
@@ -83,9 +84,7 @@ def held_check(tissue: TissueMesh, facets: Ints) -> None:
     held = np.zeros(len(parts.cells), dtype=np.int64)
     held[labels[cells]] = 1
     held = mesh.comm.allreduce(held)
-    with agree(mesh.comm):
-        if mesh.comm.rank == 0:
-            check_parts(parts, held > 0, tissue.source)
+    on_root(mesh.comm, lambda: check_parts(parts, held > 0, tissue.source))
 
 
 def check_parts(parts: Parts, held: Flags, source: str) -> None:

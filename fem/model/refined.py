@@ -32,6 +32,7 @@ from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, make_mesh
 from softgrasp.fem.model.assembly import cells_of_layers
 from softgrasp.fem.model.contact import contact_facets
+from softgrasp.fem.petsc import on_root
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -43,7 +44,7 @@ ACROSS = {2: {1: 32.0, 2: 3.5, 3: 3.0}, 3: {1: 8.0, 2: 1.8, 3: 2.0}}
 MORE = {1: 0.0, 2: 0.7, 3: 0.0}  # cells beside these, for coarse meshes: with them the first estimate meets 1e-2
 LINES_ACROSS = {2: {1: 24.0, 2: 8.0, 3: 5.0}, 3: {1: 16.0, 2: 6.0, 3: 4.0}}
 # Smallest cell over tolerance times shortest side: what an end costs is about proportional to it.
-FLOOR = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
+SMALLEST = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
 DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a tolerance: edges in 3D fill a body quickly
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
 
@@ -53,7 +54,7 @@ def aims(refine: Refine, order: int, d: int, tolerance: float) -> tuple[float, f
     p = min(order, 3)
     mu = refine.grading if isinstance(refine.grading, float) else BISECTION[p]
     across = MORE[p] + ACROSS[d][p] * (1e-2 / tolerance) ** (1 / (2 * p))
-    return across, mu, FLOOR[d][p] * tolerance
+    return across, mu, SMALLEST[d][p] * tolerance
 
 
 def by_lines(scene: Scene) -> bool:
@@ -118,8 +119,8 @@ def _bisected(scene: Scene, refine: Refine, goal: float | None) -> Whole:
         aim *= SHRINK
     if refine.contact == "inherit":
         return whole
-    tags, marks = ({k: v for k, v in marks.items() if k.endswith("_tags")} for marks in (whole.cells, whole.facets))
-    return replace(whole, cells=tags, facets=marks)  # zone and layers are selected again
+    cells, facets = ({k: v for k, v in marks.items() if k.endswith("_tags")} for marks in (whole.cells, whole.facets))
+    return replace(whole, cells=cells, facets=facets)  # zone and layers are selected again
 
 
 def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
@@ -209,15 +210,14 @@ def scene_ends(comm: MPI.Intracomm, tissue: TissueMesh, scene: Scene) -> Ends:
 
     Raises MeshError: the mesh file cannot be read again.
     """
-    ends: Ends | None = None
-    with agree(comm):
-        if comm.rank == 0:
-            whole = tissue.whole
-            if whole is None or "contact" not in whole.facets:
-                whole = marked(_even(scene, scene.tissue.cells), scene)
-            ends = ends_of(whole, scene)
-    result: Ends = comm.bcast(ends)
-    return result
+
+    def ends() -> Ends:
+        whole = tissue.whole
+        if whole is None or "contact" not in whole.facets:
+            whole = marked(_even(scene, scene.tissue.cells), scene)
+        return ends_of(whole, scene)
+
+    return on_root(comm, ends)
 
 
 def _even(scene: Scene, cells: list[int] | None) -> TissueMesh:

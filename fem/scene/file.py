@@ -169,16 +169,22 @@ def _parse(text: str, override: str) -> Any:
 
 
 def _explain(error: ValidationError, data: dict[str, Any]) -> str:
-    """The first problem as a sentence, and how many more there are; misspelled keys come first."""
-    problems: dict[str, tuple[bool, list[str]]] = {}
+    """The first problem as a sentence, and how many more there are; misspelled keys come first.
+
+    A key that is missing because it is misspelled counts once.
+    """
+    problems: dict[str, str] = {}
+    misspelled, missing = [], []
     for item in error.errors(include_url=False):
         path, value = _locate(item["loc"], data)
         dotted = ".".join(path)
         kind, message = item["type"], item["msg"]
         if kind == "extra_forbidden":
             text = f"{dotted} is not a key; {_suggest(path)}"
+            misspelled.append(text)
         elif kind == "missing":
             text = f"{dotted} is missing; {_purpose(path)}"
+            missing.append(dotted)
         elif kind == "value_error":
             reason = message.removeprefix("Value error, ")
             text = f"{dotted} {reason}" if reason.startswith("'") else ".".join(filter(None, [dotted, reason]))
@@ -187,18 +193,18 @@ def _explain(error: ValidationError, data: dict[str, Any]) -> str:
             verb = "have" if kind.startswith(("too_", "string_too_")) else "be"
             text = text.replace("greater than", ">").replace("> or equal to", ">=").replace("less than", "<")
             text = text.replace(" after validation", "")
-            earlier = problems.get(dotted, (False, []))[1]
             text = (
-                f"{earlier[0].partition('; write ')[0]} or {text}"
-                if earlier
+                f"{problems[dotted].partition('; write ')[0]} or {text}"
+                if dotted in problems
                 else f"{dotted} is {_show(value)}; it must {verb} {text}"
             )
         if kind == "missing" or kind.endswith("_type") or kind.startswith("too_"):
             text += next((f"; write {form}" for key, form in _FORMS.items() if f"{dotted}.".startswith(f"{key}.")), "")
-        problems[dotted] = (kind == "extra_forbidden", [text])
-    ordered = sorted(problems.values(), key=lambda problem: not problem[0])
-    more = f"; and {len(ordered) - 1} more" if len(ordered) > 1 else ""
-    return ordered[0][1][0] + more
+        problems[dotted] = text
+    meant = [key for key in missing if any(text.endswith(f"did you mean {key}?") for text in misspelled)]
+    first = next(iter(misspelled or problems.values()))
+    more = len(problems) - len(meant) - 1
+    return first + (f"; and {more} more" if more else "")
 
 
 def _show(value: Any) -> str:

@@ -109,15 +109,7 @@ def _gain(design: Design, basis: BasisGains | None, order: int | None) -> tuple[
     best = None if basis is None else basis.best(most, least)
     if basis is None or basis.family is None or best is None or best.gain is None:
         raise NoController("no a-priori gain of small order with tissue in it is certified to be stable")
-    return basis.name, best.gain, a_priori_shapes(design, basis, best.N)
-
-
-def a_priori_shapes(design: Design, basis: BasisGains, N: int) -> Array:
-    """Modes of the tissue in the a-priori basis of order N, local rows (n_local, (N - 2 n_s) / 2). Collective."""
-    if basis.family is None:
-        raise ControlError(f"basis {basis.name} is refused: {basis.refused}")
-    layout = design.problem.layout
-    return basis.family.at(N).U.tall[layout.n_local :, -((N - 2 * layout.n_s) // 2) :]
+    return basis.name, best.gain, basis.family.at(best.N).modes
 
 
 def blind(design: Design) -> bool:

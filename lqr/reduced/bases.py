@@ -45,6 +45,12 @@ class RiccatiBasis:
         """Order of the reduced Riccati equation."""
         return self.W.columns
 
+    @property
+    def modes(self) -> Array:
+        """Of an a-priori basis the modes V of the tissue in z = V eta, local rows (n_local, (N - 2 n_s) / 2)."""
+        n_s = len(self.U.hand) // 2
+        return self.U.parts[3][:, n_s + self.N // 2 :]
+
 
 @dataclass(frozen=True)
 class BasisFamily:

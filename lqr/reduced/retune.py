@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -11,13 +10,10 @@ import numpy as np
 from softgrasp.fem.petsc import Array, on_root, times_columns, total
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.lqr.dense.care import StateSpace, solve_reduced
-from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.checks import ControlError
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
 from softgrasp.lqr.reduced.riccati import NAN, GainCheck, GainQuality, full_gain, project_plant
-from softgrasp.lqr.spectrum.modal_loop import ModalLoop
-from softgrasp.lqr.spectrum.sampled import Sampling
 
 Materials = tuple[LayerMaterial, ...]
 
@@ -28,7 +24,6 @@ class Tuned:
 
     P_N: Array  # (N, N), in the retuner's scaled basis
     K_N: Array  # gain on reduced states, u = K_N x_N, (n_s, N)
-    seconds: float  # to combine the components and solve the equation
 
 
 class Retuner:
@@ -79,11 +74,9 @@ class Retuner:
 
         Raises ControlError: the setting is refused, or its reduced equation has no stabilising solution.
         """
-        begin = time.perf_counter()
         m = self.at(materials)
         P_N = solve_reduced(m)
-        K_N = -np.linalg.solve(m.R, m.B.T @ P_N @ m.E)
-        return Tuned(P_N, K_N, time.perf_counter() - begin)
+        return Tuned(P_N, -np.linalg.solve(m.R, m.B.T @ P_N @ m.E))
 
 
 @dataclass(frozen=True)
@@ -91,31 +84,16 @@ class RetunedGain(GainQuality):
     """The gain at one setting of the box, against the full Riccati solution there."""
 
     materials: Materials  # of all layers
-    seconds: float = NAN  # of the re-tuning
+    seconds: float = NAN  # of the re-tuning, for who measures it
 
 
-def retuned_gain(
-    retuner: Retuner,
-    materials: Materials,
-    solve: Callable[[RiccatiProblem], RiccatiSolution],
-    start: Block,
-    modes: int | None = None,
-    law: Sampling | None = None,
-) -> RetunedGain:
+def retuned_gain(retuner: Retuner, materials: Materials, gain_check: Callable[[], GainCheck]) -> RetunedGain:
     """Error of the re-tuned gain at one setting of the box. Collective.
 
-    Args:
-        solve: full solver, the reference.
-        start: start minus target of hand and tissue, one column.
-        modes: modes of the full closed loop, see :class:`softgrasp.lqr.spectrum.modal_loop.ModalLoop`.
-        law: instants of the loop; None checks the continuous law alone.
+    ``gain_check``: with the full solution at this setting; called where the re-tuned equation has one.
     """
     try:
         tuned = on_root(retuner.problem.layout.comm, lambda: retuner.solve(materials))
     except ControlError as error:
         return RetunedGain(materials, reason=str(error))
-    problem = replace(retuner.problem, system=retuner.problem.system.with_materials(materials))
-    gain_check = GainCheck(problem, solve(problem), start, ModalLoop(problem, modes), law)
-    return gain_check.with_quality(
-        RetunedGain(materials, tuned.seconds), full_gain(retuner.problem, retuner.basis, tuned.P_N)
-    )
+    return gain_check().with_quality(RetunedGain(materials), full_gain(retuner.problem, retuner.basis, tuned.P_N))

@@ -157,7 +157,7 @@ class GainCheck:
         loop: ModalLoop | None = None,
         law: Sampling | None = None,
     ) -> None:
-        self.problem, self.gain, self.K = problem, solution.gain, solution.gain.block
+        self.problem, self.solution, self.K = problem, solution, solution.gain.block
         Z = solution.factor
         self.Z_absolute = costates_to_absolute(problem.system, Z)
         self.start = start
@@ -166,7 +166,6 @@ class GainCheck:
         self.optimal = float(np.sum(gram(problem.layout.comm, Z, descriptor(problem, start)) ** 2))
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
-        self._whole: ModalLoop | None = None
 
     def quality(self, gain: Gain) -> LoopQuality:
         """Abscissa, excess cost and sampled radius of any gain. Collective.
@@ -188,12 +187,10 @@ class GainCheck:
                 raise
             spectrum = None
         if spectrum is None or (fits and not spectrum.certified):
-            if self._whole is None:
-                self._whole = ModalLoop(self.problem, DENSE_LIMIT)
-                self.ticks = SampledLoop(self.problem, self._whole)
+            whole = self.ticks.modes(whole=True)
             if spectrum is None:  # nor would it converge for the next gain
-                self.loop = self._whole
-            return self._sampled(K, self._modal(self._whole, K))
+                self.loop = whole
+            return self._sampled(K, self._modal(whole, K))
         excess = self._modal(self.loop, K).cost_excess if spectrum.value < 0 else np.inf
         poles = spectrum.eigenvalues
         return self._sampled(K, LoopQuality(spectrum.value, excess, spectrum.certified, spectrum.exact, poles))
@@ -225,12 +222,13 @@ class GainCheck:
         try:
             return self.with_quality(report, reduced.gain)
         except SolverError:
-            return replace(report, error_K=gain_error(self.problem, self.gain, reduced.gain), certified=False)
+            return replace(report, error_K=gain_error(self.problem, self.solution.gain, reduced.gain), certified=False)
 
     def with_quality[Figures: GainQuality](self, report: Figures, gain: Gain) -> Figures:
         """The same with the figures of a gain. Collective. Raises SolverError: see :meth:`quality`."""
         quality = self.quality(gain)
         return replace(
-            report, gain=gain, error_K=gain_error(self.problem, self.gain, gain), cost_excess=quality.cost_excess,
-            abscissa_full=quality.abscissa, certified=quality.certified, sampled=quality.sampled,
+            report, gain=gain, error_K=gain_error(self.problem, self.solution.gain, gain),
+            cost_excess=quality.cost_excess, abscissa_full=quality.abscissa, certified=quality.certified,
+            sampled=quality.sampled,
         )  # fmt: skip

@@ -68,7 +68,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
 
     Args:
         problem: the plant; damped in every layer for a certificate.
-        gain: u = K x, K = [K_q, K_v] on the hand (n_s, 2 n_s) and on the tissue's local rows (n_local, n_s).
+        gain: u = K x.
 
     Raises:
         ControlError: the plant has no hand.
@@ -159,7 +159,7 @@ class Resolvent:
         self.system, self.layout, self.comm = problem.system, problem.layout, problem.layout.comm
         self.n_s, self.n = self.layout.n_s, self.layout.n_local
         damping = self.system.damping
-        self.drag = damping.alpha if damping.in_space else 0.0
+        self.drag = damping.drag
         terms = [(1 + shift * damping.beta, self.system.K_ee), (shift * (shift + damping.alpha), self.system.M_ee)]
         S = combine(terms + ([] if damping.matrix is None else [(shift, damping.matrix)]))
         name = choose_solver(self.layout, few=True)[0]

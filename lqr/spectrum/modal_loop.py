@@ -16,7 +16,7 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 
 ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
 DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
-SOME_MODES = 150
+LOWEST_MODES = 150  # of a larger plant
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ModalLoop:
     :func:`softgrasp.lqr.spectrum.certificate.abscissa` for large scenes.
 
     Args:
-        modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`SOME_MODES`. All modes are
+        modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`LOWEST_MODES`. All modes are
             allowed up to :data:`DENSE_LIMIT`.
     """
 
@@ -67,7 +67,7 @@ class ModalLoop:
         self.problem, self.comm = problem, problem.layout.comm
         n_e = problem.layout.n_e
         self.complete = n_e <= (ALL_MODES if modes is None else min(modes, DENSE_LIMIT))
-        self.plant = _all(problem) if self.complete else lowest_plant(problem, min(modes or SOME_MODES, n_e))
+        self.plant = _all(problem) if self.complete else lowest_plant(problem, min(modes or LOWEST_MODES, n_e))
         space = self.plant.space
         solved = np.linalg.solve(space.E, np.hstack([space.A, space.B]))
         self.A, self.B = solved[:, : len(space.A)], solved[:, len(space.A) :]
@@ -86,6 +86,23 @@ class ModalLoop:
         """Eigenvalues of the closed loop. Collective."""
         k = self.gain(K)
         return on_root(self.comm, lambda: np.asarray(scipy.linalg.eigvals(self.A + self.B @ k)))
+
+    def exact(self, K: Block, x: Block, C: Array, dt: float, steps: int) -> Array:
+        """C exp((A + B K) t) xi(0) at t = 0, dt, ..., the loop without a time step, (steps + 1, rows of C). Collective.
+
+        ``K``: gain, transposed, hand-relative; ``x``: x(0) minus target, one column; ``C``: (rows, 2 n_s + 2 k).
+        """
+        k, xi = self.gain(K), self.state(x)[:, 0]
+
+        def march() -> Array:
+            step, state, values = scipy.linalg.expm(dt * (self.A + self.B @ k)), xi, [C @ xi]
+            with np.errstate(over="ignore", invalid="ignore"):  # of a gain that does not stabilise
+                for _ in range(steps):
+                    state = step @ state
+                    values.append(C @ state)
+            return np.stack(values)
+
+        return on_root(self.comm, march)
 
     def quality(self, K: Block, best: Block, x: Block, optimal: float) -> LoopQuality:
         """Abscissa and cost of a gain against the optimal one. Collective.

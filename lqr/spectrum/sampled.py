@@ -15,7 +15,7 @@ from softgrasp.lqr.lowrank.shifts import shift_range
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, ModalLoop, SampledRadius
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LOWEST_MODES, ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.tail import Tail, tail_modes
 
 SAFE = 0.5  # small gain below which the modes left out are harmless; the rest covers what lies between grid points
@@ -116,7 +116,7 @@ class SampledLoop:
         modes: how many a large plant keeps.
     """
 
-    def __init__(self, problem: RiccatiProblem, loop: ModalLoop | None = None, modes: int = SOME_MODES) -> None:
+    def __init__(self, problem: RiccatiProblem, loop: ModalLoop | None = None, modes: int = LOWEST_MODES) -> None:
         self.problem, self.comm = problem, problem.layout.comm
         self.n_e = problem.layout.n_e
         self.kept = min(modes, self.n_e)
@@ -129,7 +129,7 @@ class SampledLoop:
         answer = self._radius(self._parts(K), law)
         if answer.certified or self.n_e > DENSE_LIMIT:
             return answer
-        self.loop = ModalLoop(self.problem, DENSE_LIMIT)
+        self.modes(whole=True)
         return self._radius(self._parts(K), law)
 
     def stable_rate(self, K: Block, law: Sampling, end: float, most: float = 1.0) -> StableRate | None:
@@ -172,25 +172,25 @@ class SampledLoop:
 
         ``K``: as it would be saved; ``law``: instants of the plant; one tick is the controller's period.
         """
-        loop = self._modes() if self.problem.system.two_way else None
+        loop = self.modes() if self.problem.system.two_way else None
         if loop is None:
             A, B = np.split(np.linalg.solve(K.plant.E, np.hstack([K.plant.A, K.plant.B])), [len(K.plant.A)], axis=1)
         else:
             A, B = loop.A, loop.B
         return replace(on_root(self.comm, lambda: _carried(A, B, K, law)), exact=loop is None or loop.complete)
 
-    def _modes(self) -> ModalLoop:
-        """All modes as far as they fit, else the lowest. Collective."""
-        fits = self.n_e <= self.kept or (self.coupled and self.n_e <= DENSE_LIMIT)
-        if self.loop is None or (fits and not self.loop.complete):
-            self.loop = ModalLoop(self.problem, DENSE_LIMIT if fits else self.kept)
+    def modes(self, whole: bool = False) -> ModalLoop:
+        """All modes where ``whole`` or where they have to be and fit, else the lowest; kept for later. Collective."""
+        whole = whole or self.n_e <= self.kept or (self.coupled and self.n_e <= DENSE_LIMIT)
+        if self.loop is None or (whole and not self.loop.complete):
+            self.loop = ModalLoop(self.problem, DENSE_LIMIT if whole else self.kept)
         return self.loop
 
     def _parts(self, K: Block) -> _Parts:
         """Modes kept and gain on them. Collective."""
         whole = self.loop is not None and self.loop.complete
         if whole or self.coupled or self.n_e <= self.kept:
-            loop, reason = self._modes(), ""
+            loop, reason = self.modes(), ""
             if not loop.complete:
                 reason = f"damping couples the modes, and {self.n_e} are too many to take all"
             return _Parts(loop.A, loop.B, loop.gain(K), loop.complete, reason=reason)

@@ -23,7 +23,7 @@ def why_no_bound(problem: RiccatiProblem) -> str:
         return "no damping: modes beyond the radius stay on the axis"
     if damping.matrix is not None and not least_beta(problem) > 0:
         return "a layer without damping of its own: only the eigenvalues inside the radius are known"
-    if system.two_way and damping.alpha > 0 and damping.in_space:
+    if system.two_way and damping.drag > 0:
         return "two-way coupling with alpha > 0 in space: only the eigenvalues inside the radius are known"
     return ""
 
@@ -76,7 +76,7 @@ class Tail:
         self.K_q, self.K_v = (float(np.linalg.norm(k.T @ inverse, 2)) for k in (hand_q, hand_v))
         self.alpha, self.beta = system.damping.alpha, least_beta(problem)
         self.coupled = modes_couple(system)
-        self.drag = self.alpha if system.damping.in_space else 0.0
+        self.drag = system.damping.drag
         force = system.G @ inverse
         if system.two_way:  # the hand gives way: q_s = M_s^{-1} (u / s^2 - G'z)
             gain_z, gain_v = gain_z - force @ hand_q, gain_v - force @ hand_v

@@ -25,15 +25,13 @@ from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.lqr.dense.modal import factor_psd
 from softgrasp.lqr.dense.paper import paper_form
 from softgrasp.lqr.design.scene import problem as make_problem
-from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
-from softgrasp.lqr.lowrank.newton import NewtonADI
-from softgrasp.lqr.lowrank.radi import RADI
 from softgrasp.lqr.lowrank.residual import residual
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.operators import costates_to_relative, gain_to_absolute
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.riccati import gain_error
+from softgrasp.lqr.riccati import Method, make_solver
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, Goal, number
 from softgrasp.study.report.files import write_json
@@ -46,7 +44,7 @@ PEER_LIMIT = {"scipy": 10, "slycot": 10, "pymor": 40}  # nx; minutes beyond
 LIMITS = {("newton_adi", 10): 0.2, ("newton_adi", 80): 20.0, ("galerkin", 10): 0.03, ("galerkin", 80): 4.0}  # [s]
 LARGE_SECONDS, LARGE_MB = 900.0, 24 * 1024
 RESIDUAL, GAIN = 1e-10, 1e-6
-METHODS: dict[str, Callable[[], Any]] = {"newton_adi": NewtonADI, "radi": RADI, "galerkin": StructuredGalerkin}
+METHODS: tuple[Method, ...] = ("newton_adi", "radi", "galerkin")
 REPEAT_SECONDS = 3.0  # a method is repeated while it has taken less
 STAGES = {
     "factor": ("factor",),
@@ -78,7 +76,7 @@ CSV |= {f"{name}_s": f"split.{name}" for name in STAGES}
 
 
 @dataclass(frozen=True)
-class RiccatiPoint:
+class SolverPoint:
     """One method on nx x 2 nx cells; a peer has fewer numbers."""
 
     nx: int
@@ -97,7 +95,7 @@ class RiccatiPoint:
     memory_base_mb: float = 0.0
 
 
-Rows = list[RiccatiPoint | Failure]
+Rows = list[SolverPoint | Failure]
 
 
 def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
@@ -106,7 +104,7 @@ def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
     return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm=comm))
 
 
-def measure(nx: int, beta: float, methods: Sequence[str], repeats: int) -> Iterator[RiccatiPoint | Failure]:
+def measure(nx: int, beta: float, methods: Sequence[Method], repeats: int) -> Iterator[SolverPoint | Failure]:
     """All methods on nx x 2 nx cells; gains are compared with the first one. Collective.
 
     ``beta`` is the Kelvin-Voigt time [s].
@@ -117,14 +115,14 @@ def measure(nx: int, beta: float, methods: Sequence[str], repeats: int) -> Itera
     reference: Gain | None = None
     for name in methods:
         solved: list[RiccatiSolution] = []
-        solve = partial(lambda name, to: to.append(METHODS[name]().solve(problem)), name, solved)
+        solve = partial(lambda solver, to: to.append(solver.solve(problem)), make_solver(name), solved)
         try:
             seconds = float(np.median(repeated(comm, solve, repeats, REPEAT_SECONDS)))
         except SoftgraspError as error:
             yield Failure(f"nx = {nx}, {name}", comm.size, str(error))
             continue
         s = solved[-1]
-        yield RiccatiPoint(
+        yield SolverPoint(
             nx, comm.size, name, problem.layout.states, seconds, s.rank, s.residual,
             None if reference is None else gain_error(problem, reference, s.gain),
             {part: sum(s.seconds.get(key, 0.0) for key in keys) for part, keys in STAGES.items()},
@@ -177,10 +175,10 @@ def pymor_solver(plant: PaperPlant) -> Callable[[], Array]:
 PEERS = {"scipy": scipy_solver, "slycot": slycot_solver, "pymor": pymor_solver}
 
 
-def measure_peer(nx: int, beta: float, peer: str) -> Iterator[RiccatiPoint | Failure]:
+def measure_peer(nx: int, beta: float, peer: str) -> Iterator[SolverPoint | Failure]:
     """One peer on the paper's matrices against our Newton-ADI, on one rank."""
     problem = problem_for(MPI.COMM_WORLD, nx, beta)
-    reference, s = NewtonADI().solve(problem).gain, 2 * problem.layout.n_s
+    reference, s = make_solver("newton_adi").solve(problem).gain, 2 * problem.layout.n_s
     try:
         plant = PaperPlant(*paper_form(problem), problem.Q, problem.R)
         solve = PEERS[peer](plant)
@@ -196,10 +194,10 @@ def measure_peer(nx: int, beta: float, peer: str) -> Iterator[RiccatiPoint | Fai
         yield Failure(f"{peer}, nx = {nx}", 1, f"failed, {type(error).__name__}: {error}"[:200])
         return
     accuracy = residual(problem, relative), gain_error(problem, reference, gain)
-    yield RiccatiPoint(nx, 1, peer, problem.layout.states, seconds, relative.columns, *accuracy)
+    yield SolverPoint(nx, 1, peer, problem.layout.states, seconds, relative.columns, *accuracy)
 
 
-def measure_row(**arguments: Any) -> Iterator[RiccatiPoint | Failure]:
+def measure_row(**arguments: Any) -> Iterator[SolverPoint | Failure]:
     """The points that the launcher asks for. Collective."""
     return (measure_peer if "peer" in arguments else measure)(**arguments)
 
@@ -215,13 +213,13 @@ class Record:
     peers: Rows = field(default_factory=list)
 
     @property
-    def points(self) -> list[RiccatiPoint]:
+    def points(self) -> list[SolverPoint]:
         """Rows that did not fail."""
-        return driver.of(RiccatiPoint, self.rows)
+        return driver.of(SolverPoint, self.rows)
 
     def resume(self) -> None:
         """Take what an earlier run with this damping has measured. Raises CheckpointError: not such a file."""
-        adapter = TypeAdapter(list[RiccatiPoint])
+        adapter = TypeAdapter(list[SolverPoint])
         try:
             old = json.loads(self.file.read_text()) if self.file.is_file() else {}
             if old.get("beta") == self.beta:
@@ -232,20 +230,20 @@ class Record:
 
     def kept(self, nx: int, ranks: int, methods: Sequence[str]) -> Rows:
         """The points of a row where all its methods are there."""
-        own = [p for p in driver.of(RiccatiPoint, [*self.rows, *self.peers]) if (p.nx, p.ranks) == (nx, ranks)]
+        own = [p for p in driver.of(SolverPoint, [*self.rows, *self.peers]) if (p.nx, p.ranks) == (nx, ranks)]
         return [p for p in own if p.method in methods] if {p.method for p in own} >= set(methods) else []
 
     def save(self) -> None:
         """Write the file."""
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        peers = driver.of(RiccatiPoint, self.peers)
+        peers = driver.of(SolverPoint, self.peers)
         report = {"command": "bench_riccati", "beta": self.beta, "rows": driver.as_rows(self.points)}
         report |= {"peers": driver.as_rows(peers), "exponents": exponents(self.points)}
         report |= {"failed": driver.as_rows(driver.failures([*self.rows, *self.peers]))}
         write_json(self.file, report | {"goals": driver.goal_rows(goals(self.points))})
 
 
-def exponents(points: Sequence[RiccatiPoint]) -> dict[str, float | None]:
+def exponents(points: Sequence[SolverPoint]) -> dict[str, float | None]:
     """Growth of time with the number of states, from nx = 20 on, by method and rank count."""
     result: dict[str, float | None] = {}
     for method, ranks in sorted({(p.method, p.ranks) for p in points if p.nx >= 20}):
@@ -254,7 +252,7 @@ def exponents(points: Sequence[RiccatiPoint]) -> dict[str, float | None]:
     return result
 
 
-def goals(points: Sequence[RiccatiPoint]) -> list[Goal]:
+def goals(points: Sequence[SolverPoint]) -> list[Goal]:
     """All goals that the points can speak for."""
     result = []
     for p in points:
@@ -278,7 +276,7 @@ def goals(points: Sequence[RiccatiPoint]) -> list[Goal]:
     return result
 
 
-def peer_line(peer: RiccatiPoint | Failure) -> str:
+def peer_line(peer: SolverPoint | Failure) -> str:
     """One sentence about a peer."""
     if isinstance(peer, Failure):
         return f"{peer.label}: {peer.error}"
@@ -288,7 +286,7 @@ def peer_line(peer: RiccatiPoint | Failure) -> str:
     )
 
 
-def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoint]) -> tuple[Path, ...]:
+def draw(path: Path, points: Sequence[SolverPoint], peers: Sequence[SolverPoint]) -> tuple[Path, ...]:
     """Time against states for every method on the fewest ranks, peers as single marks, log-log."""
     from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE
 
@@ -297,9 +295,9 @@ def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoin
     for name, colour in zip(METHODS, (BLUE, GREEN, ORANGE), strict=True):
         own = [(p.states, p.seconds) for p in points if p.method == name and p.ranks == fewest]
         curves.append((name, own, {"color": colour}))
-    for name, mark, colour in (("scipy", "s", HAND), ("slycot", "^", HAND), ("pymor", "x", PURPLE)):
-        ran = [p for p in peers if p.method == name]
-        label = f"{name} (residual to {max((p.residual for p in ran), default=0.0):.0e})"
+    for peer, mark, colour in (("scipy", "s", HAND), ("slycot", "^", HAND), ("pymor", "x", PURPLE)):
+        ran = [p for p in peers if p.method == peer]
+        label = f"{peer} (residual to {max((p.residual for p in ran), default=0.0):.0e})"
         look = {"color": colour, "ls": "", "marker": mark, "ms": 5}
         curves.append((label, [(p.states, p.seconds) for p in ran], look))
     return driver.loglog(path, curves, "states 2n", "time [s]", f"{fewest} rank(s), median")
@@ -307,9 +305,7 @@ def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoin
 
 def collect(console: Console, meshes: list[int], ranks: list[int], repeats: int, large: bool, record: Record) -> None:
     """Launch all workers one after the other, the largest last."""
-    jobs: list[tuple[int, int, tuple[str, ...], int]] = [
-        (nx, k, tuple(METHODS), repeats) for nx in meshes for k in ranks
-    ]
+    jobs: list[tuple[int, int, tuple[Method, ...], int]] = [(nx, k, METHODS, repeats) for nx in meshes for k in ranks]
     if large:
         jobs.append((LARGEST, LARGEST_RANKS, ("newton_adi", "galerkin"), 1))
     kept = [record.kept(*job[:3]) for job in jobs]
@@ -317,11 +313,11 @@ def collect(console: Console, meshes: list[int], ranks: list[int], repeats: int,
     for i, ((nx, k, methods, count), known) in enumerate(zip(jobs, kept, strict=True), start=1):
         label = f"nx = {nx}"
         spec = {"nx": nx, "beta": record.beta, "methods": methods, "repeats": count}
-        rows = known or driver.measure(console, RiccatiPoint, "riccati", spec, k, f"row {i} of {len(jobs)}, {label}")
+        rows = known or driver.measure(console, SolverPoint, "riccati", spec, k, f"row {i} of {len(jobs)}, {label}")
         if not known:
             record.rows += rows
             record.save()
-        times = ", ".join(f"{p.method} {number(p.seconds)} s" for p in driver.of(RiccatiPoint, rows))
+        times = ", ".join(f"{p.method} {number(p.seconds)} s" for p in driver.of(SolverPoint, rows))
         console.print(f"row {i} of {len(jobs)}, {label}, {k} rank(s): {'kept' if known else times or 'failed'}")
 
 
@@ -339,7 +335,7 @@ def collect_peers(console: Console, meshes: list[int], record: Record) -> None:
             record.peers += known[peer, nx] or (
                 [Failure(label, 1, f"{why} {limit}")]
                 if nx > limit
-                else driver.measure(console, RiccatiPoint, "riccati", spec, 1, label)
+                else driver.measure(console, SolverPoint, "riccati", spec, 1, label)
             )
             record.save()
 
@@ -375,5 +371,5 @@ def main(
     driver.show_goals(console, goals(points))
     files = [record.file, driver.table_of(points, CSV).write_csv(out / "bench_riccati.csv"), out / "bench_riccati.md"]
     files[-1].write_text(table.markdown() + "".join(f"\n- {line}" for line in lines) + "\n")
-    files += draw(out / "bench_riccati.png", points, driver.of(RiccatiPoint, record.peers))
+    files += draw(out / "bench_riccati.png", points, driver.of(SolverPoint, record.peers))
     driver.list_bench(console, files, driver.failures(record.rows))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import timeit
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +27,13 @@ from softgrasp.lqr.loop.cost import overshoot, predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopOptions, LoopTrajectory
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import PlantState
-from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
+from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import rest
 from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
 from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
-from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.lqr.reduced.riccati import GainCheck, GainReport
 from softgrasp.lqr.riccati import solve
-from softgrasp.lqr.spectrum.modal_loop import SOME_MODES
+from softgrasp.lqr.spectrum.modal_loop import LOWEST_MODES, ModalLoop
 from softgrasp.reduction.parameters import grid_of, materials_at, outside
 from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, ReducedLoopRun, Retuned
 from softgrasp.study.pictures.frames import Frames
@@ -166,10 +168,8 @@ def with_time(problem: RiccatiProblem, report: GainReport) -> GainReport:
     matrices = report.matrices
     if matrices is None:
         return report
-    seconds = on_root(
-        problem.layout.comm, lambda: repeated(MPI.COMM_SELF, lambda: solve_reduced(matrices), SOLUTIONS, np.inf)
-    )
-    return replace(report, time_are=min(seconds))
+    times = partial(timeit.repeat, partial(solve_reduced, matrices), number=1, repeat=SOLUTIONS)
+    return replace(report, time_are=min(on_root(problem.layout.comm, times)))
 
 
 def retune(
@@ -190,40 +190,36 @@ def retune(
     if reason:
         return (), reason
     tuners = [Retuner(design.problem, family.at(N)) for family, N in chosen]
-    solutions: dict[Materials, RiccatiSolution] = {}
     columns: list[list[RetunedGain]] = []
     settings = [materials_at(design.model, *place) for place in grid_of(design.model)]
     for done, materials in enumerate(settings, 1):
-        points = [_at(tuner, materials, solutions, design) for tuner in tuners]
-        if materials in solutions:
-            problem = replace(design.problem, system=design.problem.system.with_materials(materials))
-            points = with_bounds(problem, solutions[materials], points, design.error, plan)
+        problem = replace(design.problem, system=design.problem.system.with_materials(materials))
+        gain_check = cache(partial(_gain_check, problem, design))
+        points = [_at(tuner, materials, gain_check) for tuner in tuners]
+        if any(point.gain is not None for point in points):
+            points = with_bounds(problem, gain_check().solution, points, design.error, plan)
         columns.append([replace(point, gain=None) for point in points])
         notify(done, len(settings))
     rows = zip(*columns, strict=True)
     return tuple(Retuned(family.name, N, tuple(row)) for (family, N), row in zip(chosen, rows, strict=True)), ""
 
 
-def _at(
-    tuner: Retuner, materials: Materials, solutions: dict[Materials, RiccatiSolution], design: Design
-) -> RetunedGain:
-    """The gain at one setting; the full solution there is kept for the other bases. Collective."""
-    comm, modes = tuner.problem.layout.comm, min(SOME_MODES, tuner.problem.layout.n_e)
+def _gain_check(problem: RiccatiProblem, design: Design) -> GainCheck:
+    """With the full solution at other materials. Collective."""
+    return GainCheck(problem, solve(problem), design.error, ModalLoop(problem, LOWEST_MODES), design.gain_check.law)
 
-    def full(problem: RiccatiProblem) -> RiccatiSolution:
-        key = problem.system.materials
-        if key not in solutions:
-            solutions[key] = solve(problem)
-        return solutions[key]
 
+def _at(tuner: Retuner, materials: Materials, gain_check: Callable[[], GainCheck]) -> RetunedGain:
+    """The gain at one setting and the seconds of its re-tuning. Collective."""
     try:
-        point = retuned_gain(tuner, materials, full, design.error, modes, design.gain_check.law)
+        point = retuned_gain(tuner, materials, gain_check)
     except (ControlError, SolverError) as failed:  # the full solution, not the re-tuned one
         return RetunedGain(materials, reason=f"no reference: {failed}")
     if point.reason:
         return point
     # the first solution of a size pays for memory and caches, which a running controller does not
-    return replace(point, seconds=on_root(comm, lambda: min(tuner.solve(materials).seconds for _ in range(REPEATS))))
+    times = partial(timeit.repeat, partial(tuner.solve, materials), number=1, repeat=REPEATS)
+    return replace(point, seconds=min(on_root(tuner.problem.layout.comm, times)))
 
 
 def re_tunable(bases: Sequence[BasisGains], n_s: int) -> list[tuple[BasisFamily, int]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgrasp.fem.effects.finite_strain import linear_error
+from softgrasp.fem.effects.gate import SMALL_SHARE
 from softgrasp.fem.fields.scales import SMALL_STRAIN, gradient, magnified, slowest
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, total
@@ -98,9 +99,9 @@ def run_warnings(model: Model, run: Trajectory, most: tuple[float, Array] | None
     if steep is not None and not steep.linear:
         texts.append(
             f"The gradient of the displacement against the hand is above {SMALL_STRAIN} in {steep.share:.0%} of the "
-            f"body at t = {t:.3g} s, at most {steep.largest:.2g}: linear elasticity assumes small strains and "
-            f"rotations, and is off by about {linear_error(steep.rms, d):.2g} of the deformation here"
-            + ("." if scene.effects.rotation else "; set effects.finite_strain.law = 'neo-hooke'.")
+            f"body at t = {t:.3g} s, and at most {steep.typical:.2g} in {1 - SMALL_SHARE:.0%} of it: linear elasticity "
+            f"assumes small strains and rotations, and is off by about {linear_error(steep.rms, d):.2g} of the "
+            "deformation here" + ("." if scene.effects.rotation else "; set effects.finite_strain.law = 'neo-hooke'.")
         )
     texts += turned(float(np.abs(run.q_s[:, d:]).max(initial=0.0)))
     return texts + inexact(

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.effects import EFFECTS, Gate
-from softgrasp.fem.effects.gate import Sag
+from softgrasp.fem.effects.gate import SMALL_SHARE, Sag
 from softgrasp.fem.fields.scales import SMALL_STRAIN, measure
 from softgrasp.fem.mesh.singular import expected_order
 from softgrasp.fem.model.build import Model, build
@@ -197,8 +197,9 @@ def _warnings(
     if effects["gravity"].on and not sag.gradient.linear and not effects["finite_strain"].on:
         texts.append(
             f"At rest under its weight the tissue would sag by {sag.largest:.2g} m and |grad z| would be above "
-            f"{SMALL_STRAIN} in {sag.gradient.share:.0%} of the body, at most {sag.gradient.largest:.2g}: linear "
-            f"elasticity assumes small strains and rotations, effects.finite_strain does not."
+            f"{SMALL_STRAIN} in {sag.gradient.share:.0%} of the body, and at most {sag.gradient.typical:.2g} in "
+            f"{1 - SMALL_SHARE:.0%} of it: linear elasticity assumes small strains and rotations, "
+            "effects.finite_strain does not."
         )
     if scene.effects.rotation:
         texts += turned(max(map(abs, (scene.motion.target or [])[d:]), default=0.0))

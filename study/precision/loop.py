@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-import scipy.linalg
 from mpi4py import MPI
 
 from softgrasp.fem.columns import Columns, farthest
@@ -27,14 +26,14 @@ from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
 from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain
-from softgrasp.lqr.reduced.bases import BasisFamily, make_family
-from softgrasp.lqr.reduced.riccati import reduce_riccati
+from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily, make_family
+from softgrasp.lqr.reduced.riccati import GainReport
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.study.control.result import TITLES
 from softgrasp.study.precision.fit import Slope, series_of, slope
 from softgrasp.study.precision.points import LoopPoint
 from softgrasp.study.precision.result import LoopReference, Question
-from softgrasp.study.precision.riccati import A_PRIORI, ControlRuns
+from softgrasp.study.precision.riccati import ControlRuns
 from softgrasp.study.precision.settings import LEAST_STEPS
 
 SHARES = (16.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # of the scene's steps
@@ -76,7 +75,7 @@ class LoopSetting:
         return f"{self.gain.label}, {law}" + (", reduced plant" if self.reduced else "")
 
 
-def step_counts(shares: Sequence[float], steps: int, n_e: int = 1, most: float = np.inf) -> list[int]:
+def nested_counts(shares: Sequence[float], steps: int, n_e: int, most: float) -> list[int]:
     """Whole multiples and parts of the scene's steps that nest, most first, as the shares are.
 
     Only the scene's own and fewer steps may have more unknowns n_e times steps than ``most``.
@@ -94,26 +93,37 @@ class LoopSweep:
     def __init__(self, runs: ControlRuns) -> None:
         self.runs, self.layout = runs, runs.layout
         self.scene, self.cache = runs.scene, runs.cache
-        self.counts = step_counts(SHARES, self.scene.time.steps, self.layout.n_e, LOOP_WORK[self.layout.dimension])
-        self.gain, self.family, self._finest = cache(self._gain), cache(self._family), cache(self._exact)
-
-    def _gain(self, what: Feedback) -> Gain:
-        """The gain as blocks."""
-        if not what.basis:
-            return self.runs.design.gain
-        return reduce_riccati(self.runs.problem, self.family(what.basis).at(what.N)).gain
+        self.counts = nested_counts(SHARES, self.scene.time.steps, self.layout.n_e, LOOP_WORK[self.layout.dimension])
+        self.family, self.report, self._finest = cache(self._family), cache(self._report), cache(self._exact)
 
     def _family(self, name: str) -> BasisFamily:
         """Bases of one method."""
         return make_family(name, self.runs.problem, self.runs.design.solution.factor)
 
-    def _exact(self, what: Feedback) -> Array:
-        return exact_outputs(self.runs, self.runs.design.gain_check.loop, self.gain(what), self.counts[0])
+    def _report(self, what: Feedback) -> GainReport:
+        """A reduced gain, checked on the full plant."""
+        return self.runs.design.gain_check.report(self.family(what.basis).at(what.N))
+
+    def gain(self, what: Feedback) -> Gain:
+        """The optimal gain, or a reduced one. Raises ControlError: its equation has no solution."""
+        if not what.basis:
+            return self.runs.design.gain
+        report = self.report(what)
+        if report.gain is None:
+            raise ControlError(report.reason)
+        return report.gain
+
+    def _exact(self, what: Feedback, modal: ModalLoop | None = None) -> Array:
+        """Outputs less y_bar without the part C_s of the hand, and with it, at the instants of most steps, (m, 2 p)."""
+        modal, steps = modal or self.runs.design.gain_check.loop, self.counts[0]
+        C, dt = modal.plant.space.C, self.scene.time_end / steps
+        tissue = np.arange(C.shape[1]) >= self.layout.n_s
+        return modal.exact(self.gain(what).block, self.runs.design.error, np.vstack([C * tissue, C]), dt, steps)
 
     # --- reference
 
     def exact(self, what: Feedback, steps: int) -> Array:
-        """:func:`exact_outputs` of a gain at the instants of a grid, (steps + 1, 2 p)."""
+        """:meth:`_exact` of a gain at the instants of a coarser grid, (steps + 1, 2 p)."""
         return self._finest(what)[:: self.counts[0] // steps]
 
     @cached_property
@@ -131,8 +141,7 @@ class LoopSweep:
             true, loop, columns = self.exact(best, most), design.gain_check.loop, design.problem.columns
             modes, error = len(loop.plant.omega), 0.0
             if not loop.complete:
-                coarse = exact_outputs(self.runs, ModalLoop(design.problem, modes // 2), self.gain(best), most)
-                error = errors_of(coarse, true, columns)[0]
+                error = relative_errors(self._exact(best, ModalLoop(design.problem, modes // 2)), true, columns)[0]
             run = self._full(LoopSetting(best), most)[0]
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
             return [LoopReference(error, modes, loop.complete, design.gain_check.optimal, rest)]
@@ -190,9 +199,8 @@ class LoopSweep:
 
     def _reduced(self, what: LoopSetting, steps: int) -> tuple[ReducedLoopTrajectory, list[float]]:
         """Runs of the reduced plant of an a-priori gain on rank 0."""
-        design, problem, n_s, n = self.runs.design, self.runs.problem, self.layout.n_s, self.layout.n_local
-        V = self.family(what.gain.basis).at(what.gain.N).U.tall[n:, -((what.gain.N - 2 * n_s) // 2) :]
-        plant, shapes = galerkin(problem, V)
+        design, problem, n_s = self.runs.design, self.runs.problem, self.layout.n_s
+        plant, shapes = galerkin(problem, self.family(what.gain.basis).at(what.gain.N).modes)
         K = shapes.reduce_gain(problem, self.gain(what.gain))
         start = plant.rest_at(np.zeros(n_s))[0]
         if self.scene.time.start != "equilibrium":
@@ -210,8 +218,7 @@ class LoopSweep:
         """All steps of one controller; not ok unless its gain is certified to stabilise the full plant."""
 
         def measure() -> list[LoopPoint]:
-            gain = what.gain
-            stable = not gain.basis or self.runs.design.gain_check.report(self.family(gain.basis).at(gain.N)).stable
+            stable = not what.gain.basis or self.report(what.gain).stable
             return [self._point(what, steps, stable) for steps in self.counts]
 
         key = {"controller": what.label, "counts": self.counts, "repeats": self.runs.repeats}
@@ -234,7 +241,7 @@ class LoopSweep:
         problem, target = self.runs.problem, self.runs.design.target
         columns, y = problem.columns, run.outputs - target.y
         both = np.hstack([y - (run.q_s - target.state.q_s) @ problem.C_s.T, y])
-        error, displacement = errors_of(both, self.exact(Feedback(), steps), columns)
+        error, displacement = relative_errors(both, self.exact(Feedback(), steps), columns)
         if not displacement <= GONE:
             return replace(lost, reason="far from the reference")
         per_step, cost = statistics.median(means), float(run.cost[-1])
@@ -242,41 +249,16 @@ class LoopSweep:
         due = reference.optimal - reference.to_come
         return replace(
             lost, seconds=setup + steps * per_step, error=error, ok=stable, per_step=per_step, setup=setup,
-            error_displacement=displacement, error_time=errors_of(both, self.exact(what.gain, steps), columns)[0],
+            error_displacement=displacement, error_time=relative_errors(both, self.exact(what.gain, steps), columns)[0],
             cost=cost, cost_error=abs(cost - due) / reference.optimal,
         )  # fmt: skip
 
 
-def errors_of(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
+def relative_errors(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
     """Largest error of any output at any instant over the largest value, of each half of the columns (m, 2 p)."""
     still = np.zeros(true.shape[1] // 2)
     gaps, sizes = ([farthest(half, still, columns).max() for half in np.hsplit(v, 2)] for v in (values - true, true))
     return float(gaps[0] / sizes[0]), float(gaps[1] / sizes[1])
-
-
-def exact_outputs(runs: ControlRuns, modal: ModalLoop, gain: Gain, steps: int) -> Array:
-    """C exp(F t_n) e(0), F = A + B K: y - y_bar without the part C_s of the hand, and with it, (steps + 1, 2 p).
-
-    Collective.
-    """
-    K = modal.gain(gain.block)
-    e = modal.state(runs.design.error)[:, 0]
-    whole, dt = modal.plant.space.C, runs.scene.time_end / steps
-    own = whole.copy()
-    own[:, : runs.layout.n_s] = 0.0
-    C = np.vstack([own, whole])
-
-    def march() -> Array:
-        step = scipy.linalg.expm(dt * (modal.A + modal.B @ K))
-        values, x = np.empty((steps + 1, len(C))), e
-        values[0] = C @ x
-        with np.errstate(over="ignore", invalid="ignore"):  # of a gain that does not stabilise
-            for n in range(steps):
-                x = step @ x
-                values[n + 1] = C @ x
-        return values
-
-    return on_root(runs.layout.comm, march)
 
 
 def ask_loop(runs: ControlRuns) -> Question:

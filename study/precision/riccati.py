@@ -21,11 +21,11 @@ from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.feedback import Design, check, design
 from softgrasp.lqr.design.orders import orders
-from softgrasp.lqr.diagnosis import Diagnosis
+from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
-from softgrasp.lqr.reduced.bases import BASES, BasisFamily, make_family
-from softgrasp.lqr.reduced.riccati import ReducedRiccati, gain_error, reduce_riccati
+from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_family
+from softgrasp.lqr.reduced.riccati import gain_error, reduce_riccati
 from softgrasp.lqr.riccati import Method, solve
 from softgrasp.study.control.measure import with_time
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
@@ -93,19 +93,15 @@ class ControlRuns:
 
     def _diagnose(self) -> Refusal:
         try:
-            modal = self._checked[2]
+            modal = check(self.model)[2]
         except (ControlError, SceneError) as error:
             return Refusal(str(error))
         return Refusal("control.method = 'modal' leaves no P of the whole plant to compare with" if modal else "")
 
     @cached_property
-    def _checked(self) -> tuple[RiccatiProblem, Diagnosis, bool]:
-        return check(self.model)
-
-    @property
     def problem(self) -> RiccatiProblem:
         """Plant, outputs, weights."""
-        return self._checked[0]
+        return make_problem(self.model)
 
     @cached_property
     def design(self) -> Design:
@@ -226,7 +222,6 @@ def riccati_slopes(points: Sequence[RiccatiPoint], reference_error: float | None
     return slopes
 
 
-A_PRIORI = "structured"  # the basis that is made without P
 SMALL_SECONDS = 0.2  # a small equation is repeated while it has taken less
 
 
@@ -266,18 +261,12 @@ def _family(runs: ControlRuns, name: str) -> list[ReducedRiccatiPoint]:
 def _order(runs: ControlRuns, family: BasisFamily, N: int, time_basis: float, before: float) -> ReducedRiccatiPoint:
     """One reduced equation: cost of its gain, median seconds to solve it, and those to project and lift. Collective."""
     report = with_time(runs.problem, runs.design.gain_check.report(family.at(N)))
-    seconds, lift = float("inf"), 0.0
-    if not report.reason:
-        solutions: list[ReducedRiccati] = []
-        whole = timed(runs.layout.comm, lambda: solutions.append(reduce_riccati(runs.problem, family.at(N))))
-        (reduced,) = solutions
+    seconds, lift, comm = float("inf"), 0.0, runs.layout.comm
+    if report.matrices is not None:
+        whole = timed(comm, lambda: reduce_riccati(runs.problem, family.at(N)))
         lift = max(whole - report.time_are, 0.0)  # the rest is solving
-
-        def median() -> float:
-            once = partial(solve_reduced, reduced.matrices)
-            return statistics.median(repeated(MPI.COMM_SELF, once, runs.repeats, SMALL_SECONDS))
-
-        seconds = on_root(runs.layout.comm, median)
+        once = partial(solve_reduced, report.matrices)
+        seconds = statistics.median(on_root(comm, lambda: repeated(MPI.COMM_SELF, once, runs.repeats, SMALL_SECONDS)))
     name = family.name
     return ReducedRiccatiPoint(
         name, f"{BASIS_TITLES.get(name, name)}, N = {N}", seconds, report.error_K, report.stable, method=name,

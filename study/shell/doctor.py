@@ -195,7 +195,8 @@ def show(console: Console) -> bool:
     table = Table("", "check", "value", "cure", box=None, pad_edge=False)
     for column in table.columns:
         column.overflow = "fold"
-    results = checks()
+    with console.status("looking at the installation"):
+        results = checks()
     for check in results:
         mark = "[green]ok[/]" if check.ok else "[red]bad[/]"
         table.add_row(mark, check.name, escape(check.value), escape(check.cure))

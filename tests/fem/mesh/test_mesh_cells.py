@@ -382,7 +382,7 @@ def test_numbers_of_cad_entities_are_no_cells(tmp_path: Path) -> None:
     path.write_text(GMSH_41)
     arrays = load_arrays(path, 1.0, False)
     assert len(arrays.cells) == 2
-    assert "gmsh:bounding_entities" not in arrays.cell_sets
+    assert "gmsh:bounding_entities" not in arrays.known["cell_sets"]
 
 
 ABAQUS = """\
@@ -405,7 +405,7 @@ def test_sets_of_sets_are_left_out(tmp_path: Path) -> None:
     """Which cells they hold meshio does not say; taking its numbers at their word would mark the wrong ones."""
     path = tmp_path / "a.inp"
     path.write_text(ABAQUS)
-    assert "ALL" not in load_arrays(path, 1.0, False).cell_sets
+    assert "ALL" not in load_arrays(path, 1.0, False).known["cell_sets"]
 
 
 @pytest.mark.serial

@@ -18,7 +18,7 @@ from mpi4py import MPI
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.grading import bisect, distribute
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, make_mesh, spread, structured_mesh
+from softgrasp.fem.mesh.tissue_mesh import MeshArrays, TissueMesh, Whole, make_mesh, spread, structured_mesh
 from softgrasp.fem.model.assembly import cells_of_layers
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.contact import contact_facets
@@ -147,7 +147,7 @@ def test_tags_survive_four_bisections(comm: MPI.Intracomm, dimension: int) -> No
 def test_cells_that_cannot_be_bisected_are_named() -> None:
     """A needle with a short side beside a cell that is split: half of it keeps its length and has half its area."""
     points, cells = np.array([[0.0, 0.0], [1.0, 0.0], [0.99, 3e-12], [0.0, -1.0]]), np.array([[0, 1, 2], [0, 3, 1]])
-    mesh = spread(MPI.COMM_SELF, (points, cells), {}, {"source": "needle.msh"}).mesh
+    mesh = spread(MPI.COMM_SELF, MeshArrays(points, cells, {}, {"source": "needle.msh"})).mesh
     mesh.topology.create_connectivity(1, 2)
     whole = Whole(mesh, "needle.msh", {}, {})
     beside = int(np.argmin(whole.points[whole.simplices].mean(axis=1)[:, 1]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from mpi4py import MPI
 
 from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.mesh.scene_hash import scene_hash
+from softgrasp.fem.model.build import build
 from softgrasp.fem.scene import materials
 from softgrasp.fem.scene.file import load_scene, load_scene_collective, resolved_toml, shipped_scenes
 from softgrasp.fem.scene.scene import check_dimension, scene_schema
@@ -168,6 +170,12 @@ def test_refused_with_one_sentence(path: Path, overrides: list[str], sentence: s
     assert message.startswith((f"{path}: ", "--set "))
 
 
+@pytest.mark.parametrize(("value", "others"), [("{stepps=5}", ""), ("{stepps=5, end=0}", "; and 1 more")])
+def test_a_misspelled_key_is_not_missing_too(value: str, others: str) -> None:
+    with pytest.raises(SceneError, match=re.escape(f"did you mean time.steps?{others}") + "$"):
+        load_scene(PAPER, [f"time={value}"])
+
+
 def test_semidefinite_output_weight_is_allowed() -> None:
     assert load_scene(PAPER, ["control.Q=[[1.0, 1.0], [1.0, 1.0]]"]).control is not None
 
@@ -239,6 +247,10 @@ def test_dimension_of_a_mesh_scene_is_checked_later() -> None:
     check_dimension(scene, 3)
     with pytest.raises(SceneError, match=r"effects.gravity.g has a vector of 3 entries; it must have 2"):
         check_dimension(scene, 2)
+    for key, value in (("motion.target", "[0.3, 0.2]"), ("hand.reference", "[0, 0]"), ("effects.gravity.g", "[0, 1]")):
+        wrong = load_scene(PILLOW, [f"{key}={value}", "tissue.order=1", "tissue.refine=false"])
+        with pytest.raises(SceneError, match=f"{key} has a vector of 2 entries; it must have 3 in this 3D scene"):
+            build(wrong)
 
 
 def test_hash_sees_values_and_mesh_contents_but_not_names(tmp_path: Path) -> None:

@@ -176,7 +176,7 @@ def test_a_run_that_stores_nothing_warns_of_a_strain_seen_on_the_way(comm: MPI.I
     z = np.zeros(model.system.layout.n_local)
     z[::2] = model.space.layout.nodes[:, 1] / 2  # sheared by a half
     (found,) = run_warnings(model, run, (0.25, z))
-    assert "at t = 0.25 s, at most" in found
+    assert "at t = 0.25 s, and at most" in found
 
 
 def test_a_run_warns_of_what_explain_warns_of(comm: MPI.Intracomm) -> None:
