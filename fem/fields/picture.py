@@ -52,11 +52,16 @@ def gather_picture(model: Model) -> PictureMesh | None:
     def facet_nodes(facets: npt.NDArray[np.int32]) -> Integers:
         return _numbered(nodes, _outward(mesh, d, facets))
 
-    cells = np.asarray(cell_nodes(mesh)[: tissue.owned])
     outer = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     held = contact_facets(tissue, model.scene.contact)
     points = np.ascontiguousarray(mesh.geometry.x[: nodes.size_local, :d])
-    parts = [points, _numbered(nodes, cells), facet_nodes(outer), facet_nodes(held), model.space.layer]
+    parts = [
+        points,
+        _numbered(nodes, cell_nodes(mesh)[: tissue.owned]),
+        facet_nodes(outer),
+        facet_nodes(held),
+        model.space.layer,
+    ]
     whole = [rows for rows in (rows_on_root(comm, part) for part in parts) if rows is not None]
     if not whole:
         return None
