@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 import numpy as np
 from mpi4py import MPI
+from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.control import Reduction
 from softgrasp.reduction.bases import registry
@@ -38,6 +40,7 @@ from softgrasp.study.reduce.result import (
     kept_points,
     nearest,
 )
+from softgrasp.study.shell.session import Session
 from softgrasp.study.shell.timing import median_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
@@ -50,6 +53,9 @@ LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 
 Progress = Callable[[int, int], None]
 """Called with what is done and what there is."""
+
+Say = Callable[[str, int, int], None]
+"""Called with what is done, its number and how many there are."""
 
 
 def chosen_methods(options: Reduction) -> tuple[str, ...]:
@@ -203,15 +209,22 @@ def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress
     return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
 
 
-def measured_run(model: Model, progress: Callable[[Run], None]) -> tuple[FullRun, FullTimes]:
-    """The full run, and its seconds in the median of several when it is short. Collective."""
-    first = simulate(model, RunOptions(progress=progress))
-    comm, runs = model.system.layout.comm, [first]
-    repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
-    runs += [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
-    factors = [run.seconds["factor"] for run in runs]
-    times = FullTimes(statistics.median(map(steps_seconds, runs)), statistics.median(factors))
-    return full_run(model, first), times
+@contextmanager
+def full_run_shown(session: Session, model: Model, watch: Stopwatch) -> Iterator[tuple[FullRun, FullTimes, Say]]:
+    """The full run, its times in the median of several when it is short, and a bar that goes on inside. Collective."""
+    with session.progress(MofNCompleteColumn()) as bar:
+        task, comm = bar.add_task("full run", total=None), session.comm
+
+        def say(what: str, done: int, of: int) -> None:
+            bar.update(task, description=what, completed=done, total=of)
+
+        with watch.stage("full"):
+            first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
+            repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
+            runs = [first] + [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
+            factor = statistics.median(run.seconds["factor"] for run in runs)
+            times, full = FullTimes(statistics.median(map(steps_seconds, runs)), factor), full_run(model, first)
+        yield full, times, say
 
 
 def steps_seconds(run: Trajectory) -> float:
@@ -225,7 +238,7 @@ def speed_of(sweep: MethodSweep, full: FullTimes) -> Speed | None:
     p = nearest(sweep.points) or nearest(sweep.points, stable=False)
     if p is None:
         return None
-    return Speed(sweep.method, p, *full.against(p.time_offline, p.time_setup, p.time_online))
+    return Speed(sweep.method, p, *full.against(p))
 
 
 def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) -> tuple[str, ...]:
