@@ -8,7 +8,7 @@ import numpy as np
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import PETSc, combine, total
+from softgrasp.fem.petsc import Array, PETSc, combine, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.compress import gram
@@ -53,7 +53,7 @@ class Abscissa:
         return self.certified and self.value < 0
 
 
-def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
+def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | None = None) -> Abscissa:
     """Largest real part of the spectrum of x' = (A + B K) x [1/s], with a certificate of its sign. Collective.
 
     Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it:
@@ -69,6 +69,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
     Args:
         problem: the plant; damped in every layer for a certificate.
         gain: u = K x.
+        modes: see :class:`softgrasp.lqr.spectrum.tail.Tail`, when they are there already.
 
     Raises:
         ControlError: the plant has no hand.
@@ -89,7 +90,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
         reason = "the gain on a rigid displacement is singular: the hand is not held"
         return Abscissa(0.0, True, 0.0, np.inf, np.zeros(1, dtype=complex), reason)
     why = why_no_bound(problem)
-    tail = None if why else Tail(problem, K)
+    tail = None if why else Tail(problem, K, modes)
     # the same bits on every rank: they decide how often all search
     aim, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
     resolvent = Resolvent(problem, K, shift)

@@ -36,7 +36,7 @@ from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, Goal, number
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.timing import repeated
+from softgrasp.study.shell.timing import power_law, repeated
 
 SIZES = "10,20,40,80,160"
 LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
@@ -248,7 +248,7 @@ def exponents(points: Sequence[SolverPoint]) -> dict[str, float | None]:
     result: dict[str, float | None] = {}
     for method, ranks in sorted({(p.method, p.ranks) for p in points if p.nx >= 20}):
         own = [p for p in points if p.nx >= 20 and (p.method, p.ranks) == (method, ranks)]
-        result[f"{method}, {ranks} rank(s)"] = driver.growth([p.states for p in own], [p.seconds for p in own])
+        result[f"{method}, {ranks} rank(s)"] = power_law([p.states for p in own], [p.seconds for p in own])
     return result
 
 

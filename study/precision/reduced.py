@@ -96,7 +96,7 @@ class ReducedRuns:
         own = ("error", "error_deformation", "times", "values")
         return ReducedPoint(
             name, label, model.time_online, error, model.stable and finite, method=name, mesh=setting.mesh,
-            error_displacement=displacement, error_range=self.truth.range_of(error), **setting.told,
+            error_displacement=displacement, error_range=self.truth.range_of(error), **setting.entries,
             error_full=model.error, error_full_deformation=model.error_deformation,
             error_outputs_full=errors_of(series, full.series)[0] if finite else float("inf"), scratch=scratch,
             **{k: v for k, v in vars(model).items() if k not in own},
