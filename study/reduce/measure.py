@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 import numpy as np
 from mpi4py import MPI
-from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.model.build import Model, Stopwatch
 from softgrasp.fem.run.simulate import RunOptions, simulate
@@ -40,7 +38,6 @@ from softgrasp.study.reduce.result import (
     kept_points,
     nearest,
 )
-from softgrasp.study.shell.session import Session
 from softgrasp.study.shell.timing import median_seconds
 
 FURTHER = ("psd_svd_like", "psd_svd_like_fixed", "psd_cotangent_lift_fixed", "psd_fixed_relative", "craig_bampton")
@@ -209,22 +206,14 @@ def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress
     return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
 
 
-@contextmanager
-def full_run_shown(session: Session, model: Model, watch: Stopwatch) -> Iterator[tuple[FullRun, FullTimes, Say]]:
-    """The full run, its times in the median of several when it is short, and a bar that goes on inside. Collective."""
-    with session.progress(MofNCompleteColumn()) as bar:
-        task, comm = bar.add_task("full run", total=None), session.comm
-
-        def say(what: str, done: int, of: int) -> None:
-            bar.update(task, description=what, completed=done, total=of)
-
-        with watch.stage("full"):
-            first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
-            repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
-            runs = [first] + [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
-            factor = statistics.median(run.seconds["factor"] for run in runs)
-            times, full = FullTimes(statistics.median(map(steps_seconds, runs)), factor), full_run(model, first)
-        yield full, times, say
+def measured_run(model: Model, say: Say) -> tuple[FullRun, FullTimes]:
+    """The full run, and its seconds in the median of several when it is short. Collective."""
+    comm = model.system.layout.comm
+    first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
+    repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
+    runs = [first] + [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
+    factor = statistics.median(run.seconds["factor"] for run in runs)
+    return full_run(model, first), FullTimes(statistics.median(map(steps_seconds, runs)), factor)
 
 
 def steps_seconds(run: Trajectory) -> float:

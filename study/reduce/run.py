@@ -62,7 +62,9 @@ def run_reduce(
 
         return run_strain(session, scene)
     model, watch = session.model(scene), Stopwatch(session.comm)
-    with measure.full_run_shown(session, model, watch) as (full, times, say):
+    with session.counting("full run") as say:
+        with watch.stage("full"):
+            full, times = measure.measured_run(model, say)
         study, drawn = reduce_model(session, full, times, names, watch, say)
     chosen = [(s, p) for s in study.sweeps if (p := best(s.points)) is not None]
     models = [out / "models" / f"{s.method.key}.h5" for s, _ in chosen]

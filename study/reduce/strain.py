@@ -14,7 +14,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
-from softgrasp.study.reduce.measure import full_run_shown
+from softgrasp.study.reduce.measure import measured_run
 from softgrasp.study.reduce.report import TIMES, time_cells
 from softgrasp.study.reduce.result import StrainPoint, reduce_result
 from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainFamily, StrainStudy, measure_strain
@@ -44,8 +44,11 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
             "reduction.methods names linear bases; leave it out with effects.finite_strain, whose models have one basis"
         )
     model, watch = session.model(scene), Stopwatch(session.comm)
-    with full_run_shown(session, model, watch) as (full, times, say), watch.stage("reduced"):
-        study = measure_strain(full, times, say)
+    with session.counting("full run") as say:
+        with watch.stage("full"):
+            full, times = measured_run(model, say)
+        with watch.stage("reduced"):
+            study = measure_strain(full, times, say)
     folder = session.out / "models"
     models = {folder / f"{f.key}_N{N}.h5": rom for f in study.families for N, rom in f.models.items()}
     for path, rom in models.items():
