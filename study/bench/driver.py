@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from rich.console import Console
 
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.processes import IN_MPI_JOB, child_environment, find_mpiexec
+from softgrasp.study.shell.processes import child_environment, find_mpiexec, in_mpi_job
 
 Row = dict[str, Any]
 Ranks = Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")]
@@ -184,7 +183,7 @@ def loglog(path: Path, curves: Sequence[Curve], x: str, y: str, title: str = "")
 
 def open_console(width: int) -> Console:
     """A terminal wide enough for the table. Raises typer.BadParameter: the benchmark was started under mpiexec."""
-    if any(variable in os.environ for variable in IN_MPI_JOB):
+    if in_mpi_job():
         raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
     return Console(highlight=False, width=max(Console().width, width), soft_wrap=True)
 
