@@ -9,6 +9,8 @@ from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array
 
+Place = tuple[tuple[float, ...], int, int]  # of a node: coordinates [m], owning rank, its number there
+
 
 @dataclass(frozen=True)
 class BlockLayout:
@@ -44,16 +46,20 @@ class BlockLayout:
         Ties go to the lexicographically smallest coordinates, so that every rank count picks the same node.
         Collective.
         """
-        best: tuple[float, tuple[float, ...], int, int] | None = None
-        if len(self.nodes):
-            distance = np.linalg.norm(self.nodes - point, axis=1)
-            key = self.rounded(distance)
-            candidates = np.flatnonzero(key == key.min())
-            first = min(candidates, key=lambda i: tuple(self.rounded(self.nodes[i])))
-            where = tuple(self.rounded(self.nodes[first]).tolist())
-            best = float(key[first]), where, self.comm.rank, int(first) * self.dimension
-        nearest = min(b for b in self.comm.allgather(best) if b is not None)
-        return nearest[2], nearest[3], np.array(nearest[1])
+        where, rank, i = self.nearest_nodes(self.nodes, point)[1][0]
+        return rank, i * self.dimension, np.array(where)
+
+    def nearest_nodes(self, nodes: Array, point: Array, farthest: bool = False) -> tuple[float, list[Place]]:
+        """Distance of the nearest (farthest) of distributed nodes from a point, and all nodes at it, sorted.
+
+        The distance is infinite where there is no node. Collective.
+        """
+        sign = -1.0 if farthest else 1.0
+        distance = sign * self.rounded(np.linalg.norm(nodes - point, axis=1)) if len(nodes) else np.zeros(0)
+        least = min(self.comm.allgather(float(distance.min(initial=np.inf))))
+        here = np.flatnonzero(distance == least).tolist()
+        parts = self.comm.allgather([(tuple(self.rounded(nodes[i]).tolist()), self.comm.rank, i) for i in here])
+        return sign * least, sorted(node for part in parts for node in part)
 
 
 def bounding_box(comm: MPI.Intracomm, nodes: Array) -> tuple[Array, Array]:

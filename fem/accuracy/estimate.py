@@ -32,10 +32,9 @@ from mpi4py import MPI
 from softgrasp.fem.accuracy.small import Small, reduced, run_small, static_solves
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.contact import contact_facets
-from softgrasp.fem.petsc import Array, times_columns
+from softgrasp.fem.petsc import Array, rows_on_root, times_columns
 from softgrasp.fem.scene.tissue import Refine
 
 if TYPE_CHECKING:
@@ -195,11 +194,9 @@ def marked_cells(small: Small, finer: Small, factor: float) -> npt.NDArray[np.in
     eta = indicators(small, finer)
     topology = small.model.space.mesh.mesh.topology
     original = np.asarray(topology.original_cell_index)[: len(eta)]
-    comm = small.model.system.layout.comm
-    parts = comm.gather((original, eta))
-    if parts is None:
+    cells, values = (rows_on_root(small.model.system.layout.comm, part) for part in (original, eta))
+    if cells is None or values is None:
         return None
-    cells, values = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     values = np.round(values / (values.max() or 1.0), DIGITS)  # rounding must not choose, nor the number of ranks
     largest = np.sort(values)[::-1]
     total = np.cumsum(largest)
@@ -241,22 +238,18 @@ def prolong(model: Model, finer: Model, X: Array) -> Array:
 def cell_products(model: Model, X: Array) -> Array:
     """Elastic energy products k_T(x_i, x_j) of columns on the owned cells, (cells, k, k). Collective."""
     V, d, tissue = model.space.V, model.space.mesh.dimension, model.space.mesh
-    _, layer = layer_numbers(tissue, model.scene)
-    lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[layer].T
-    cells = len(layer)
+    lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[model.space.layer].T
+    cells = tissue.owned
     element = V.element.basix_element
-    shape = basix.CellType.triangle if d == 2 else basix.CellType.tetrahedron
-    points, weights = basix.make_quadrature(shape, max(2 * (element.degree - 1), 1))
-    D = element.tabulate(1, points)[1 : d + 1, :, :, 0]
-    x = tissue.vertices
-    J = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
-    inverse, scale = np.linalg.inv(J), np.abs(np.linalg.det(J))[:, None] * weights * model.scene.tissue.thickness
-    u = np.zeros((cells, D.shape[2], d, X.shape[1]))
+    points, weights = basix.make_quadrature(element.cell_type, max(2 * (element.degree - 1), 1))
+    scale = np.abs(np.linalg.det(tissue.edges))[:, None] * weights * model.scene.tissue.thickness
+    dofs = V.dofmap.list[:cells]
+    u = np.zeros((*dofs.shape, d, X.shape[1]))
     for j in range(X.shape[1]):
-        u[..., j] = model.space.nodal(X[:, j]).x.array.reshape(-1, d)[V.dofmap.list[:cells]]
+        u[..., j] = model.space.nodal(X[:, j]).x.array.reshape(-1, d)[dofs]
     E = np.zeros((cells, X.shape[1], X.shape[1]))
     for q in range(len(weights)):  # one point at a time: gradients of all at once would be large
-        gradient = np.einsum("an,cab,cnik->cibk", D[:, q], inverse, u, optimize=True)
+        gradient = np.einsum("cnb,cnik->cibk", model.space.gradients(points[q : q + 1])[:, 0], u, optimize=True)
         strain = (gradient + np.swapaxes(gradient, 1, 2)) / 2
         flat = strain.reshape(cells, d * d, -1)
         trace = np.einsum("ciik->ck", strain)

@@ -19,13 +19,13 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import Output, make_outputs
+from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.run.motion import force_values, free_table
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 
 if TYPE_CHECKING:
-    from softgrasp.fem.scene.scene import Scene
+    pass
 
 BLOCKS = 4
 DROPPED = 1e-12  # of the largest squared length in a block: directions that are rounding only
@@ -59,18 +59,6 @@ class Small:
         """Ritz frequencies omega (N,), ascending [1/s], and modes (N, N) with Phi' M Phi = 1."""
         squares, Phi = scipy.linalg.eigh(np.eye(len(self.M)), self.M)
         return np.sqrt(squares), Phi
-
-
-def output_columns(outputs: tuple[Output, ...], n_local: int) -> Array:
-    """C' of all outputs, local rows (n_local, p)."""
-    columns = []
-    for output in outputs:
-        for c in range(output.size):
-            column = np.zeros(n_local)
-            if len(output.dofs):
-                column[output.dofs[:, c]] = output.weight
-            columns.append(column)
-    return np.asfortranarray(np.array(columns).reshape(len(columns), n_local).T)
 
 
 @contextmanager
@@ -136,47 +124,34 @@ def run_small(small: Small, steps: int | None = None) -> SmallRun:
     system, scene = small.model.system, small.model.scene
     n = steps or scene.time.steps
     scene = scene.model_copy(update={"time": scene.time.model_copy(update={"steps": n})})
-    dt = scene.time_end / n
-    z = small.G @ system.fall if scene.time.start == "equilibrium" else np.zeros(len(small.M))  # V' K V = 1
-    if scene.motion.drive == "force" and system.two_way:
-        return _driven(small, scene, z, dt)
-    table, _ = free_table(system, scene, dt)
-    loads = system.fall - table.a - system.damping.drag * (table.v[1:] + table.v[:-1]) / 2
-    s = 2 / dt
-    inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
-    half = np.hstack([-inverse, s * s * inverse @ small.M])  # w = z_mid - z_n from z_n and u_n = v_n / s
-    T = np.vstack([2 * half, 2 * half]) + np.diag(np.repeat([1.0, -1.0], len(z)))  # u_{n+1} = 2 w - u_n
-    Y = np.empty((n + 1, 2 * len(z)))
-    Y[0, : len(z)], Y[0, len(z) :] = z, 0.0
-    Y[1:] = np.tile(2 * loads @ (inverse @ small.G).T, 2)
+    dt, g, alpha = scene.time_end / n, system.fall, system.damping.drag
+    z = small.G @ g if scene.time.start == "equilibrium" else np.zeros(len(small.M))  # V' K V = 1
+    if scene.motion.drive == "force" and system.two_way:  # hand and tissue together
+        G, R, n_s = small.G, system.M_rigid, len(g)
+        M = np.block([[system.M_hand + R, G.T], [G, small.M]])
+        D = np.block([[alpha * R, alpha * G.T], [alpha * G, small.D]])
+        K = np.diag(np.repeat([0.0, 1.0], [n_s, len(z)]))
+        B = np.block([[np.eye(n_s), R], [np.zeros_like(G), G]])
+        u = force_values(scene, n_s, system.M_hand) + system.weight
+        X, a = _midpoint(M, D, K, B, np.hstack([u, np.tile(g, (n, 1))]), np.append(np.zeros(n_s), z), dt)
+        q, Z, accelerations = X[:, :n_s], X[:, n_s:], a[:, n_s:]
+        loads = g - a[:, :n_s] - alpha * np.diff(q, axis=0) / dt
+    else:
+        table, _ = free_table(system, scene, dt)
+        q, loads = table.q, g - table.a - alpha * (table.v[1:] + table.v[:-1]) / 2
+        Z, accelerations = _midpoint(small.M, small.D, np.eye(len(z)), small.G, loads, z, dt)
+    return SmallRun(Z @ small.C.T, q @ small.C_s.T, loads, accelerations)
+
+
+def _midpoint(M: Array, D: Array, K: Array, B: Array, f: Array, x: Array, dt: float) -> tuple[Array, Array]:
+    """M x'' + D x' + K x = B f from rest at x, f in the middle of the steps, (n, k): x (n + 1, N) and x'' (n, N)."""
+    n, s = len(f), 2 / dt
+    inverse = np.linalg.inv(K + s * D + s * s * M)
+    half = np.hstack([-inverse @ K, s * s * inverse @ M])  # w = x_mid - x_n from x_n and u_n = x'_n / s
+    T = np.vstack([2 * half, 2 * half]) + np.diag(np.repeat([1.0, -1.0], len(x)))  # u_{n+1} = 2 w - u_n
+    Y = np.empty((n + 1, 2 * len(x)))
+    Y[0, : len(x)], Y[0, len(x) :] = x, 0.0
+    Y[1:] = np.tile(2 * f @ (inverse @ B).T, 2)
     for i in range(n):
         Y[i + 1] += T @ Y[i]
-    u = Y[:, len(z) :]
-    return SmallRun(Y[:, : len(z)] @ small.C.T, table.q @ small.C_s.T, loads, s * s * np.diff(u, axis=0) / 2)
-
-
-def _driven(small: Small, scene: Scene, z: Array, dt: float) -> SmallRun:
-    """Hand and tissue together, as in :class:`softgrasp.fem.run.motion.ForceDrive`."""
-    system, s, n_s = small.model.system, 2 / dt, small.G.shape[1]
-    u = force_values(scene, n_s, system.M_hand) + system.weight
-    g, alpha = system.fall, system.damping.drag
-    kappa, theta = 1 + alpha * dt / 2, s * s + alpha * s
-    inverse = np.linalg.inv(np.eye(len(z)) + s * small.D + s * s * small.M)
-    Y = inverse @ small.G
-    hand = np.linalg.inv(system.M_hand + kappa * (system.M_rigid - theta * small.G.T @ Y))
-    n = len(u)
-    q, vs, v = np.zeros((n + 1, n_s)), np.zeros(n_s), np.zeros_like(z)
-    Z, loads, a = np.empty((n + 1, len(z))), np.empty((n, n_s)), np.empty((n, len(z)))
-    Z[0] = z
-    for i in range(n):
-        c0 = alpha * vs - g
-        x = inverse @ (s * (small.M @ v) - Z[i])
-        pull = small.G.T @ (theta * (x - Y @ c0) - s * v)
-        push = hand @ (u[i] - system.M_rigid @ c0 - pull)
-        loads[i] = -(kappa * push + c0)
-        w = x + Y @ loads[i]
-        a[i] = s * (s * w - v)
-        Z[i + 1], v = Z[i] + 2 * w, 2 * s * w - v
-        q[i + 1] = q[i] + dt * (vs + dt * push / 2)
-        vs = vs + dt * push
-    return SmallRun(Z @ small.C.T, q @ small.C_s.T, loads, a)
+    return Y[:, : len(x)], s * s * np.diff(Y[:, len(x) :], axis=0) / 2

@@ -7,9 +7,7 @@ import numpy as np
 from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
 from softgrasp.fem.effects.gravity import EARTH, acceleration
-from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.solve.solvers import choose_solver
@@ -24,10 +22,9 @@ SEEN = 1e-8  # share of the largest squared amplitude that a motion needs to cou
 def gradient(model: Model, z: Array) -> Gradient:
     """Gradient of a displacement z against the hand, local rows (n_local,) [m]. Collective."""
     space, d = model.space, model.space.mesh.dimension
-    comm, x = space.layout.comm, space.mesh.vertices
-    nodal = FullField(model).fill(z, np.zeros(space.layout.n_s)).x.array.reshape(-1, d)
-    u = nodal[space.V.dofmap.list[: len(x), : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
-    edges = x[:, 1:] - x[:, :1]
+    comm, edges = space.layout.comm, space.mesh.edges
+    nodal = space.nodal(z).x.array.reshape(-1, d)
+    u = nodal[space.V.dofmap.list[: len(edges), : d + 1]]  # the first d + 1 dofs of a cell sit on its vertices
     size = np.linalg.norm(np.linalg.solve(edges, u[:, 1:] - u[:, :1]), axis=(1, 2))
     volume = np.abs(np.linalg.det(edges))
     parts = np.array([volume[size > SMALL_STRAIN].sum(), volume.sum(), volume @ size**2])
@@ -132,7 +129,7 @@ def rigid_inertia(model: Model) -> tuple[float, tuple[float, ...]]:
     """
     mesh, scene, layout = model.space.mesh, model.scene, model.system.layout
     d = mesh.dimension
-    density = np.array([m.rho for m in model.system.materials])[layer_numbers(mesh, scene)[1]]
+    density = np.array([m.rho for m in model.system.materials])[model.space.layer]
     x = mesh.vertices - layout.reference
     edges = x[:, 1:] - x[:, :1]
     weight = density * np.abs(np.linalg.det(edges)) / (2 if d == 2 else 6) * scene.tissue.thickness

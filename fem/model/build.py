@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -19,8 +20,8 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, make_mesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
-from softgrasp.fem.model.memory import check_memory, simplices
-from softgrasp.fem.model.outputs import Output, make_outputs
+from softgrasp.fem.model.memory import box_simplices, check_memory
+from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene, check_dimension
@@ -106,9 +107,21 @@ class Model:
         return make_outputs(self.scene, self.system)
 
     @property
+    def output_columns(self) -> Array:
+        """C' of all outputs, y = C z + C_s q_s: local rows (n_local, p). Collective."""
+        return output_columns(self.outputs, self.system.layout.n_local)
+
+    @property
     def scene_hash(self) -> str:
         """See :func:`softgrasp.fem.mesh.scene_hash.scene_hash`."""
         return scene_hash(self.scene)
+
+    def displacement(self, z: Array, q_s: Array) -> Any:
+        """Absolute displacement u = R q_s + (z + T q_s) as a function [m], ghosts updated. Collective.
+
+        With velocities in place of z, local rows (n_local,) [m], and q_s (n_s,) [m, rad] it is the absolute velocity.
+        """
+        return self.space.nodal(z + self.system.T @ q_s, self.space.R @ q_s)
 
     def with_materials(self, lam: float | None = None, mu: float | None = None, rho: float | None = None) -> Model:
         """The same mesh with other numbers in every layer: K = mu K_mu + lambda K_lambda, M = rho M_1. Collective.
@@ -178,7 +191,7 @@ def build(
     watch, inventory = Stopwatch(comm), Inventory()
     boxed = scene.tissue.cells if mesh is None and scene.tissue.refine is None else None
     if boxed:
-        check_memory(scene, comm, run, len(boxed), simplices(boxed))
+        check_memory(scene, comm, run, len(boxed), box_simplices(boxed))
     with watch.stage("mesh"):
         if mesh is None and scene.tissue.refine is not None:
             from softgrasp.fem.model.refined import refined_mesh  # only scenes with graded cells pay for it

@@ -54,7 +54,7 @@ def factor_bytes(name: str, n: int, dimension: int, copies: int) -> float:
     return float(entry * n * np.clip(row, 1, (n + 1) / 2) * copies)
 
 
-def simplices(cells: list[int]) -> int:
+def box_simplices(cells: list[int]) -> int:
     """Triangles or tetrahedra of a structured box."""
     return math.factorial(len(cells)) * math.prod(cells)
 
@@ -141,7 +141,7 @@ def _fitting(
     low, high = 0.0, 1.0
     for _ in range(60):
         middle = (low + high) / 2
-        count = simplices(smaller(middle)) if box else smaller(middle)[0]
+        count = box_simplices(smaller(middle)) if box else smaller(middle)[0]
         fits = need(scene, dimension, count, comm, run).of(share, ranks) <= free
         low, high = (middle, high) if fits else (low, middle)
     return f"tissue.cells = {smaller(low)}" if box else f"{smaller(low)[0]} of its {cells} cells"

@@ -46,9 +46,9 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     """
     entries = scene.control.outputs if scene.control is not None else []
     if not entries:
-        point, count = _farthest(system)
-        which = "the free one" if count == 1 else f"one of the {count} free ones"
-        tip = _node(system, "tip", point)
+        _, far = system.layout.nearest_nodes(system.layout.nodes, system.layout.reference, farthest=True)
+        which = "the free one" if len(far) == 1 else f"one of the {len(far)} free ones"
+        tip = _node(system, "tip", np.asarray(far[0][0]))
         return (replace(tip, place=f"node {_coordinates(tip.point)}, {which} farthest from the hand"),)
     result = []
     for i, output in enumerate(entries):
@@ -64,6 +64,14 @@ def make_outputs(scene: Scene, system: BlockSystem) -> tuple[Output, ...]:
     return tuple(result)
 
 
+def output_columns(outputs: Sequence[Output], n_local: int) -> Array:
+    """C' of all outputs, y = C z + C_s q_s: local rows (n_local, p), Fortran order."""
+    C = np.zeros((n_local, sum(o.size for o in outputs)), order="F")
+    for j, (output, c) in enumerate((o, c) for o in outputs for c in range(o.size)):
+        C[output.dofs[:, c], j] = output.weight
+    return C
+
+
 def _node(system: BlockSystem, name: str, point: Array) -> Output:
     layout = system.layout
     d = layout.dimension
@@ -77,17 +85,10 @@ def _node(system: BlockSystem, name: str, point: Array) -> Output:
 def _taken(system: BlockSystem, point: Array, where: Array) -> str:
     """The node that stands for a point, and how many others are as near. Collective."""
     layout = system.layout
-
-    def near(nodes: Array) -> tuple[float, int]:
-        """Smallest distance over all ranks, and how many nodes have it."""
-        distance = layout.rounded(np.linalg.norm(nodes - point, axis=1)) if len(nodes) else np.zeros(0)
-        least = min(layout.comm.allgather(float(distance.min(initial=np.inf))))
-        return least, int(total(layout.comm, np.array([float((distance == least).sum())]))[0])
-
-    (least, count), (nearer, _) = near(layout.nodes), near(layout.held)
+    (least, equal), (nearer, _) = (layout.nearest_nodes(nodes, point) for nodes in (layout.nodes, layout.held))
     text = f"node {_coordinates(where)}"
-    if count > 1:
-        text += f", one of {count} equally near to {_coordinates(point)}"
+    if len(equal) > 1:
+        text += f", one of {len(equal)} equally near to {_coordinates(point)}"
     elif least > 0:
         text += f", nearest to {_coordinates(point)}"
     return text + ("; the hand holds a nearer one" if nearer < least else "")
@@ -131,13 +132,3 @@ def _inside(system: BlockSystem, point: list[float], i: int) -> None:
             f"control.outputs[{i}].point = {list(point)} lies outside the body, which spans "
             f"{(np.round(low, 6) + 0.0).tolist()} to {(np.round(high, 6) + 0.0).tolist()} m"  # + 0: no -0.0
         )
-
-
-def _farthest(system: BlockSystem) -> tuple[Array, int]:
-    """The free node farthest from the hand, of several the first by its coordinates, and how many. Collective."""
-    layout = system.layout
-    distance = layout.rounded(np.linalg.norm(layout.nodes - layout.reference, axis=1))
-    most = max(layout.comm.allgather(float(distance.max(initial=-1.0))))
-    parts = layout.comm.allgather(layout.rounded(layout.nodes[distance == most]).tolist())
-    far = [node for part in parts for node in part]
-    return np.asarray(min(far), dtype=float), len(far)

@@ -30,7 +30,7 @@ from softgrasp.fem.mesh.grading import (
 )
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, make_mesh
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.petsc import on_root
 
@@ -44,7 +44,7 @@ ACROSS = {2: {1: 32.0, 2: 3.5, 3: 3.0}, 3: {1: 8.0, 2: 1.8, 3: 2.0}}
 MORE = {1: 0.0, 2: 0.7, 3: 0.0}  # cells beside these, for coarse meshes: with them the first estimate meets 1e-2
 LINES_ACROSS = {2: {1: 24.0, 2: 8.0, 3: 5.0}, 3: {1: 16.0, 2: 6.0, 3: 4.0}}
 # Smallest cell over tolerance times shortest side: what an end costs is about proportional to it.
-FLOOR = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
+SMALLEST = {2: {1: 0.1, 2: 0.4, 3: 1.0}, 3: {1: 16.0, 2: 48.0, 3: 96.0}}
 DEEPEST = {2: 1 / 256, 3: 1 / 8}  # smallest over largest cell without a tolerance: edges in 3D fill a body quickly
 SHRINK = 1.25  # of the tolerance, from mesh to mesh, until the unknowns fit
 
@@ -54,7 +54,7 @@ def aims(refine: Refine, order: int, d: int, tolerance: float) -> tuple[float, f
     p = min(order, 3)
     mu = refine.grading if isinstance(refine.grading, float) else BISECTION[p]
     across = MORE[p] + ACROSS[d][p] * (1e-2 / tolerance) ** (1 / (2 * p))
-    return across, mu, FLOOR[d][p] * tolerance
+    return across, mu, SMALLEST[d][p] * tolerance
 
 
 def by_lines(scene: Scene) -> bool:
@@ -135,15 +135,9 @@ def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
 def marked(tissue: TissueMesh, scene: Scene) -> Whole:
     """A mesh on one rank with its contact zone, layers and tags as marks."""
     facets = contact_facets(tissue, scene.contact)
-    n = tissue.owned
-    layers = np.full(n, -1, dtype=np.int32)
-    if scene.tissue.layers:
-        names = list(scene.tissue.layers)
-        for name, cells in cells_of_layers(tissue, scene).items():
-            layers[cells] = names.index(name) if name in names else -1
-    on_cells = {"layers": layers}
+    on_cells = {"layers": layer_numbers(tissue, scene)[1].astype(np.int32)}
     if tissue.cell_tags is not None:
-        tags = np.zeros(n, dtype=np.int32)
+        tags = np.zeros(tissue.owned, dtype=np.int32)
         tags[tissue.cell_tags.indices] = tissue.cell_tags.values
         on_cells["cell_tags"] = tags
     contact = dolfinx.mesh.meshtags(
@@ -157,9 +151,9 @@ def marked(tissue: TissueMesh, scene: Scene) -> Whole:
 
 def ends_of(whole: Whole, scene: Scene) -> Ends:
     """Singular ends of a marked mesh."""
-    layers = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
+    materials = [*(layer.material for layer in scene.tissue.layers.values()), scene.tissue.material]
     number = whole.cells["layers"].astype(np.int64)
-    nu = np.array([m.nu for m in layers])[number + 1]
+    nu = np.array([m.nu for m in materials])[number]
     return singular_ends(whole.points, whole.simplices, whole.facet_nodes("contact"), number, nu)
 
 

@@ -18,7 +18,7 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainCheck
 from softgrasp.lqr.riccati import Method, choose, modal_lqr, solve
-from softgrasp.lqr.spectrum.modal_loop import SOME_MODES, LoopQuality, ModalLoop
+from softgrasp.lqr.spectrum.modal_loop import LOWEST_MODES, LoopQuality, ModalLoop
 from softgrasp.lqr.spectrum.sampled import Sampling
 
 Progress = Callable[[dict[str, float]], None]
@@ -101,8 +101,7 @@ def design(
         solution = _modal(plant, diagnosis) if modal else _solve(model, plant, progress, checkpoint)
     with watch.stage("judge"):
         error = (start - target.state).block
-        loop = ModalLoop(plant, min(SOME_MODES, plant.layout.n_e))
-        gain_check = GainCheck(plant, solution, error, loop, sampling(model))
+        gain_check = GainCheck(plant, solution, error, ModalLoop(plant, LOWEST_MODES), sampling(model))
         quality = gain_check.quality(solution.gain)
     if quality.certified and not quality.abscissa < 0 and not modal:
         raise SolverError(

@@ -8,7 +8,7 @@ import numpy as np
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.scene.control import Control, ControlOutput
@@ -45,16 +45,9 @@ def problem(model: Model) -> RiccatiProblem:
     """
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)
-    p = sum(output.size for output in outputs)
-    C_z = np.zeros((system.layout.n_local, p), order="F")
-    first = 0
-    for output in outputs:
-        for c in range(output.size):
-            # every listed dof enters with the weight of the output; a dof is listed once
-            C_z[output.dofs[:, c], first + c] = output.weight
-        first += output.size
+    C_z = output_columns(outputs, system.layout.n_local)
     control, columns = scene.control, tuple(column for output in outputs for column in output.columns)
-    Q = weight(1.0 if control is None else control.Q, p, "control.Q")
+    Q = weight(1.0 if control is None else control.Q, C_z.shape[1], "control.Q")
     R = weight(1.0 if control is None else control.R, system.layout.n_s, "control.R")
     return RiccatiProblem(system, np.vstack([o.C_s for o in outputs]), C_z, Q, R, columns)
 

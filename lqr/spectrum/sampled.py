@@ -15,7 +15,7 @@ from softgrasp.lqr.lowrank.shifts import shift_range
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
-from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, SOME_MODES, ModalLoop, SampledRadius
+from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LOWEST_MODES, ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.tail import Tail, tail_modes
 
 SAFE = 0.5  # small gain below which the modes left out are harmless; the rest covers what lies between grid points
@@ -116,7 +116,7 @@ class SampledLoop:
         modes: how many a large plant keeps.
     """
 
-    def __init__(self, problem: RiccatiProblem, loop: ModalLoop | None = None, modes: int = SOME_MODES) -> None:
+    def __init__(self, problem: RiccatiProblem, loop: ModalLoop | None = None, modes: int = LOWEST_MODES) -> None:
         self.problem, self.comm = problem, problem.layout.comm
         self.n_e = problem.layout.n_e
         self.kept = min(modes, self.n_e)

@@ -85,7 +85,7 @@ def certified_model(
         if own:
             space.extend(Phi)
         rom = project_scene(second_order_basis(model, Phi), model)
-        norms, compliance = space.norms(), space.compliance(output_columns(model))
+        norms, compliance = space.norms(), space.compliance(model.output_columns)
     finally:
         if own:
             space.destroy()
@@ -108,20 +108,8 @@ def certified_any(model: Model, rom: ReducedModel, **about: Any) -> CertifiedMod
     try:
         space.extend(L_q)
         norms = replace(space.norms(), shape=kinematic_triangles(space, L_q, L_v))
-        compliance = space.compliance(output_columns(model))
+        compliance = space.compliance(model.output_columns)
     finally:
         space.destroy()
     about.setdefault("drive", scene_drive(model.scene, model.system.M_hand))
     return CertifiedModel(rom, L_q.shape[1], norms, compliance, **about)
-
-
-def output_columns(model: Model) -> Array:
-    """C' of the tissue for all outputs of the scene, local rows (n_local, p). Collective."""
-    outputs = model.outputs
-    C = np.zeros((model.system.layout.n_local, sum(o.size for o in outputs)))
-    at = 0
-    for o in outputs:
-        for i in range(o.size):
-            C[o.dofs[:, i], at + i] = o.weight
-        at += o.size
-    return C

@@ -34,7 +34,7 @@ REFERENCE, REFERENCE_COST = 1e-5, 1e-4  # tolerances of the graded P3 meshes of 
 EVEN = {1: (16, 32, 64), 2: (8, 16, 32), 3: (8, 16)}  # cells across
 GRADED = {1: (0.1, 0.03), 2: (0.03, 0.01, 3e-3, 1e-3), 3: (0.03, 0.01, 1e-3)}  # tolerances of a-priori meshes
 # Most unknowns, seconds of mesh, assembly and run, and the same with estimate and passes, by tolerance with P2
-ASKED = {1e-2: (2000, 0.15, 0.15), 1e-3: (6000, 0.5, 1.0), 1e-4: (14000, None, None)}
+TOLERANCES = {1e-2: (2000, 0.15, 0.15), 1e-3: (6000, 0.5, 1.0), 1e-4: (14000, None, None)}
 SOLVES, RESIDUAL = 60, 1e-10
 CONTROL = ("control.method=newton-adi", "effects.damping={kind='kelvin-voigt',beta=0.002}", "time.end=300.0")
 HELP = f"""Error of the deformation against time on even and graded meshes of P1, P2 and P3.
@@ -176,7 +176,7 @@ def goals(rows: list[MeshPoint], reached: list[TolerancePoint]) -> list[Goal]:
         Goal("its residual", max(row.residual for row in rows), RESIDUAL),
     ]
     for r in reached:
-        name, (most, run, whole) = f"tolerance {r.tolerance:g}, P2:", ASKED[r.tolerance]
+        name, (most, run, whole) = f"tolerance {r.tolerance:g}, P2:", TOLERANCES[r.tolerance]
         result += [Goal(f"{name} error", r.error, r.tolerance), Goal(f"{name} n_e", r.n_e, most)]
         seconds = ((r.time_run, run, "mesh, assembly, run"), (r.time_all, whole, "these, estimate, passes"))
         result += [Goal(f"{name} seconds of {what}", t, limit) for t, limit, what in seconds if limit]
@@ -190,7 +190,7 @@ def main(
     console = driver.open_console(150)
     exact = deformation(simulate(build(paper(graded(3, REFERENCE)), comm=MPI.COMM_WORLD)))
     cost = controlled(graded(3, REFERENCE_COST)).gain_check.optimal
-    reached, rows = [reach(goal, exact) for goal in ASKED], []
+    reached, rows = [reach(goal, exact) for goal in TOLERANCES], []
     for name, sets in meshes().items():
         rows.append(measure(name, sets, exact, cost))
         console.print(f"{name}: n_e = {rows[-1].n_e}, error {rows[-1].error:.2e}", style="dim")

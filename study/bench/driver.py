@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,16 +11,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from pydantic import TypeAdapter
 from rich.console import Console
 
+from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.processes import child_environment, find_mpiexec, in_mpi_job
+from softgrasp.study.shell.processes import in_mpi_job, run_ranks
 
 Row = dict[str, Any]
+LIMIT = 3600.0  # [s] of a worker
 Ranks = Annotated[str, typer.Option(help="MPI rank counts; no more than there are cores")]
 Repeats = Annotated[int, typer.Option(help="repeats behind each median", min=1)]
 
@@ -36,30 +35,26 @@ class Failure:
     error: str  # why there is nothing
 
 
-def launch_worker(name: str, spec: Row, ranks: int, limit: float = 3600.0) -> Row:
+def launch_worker(name: str, spec: Row, ranks: int) -> Row:
     """Run ``python -m softgrasp.study.bench worker NAME SPEC``, so that no row inherits memory or caches from another.
 
-    ``spec``: arguments of the function that measures, fit for JSON; ``limit``: longest time [s]. Returns the ``points``
-    measured until the end, or until the ``error`` that came before it.
+    ``spec``: arguments of the function that measures, fit for JSON. Returns the ``points`` measured until the end, or
+    until the ``error`` that came before it.
     """
-    mpiexec = find_mpiexec()
-    if mpiexec is None:
-        return {"points": [], "error": "no mpiexec found; `softgrasp doctor` says what to do"}
-    environment = child_environment() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "points.jsonl"
-        text = json.dumps(spec | {"file": str(file)})
-        command = [mpiexec, "-n", str(ranks), sys.executable, "-m", "softgrasp.study.bench", "worker", name, text]
-        error = {}
+        text, error = json.dumps(spec | {"file": str(file)}), {}
         try:
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
-        except subprocess.TimeoutExpired:
-            error = {"error": f"no result after {limit:g} s"}
+            status, output = run_ranks(["-m", "softgrasp.study.bench", "worker", name, text], ranks, LIMIT)
+        except SoftgraspError as missing:
+            error = {"error": str(missing)}
         else:
-            if done.returncode:
-                lines = (done.stderr + done.stdout).strip().splitlines() or ["no output"]
+            if status is None:
+                error = {"error": f"no result after {LIMIT:g} s"}
+            elif status:
+                lines = output.strip().splitlines() or ["no output"]
                 said = next((line for line in lines if "Error: " in line and not line.startswith(" ")), lines[-1])
-                error = {"error": f"exit status {done.returncode}: {said}"}
+                error = {"error": f"exit status {status}: {said}"}
         lines = file.read_text().splitlines() if file.is_file() else []
     return {"points": [json.loads(line) for line in lines], **error}
 
@@ -113,15 +108,6 @@ def parse_numbers(text: str, pattern: str, advice: str) -> list[int]:
 def parse_ranks(text: str) -> list[int]:
     """``1,2`` as numbers. Raises typer.BadParameter: anything else."""
     return parse_numbers(text, r"([1-9]\d*)", "number of ranks; write 1,2")
-
-
-def growth(n: Sequence[float], cost: Sequence[float]) -> float | None:
-    """Exponent p of cost ~ n^p by least squares on logarithms; None for fewer than two positive points."""
-    points = [(a, b) for a, b in zip(n, cost, strict=True) if a > 0 and b > 0]
-    if len({a for a, _ in points}) < 2:
-        return None
-    x, y = np.log(np.array(points)).T
-    return float(np.polyfit(x, y, 1)[0])
 
 
 def cpu_seconds(call: Callable[[], object]) -> float:

@@ -11,8 +11,9 @@ from rich.console import Console
 
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, Goal, number
-from softgrasp.study.bench.forward_rows import ForwardPoint
+from softgrasp.study.bench.forward_rows import ForwardCost
 from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.timing import power_law
 
 SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"
 LARGE = (("2d", 1_000_000), ("3d", 200_000))
@@ -59,7 +60,7 @@ def parse_sizes(text: str) -> list[tuple[str, int]]:
     return [(kind or "2d", int(size)) for kind, size in parts]
 
 
-def exponents(points: Sequence[ForwardPoint]) -> dict[str, dict[str, float | None]]:
+def exponents(points: Sequence[ForwardCost]) -> dict[str, dict[str, float | None]]:
     """Growth over the 2D sizes for each rank count, memory counted above that of the libraries."""
     result = {}
     plane = [point for point in points if point.dimension == 2 and not point.large]
@@ -73,11 +74,11 @@ def exponents(points: Sequence[ForwardPoint]) -> dict[str, dict[str, float | Non
             "memory": [m if m > MEMORY_NOISE_MB else 0.0 for m in memory],
         }
         n = [point.n_e for point in own]
-        result[str(ranks)] = {name: driver.growth(n, cost) for name, cost in costs.items()}
+        result[str(ranks)] = {name: power_law(n, cost) for name, cost in costs.items()}
     return result
 
 
-def goals(points: Sequence[ForwardPoint]) -> list[Goal]:
+def goals(points: Sequence[ForwardCost]) -> list[Goal]:
     """All goals that the points can speak for."""
     result = []
     for p in points:
@@ -92,12 +93,12 @@ def goals(points: Sequence[ForwardPoint]) -> list[Goal]:
     return result
 
 
-def table_of(points: Sequence[ForwardPoint]) -> Table:
+def table_of(points: Sequence[ForwardCost]) -> Table:
     """The table of the terminal and the README."""
     return driver.table_of(points, COLUMNS, "cost of a forward run, medians; µs are per time step")
 
 
-def show(console: Console, points: Sequence[ForwardPoint]) -> None:
+def show(console: Console, points: Sequence[ForwardCost]) -> None:
     """Table, set-ups, whole runs, exponents and goals."""
     console.print(table_of(points).terminal())
     for p in points:
@@ -117,7 +118,7 @@ def show(console: Console, points: Sequence[ForwardPoint]) -> None:
     driver.show_goals(console, goals(points))
 
 
-def draw(path: Path, points: Sequence[ForwardPoint]) -> tuple[Path, ...]:
+def draw(path: Path, points: Sequence[ForwardCost]) -> tuple[Path, ...]:
     """Per-step time against size for every method, log-log, 2D full and 3D hollow, on one rank (else the fewest)."""
     from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE, SKY
 
@@ -141,7 +142,7 @@ def main(
     large: Annotated[bool, typer.Option("--large", help=f"also 1e6 (2D) and 2e5 (3D), {LARGE_STEPS} steps")] = False,
 ) -> None:
     """See HELP."""
-    console, rows = driver.open_console(175), list[ForwardPoint | Failure]()
+    console, rows = driver.open_console(175), list[ForwardCost | Failure]()
     jobs = [(kind, size, k, False) for kind, size in parse_sizes(sizes) for k in driver.parse_ranks(ranks)]
     jobs += [(kind, size, LARGE_RANKS, True) for kind, size in LARGE] if large else []
     for kind, size, k, big in jobs:
@@ -149,8 +150,8 @@ def main(
         problem = f"{kind.upper()} paper" if paper else f"{kind.upper()} {size:.0e}".replace("e+0", "e")
         spec: dict[str, Any] = {"problem": problem, "dimension": int(kind[0]), "size": size, "large": big}
         spec |= {"steps": LARGE_STEPS} if big else {"repeats": repeats, "whole": paper}
-        rows += driver.measure(console, ForwardPoint, "forward", spec, k, problem)
-    points, failed = driver.of(ForwardPoint, rows), driver.failures(rows)
+        rows += driver.measure(console, ForwardCost, "forward", spec, k, problem)
+    points, failed = driver.of(ForwardCost, rows), driver.failures(rows)
     show(console, points)
     content: dict[str, Any] = {"command": "bench_forward", "rows": driver.as_rows(points)}
     content |= {"failed": driver.as_rows(failed), "exponents": exponents(points)}

@@ -6,19 +6,19 @@ import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import Array, to_scipy, whole_copy
 from softgrasp.fem.run.midpoint import midpoint_matrix
-from softgrasp.fem.run.motion import TableDrive
+from softgrasp.fem.run.motion import motion_table
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
 from softgrasp.fem.run.stepping import make_ts
-from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
+from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import make_solver
 from softgrasp.study.bench.peers import BareSolve, PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, has_pymor
@@ -44,7 +44,7 @@ class WholeRun:
 
 
 @dataclass(frozen=True)
-class ForwardPoint:
+class ForwardCost:
     """One mesh on so many ranks; what a large run leaves out is empty."""
 
     problem: str
@@ -96,7 +96,7 @@ def bench_scene(comm: MPI.Intracomm, dimension: int, cells: list[int], steps: in
     if dimension == 3:
         changes += ["tissue.size=[1.0, 1.0, 2.0]", "contact.box=[[0.0, 0.0, 1.5], [1.0, 1.0, 2.0]]"]
         changes += ["motion.target=[5.0, 3.0, 0.0]", "control.outputs.0.point=[0.5, 0.5, 0.0]"]
-    return load_scene_collective(comm, shipped_scenes()["paper_forward"], changes)
+    return load_scene_collective(comm, "paper_forward", changes)
 
 
 def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dict[str, list[float]], float, float]:
@@ -151,7 +151,11 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, repeats: int, peers: bool)
     methods = {"ts": of_ts} | {name: _repeated(comm, loop, k) for name, loop in loops.items()}
     if peers and comm.size == 1:
         few = max(2, k // PEER_SHARE)
-        methods |= {name: _repeated(comm, loop, few) for name, loop in _peers(run, factor).items()}
+        for name, make in _peers(model).items():
+            begin = time.perf_counter()
+            methods[name] = _repeated(comm, make(), few)
+            if name == "scipy":  # pyMOR factors in its first step
+                factor[name] = time.perf_counter() - begin
     samples = interleave(methods, repeats)
 
     def ratio(name: str) -> float | None:
@@ -168,10 +172,9 @@ def _steps(comm: MPI.Intracomm, model: Model, k: int, repeats: int, peers: bool)
     return result
 
 
-def _loads(run: Run) -> Array:
-    if not isinstance(run.drive, TableDrive):
-        raise SolverError("the benchmark needs a hand with a prescribed motion")
-    return run.drive.c
+def _loads(model: Model) -> Array:
+    """c_n = -a_n in the load G c_n of a prescribed motion, (steps, n_s)."""
+    return -motion_table(model.scene, model.system.layout.n_s).a
 
 
 def _loops(run: Run, factor: dict[str, float]) -> tuple[dict[str, Any], list[Any]]:
@@ -194,39 +197,34 @@ def _loops(run: Run, factor: dict[str, float]) -> tuple[dict[str, Any], list[Any
     if midpoint.held.whole and system.layout.comm.size > 1:
         solvers.append(make_solver(midpoint_matrix(system, DT), name, system.layout, "textbook_"))
         solve = solvers[-1].solve
-    loops["loop"] = TextbookLoop(system, DT, solve, _loads(run))
+    loops["loop"] = TextbookLoop(system, DT, solve, _loads(run.model))
     return loops, solvers
 
 
-def _peers(run: Run, factor: dict[str, float]) -> dict[str, Any]:
-    """SciPy's loop and pyMOR's where it is installed and small enough; notes SciPy's factor time."""
-    system = run.model.system
-    K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
-    begin = time.perf_counter()
-    loops: dict[str, Any] = {"scipy": ScipyLoop(K, M, system.G, DT, _loads(run))}
-    factor["scipy"] = time.perf_counter() - begin
+def _peers(model: Model) -> dict[str, Callable[[], Any]]:
+    """SciPy's loop and pyMOR's where it is installed and small enough, yet to be set up."""
+    system = model.system
+    arguments = to_scipy(system.K_ee), to_scipy(system.M_ee), system.G, DT, _loads(model)
+    loops: dict[str, Callable[[], Any]] = {"scipy": partial(ScipyLoop, *arguments)}
     if has_pymor() and system.layout.n_e <= PYMOR_LIMIT:
-        loops["pymor"] = PymorLoop(K, M, system.G, DT, _loads(run))
+        loops["pymor"] = partial(PymorLoop, *arguments)
     return loops
 
 
 def _whole(comm: MPI.Intracomm, model: Model, cells: list[int], steps: int, repeats: int) -> WholeRun:
     scenes = {kind: bench_scene(comm, 2, cells, steps, kind) for kind in ("none", "memory")}
-    system, table = model.system, Run(replace(model, scene=scenes["none"]), RunOptions())
-    drive = table.drive
-    table.midpoint.destroy()
     drifts: list[float] = []
 
-    def of_ts(kind: str) -> Callable[[], float]:
-        of_kind = replace(model, scene=scenes[kind])
-        return lambda: timed(comm, lambda: drifts.append(simulate(of_kind).energy_drift))
+    def of_ts(kind: str) -> None:
+        drifts.append(simulate(replace(model, scene=scenes[kind])).energy_drift)
 
-    methods = {"ts_none": of_ts("none"), "ts_memory": of_ts("memory")}
-    if comm.size == 1 and isinstance(drive, TableDrive):
-        K, M, loads = to_scipy(system.K_ee), to_scipy(system.M_ee), drive.c
-        methods["scipy"] = lambda: timed(comm, lambda: ScipyLoop(K, M, system.G, DT, loads).store(steps))
-        if has_pymor():
-            methods["pymor"] = lambda: timed(comm, lambda: PymorLoop(K, M, system.G, DT, loads).advance(steps))
+    calls: dict[str, Callable[[], Any]] = {f"ts_{kind}": partial(of_ts, kind) for kind in scenes}
+    if comm.size == 1:
+        peers = _peers(replace(model, scene=scenes["none"]))
+        calls["scipy"] = lambda: peers["scipy"]().store(steps)
+        if "pymor" in peers:
+            calls["pymor"] = lambda: peers["pymor"]().advance(steps)
+    methods = {name: partial(timed, comm, call) for name, call in calls.items()}
     interleave(methods, 1)  # warm up
     samples = interleave(methods, repeats)
     return WholeRun(steps, medians(samples), samples, max(drifts))
@@ -241,7 +239,7 @@ def measure(
     whole: bool = False,
     peers: bool = True,
     problem: str = "",
-) -> ForwardPoint:
+) -> ForwardCost:
     """One point, each number taken ``repeats`` times. Collective.
 
     One repeat takes about ``repeat_seconds``; ``whole``: also the paper's 600 steps; ``peers``: SciPy and pyMOR too.
@@ -252,14 +250,14 @@ def measure(
     model, samples, memory, pace = _builds(comm, bench_scene(comm, dimension, cells, PAPER_STEPS), repeats)
     k = int(np.clip(repeat_seconds / pace, 3, 50_000))
     stepped = replace(model, scene=bench_scene(comm, dimension, cells, repeats * (k + warm(k)) + 10))
-    return ForwardPoint(
+    return ForwardCost(
         **_sizes(model, cells), problem=problem, large=False, seconds=medians(samples), memory_mb=memory,
         memory_base_mb=base, repeats=repeats, steps_per_repeat=k, **_steps(comm, stepped, k, repeats, peers),
         whole=_whole(comm, model, cells, PAPER_STEPS, repeats) if whole else None,
     )  # fmt: skip
 
 
-def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int, problem: str = "") -> ForwardPoint:
+def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int, problem: str = "") -> ForwardCost:
     """A large scene once, from the mesh to the end, nothing stored. Collective."""
     cells = cells_for(dimension, size)
     base = peak_memory_mb(comm)
@@ -268,7 +266,7 @@ def measure_large(comm: MPI.Intracomm, dimension: int, size: int, steps: int, pr
     run = simulate(model)
     seconds = {name: run.seconds[name] for name in ("mesh", "assembly", "factor")}
     seconds["total"] = comm.allreduce(time.perf_counter() - begin, MPI.MAX)
-    return ForwardPoint(
+    return ForwardCost(
         **_sizes(model, cells), problem=problem, large=True, seconds=seconds, memory_mb=peak_memory_mb(comm),
         memory_base_mb=base, repeats=1, steps_per_repeat=steps, step_us={"ts": 1e6 * run.seconds["steps"] / steps},
         drift=run.energy_drift, drift_steps=steps, residual=run.residuals[1], solver=run.solver[0],
@@ -281,6 +279,6 @@ def _sizes(model: Model, cells: list[int]) -> dict[str, Any]:
     return names | {"cells": cells}
 
 
-def measure_row(*, large: bool, **arguments: Any) -> list[ForwardPoint]:
+def measure_row(*, large: bool, **arguments: Any) -> list[ForwardCost]:
     """The point that :mod:`softgrasp.study.bench.forward` asks for. Collective."""
     return [(measure_large if large else measure)(MPI.COMM_WORLD, **arguments)]

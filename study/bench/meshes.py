@@ -18,17 +18,18 @@ from softgrasp.fem import _stack as _stack  # threads and MPI before anything nu
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import load_scene, shipped_scenes
+from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.registry import METHODS, find_method
 from softgrasp.reduction.replay import full_run
-from softgrasp.study.bench.driver import Curve, growth, loglog, parse_list
-from softgrasp.study.reduce.measure import sweep
+from softgrasp.study.bench.driver import Curve, loglog, parse_list
+from softgrasp.study.reduce.measure import steps_seconds, sweep
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import machine
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.ending import console
 from softgrasp.study.shell.session import list_files
+from softgrasp.study.shell.timing import power_law
 
 SIZES = "1e3,1e4,1e5,1e6"
 KEPT = 60  # snapshots of a run, the same on every mesh: those of all steps would not fit in memory at n_e = 1e6
@@ -64,21 +65,20 @@ def block(n_e: int, steps: int, method: str, N: int) -> Scene:
     """The paper's block with about n_e tissue unknowns, 4 nx^2 on nx x 2 nx cells."""
     nx = max(4, round(math.sqrt(n_e / 4)))
     keys = [f"tissue.cells=[{nx}, {2 * nx}]", f"time.steps={steps}", f"output.every={max(1, steps // KEPT)}"]
-    return load_scene(shipped_scenes()["paper_forward"], [*keys, f"reduction={{methods=['{method}'], N=[{N}]}}"])
+    return load_scene("paper_forward", [*keys, f"reduction={{methods=['{method}'], N=[{N}]}}"])
 
 
 def measure_mesh(scene: Scene, comm: MPI.Intracomm) -> MeshRow:
     """One mesh. Collective. Raises SoftgraspError: a solve failed, the snapshots do not fit, or no model has this N."""
     model = build(scene, comm=comm)
     run = simulate(model)
-    steps = scene.time.steps
     result = sweep(scene.reduction.methods[0], full_run(model, run), scene.reduction)
     if not result.points:
         refused = [f"N = {N}: {reason}" for N, reason in result.refused.items()]
         reason = next(iter(refused), f"reduction.N = {scene.reduction.N} fits no basis of this method")
         raise SoftgraspError(f"{scene.reduction.methods[0]}: {reason}")
     cells = scene.tissue.cells[0] if scene.tissue.cells else 0
-    times = run.seconds["factor"], run.seconds["steps"] / max(steps - 1, 1) * steps
+    times = run.seconds["factor"], steps_seconds(run)
     names = ("time_offline", "time_setup", "time_online", "N", "error", "error_deformation", "stable")
     return MeshRow(cells, model.system.layout.n_e, *times, **{name: getattr(result.points[0], name) for name in names})
 
@@ -97,9 +97,9 @@ def findings(rows: Sequence[MeshRow]) -> dict[str, Any]:
     """Exponents, spread of the online time, break-even mesh; None where one mesh does not tell."""
     n_e, online = [row.n_e for row in rows], [row.time_online for row in rows]
     return {
-        "exponent_full": growth(n_e, [row.time_full for row in rows]),
-        "exponent_offline": growth(n_e, [row.time_offline for row in rows]),
-        "exponent_online": growth(n_e, online),
+        "exponent_full": power_law(n_e, [row.time_full for row in rows]),
+        "exponent_offline": power_law(n_e, [row.time_offline for row in rows]),
+        "exponent_online": power_law(n_e, online),
         "online_spread": max(online) / min(online),
         "break_even_n_e": break_even(rows),
     }

@@ -36,7 +36,7 @@ from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, Goal, number
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.origin import peak_memory_mb
-from softgrasp.study.shell.timing import repeated
+from softgrasp.study.shell.timing import power_law, repeated
 
 SIZES = "10,20,40,80,160"
 LARGEST, LARGEST_RANKS = 355, 2  # 2n = 1 009 660
@@ -76,7 +76,7 @@ CSV |= {f"{name}_s": f"split.{name}" for name in STAGES}
 
 
 @dataclass(frozen=True)
-class RiccatiPoint:
+class SolverPoint:
     """One method on nx x 2 nx cells; a peer has fewer numbers."""
 
     nx: int
@@ -95,7 +95,7 @@ class RiccatiPoint:
     memory_base_mb: float = 0.0
 
 
-Rows = list[RiccatiPoint | Failure]
+Rows = list[SolverPoint | Failure]
 
 
 def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
@@ -104,7 +104,7 @@ def problem_for(comm: MPI.Intracomm, nx: int, beta: float) -> RiccatiProblem:
     return make_problem(build(load_scene_collective(comm, shipped_scenes()["paper_lqr"], changes), comm=comm))
 
 
-def measure(nx: int, beta: float, methods: Sequence[Method], repeats: int) -> Iterator[RiccatiPoint | Failure]:
+def measure(nx: int, beta: float, methods: Sequence[Method], repeats: int) -> Iterator[SolverPoint | Failure]:
     """All methods on nx x 2 nx cells; gains are compared with the first one. Collective.
 
     ``beta`` is the Kelvin-Voigt time [s].
@@ -122,7 +122,7 @@ def measure(nx: int, beta: float, methods: Sequence[Method], repeats: int) -> It
             yield Failure(f"nx = {nx}, {name}", comm.size, str(error))
             continue
         s = solved[-1]
-        yield RiccatiPoint(
+        yield SolverPoint(
             nx, comm.size, name, problem.layout.states, seconds, s.rank, s.residual,
             None if reference is None else gain_error(problem, reference, s.gain),
             {part: sum(s.seconds.get(key, 0.0) for key in keys) for part, keys in STAGES.items()},
@@ -175,7 +175,7 @@ def pymor_solver(plant: PaperPlant) -> Callable[[], Array]:
 PEERS = {"scipy": scipy_solver, "slycot": slycot_solver, "pymor": pymor_solver}
 
 
-def measure_peer(nx: int, beta: float, peer: str) -> Iterator[RiccatiPoint | Failure]:
+def measure_peer(nx: int, beta: float, peer: str) -> Iterator[SolverPoint | Failure]:
     """One peer on the paper's matrices against our Newton-ADI, on one rank."""
     problem = problem_for(MPI.COMM_WORLD, nx, beta)
     reference, s = make_solver("newton_adi").solve(problem).gain, 2 * problem.layout.n_s
@@ -194,10 +194,10 @@ def measure_peer(nx: int, beta: float, peer: str) -> Iterator[RiccatiPoint | Fai
         yield Failure(f"{peer}, nx = {nx}", 1, f"failed, {type(error).__name__}: {error}"[:200])
         return
     accuracy = residual(problem, relative), gain_error(problem, reference, gain)
-    yield RiccatiPoint(nx, 1, peer, problem.layout.states, seconds, relative.columns, *accuracy)
+    yield SolverPoint(nx, 1, peer, problem.layout.states, seconds, relative.columns, *accuracy)
 
 
-def measure_row(**arguments: Any) -> Iterator[RiccatiPoint | Failure]:
+def measure_row(**arguments: Any) -> Iterator[SolverPoint | Failure]:
     """The points that the launcher asks for. Collective."""
     return (measure_peer if "peer" in arguments else measure)(**arguments)
 
@@ -213,13 +213,13 @@ class Record:
     peers: Rows = field(default_factory=list)
 
     @property
-    def points(self) -> list[RiccatiPoint]:
+    def points(self) -> list[SolverPoint]:
         """Rows that did not fail."""
-        return driver.of(RiccatiPoint, self.rows)
+        return driver.of(SolverPoint, self.rows)
 
     def resume(self) -> None:
         """Take what an earlier run with this damping has measured. Raises CheckpointError: not such a file."""
-        adapter = TypeAdapter(list[RiccatiPoint])
+        adapter = TypeAdapter(list[SolverPoint])
         try:
             old = json.loads(self.file.read_text()) if self.file.is_file() else {}
             if old.get("beta") == self.beta:
@@ -230,29 +230,29 @@ class Record:
 
     def kept(self, nx: int, ranks: int, methods: Sequence[str]) -> Rows:
         """The points of a row where all its methods are there."""
-        own = [p for p in driver.of(RiccatiPoint, [*self.rows, *self.peers]) if (p.nx, p.ranks) == (nx, ranks)]
+        own = [p for p in driver.of(SolverPoint, [*self.rows, *self.peers]) if (p.nx, p.ranks) == (nx, ranks)]
         return [p for p in own if p.method in methods] if {p.method for p in own} >= set(methods) else []
 
     def save(self) -> None:
         """Write the file."""
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        peers = driver.of(RiccatiPoint, self.peers)
+        peers = driver.of(SolverPoint, self.peers)
         report = {"command": "bench_riccati", "beta": self.beta, "rows": driver.as_rows(self.points)}
         report |= {"peers": driver.as_rows(peers), "exponents": exponents(self.points)}
         report |= {"failed": driver.as_rows(driver.failures([*self.rows, *self.peers]))}
         write_json(self.file, report | {"goals": driver.goal_rows(goals(self.points))})
 
 
-def exponents(points: Sequence[RiccatiPoint]) -> dict[str, float | None]:
+def exponents(points: Sequence[SolverPoint]) -> dict[str, float | None]:
     """Growth of time with the number of states, from nx = 20 on, by method and rank count."""
     result: dict[str, float | None] = {}
     for method, ranks in sorted({(p.method, p.ranks) for p in points if p.nx >= 20}):
         own = [p for p in points if p.nx >= 20 and (p.method, p.ranks) == (method, ranks)]
-        result[f"{method}, {ranks} rank(s)"] = driver.growth([p.states for p in own], [p.seconds for p in own])
+        result[f"{method}, {ranks} rank(s)"] = power_law([p.states for p in own], [p.seconds for p in own])
     return result
 
 
-def goals(points: Sequence[RiccatiPoint]) -> list[Goal]:
+def goals(points: Sequence[SolverPoint]) -> list[Goal]:
     """All goals that the points can speak for."""
     result = []
     for p in points:
@@ -276,7 +276,7 @@ def goals(points: Sequence[RiccatiPoint]) -> list[Goal]:
     return result
 
 
-def peer_line(peer: RiccatiPoint | Failure) -> str:
+def peer_line(peer: SolverPoint | Failure) -> str:
     """One sentence about a peer."""
     if isinstance(peer, Failure):
         return f"{peer.label}: {peer.error}"
@@ -286,7 +286,7 @@ def peer_line(peer: RiccatiPoint | Failure) -> str:
     )
 
 
-def draw(path: Path, points: Sequence[RiccatiPoint], peers: Sequence[RiccatiPoint]) -> tuple[Path, ...]:
+def draw(path: Path, points: Sequence[SolverPoint], peers: Sequence[SolverPoint]) -> tuple[Path, ...]:
     """Time against states for every method on the fewest ranks, peers as single marks, log-log."""
     from softgrasp.study.pictures.style import BLUE, GREEN, HAND, ORANGE, PURPLE
 
@@ -313,11 +313,11 @@ def collect(console: Console, meshes: list[int], ranks: list[int], repeats: int,
     for i, ((nx, k, methods, count), known) in enumerate(zip(jobs, kept, strict=True), start=1):
         label = f"nx = {nx}"
         spec = {"nx": nx, "beta": record.beta, "methods": methods, "repeats": count}
-        rows = known or driver.measure(console, RiccatiPoint, "riccati", spec, k, f"row {i} of {len(jobs)}, {label}")
+        rows = known or driver.measure(console, SolverPoint, "riccati", spec, k, f"row {i} of {len(jobs)}, {label}")
         if not known:
             record.rows += rows
             record.save()
-        times = ", ".join(f"{p.method} {number(p.seconds)} s" for p in driver.of(RiccatiPoint, rows))
+        times = ", ".join(f"{p.method} {number(p.seconds)} s" for p in driver.of(SolverPoint, rows))
         console.print(f"row {i} of {len(jobs)}, {label}, {k} rank(s): {'kept' if known else times or 'failed'}")
 
 
@@ -335,7 +335,7 @@ def collect_peers(console: Console, meshes: list[int], record: Record) -> None:
             record.peers += known[peer, nx] or (
                 [Failure(label, 1, f"{why} {limit}")]
                 if nx > limit
-                else driver.measure(console, RiccatiPoint, "riccati", spec, 1, label)
+                else driver.measure(console, SolverPoint, "riccati", spec, 1, label)
             )
             record.save()
 
@@ -371,5 +371,5 @@ def main(
     driver.show_goals(console, goals(points))
     files = [record.file, driver.table_of(points, CSV).write_csv(out / "bench_riccati.csv"), out / "bench_riccati.md"]
     files[-1].write_text(table.markdown() + "".join(f"\n- {line}" for line in lines) + "\n")
-    files += draw(out / "bench_riccati.png", points, driver.of(RiccatiPoint, record.peers))
+    files += draw(out / "bench_riccati.png", points, driver.of(SolverPoint, record.peers))
     driver.list_bench(console, files, driver.failures(record.rows))

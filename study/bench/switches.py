@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import operator
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -27,7 +26,6 @@ from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import Array, PETSc, times_columns, to_scipy
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.scene.file import load_scene_collective, shipped_scenes
 from softgrasp.fem.solve.solvers import SolverName
 from softgrasp.lqr.dense.modal import DenseRiccati
 from softgrasp.lqr.lowrank.modal_start import plant_modes, restrict, solve_small
@@ -130,7 +128,7 @@ def under(module: ModuleType, name: str, value: float, call: Callable[..., Any],
 def batch(setup: Setup) -> Iterator[SwitchPoint]:
     """Reduced models of random materials, together and one by one. One rank."""
     changes = ["effects.damping={kind='kelvin-voigt', beta=0.002}", "motion={drive='force', profile='hold'}"]
-    model = build(load_scene_collective(setup.comm, shipped_scenes()["paper_forward"], changes), comm=setup.comm)
+    model = build("paper_forward", changes, setup.comm)
     system = model.system
     material, rng = system.materials[0], np.random.default_rng(0)
     force = np.ones((STEPS, system.layout.n_s))
@@ -240,8 +238,7 @@ def finite(setup: Setup) -> Iterator[SwitchPoint]:
     """Whole runs with linear elasticity and with finite strain, CPU seconds. One rank."""
 
     def run_of(changes: list[str]) -> Callable[[], float]:
-        scene = load_scene_collective(setup.comm, shipped_scenes()["paper_forward"], changes)
-        return partial(driver.cpu_seconds, partial(simulate, build(scene, comm=setup.comm)))
+        return partial(driver.cpu_seconds, partial(simulate, build("paper_forward", changes, setup.comm)))
 
     for nx in (15, 60):
         cells = f"tissue.cells=[{nx}, {2 * nx}]"
@@ -254,14 +251,12 @@ def _two(
     setup: Setup, model: Model, ways: Sequence[tuple[SolverName, Any]], head: str, limit: str
 ) -> Iterator[SwitchPoint]:
     """Set-up and step with two solvers."""
-    system, comm = model.system, setup.comm
+    system = model.system
     setting = f"{system.layout.dimension}D, n_e = {system.layout.n_e}"
-    seconds, midpoints = [], []
+    seconds, midpoints = [], list[TissueMidpoint]()
     for name, reproducible in ways:
-        comm.Barrier()
-        begin = time.perf_counter()
-        midpoints.append(TissueMidpoint(system, DT, name, reproducible=reproducible))
-        seconds.append(float(comm.allreduce(time.perf_counter() - begin, MPI.MAX)))
+        make = partial(TissueMidpoint, system, DT, name, reproducible=reproducible)
+        seconds.append(timed(setup.comm, lambda: midpoints.append(make())))  # noqa: B023  (called at once)
     yield setup.point(f"{head}set-up", limit, setting, *seconds)
     c = np.ones(system.layout.n_s)
     states = [state_on(np.zeros(2 * system.layout.n_local), system) for _ in midpoints]

@@ -54,7 +54,7 @@ def unstable(basis: BasisGains, key: str) -> tuple[list[int], list[float]]:
     return [r.N for r in bad], [getattr(r, key) if getattr(r, key) <= TOP else float("nan") for r in bad]
 
 
-def figure_reduced(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]:
+def figure_gains(bases: Sequence[BasisGains], out_png: Path) -> tuple[Path, ...]:
     """Relative error of P, of K, and excess cost against N for all methods; unstable gains marked; PNG and PDF."""
     ran = [s for s in bases if s.reports]
     bad = False
@@ -161,7 +161,7 @@ def draw_all(out: Path, study: ControlStudy, poles: dict[str, Poles], frames: Fr
         dimension=design.problem.layout.dimension,
     )  # fmt: skip
     if any(b.reports for b in study.bases):
-        files += figure_reduced(study.bases, out / "errors.png")
+        files += figure_gains(study.bases, out / "errors.png")
     if study.margins is not None:
         files += figure_bode(study.margins, out / "bode.png")
     # rounding of the eigenvalues of the lowest modes

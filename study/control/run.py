@@ -190,7 +190,7 @@ def solver_bar(bar: Progress, model: Model) -> Callable[[dict[str, float]], None
 
 
 def counted(bar: Progress, text: str) -> Callable[[int, int], None]:
-    """A bar that is told what is done and how much there is."""
+    """A bar of what is done and how much there is."""
     task = bar.add_task(text, total=None)
 
     def note(done: int, total: int) -> None:

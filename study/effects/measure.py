@@ -46,7 +46,7 @@ class MeasuredScene:
     model: Model  # the last one built
     # samples of each stage: mesh, assembly, setup (factor and the drive's own solves), step
     seconds: dict[str, list[float]] = field(default_factory=dict)
-    prints: dict[str, str] = field(default_factory=dict)  # hash of each operator, see `fingerprint`
+    prints: dict[str, str] = field(default_factory=dict)  # hash of each operator, see `operator_hashes`
     bytes: dict[str, float] = field(default_factory=dict)  # memory of what the run holds, over all ranks [byte]
     flops: float = 0.0  # operations of PETSc in a step, over all ranks [1]
     # what PETSc's log counts as created by build, factor, start and the first step, by class
@@ -54,7 +54,7 @@ class MeasuredScene:
     objects_in_steps: dict[str, int] = field(default_factory=dict)  # the same of the next steps
 
 
-class TimedRun:
+class RepeatableRun:
     """A run that can be taken back to its start, to time its steps any number of times. Collective."""
 
     def __init__(self, model: Model) -> None:
@@ -109,7 +109,7 @@ def bare_output(scene: Scene) -> Scene:
 # --- hashes and memory
 
 
-def fingerprint(model: Model, run: Run) -> dict[str, str]:
+def operator_hashes(model: Model, run: Run) -> dict[str, str]:
     """Hash of pattern and values of every operator that the steps use, and of the hand's part. Collective."""
     system, comm = model.system, model.system.layout.comm
     matrices = {"M_ee": system.M_ee, "K_ee": system.K_ee, "S": run.midpoint.solver.S}
@@ -206,7 +206,7 @@ def measure_builds(
 
 def measure_steps(comm: MPI.Intracomm, cases: dict[str, MeasuredScene], repeats: int, tick: Callable[[], None]) -> None:
     """Time the steps of all cases interleaved, then count their work, memory and hashes. Collective."""
-    steppers = {name: TimedRun(case.model) for name, case in cases.items()}
+    steppers = {name: RepeatableRun(case.model) for name, case in cases.items()}
     try:
         pace = next(iter(steppers.values())).seconds_per_step(5)
         for stepper in steppers.values():
@@ -219,7 +219,7 @@ def measure_steps(comm: MPI.Intracomm, cases: dict[str, MeasuredScene], repeats:
                 tick()
         for name, case in cases.items():
             case.flops = steppers[name].flops()
-            case.prints = fingerprint(case.model, steppers[name].run)
+            case.prints = operator_hashes(case.model, steppers[name].run)
             case.bytes = holdings(case.model, steppers[name].run)
     finally:
         for stepper in steppers.values():
@@ -248,8 +248,9 @@ def read_table(text: str) -> dict[str, int]:
     counts: Counter[str] = Counter()
     table = f"\n{text}".partition("\nObject Type")[2].partition("\n===")[0]
     for name, creations in re.findall(r"^ *(\S.*?) +(\d+) +\d+ *$", table, re.MULTILINE):  # one row a stage
-        counts[name] += int(creations) if name != OWN else 0
-    return dict(+counts)
+        if name != OWN and int(creations):
+            counts[name] += int(creations)
+    return dict(counts)
 
 
 @contextmanager
@@ -267,7 +268,7 @@ def objects_of(comm: MPI.Intracomm, scene: Scene) -> tuple[dict[str, int], dict[
     Turns on PETSc's log, which takes a tenth of a short step: not before times are measured.
     """
     with counting(comm) as at_first:
-        stepper = TimedRun(build(scene, comm=comm))
+        stepper = RepeatableRun(build(scene, comm=comm))
         stepper.run.advance_to(stepper.ts, min(1, stepper.run.steps))
     with counting(comm) as in_steps:
         stepper.run.advance_to(stepper.ts, min(1 + STEPS, stepper.run.steps))
@@ -324,7 +325,7 @@ def prove_off(name: str, before: MeasuredScene, again: MeasuredScene) -> OffProo
     if with_zero is not None:
         model = build(with_zero, comm=layout.comm)
         run = Run(model, RunOptions())
-        prints.append(fingerprint(model, run))
+        prints.append(operator_hashes(model, run))
         run.midpoint.destroy()
         if before.objects:
             counts.append(objects_of(layout.comm, with_zero))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 from mpi4py import MPI
 from rich.console import Console
 from rich.progress import MofNCompleteColumn
@@ -16,6 +15,7 @@ from rich.progress import MofNCompleteColumn
 from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
+from softgrasp.fem.model.memory import free_bytes
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
@@ -59,7 +59,7 @@ def study_effects(
     effects = tuple(_runnable(s, comm) for s in switches(scene, scales))
     tried = [s for s in effects if s.other is not None]
     scenes = {SCENE: scene} | {s.name: s.other for s in tried if s.other is not None} | {AGAIN: scene}
-    check_memory(comm, explanation, len(scenes))
+    check_variants(scene, comm, explanation, len(scenes))
     repeats, done = scene.study.repeats, 0
     work = len(scenes) * (3 * repeats)
 
@@ -123,9 +123,9 @@ def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
     return s
 
 
-def check_memory(comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
+def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
     """Refuse so many variants of the scene where they would not fit in memory at once. Collective."""
-    free = comm.bcast(psutil.virtual_memory().available)
+    free = comm.bcast(free_bytes(scene))
     # matrices and vectors need about as much as the factor
     needed = 2 * count * explanation.solver.factor_bytes
     if needed > 0.8 * free:

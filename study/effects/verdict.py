@@ -41,14 +41,9 @@ class Shown:
 
 def shown(model: Model, run: Trajectory) -> Shown:
     """Displacements of the outputs of a run."""
-    d, control = model.system.layout.dimension, model.scene.control
-    kinds = [o.kind for o in control.outputs] if control is not None and control.outputs else ["node"]
-    widths = [model.system.layout.n_s if kind == "hand" else d for kind in kinds]
-    starts = np.cumsum([0, *widths[:-1]])
-    places, rigid = (
-        np.stack([values[:, at : at + d] for at in starts], axis=1) for values in (run.outputs, run.outputs_rigid)
-    )
-    return Shown(places, rigid)
+    moves = [not column.rotation for column in run.columns]
+    shape = len(run.times), -1, model.system.layout.dimension
+    return Shown(run.outputs[:, moves].reshape(shape), run.outputs_rigid[:, moves].reshape(shape))
 
 
 def compare(a: Shown, b: Shown) -> Change:

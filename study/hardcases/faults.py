@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 import tomllib
@@ -23,7 +22,7 @@ from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, make, short, textbook
 from softgrasp.study.hardcases.textbook import textbook_midpoint
-from softgrasp.study.shell.processes import child_environment, find_mpiexec, in_mpi_job, run_limited
+from softgrasp.study.shell.processes import in_mpi_job, run_ranks
 
 BAD = ("nan", "inf", "-inf")
 SCENE = """
@@ -194,11 +193,8 @@ def healthy_seconds() -> float:
 
 def job(command: list[str], limit: float) -> tuple[int | None, str, float]:
     """Run two ranks for at most ``limit`` [s]; status, None when that was not enough, output and seconds."""
-    mpiexec = find_mpiexec()
-    if mpiexec is None:
-        raise SoftgraspError("no mpiexec found; `softgrasp doctor` says what to do")
     begin = time.perf_counter()
-    status, output = run_limited([mpiexec, "-n", "2", sys.executable, *command], limit, child_environment())
+    status, output = run_ranks(command, 2, limit)
     return status, output, time.perf_counter() - begin
 
 

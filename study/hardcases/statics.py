@@ -134,8 +134,9 @@ def slender_rows(quick: bool) -> Iterator[HardCase]:
         yield HardCase(f"length / height = {slender:g}", slender, p2, locked, bound, reason, may_refuse=may)
 
 
-def sliver_mesh(gap: float, columns: int = 4) -> tuple[Array, NDArray[np.int64]]:
+def sliver_mesh(gap: float) -> tuple[Array, NDArray[np.int64]]:
     """Nodes and cells of a column of 1 x 2 with two rows of nodes ``gap`` apart at mid height."""
+    columns = 4
     heights = [0.0, 0.5, 1.0 - gap / 2, 1.0 + gap / 2, 1.5, 2.0]
     nodes = [(i / columns, y) for y in heights for i in range(columns + 1)]
     cells = []

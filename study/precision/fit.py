@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.study.precision.points import WorkPoint
+from softgrasp.study.shell.timing import power_law
 
 GAIN = 0.01  # of the error: what a slower point must gain to be on the front
 
@@ -70,15 +71,6 @@ def slopes(points: Sequence[WorkPoint], *relations: tuple[str, str, str]) -> tup
     """Of every series of usable points and relation: what against what in words, and the attributes x and y."""
     lines = series_of([p for p in points if p.ok]).values()
     return tuple(s for line in lines for relation in relations for s in slope(line, *relation))
-
-
-def power_law(x: Sequence[float], y: Sequence[float]) -> float | None:
-    """Exponent of y ~ x^power; None with fewer than two different x or values that are not positive."""
-    a, b = np.array(x, dtype=float), np.array(y, dtype=float)
-    good = (a > 0) & (b > 0) & np.isfinite(a) & np.isfinite(b)
-    if len(set(a[good])) < 2:
-        return None
-    return float(np.polyfit(np.log(a[good]), np.log(b[good]), 1)[0])
 
 
 def interpolate(x: float, xs: Sequence[float], ys: Sequence[float], power: float | None = None) -> float:

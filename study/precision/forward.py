@@ -62,7 +62,7 @@ def to_point(setting: Setting, run: TimedRun, truth: Truth, finest: TimedRun | N
     return ForwardPoint(
         setting.mesh if setting.solver == "auto" else "solver", setting.label, run.seconds, error,
         error_displacement=displacement, error_range=truth.range_of(error), error_time=change,
-        **setting.told, **{name: getattr(run, name) for name in names},
+        **setting.entries, **{name: getattr(run, name) for name in names},
     )  # fmt: skip
 
 

@@ -75,7 +75,7 @@ class LoopSetting:
         return f"{self.gain.label}, {law}" + (", reduced plant" if self.reduced else "")
 
 
-def step_counts(shares: Sequence[float], steps: int, n_e: int = 1, most: float = np.inf) -> list[int]:
+def nested_counts(shares: Sequence[float], steps: int, n_e: int, most: float) -> list[int]:
     """Whole multiples and parts of the scene's steps that nest, most first, as the shares are.
 
     Only the scene's own and fewer steps may have more unknowns n_e times steps than ``most``.
@@ -93,7 +93,7 @@ class LoopSweep:
     def __init__(self, runs: ControlRuns) -> None:
         self.runs, self.layout = runs, runs.layout
         self.scene, self.cache = runs.scene, runs.cache
-        self.counts = step_counts(SHARES, self.scene.time.steps, self.layout.n_e, LOOP_WORK[self.layout.dimension])
+        self.counts = nested_counts(SHARES, self.scene.time.steps, self.layout.n_e, LOOP_WORK[self.layout.dimension])
         self.family, self.report, self._finest = cache(self._family), cache(self._report), cache(self._exact)
 
     def _family(self, name: str) -> BasisFamily:
@@ -141,7 +141,7 @@ class LoopSweep:
             true, loop, columns = self.exact(best, most), design.gain_check.loop, design.problem.columns
             modes, error = len(loop.plant.omega), 0.0
             if not loop.complete:
-                error = errors_of(self._exact(best, ModalLoop(design.problem, modes // 2)), true, columns)[0]
+                error = relative_errors(self._exact(best, ModalLoop(design.problem, modes // 2)), true, columns)[0]
             run = self._full(LoopSetting(best), most)[0]
             rest = predicted_cost(design.problem, design.solution, run.final - design.target.state)
             return [LoopReference(error, modes, loop.complete, design.gain_check.optimal, rest)]
@@ -241,7 +241,7 @@ class LoopSweep:
         problem, target = self.runs.problem, self.runs.design.target
         columns, y = problem.columns, run.outputs - target.y
         both = np.hstack([y - (run.q_s - target.state.q_s) @ problem.C_s.T, y])
-        error, displacement = errors_of(both, self.exact(Feedback(), steps), columns)
+        error, displacement = relative_errors(both, self.exact(Feedback(), steps), columns)
         if not displacement <= GONE:
             return replace(lost, reason="far from the reference")
         per_step, cost = statistics.median(means), float(run.cost[-1])
@@ -249,12 +249,12 @@ class LoopSweep:
         due = reference.optimal - reference.to_come
         return replace(
             lost, seconds=setup + steps * per_step, error=error, ok=stable, per_step=per_step, setup=setup,
-            error_displacement=displacement, error_time=errors_of(both, self.exact(what.gain, steps), columns)[0],
+            error_displacement=displacement, error_time=relative_errors(both, self.exact(what.gain, steps), columns)[0],
             cost=cost, cost_error=abs(cost - due) / reference.optimal,
         )  # fmt: skip
 
 
-def errors_of(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
+def relative_errors(values: Array, true: Array, columns: Columns) -> tuple[float, float]:
     """Largest error of any output at any instant over the largest value, of each half of the columns (m, 2 p)."""
     still = np.zeros(true.shape[1] // 2)
     gaps, sizes = ([farthest(half, still, columns).max() for half in np.hsplit(v, 2)] for v in (values - true, true))

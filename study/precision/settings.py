@@ -39,7 +39,7 @@ class Setting:
         return f"{shape if self.refine == 'off' else f'graded {self.refine:.2g}'}, P{self.order}"
 
     @property
-    def told(self) -> dict[str, Any]:
+    def entries(self) -> dict[str, Any]:
         """All by name; a direct solver has no tolerance."""
         return asdict(self) | {"rtol": self.rtol if self.solver == "cg" else None}
 
@@ -103,7 +103,7 @@ def least_steps(scene: Scene) -> int:
 
 
 def variant(scene: Scene, setting: Setting, snapshots: str = "none", reference: Sequence[float] | None = None) -> Scene:
-    """The scene under another setting; the reference that the hand turns about moves a little with the mesh else."""
+    """The scene under another setting; ``reference``: where the hand turns, by default where the mesh puts it [m]."""
 
     def edit(table: dict[str, Any]) -> None:
         tissue = table["tissue"]
@@ -194,6 +194,6 @@ def few_steps(scene: Scene) -> int:
 
 
 def contraction(changes: list[float], growth: float) -> float:
-    """By what errors fall from mesh to mesh: as the last changes of the solution do, one alone like 1 / that of n_e."""
+    """By what errors fall from mesh to mesh: as the last two changes of the solution; 1 / growth of n_e after one."""
     ratio = changes[-1] / changes[-2] if len(changes) > 1 and changes[-2] > 0 else 1 / growth
     return float(np.clip(ratio, FASTEST, SLOWEST))

@@ -59,7 +59,7 @@ def parse_axis(text: str) -> SweepAxis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is asked for."""
+    """A scene and the values of its keys."""
 
     path: Path  # scene file
     overrides: Sequence[str]  # arguments of ``--set``

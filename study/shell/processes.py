@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from softgrasp import PACKAGE
+from softgrasp.fem.errors import SoftgraspError
 
 IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
 
@@ -43,3 +44,14 @@ def run_limited(command: list[str], limit: float, environment: dict[str, str] | 
             output, _ = process.communicate()
             return None, output
     return process.returncode, output
+
+
+def run_ranks(command: list[str], ranks: int, limit: float) -> tuple[int | None, str]:
+    """:func:`run_limited` of this Python with arguments on several ranks, one thread each unless threads are set.
+
+    Raises SoftgraspError: there is no launcher.
+    """
+    mpiexec = find_mpiexec()
+    if mpiexec is None:
+        raise SoftgraspError("no mpiexec found; `softgrasp doctor` says what to do")
+    return run_limited([mpiexec, "-n", str(ranks), sys.executable, *command], limit, child_environment())

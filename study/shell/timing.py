@@ -1,13 +1,14 @@
-"""Seconds of calls on the slowest rank, in turn, and their medians."""
+"""Seconds of calls on the slowest rank, in turn, their medians, and how they grow with a size."""
 
 from __future__ import annotations
 
 import gc
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
 
@@ -62,3 +63,15 @@ def median_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -
         call()
         seconds.append(time.perf_counter() - begin)
     return float(comm.allreduce(statistics.median(seconds), MPI.MAX))
+
+
+def power_law(x: Sequence[float | None], y: Sequence[float | None]) -> float | None:
+    """Exponent of y ~ x^power by least squares in logarithms, over pairs of finite positive numbers.
+
+    None where these have fewer than two different x.
+    """
+    a, b = np.array(x, dtype=float), np.array(y, dtype=float)
+    good = (a > 0) & (b > 0) & np.isfinite(a) & np.isfinite(b)
+    if len(set(a[good])) < 2:
+        return None
+    return float(np.polyfit(np.log(a[good]), np.log(b[good]), 1)[0])

@@ -11,7 +11,7 @@ from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.mesh.tissue_mesh import make_mesh
 from softgrasp.fem.model import memory
 from softgrasp.fem.model.build import build
-from softgrasp.fem.model.memory import check_memory, free_bytes, need, simplices
+from softgrasp.fem.model.memory import box_simplices, check_memory, free_bytes, need
 from softgrasp.fem.strain.body import Body
 from tests.helpers.models import CUBE, make_scene
 
@@ -56,9 +56,9 @@ def test_what_the_sentence_advises_fits(comm: MPI.Intracomm) -> None:
     cells = [int(n) for n in text.strip("[]").split(", ")]
     assert cells[1] == pytest.approx(2 * cells[0], rel=0.1)  # two digits are kept
     some = make_scene(tissue={"cells": cells}, output={"memory": 0.5})
-    check_memory(some, comm, True, 2, simplices(cells))
+    check_memory(some, comm, True, 2, box_simplices(cells))
     with pytest.raises(ResourceError):
-        check_memory(some, comm, True, 2, simplices([round(1.25 * n) for n in cells]))
+        check_memory(some, comm, True, 2, box_simplices([round(1.25 * n) for n in cells]))
 
 
 def test_a_graded_mesh_that_does_not_fit_is_refused(comm: MPI.Intracomm) -> None:
@@ -81,7 +81,7 @@ def test_steps_count_only_for_a_run(comm: MPI.Intracomm) -> None:
 def test_cells_of_a_box_are_those_of_its_mesh(comm: MPI.Intracomm, table: dict[str, Any], d: int) -> None:
     scene = make_scene(table)
     mesh = make_mesh(comm, scene).mesh
-    assert simplices(scene.tissue.cells or []) == mesh.topology.index_map(d).size_global
+    assert box_simplices(scene.tissue.cells or []) == mesh.topology.index_map(d).size_global
 
 
 @pytest.mark.ranks
@@ -107,7 +107,7 @@ def test_finite_strain_counts_its_matrices(order: int) -> None:
     """B, B'AB, A and the pass over the points are a good part of what it adds, and no more than that."""
     tissue = {"cells": [16, 32], "order": order}
     model = build(make_scene(tissue=tissue, effects={"finite_strain": {}}), comm=MPI.COMM_SELF)
-    system, cells = model.system, simplices([16, 32])
+    system, cells = model.system, box_simplices([16, 32])
     assert system.points is not None
     body = Body(system.points, system.materials)
     body.tangent(system.K_ee.createVecRight())

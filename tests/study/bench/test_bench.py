@@ -21,10 +21,11 @@ from softgrasp.study.bench import driver
 from softgrasp.study.bench import forward as bench_forward
 from softgrasp.study.bench import forward_rows as bench_worker
 from softgrasp.study.bench.__main__ import app
-from softgrasp.study.bench.driver import growth, launch_worker
-from softgrasp.study.bench.forward_rows import ForwardPoint, WholeRun
+from softgrasp.study.bench.driver import launch_worker
+from softgrasp.study.bench.forward_rows import ForwardCost, WholeRun
 from softgrasp.study.bench.peers import PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop
 from softgrasp.study.shell.processes import IN_MPI_JOB
+from softgrasp.study.shell.timing import power_law
 
 TINY: dict[str, Any] = {"size": 150, "repeats": 3, "repeat_seconds": 0.005}
 
@@ -108,16 +109,16 @@ def test_methods_take_turns_and_none_is_always_first() -> None:
 
 def test_exponents_of_made_up_costs_come_back() -> None:
     n = [956, 10_198, 99_856]
-    assert growth(n, [2e-6 * m**1.37 for m in n]) == pytest.approx(1.37, rel=1e-12)  # rounding of log
-    assert growth(n[:1], [1.0]) is None
-    assert growth(n, [0.0, 0.0, 5.0]) is None
+    assert power_law(n, [2e-6 * m**1.37 for m in n]) == pytest.approx(1.37, rel=1e-12)  # rounding of log
+    assert power_law(n[:1], [1.0]) is None
+    assert power_law(n, [0.0, 0.0, 5.0]) is None
     powers = bench_forward.exponents([made_up(m) for m in n])["1"]
     # rounding of log
     assert powers == pytest.approx({"assembly": 1.0, "factor": 1.5, "step": 1.1, "memory": 1.0}, rel=1e-12)
 
 
-def made_up(n: int, **changes: Any) -> ForwardPoint:
-    point = ForwardPoint(
+def made_up(n: int, **changes: Any) -> ForwardCost:
+    point = ForwardCost(
         problem=f"2D {n}",
         dimension=2,
         cells=[1, 2],

@@ -12,13 +12,13 @@ from rich.console import Console
 from softgrasp.fem.errors import CheckpointError
 from softgrasp.study.bench import driver
 from softgrasp.study.bench.driver import Failure, failures, of
-from softgrasp.study.bench.riccati import Record, RiccatiPoint, collect, collect_peers, peer_line
+from softgrasp.study.bench.riccati import Record, SolverPoint, collect, collect_peers, peer_line
 
 pytestmark = pytest.mark.serial
 
 
 def point(spec: dict[str, Any], ranks: int, method: str) -> dict[str, Any]:
-    return vars(RiccatiPoint(spec["nx"], ranks, method, spec["nx"] ** 2, 1.0, 100, 9e-11, 1e-8, solves=50))
+    return vars(SolverPoint(spec["nx"], ranks, method, spec["nx"] ** 2, 1.0, 100, 9e-11, 1e-8, solves=50))
 
 
 def fake(calls: list[dict[str, Any]], fail: tuple[int, ...] = ()) -> Any:
@@ -34,8 +34,8 @@ def fake(calls: list[dict[str, Any]], fail: tuple[int, ...] = ()) -> Any:
 def test_methods_that_were_through_survive_a_failed_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "launch_worker", fake([], fail=(20,)))
     spec = {"nx": 20, "beta": 0.002, "methods": ["newton_adi", "radi"], "repeats": 1}
-    rows = driver.measure(Console(quiet=True), RiccatiPoint, "riccati", spec, 2, "nx = 20")
-    assert [p.method for p in of(RiccatiPoint, rows)] == ["newton_adi"]
+    rows = driver.measure(Console(quiet=True), SolverPoint, "riccati", spec, 2, "nx = 20")
+    assert [p.method for p in of(SolverPoint, rows)] == ["newton_adi"]
     assert failures(rows) == [Failure("nx = 20", 2, "no result after 3600 s")]
 
 

@@ -23,7 +23,7 @@ from softgrasp.lqr.design.scene import actuation, with_control
 from softgrasp.lqr.loop.controller import Controller, load_gain
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.riccati import GainReport
-from softgrasp.study.control.plots import drawn, figure_reduced, unstable
+from softgrasp.study.control.plots import drawn, figure_gains, unstable
 from softgrasp.study.control.result import settled
 from softgrasp.study.control.run import run_control, unused_rate
 from softgrasp.study.report.files import to_json
@@ -390,7 +390,7 @@ def test_large_errors_break_the_line_and_unstable_gains_are_marked() -> None:
 @pytest.mark.serial
 def test_figure_of_the_errors(tmp_path: Path) -> None:
     bases = (points("pod", (4, 0.5, -1.0), (6, 30.0, 0.1)), points("structured", (4, 1e-3, -1.0), (6, 1e-5, -1.0)))
-    (png,) = figure_reduced(bases, tmp_path / "errors.png")
+    (png,) = figure_gains(bases, tmp_path / "errors.png")
     assert png.stat().st_size > 10_000
 
 

@@ -24,13 +24,13 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.effects import measure as effects_measure
 from softgrasp.study.effects.measure import (
     MeasuredScene,
-    TimedRun,
+    RepeatableRun,
     bare_output,
     counting,
     difference,
-    fingerprint,
     holdings,
     objects_of,
+    operator_hashes,
     prove_off,
     read_table,
 )
@@ -76,9 +76,9 @@ def found(comm: MPI.Intracomm, *changes: dict[str, Any], **tables: Any) -> tuple
 
 
 def measured(model: Any) -> MeasuredScene:
-    stepper = TimedRun(model)
+    stepper = RepeatableRun(model)
     case = MeasuredScene(
-        model, {"step": [1.0]}, fingerprint(model, stepper.run), holdings(model, stepper.run), stepper.flops()
+        model, {"step": [1.0]}, operator_hashes(model, stepper.run), holdings(model, stepper.run), stepper.flops()
     )
     stepper.destroy()
     case.objects, case.objects_in_steps = objects_of(model.system.layout.comm, model.scene)
@@ -326,7 +326,7 @@ def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None
 def test_stepper_repeats_the_same_run(comm: MPI.Intracomm) -> None:
     """A run taken back to its start gives the state of a fresh one."""
     model = build(make_scene(effects=ALL_ON, motion={"drive": "force"}), comm=comm)
-    stepper = TimedRun(model)
+    stepper = RepeatableRun(model)
     stepper.seconds_per_step(2 * 60 + 17)
     stepper.rewind()
     stepper.run.advance_to(stepper.ts, 60)

@@ -25,7 +25,7 @@ from softgrasp.study.precision import loop as wp_loop
 from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import riccati as wp_riccati
 from softgrasp.study.precision.cache import Cache
-from softgrasp.study.precision.loop import step_counts
+from softgrasp.study.precision.loop import nested_counts
 from softgrasp.study.precision.points import CONTROL, LoopPoint, ReducedRiccatiPoint, Request, RiccatiPoint
 from softgrasp.study.precision.result import Question, RiccatiReference, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
@@ -211,9 +211,9 @@ def test_a_lost_loop_is_said(comm: MPI.Intracomm) -> None:
 
 def test_numbers_of_steps_nest() -> None:
     shares = (16.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
-    assert step_counts(shares, 600, 438, 5e6) == [9600, 4800, 2400, 1200, 600, 300, 150]
-    assert step_counts(shares, 75, 1, 1e9) == [1200, 600, 300, 150, 75]
-    assert step_counts(shares, 600, 100_000, 5e6) == [600, 300, 150]
+    assert nested_counts(shares, 600, 438, 5e6) == [9600, 4800, 2400, 1200, 600, 300, 150]
+    assert nested_counts(shares, 75, 1, 1e9) == [1200, 600, 300, 150, 75]
+    assert nested_counts(shares, 600, 100_000, 5e6) == [600, 300, 150]
 
 
 # --- resuming, refusing, files
