@@ -162,6 +162,13 @@ def layered_viscosity(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMat
     return combine(_stiffness(layers, viscous, "ee"))
 
 
+def dynamic_stiffness(system: BlockSystem, s: float) -> PETSc.Mat:
+    """K_ee + s D_ee + s^2 M_ee of the tissue at a real frequency s [1/s]. Collective."""
+    damping = system.damping
+    layers = [] if damping.matrix is None else [(s, damping.matrix)]
+    return combine([(1 + s * damping.beta, system.K_ee), (s * s + s * damping.alpha, system.M_ee), *layers])
+
+
 def coupling(layers: tuple[LayerBlocks, ...], materials: tuple[LayerMaterial, ...], T: Array) -> tuple[Array, Array]:
     """Return G = M_es + M_ee T, local rows, and M_rigid = [R; T]' M_h [R; T]. Collective."""
     G = np.zeros(T.shape, order="F")

@@ -32,7 +32,6 @@ from mpi4py import MPI
 from softgrasp.fem.accuracy.small import Small, reduced, run_small, static_solves
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.petsc import Array, rows_on_root, times_columns
@@ -239,9 +238,8 @@ def prolong(model: Model, finer: Model, X: Array) -> Array:
 def cell_products(model: Model, X: Array) -> Array:
     """Elastic energy products k_T(x_i, x_j) of columns on the owned cells, (cells, k, k). Collective."""
     V, d, tissue = model.space.V, model.space.mesh.dimension, model.space.mesh
-    _, layer = layer_numbers(tissue, model.scene)
-    lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[layer].T
-    cells = len(layer)
+    lam, mu = np.array([(m.lam, m.mu) for m in model.system.materials])[model.space.layer].T
+    cells = tissue.owned
     element = V.element.basix_element
     points, weights = basix.make_quadrature(element.cell_type, max(2 * (element.degree - 1), 1))
     scale = np.abs(np.linalg.det(tissue.edges))[:, None] * weights * model.scene.tissue.thickness

@@ -9,9 +9,7 @@ import dolfinx.mesh
 import numpy as np
 import numpy.typing as npt
 
-from softgrasp.fem.fields.series import FullField
 from softgrasp.fem.mesh.tissue_mesh import cell_nodes
-from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.contact import contact_facets, rigid_modes
 from softgrasp.fem.petsc import Array, rows_on_root
@@ -54,16 +52,21 @@ def gather_picture(model: Model) -> PictureMesh | None:
     def facet_nodes(facets: npt.NDArray[np.int32]) -> Integers:
         return _numbered(nodes, _outward(mesh, d, facets))
 
-    cells = np.asarray(cell_nodes(mesh)[: tissue.owned])
-    names, layers = layer_numbers(tissue, model.scene)
     outer = dolfinx.mesh.exterior_facet_indices(mesh.topology)
     held = contact_facets(tissue, model.scene.contact)
     points = np.ascontiguousarray(mesh.geometry.x[: nodes.size_local, :d])
-    parts = [points, _numbered(nodes, cells), facet_nodes(outer), facet_nodes(held), layers]
+    parts = [
+        points,
+        _numbered(nodes, cell_nodes(mesh)[: tissue.owned]),
+        facet_nodes(outer),
+        facet_nodes(held),
+        model.space.layer,
+    ]
     whole = [rows for rows in (rows_on_root(comm, part) for part in parts) if rows is not None]
     if not whole:
         return None
-    return PictureMesh(whole[0], whole[1], whole[2], whole[3], whole[4], names, layout.reference, layout.n_s)
+    points, cells, facets, contact, layers = whole
+    return PictureMesh(points, cells, facets, contact, layers, model.space.layers, layout.reference, layout.n_s)
 
 
 def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
@@ -86,12 +89,11 @@ def vertex_displacement(model: Model, z: Array, q_s: Array) -> Array | None:
     node_dof = np.zeros(len(geometry.x), dtype=np.int64)
     node_dof[cell_nodes(space.mesh.mesh)] = dofmap.list[:, : d + 1]
     dofs = node_dof[:owned]
-    full = FullField(model)
     columns = z[:, None] if z.ndim == 1 else z  # a rank may own no row
     hands = np.asarray(q_s, dtype=np.float64).reshape(len(q_s), -1)
     local = np.empty((owned, columns.shape[1] * d))
     for j in range(columns.shape[1]):
-        values = full.fill(columns[:, j], hands[:, j]).x.array.reshape(-1, d)
+        values = model.displacement(columns[:, j], hands[:, j]).x.array.reshape(-1, d)
         local[:, j * d : (j + 1) * d] = values[dofs]
     gathered = rows_on_root(space.layout.comm, local)
     if gathered is None or z.ndim == 1:

@@ -8,7 +8,6 @@ from softgrasp.fem.effects.damping import ratios
 from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
 from softgrasp.fem.effects.gravity import EARTH, acceleration
 from softgrasp.fem.layout import bounding_box
-from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.solve.solvers import choose_solver
@@ -130,7 +129,7 @@ def rigid_inertia(model: Model) -> tuple[float, tuple[float, ...]]:
     """
     mesh, scene, layout = model.space.mesh, model.scene, model.system.layout
     d = mesh.dimension
-    density = np.array([m.rho for m in model.system.materials])[layer_numbers(mesh, scene)[1]]
+    density = np.array([m.rho for m in model.system.materials])[model.space.layer]
     x = mesh.vertices - layout.reference
     edges = x[:, 1:] - x[:, :1]
     weight = density * np.abs(np.linalg.det(edges)) / (2 if d == 2 else 6) * scene.tissue.thickness

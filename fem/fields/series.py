@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import dolfinx.fem
 import dolfinx.la
 import dolfinx.plot
 import numpy as np
@@ -17,32 +15,6 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, on_root
 
 KINDS = {(2, 1): 5, (2, 2): 22, (2, 3): 69, (3, 1): 10, (3, 2): 24, (3, 3): 71}  # (d, order): VTK's kind of cell
-
-
-class FullField:
-    """Absolute displacement of hand and tissue as one function, u = R q_s + (z + T q_s).
-
-    The first term lives on the contact nodes, the second on the free ones. With velocities v_z and v_s in place of
-    z and q_s the same map gives the absolute velocity.
-
-    Attributes:
-        u: the function on the model's space.
-    """
-
-    def __init__(self, model: Model) -> None:
-        space = model.space
-        d = space.layout.dimension
-        self.u = dolfinx.fem.Function(space.V)
-        self.T, self.R = model.system.T, space.R
-        self.free = (space.free[:, None] * d + np.arange(d)).ravel()
-
-    def fill(self, z: Array, q_s: Array) -> Any:
-        """Set and return the function from z (n_local,) [m] and q_s (n_s,) [m, rad]. Collective; ghosts are updated."""
-        values = self.u.x.array
-        values[: len(self.R)] = self.R @ q_s
-        values[self.free] = z + self.T @ q_s
-        self.u.x.scatter_forward()
-        return self.u
 
 
 class SeriesWriter:
@@ -60,7 +32,7 @@ class SeriesWriter:
         self.comm, self.directory, self.d = space.layout.comm, Path(directory), d
         on_root(self.comm, lambda: self.directory.mkdir(parents=True, exist_ok=True))
         self.rename(name)
-        self.full, self.stress = FullField(model), CellStress(model)
+        self.model, self.stress = model, CellStress(model)
         rows, _, points = dolfinx.plot.vtk_mesh(space.V)
         nodes = space.V.dofmap.list.shape[1]
         self.used, cells = np.unique(rows.reshape(-1, nodes + 1)[:, 1:], return_inverse=True)  # no node of a ghost cell
@@ -115,12 +87,15 @@ class SeriesWriter:
         self.list = Collection(self.file, self.run)
 
     def _fields(self, z: Array, v: Array, q_s: Array, v_s: Array | None) -> tuple[list[Field], list[Field]]:
-        u = self.full.fill(z, q_s).x.array.reshape(-1, self.d)
+        def of_nodes(z: Array, q_s: Array) -> Array:
+            return np.asarray(self.model.displacement(z, q_s).x.array.reshape(-1, self.d))
+
+        u = of_nodes(z, q_s)
         strain, stress, mises = (values.astype(np.float32) for values in self.stress(u))
         cells = [Field("strain", "1", strain), Field("stress", "Pa", stress), Field("von_mises", "Pa", mises)]
         points = [Field("displacement", "m", self._points(u))]
         if v_s is not None:
-            points.append(Field("velocity", "m/s", self._points(self.full.fill(v, v_s).x.array.reshape(-1, self.d))))
+            points.append(Field("velocity", "m/s", self._points(of_nodes(v, v_s))))
         return [*points, self.held], [*cells, self.layer]
 
     def _points(self, values: Array) -> Array:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.strain.laws import LAWS
@@ -30,7 +29,7 @@ class CellStress:
         space, d = model.space, model.space.mesh.dimension
         self.gradients = space.gradients(np.full((1, d), 1 / (d + 1)))[:, 0].transpose(0, 2, 1)  # (m, d, k)
         self.dofs = space.V.dofmap.list[: space.mesh.owned]
-        self.layer = layer_numbers(space.mesh, model.scene)[1].astype(np.int32)
+        self.layer = space.layer.astype(np.int32)
         finite = model.scene.effects.finite_strain
         self.law = None if finite is None else LAWS[finite.law]
         self.lam, self.mu = (np.array([getattr(m, key) for m in model.system.materials]) for key in ("lam", "mu"))

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from softgrasp.fem.errors import MeshError
-from softgrasp.fem.mesh.check import FLAT, Floats, Integers, counted, longest_edges, place_text, signed_volumes
+from softgrasp.fem.mesh.check import FLAT, Floats, Integers, counted, longest_edges, place_text, quality
 
 STRAIGHT = 1e-5  # of the longest edge: above the 6 digits of text files, far below the error of the elements
 
@@ -219,8 +219,8 @@ def _replace(
 
 def _signs(points: Floats, cut: Integers, parents: Integers, count: int) -> tuple[Integers, Integers]:
     """Lowest and highest sign (-1, 0 if flat, 1) of the volumes in each parent."""
-    volumes = signed_volumes(points, cut)
-    signs = np.where(np.abs(volumes) <= FLAT * longest_edges(points, cut) ** points.shape[1], 0, np.sign(volumes))
+    shape = quality(points, cut)
+    signs = np.where(np.abs(shape) <= FLAT, 0, np.sign(shape))
     low, high = np.ones(count, dtype=np.int64), -np.ones(count, dtype=np.int64)
     np.minimum.at(low, parents, signs.astype(np.int64))
     np.maximum.at(high, parents, signs.astype(np.int64))

@@ -41,6 +41,12 @@ def longest_edges(points: Floats, cells: Integers) -> Floats:
     return longest
 
 
+def quality(points: Floats, cells: Integers) -> Floats:
+    """Signed volume of each simplex over (longest edge)^d [1]: at most `FLAT` in size if flat, negative if inverted."""
+    volumes, edges = signed_volumes(points, cells), longest_edges(points, cells)
+    return np.asarray(np.divide(volumes, edges ** points.shape[1], out=np.zeros_like(volumes), where=edges != 0))
+
+
 def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Integers:
     """Return cells of positive volume, or refuse the mesh.
 
@@ -53,21 +59,19 @@ def check_cells(points: Floats, cells: Integers, repair: bool, name: str) -> Int
             f"{name} has {counted(bad_points.size, 'point')} with NaN or infinite coordinates, "
             f"the first is {bad_points[0]}: export the mesh again."
         )
-    volumes = signed_volumes(points, cells)
-    edges = longest_edges(points, cells)
-    quality = np.divide(volumes, edges ** points.shape[1], out=np.zeros_like(volumes), where=edges > 0)
-    flat = np.abs(quality) <= FLAT
+    shape = quality(points, cells)
+    flat = np.abs(shape) <= FLAT
     if flat.any():
-        worst = int(np.argmin(np.abs(quality)))
+        worst = int(np.argmin(np.abs(shape)))
         raise MeshError(
             f"{name} has {counted(int(flat.sum()), 'cell')} of zero volume, the worst is cell {worst} around "
             f"{_middle(points, cells, worst)}: remove or remesh them."
         )
-    inverted = quality < 0
+    inverted = shape < 0
     if not inverted.any():
         return cells
     if not repair:
-        worst = int(np.argmin(quality))
+        worst = int(np.argmin(shape))
         raise MeshError(
             f"{name} has {counted(int(inverted.sum()), 'inverted cell')} of {len(cells)}, the worst is cell {worst} "
             f"around {_middle(points, cells, worst)}: set tissue.repair = true to turn them round, "

@@ -25,7 +25,7 @@ from softgrasp.fem.mesh.check import (
     find_parts,
     longest_edges,
     place_text,
-    signed_volumes,
+    quality,
     sort_facets,
 )
 from softgrasp.fem.mesh.singular import Ends
@@ -58,9 +58,9 @@ def bisect(whole: Whole, marked: Ints) -> Whole:
     above = parent[fine.topology.original_cell_index]  # DOLFINx numbers parents in the order before its own reordering
     result = replace(whole, mesh=fine, cells={k: v[above] for k, v in whole.cells.items()}, facets=facets)
     points, cells = result.points, result.simplices
-    quality = np.abs(signed_volumes(points, cells)) / longest_edges(points, cells) ** d
-    if (flat := quality <= FLAT).any():
-        place = place_text(points[cells[int(np.argmin(quality))]].mean(axis=0))
+    shape = np.abs(quality(points, cells))
+    if (flat := shape <= FLAT).any():
+        place = place_text(points[cells[int(np.argmin(shape))]].mean(axis=0))
         raise MeshError(
             f"{whole.source} cannot be bisected further: {counted(int(flat.sum()), 'cell')} would be flat, the worst "
             f"around {place}; remesh the body there or take a larger tissue.refine.tolerance."

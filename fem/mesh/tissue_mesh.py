@@ -145,19 +145,15 @@ def make_mesh(comm: MPI.Intracomm, scene: Scene) -> TissueMesh:
     Collective.
 
     Raises:
-        SceneError: neither a size nor a mesh file is given, or the cells do not fit the size.
+        SceneError: the cells do not fit the size.
         MeshError: the mesh file cannot be read or its mesh cannot carry the model.
     """
     tissue = scene.tissue
     if tissue.size:
-        if not tissue.cells:
-            raise SceneError("tissue.cells is missing: a tissue with a size needs one number of cells per side.")
-        return structured_mesh(comm, tissue.size, tissue.cells, tissue.origin)
-    if tissue.mesh is None:
-        raise SceneError("tissue.size and tissue.mesh are both missing: give one of them.")
+        return structured_mesh(comm, tissue.size, tissue.cells or [], tissue.origin)
     from softgrasp.fem.mesh.file import read_mesh  # meshio is needed for mesh files only
 
-    path = scene.directory / tissue.mesh
+    path = scene.directory / str(tissue.mesh)
     result = read_mesh(comm, path, tissue.scale, tissue.repair, tissue.seam, tissue.read_limit)
     scene._mesh_digest = result.digest  # the hash of the scene is of what was read, not of what the file says later
     return result

@@ -44,11 +44,13 @@ class Discretisation:
     is_e: PETSc.IS  # PETSc index set of the free dofs (blocked)
     R: Array  # rigid modes on the contact rows, zero elsewhere, (owned dofs, n_s)
     layout: BlockLayout
+    layers: tuple[str, ...]  # names of the layers
+    layer: np.ndarray  # number of the layer of each owned cell
 
-    def nodal(self, free: Array, held: float = 0.0) -> Any:
-        """The function with these values (n_local,) on the free dofs and one on the others. Collective."""
+    def nodal(self, free: Array, held: Array | float = 0.0) -> Any:
+        """The function with these values (n_local,) on the free dofs and ``held`` on the others. Collective."""
         result = dolfinx.fem.Function(self.V)
-        result.x.array[:] = held
+        result.x.array[: len(self.R)] = held
         result.x.array.reshape(-1, self.layout.dimension)[self.free] = free.reshape(-1, self.layout.dimension)
         result.x.scatter_forward()
         return result
@@ -63,7 +65,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
     """Build the space and the block dof maps. Collective.
 
     Raises:
-        SceneError: the contact zone is empty.
+        SceneError: the contact zone is empty, or a layer holds no cell.
         MeshError: part of the body is not held, or every node is in the contact zone.
     """
     d, comm = mesh.dimension, mesh.mesh.comm
@@ -103,7 +105,7 @@ def discretise(mesh: TissueMesh, scene: Scene) -> Discretisation:
         extent=float((high - low).max()) or 1.0,
         held=np.ascontiguousarray(X[contact, :d]),
     )
-    return Discretisation(mesh, V, contact, free, is_e, R, layout)
+    return Discretisation(mesh, V, contact, free, is_e, R, layout, *layer_numbers(mesh, scene))
 
 
 def _bilinear(V: Any) -> dict[str, Callable[[Any], Any]]:
@@ -144,11 +146,10 @@ def _component(space: Discretisation, A: PETSc.Mat, thickness: float) -> Compone
 def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple[LayerBlocks, ...]:
     """Assemble K_mu, K_lambda and M_1, once per layer; a uniform body is one layer. Collective.
 
-    One form is compiled for each component: layers share it and differ in their cells only. Raises SceneError: a layer
-    has no cells, or some cells belong to no layer.
+    One form is compiled for each component: layers share it and differ in their cells only.
     """
     domain = space.mesh.mesh
-    layers = cells_of_layers(space.mesh, scene) if scene.tissue.layers else {"tissue": None}
+    layers = {name: np.flatnonzero(space.layer == i).astype(np.int32) for i, name in enumerate(space.layers)}
     forms = _bilinear(space.V)
     inventory.forms += list(forms)
     csr = None  # one pattern for all
@@ -159,7 +160,7 @@ def assemble(space: Discretisation, scene: Scene, inventory: Inventory) -> tuple
         csr = dolfinx.fem.create_matrix(dolfinx.fem.form(forms["M_1"](whole)))
     result = []
     for name, cells in layers.items():
-        dx = ufl.dx(domain) if cells is None else ufl.Measure("dx", domain=domain, subdomain_data=[(1, cells)])(1)
+        dx = ufl.Measure("dx", domain=domain, subdomain_data=[(1, cells)])(1) if scene.tissue.layers else ufl.dx(domain)
         parts = {}
         for key, form in forms.items():
             compiled = dolfinx.fem.form(form(dx))
@@ -191,36 +192,24 @@ def _assembled(comm: MPI.Intracomm, csr: Any, form: Any) -> PETSc.Mat:
     return PETSc.Mat().createAIJ(size, bsize=d, csr=entries, comm=comm)
 
 
-def cells_of_layers(mesh: TissueMesh, scene: Scene) -> dict[str, np.ndarray]:
-    """Owned cells of each layer; later layers win where boxes overlap, the rest is ``tissue``. Collective.
-
-    Raises SceneError: a layer holds no cell.
-    """
-    label = np.full(mesh.owned, -1)
-    names = list(scene.tissue.layers)
-    if mesh.layers is not None:
-        here = mesh.layers.indices < mesh.owned
-        label[mesh.layers.indices[here]] = mesh.layers.values[here]
-    else:
-        for i, name in enumerate(names):
-            label[cells_in(mesh, scene.tissue.layers[name])] = i
-    counts = total(mesh.mesh.comm, np.array([float((label == i).sum()) for i in range(-1, len(names))]))
-    empty = [n for n, c in zip(names, counts[1:], strict=True) if c == 0]
-    if empty:
-        raise SceneError(f"tissue.layers.{empty[0]} holds no cell of {mesh.source}; check its tag or box")
-    cells = {name: np.flatnonzero(label == i).astype(np.int32) for i, name in enumerate(names)}
-    if counts[0]:
-        cells["tissue"] = np.flatnonzero(label == -1).astype(np.int32)
-    return cells
-
-
 def layer_numbers(mesh: TissueMesh, scene: Scene) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names of the layers in the order of their blocks, and the number of the layer of each owned cell. Collective."""
-    cells = cells_of_layers(mesh, scene)
-    numbers = np.zeros(mesh.owned, dtype=np.intp)
-    for i, members in enumerate(cells.values()):
-        numbers[members] = i
-    return tuple(cells), numbers
+    """Names of the layers in the order of their blocks, and the number of the layer of each owned cell. Collective.
+
+    Later layers win where boxes overlap, the rest comes last as ``tissue``. Raises SceneError: a layer holds no cell.
+    """
+    names = (*scene.tissue.layers, "tissue")
+    numbers = np.full(mesh.owned, len(names) - 1, dtype=np.intp)
+    if mesh.layers is not None and scene.tissue.layers:
+        here = mesh.layers.indices < mesh.owned
+        numbers[mesh.layers.indices[here]] = mesh.layers.values[here]
+    else:
+        for i, layer in enumerate(scene.tissue.layers.values()):
+            numbers[cells_in(mesh, layer)] = i
+    counts = total(mesh.mesh.comm, np.bincount(numbers, minlength=len(names)).astype(np.float64))
+    if not counts[:-1].all():
+        empty = names[int(np.argmin(counts[:-1] > 0))]
+        raise SceneError(f"tissue.layers.{empty} holds no cell of {mesh.source}; check its tag or box")
+    return names if counts[-1] else names[:-1], numbers
 
 
 def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Points:
@@ -233,14 +222,13 @@ def make_points(space: Discretisation, scene: Scene, effect: FiniteStrain) -> Po
     at, weights = basix.make_quadrature(V.element.basix_element.cell_type, 1 if order == 1 else 2 * order)
     volume = np.abs(np.linalg.det(edges)) * scene.tissue.thickness
     vol = (volume[:, None] * weights).ravel()
-    layer = layer_numbers(space.mesh, scene)[1]
     first = space.mesh.mesh.topology.index_map(d).local_range[0]
     layout, each = space.layout, len(weights)
     nodes = _free_nodes(space)[V.dofmap.list[:cells]]
     B = make_gradient(layout.comm, space.gradients(at), nodes, (layout.n_local, layout.n_e))
     cell = np.repeat(np.arange(first, first + cells), each)
     places = (space.mesh.vertices[:, :1] + at @ edges).reshape(-1, d)
-    return Points(B, vol, np.repeat(layer, each), cell, places, d, effect.law, effect.tol)
+    return Points(B, vol, np.repeat(space.layer, each), cell, places, d, effect.law, effect.tol)
 
 
 def _free_nodes(space: Discretisation) -> np.ndarray:

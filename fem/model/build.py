@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -114,6 +115,13 @@ class Model:
     def scene_hash(self) -> str:
         """See :func:`softgrasp.fem.mesh.scene_hash.scene_hash`."""
         return scene_hash(self.scene)
+
+    def displacement(self, z: Array, q_s: Array) -> Any:
+        """Absolute displacement u = R q_s + (z + T q_s) as a function [m], ghosts updated. Collective.
+
+        With velocities in place of z, local rows (n_local,) [m], and q_s (n_s,) [m, rad] it is the absolute velocity.
+        """
+        return self.space.nodal(z + self.system.T @ q_s, self.space.R @ q_s)
 
     def with_materials(self, lam: float | None = None, mu: float | None = None, rho: float | None = None) -> Model:
         """The same mesh with other numbers in every layer: K = mu K_mu + lambda K_lambda, M = rho M_1. Collective.

@@ -30,7 +30,7 @@ from softgrasp.fem.mesh.grading import (
 )
 from softgrasp.fem.mesh.singular import Ends, singular_ends
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole, make_mesh
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.petsc import on_root
 
@@ -135,15 +135,9 @@ def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
 def marked(tissue: TissueMesh, scene: Scene) -> Whole:
     """A mesh on one rank with its contact zone, layers and tags as marks."""
     facets = contact_facets(tissue, scene.contact)
-    n = tissue.owned
-    layers = np.full(n, -1, dtype=np.int32)
-    if scene.tissue.layers:
-        names = list(scene.tissue.layers)
-        for name, cells in cells_of_layers(tissue, scene).items():
-            layers[cells] = names.index(name) if name in names else -1
-    on_cells = {"layers": layers}
+    on_cells = {"layers": layer_numbers(tissue, scene)[1].astype(np.int32)}
     if tissue.cell_tags is not None:
-        tags = np.zeros(n, dtype=np.int32)
+        tags = np.zeros(tissue.owned, dtype=np.int32)
         tags[tissue.cell_tags.indices] = tissue.cell_tags.values
         on_cells["cell_tags"] = tags
     contact = dolfinx.mesh.meshtags(
@@ -157,9 +151,9 @@ def marked(tissue: TissueMesh, scene: Scene) -> Whole:
 
 def ends_of(whole: Whole, scene: Scene) -> Ends:
     """Singular ends of a marked mesh."""
-    layers = [scene.tissue.material, *(layer.material for layer in scene.tissue.layers.values())]
+    materials = [*(layer.material for layer in scene.tissue.layers.values()), scene.tissue.material]
     number = whole.cells["layers"].astype(np.int64)
-    nu = np.array([m.nu for m in layers])[number + 1]
+    nu = np.array([m.nu for m in materials])[number]
     return singular_ends(whole.points, whole.simplices, whole.facet_nodes("contact"), number, nu)
 
 

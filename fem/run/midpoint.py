@@ -27,7 +27,7 @@ from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import SAME, Array, PETSc, combine, total
 from softgrasp.fem.solve.held import held_operators
 from softgrasp.fem.solve.solvers import Reproducible, SolverName, TissueSolver, factor_on_every_rank, make_solver
-from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.system import BlockSystem, dynamic_stiffness
 
 if TYPE_CHECKING:
     from softgrasp.fem.strain.newton import NewtonFigures
@@ -46,9 +46,7 @@ def make_midpoint(
 
 def midpoint_matrix(system: BlockSystem, dt: float) -> PETSc.Mat:
     """S = K + s D + s^2 M with s = 2/dt. Collective."""
-    s, damping = 2 / dt, system.damping
-    layers = [] if damping.matrix is None else [(s, damping.matrix)]
-    return combine([(1 + s * damping.beta, system.K_ee), (s * s + s * damping.alpha, system.M_ee), *layers])
+    return dynamic_stiffness(system, 2 / dt)
 
 
 def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:

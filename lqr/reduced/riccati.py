@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from softgrasp.lqr.reduced.bases import RiccatiBasis, energy_scaled
 from softgrasp.lqr.spectrum.certificate import abscissa
 from softgrasp.lqr.spectrum.modal_loop import DENSE_LIMIT, LoopQuality, ModalLoop, SampledRadius
 from softgrasp.lqr.spectrum.sampled import SampledLoop, Sampling, midpoint_radius
+from softgrasp.lqr.spectrum.tail import tail_modes, why_no_bound
 
 NAN = float("nan")
 
@@ -167,6 +169,11 @@ class GainCheck:
         if not self.optimal > 0:
             raise ControlError("the start is the target: nothing moves, so the cost of a gain cannot be compared")
 
+    @cached_property
+    def _tail_modes(self) -> tuple[Array, Array] | None:
+        """What the certificates of all gains share; None where there is no bound. Collective."""
+        return None if why_no_bound(self.problem) else tail_modes(self.problem)
+
     def quality(self, gain: Gain) -> LoopQuality:
         """Abscissa, excess cost and sampled radius of any gain. Collective.
 
@@ -181,7 +188,7 @@ class GainCheck:
             return self._sampled(K, self._modal(self.loop, K))
         fits = self.problem.layout.n_e <= DENSE_LIMIT
         try:
-            spectrum = abscissa(self.problem, gain)
+            spectrum = abscissa(self.problem, gain, self._tail_modes)
         except SolverError:
             if not fits:
                 raise

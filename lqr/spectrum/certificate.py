@@ -8,8 +8,9 @@ import numpy as np
 from slepc4py import SLEPc
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import PETSc, combine, total
+from softgrasp.fem.petsc import Array, PETSc, total
 from softgrasp.fem.solve.solvers import TissueSolver, choose_solver, make_solver
+from softgrasp.fem.system import dynamic_stiffness
 from softgrasp.lqr.dense.modal import modes_of_plant
 from softgrasp.lqr.lowrank.compress import gram
 from softgrasp.lqr.plant.block import Block
@@ -53,7 +54,7 @@ class Abscissa:
         return self.certified and self.value < 0
 
 
-def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
+def abscissa(problem: RiccatiProblem, gain: Gain, modes: tuple[Array, Array] | None = None) -> Abscissa:
     """Largest real part of the spectrum of x' = (A + B K) x [1/s], with a certificate of its sign. Collective.
 
     Eigenvalues of A + B K in a circle around sigma > 0, and a small-gain bound outside it:
@@ -69,6 +70,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
     Args:
         problem: the plant; damped in every layer for a certificate.
         gain: u = K x.
+        modes: see :class:`softgrasp.lqr.spectrum.tail.Tail`, when they are there already.
 
     Raises:
         ControlError: the plant has no hand.
@@ -89,7 +91,7 @@ def abscissa(problem: RiccatiProblem, gain: Gain) -> Abscissa:
         reason = "the gain on a rigid displacement is singular: the hand is not held"
         return Abscissa(0.0, True, 0.0, np.inf, np.zeros(1, dtype=complex), reason)
     why = why_no_bound(problem)
-    tail = None if why else Tail(problem, K)
+    tail = None if why else Tail(problem, K, modes)
     # the same bits on every rank: they decide how often all search
     aim, shift, guess = problem.layout.comm.bcast(_circle(problem, tail))
     resolvent = Resolvent(problem, K, shift)
@@ -158,13 +160,9 @@ class Resolvent:
         self.problem, self.K, self.shift = problem, K, shift
         self.system, self.layout, self.comm = problem.system, problem.layout, problem.layout.comm
         self.n_s, self.n = self.layout.n_s, self.layout.n_local
-        damping = self.system.damping
-        self.drag = damping.drag
-        terms = [(1 + shift * damping.beta, self.system.K_ee), (shift * (shift + damping.alpha), self.system.M_ee)]
-        S = combine(terms + ([] if damping.matrix is None else [(shift, damping.matrix)]))
-        name = choose_solver(self.layout, few=True)[0]
+        self.drag = self.system.damping.drag
+        S, name = dynamic_stiffness(self.system, shift), choose_solver(self.layout, few=True)[0]
         self.solver: TissueSolver = make_solver(S, name, self.layout, PREFIX, rtol=1e-12)
-        self.r, self.w = self.system.K_ee.createVecs()
         self.extra = 2 * self.n_s if self.comm.rank == 0 else 0
         local = 2 * self.n + self.extra
         self.shell = PETSc.Mat().createPython(((local, self.layout.states),) * 2, self, comm=self.comm)
@@ -180,7 +178,7 @@ class Resolvent:
         system, sigma, n_s = self.system, self.shift, self.n_s
         hand = sigma**2 * self.problem.M_s
         if system.two_way:
-            self.S_G = np.column_stack([self._solve(column) for column in system.G.T]).reshape(self.n, n_s)
+            self.S_G = self.solver.columns(system.G)
             factor = sigma**2 + sigma * self.drag
             hand = hand + sigma * self.drag * system.M_rigid
             hand = hand - factor**2 * total(self.comm, system.G.T @ self.S_G)
@@ -200,12 +198,12 @@ class Resolvent:
             right = right + self.drag * (system.M_rigid @ a_s + total(self.comm, system.G.T @ a))
         factor = sigma**2 + sigma * self.drag
         if system.two_way:
-            z = self._solve(force[:, 0])[:, None]
+            z = self.solver.columns(force)
             q_s = self.hand @ (right - factor * total(self.comm, system.G.T @ z))
             z = z - factor * (self.S_G @ q_s)
         else:
             q_s = self.hand @ right
-            z = self._solve((force - factor * (system.G @ q_s))[:, 0])[:, None]
+            z = self.solver.columns(force - factor * (system.G @ q_s))
         return Block.of_parts(q_s, sigma * q_s - a_s, z, sigma * z - a)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -219,11 +217,6 @@ class Resolvent:
         out = y.array_w
         out[: self.extra] = (answer.hand + self.columns.hand @ input_)[: self.extra, 0]
         out[self.extra :] = (answer.tall + self.columns.tall @ input_)[:, 0]
-
-    def _solve(self, right: np.ndarray) -> np.ndarray:
-        self.r.array_w[:] = right
-        self.solver.solve(self.r, self.w)
-        return np.array(self.w.array_r)
 
     def nearest(self, count: int) -> np.ndarray:
         """The ``count`` eigenvalues nearest to the shift, or as many as converge before the first that does not.
@@ -268,5 +261,3 @@ class Resolvent:
         """Free all PETSc objects. Collective."""
         self.shell.destroy()
         self.solver.destroy()
-        for vector in (self.r, self.w):
-            vector.destroy()

@@ -36,8 +36,9 @@ def least_beta(problem: RiccatiProblem) -> float:
     return min((m.beta for m in system.materials), default=0.0)
 
 
-def tail_modes(problem: RiccatiProblem, k: int) -> tuple[Array, Array]:
-    """The k lowest frequencies and modes, two-way with the hand floating. Collective."""
+def tail_modes(problem: RiccatiProblem, k: int = MODES) -> tuple[Array, Array]:
+    """The k lowest frequencies and modes, or all, two-way with the hand floating. Collective."""
+    k = min(k, problem.layout.n_e)
     return plant_modes(Plant(problem), k) if problem.system.two_way else modes_of_plant(problem, k)[:2]
 
 
@@ -80,7 +81,7 @@ class Tail:
         force = system.G @ inverse
         if system.two_way:  # the hand gives way: q_s = M_s^{-1} (u / s^2 - G'z)
             gain_z, gain_v = gain_z - force @ hand_q, gain_v - force @ hand_v
-        self.omega, Phi = tail_modes(problem, min(MODES, problem.layout.n_e)) if modes is None else modes
+        self.omega, Phi = tail_modes(problem) if modes is None else modes
         columns = np.hstack([gain_z, gain_v, force])
         size = total(comm, Phi.T @ columns)
         self.parts = np.hsplit(size, 3)  # gain on z and v, and force, of each mode

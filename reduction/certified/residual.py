@@ -151,7 +151,6 @@ class Orthonormal:
         if W is not None:
             name, _ = choose_solver(system.layout, few=True)
             self.solver = make_solver(W.copy(), name, system.layout, PREFIX, 1e-12, reproducible=False)
-            self.b, self.x = W.createVecs()
         self.Q, self.Y = np.empty((self.n, 0), order="F"), np.empty((self.n, 0), order="F")
         self.T: list[Array] = []
         self.rank = 0
@@ -160,12 +159,7 @@ class Orthonormal:
         """W^-1 X, local rows. Collective."""
         if self.product is not None:
             return times_columns(self.product, X)
-        Y = np.empty(X.shape, order="F")
-        for j in range(X.shape[1]):
-            self.b.array_w[:] = X[:, j]
-            self.solver.solve(self.b, self.x)
-            Y[:, j] = self.x.array_r
-        return Y
+        return self.solver.columns(X)
 
     def add(self, C: Array) -> None:
         """Append columns, local rows (n_local, p). Collective."""
@@ -203,8 +197,7 @@ class Orthonormal:
     def destroy(self) -> None:
         """Free what PETSc holds. Collective."""
         if self.product is None:
-            for used in (self.solver, self.b, self.x):
-                used.destroy()
+            self.solver.destroy()
 
 
 class ResidualSpace:

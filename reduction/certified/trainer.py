@@ -25,7 +25,7 @@ from softgrasp.reduction.certified.model import Box, CertifiedModel
 from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.training import certified_model, scene_drive
-from softgrasp.reduction.errors import full_energy
+from softgrasp.reduction.certified.truth import tested
 from softgrasp.reduction.parameters import box_of, materials_at, outside, run_with, thinned
 
 COLUMNS = 200  # states of a full run that its modes are taken from
@@ -354,17 +354,9 @@ def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
     With c the largest ratio seen, the share of the box where the error exceeds c times the estimate is at most
     1 - 0.05^(1/n) with a confidence of 95 %.
     """
-    factors, errors = [], []
-    layout = trainer.model.system.layout
-    modes = trainer.Phi[:, : model.k]
+    modes, tests = trainer.Phi[:, : model.k], []
     for place in trainer.random(n, SEED + 1):
         full = run_with(trainer.models[0], place)
-        run = model.run(full.model.system.materials, trainer.drives[0], allow=True)
-        steps, hand = full.snapshots.steps, 2 * layout.n_s
-        a, b = np.split(run.trajectory.x[steps, hand:].T, 2)
-        d = full.snapshots.Z - np.vstack([modes @ a, modes @ b])
-        error = np.sqrt(2 * full_energy(full.model.system, d).max())
-        estimate = run.certificate.estimate
-        errors.append(error / np.sqrt(2 * full.energy.max()))
-        factors.append(error / float(estimate.largest) if estimate is not None else np.nan)
-    return Validation(n, float(max(factors)), float(max(errors)), float(1 - 0.05 ** (1 / n)))
+        tests.append(tested(full, model.run(place, trainer.drives[0], allow=True), modes))
+    factor, worst = max(t.truth / t.estimate for t in tests), max(t.truth for t in tests)
+    return Validation(n, factor, worst, float(1 - 0.05 ** (1 / n)))

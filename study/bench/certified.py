@@ -164,6 +164,6 @@ def main(
     console.print(table.terminal())
     goals = goals_of(rows)
     driver.show_goals(console, goals)
-    content = {"command": "bench_certified", "repeats": repeats, "rows": driver.as_rows(rows)}
-    content["goals"] = driver.goal_rows(goals)
+    numbers = [{key: x for key, x in row.items() if x is not None} for row in driver.as_rows(rows)]
+    content = {"command": "bench_certified", "repeats": repeats, "rows": numbers, "goals": driver.goal_rows(goals)}
     driver.list_bench(console, driver.write_bench(out, "bench_certified", content, table))

@@ -16,15 +16,15 @@ import scipy.linalg
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, to_scipy
 from softgrasp.fem.run.simulate import simulate
-from softgrasp.fem.run.snapshots import Snapshots
-from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.certified.archive import load_certified, save_certified
-from softgrasp.reduction.certified.certificate import Certificate, CertifiedRun
+from softgrasp.reduction.certified.certificate import CertifiedRun
 from softgrasp.reduction.certified.model import CertifiedModel
 from softgrasp.reduction.certified.residual import ResidualSpace
 from softgrasp.reduction.certified.trainer import Trainer, build_certified
 from softgrasp.reduction.certified.training import certified_model, scene_drive
+from softgrasp.reduction.certified.truth import energy_norm, true_error
 from softgrasp.reduction.parameters import materials_at
+from softgrasp.reduction.replay import FullRun
 from softgrasp.study.hardcases.cases import EPS, Family, HardCase, Outcome, here, make, textbook
 
 KV = "effects.damping={kind='kelvin-voigt', beta=0.002}"
@@ -76,19 +76,20 @@ def pod(model: Model, k: int) -> Array:
     root = np.linalg.cholesky(to_scipy(model.system.K_ee).toarray())
     n, columns = model.system.layout.n_local, []
     for lam, mu in TRAINING:
-        snapshots = full(model, lam, mu)[1]
-        z, v = snapshots.Z[:n, ::6], snapshots.Z[n:, ::6]
+        Z = full(model, lam, mu).snapshots.Z[:, ::6]
+        z, v = Z[:n], Z[n:]
         columns += [z, v * np.linalg.norm(z) / max(float(np.linalg.norm(v)), EPS)]
     U = np.linalg.svd(root.T @ np.hstack(columns), full_matrices=False)[0]
     return np.asfortranarray(scipy.linalg.solve_triangular(root.T, U[:, :k], lower=False))
 
 
-def full(model: Model, lam: float, mu: float) -> tuple[BlockSystem, Snapshots]:
-    """The full run at a parameter, with all states."""
-    system = model.system.with_materials(materials_at(model, lam, mu))
-    snapshots = simulate(replace(model, system=system)).snapshots
-    assert snapshots is not None
-    return system, snapshots
+def full(model: Model, lam: float, mu: float) -> FullRun:
+    """The full run at a parameter, with all states; also of a hand that does not move."""
+    other = replace(model, system=model.system.with_materials(materials_at(model, lam, mu)))
+    run = simulate(other)
+    if run.snapshots is None:
+        raise ValueError("the scene keeps no snapshots in memory")
+    return FullRun(other, run, run.snapshots)
 
 
 @cache
@@ -98,26 +99,16 @@ def trained(scene: tuple[str, ...], k: int, k2: int) -> tuple[Model, CertifiedMo
     return model, certified_model(model, pod(model, k2), k=k, tolerance=TOLERANCE)
 
 
-def true_error(system: BlockSystem, s: Snapshots, model: CertifiedModel, run: CertifiedRun, coupled: bool) -> Array:
-    """Energy norm of the error at every step, and ``ROUNDING`` of the largest of the solution taken off."""
-    n, hand, lift, x = system.layout.n_local, 2 * system.layout.n_s, model.fine.lift, run.trajectory.x.T
-    assert lift is not None
-    Phi = lift.L_q[:, hand : hand + model.k]
-    K, M = to_scipy(system.K_ee), to_scipy(system.M_ee)
+def shares(exact: FullRun, model: CertifiedModel, run: CertifiedRun, coupled: bool) -> tuple[Outcome, Outcome]:
+    """Largest true error over the proved bound, and over the difference of two bases taken for one.
 
-    def norm(z: Array, v: Array, v_s: Array) -> Array:
-        square = (z * (K @ z)).sum(0) + (v * (M @ v)).sum(0)
-        if coupled:
-            square += (v_s * (2 * system.G.T @ v + (system.M_hand + system.M_rigid) @ v_s)).sum(0)
-        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
-
-    z, v = s.Z[:n], s.Z[n:]
-    off = norm(z - Phi @ x[hand : hand + model.k], v - Phi @ x[hand + model.k :], s.v_s - run.trajectory.v_s.T)
-    return np.maximum(off - ROUNDING * norm(z, v, s.v_s).max(), 0.0)
-
-
-def shares(error: Array, c: Certificate) -> tuple[Outcome, Outcome]:
-    """Largest true error over the proved bound, and over the difference of two bases taken for one."""
+    ``ROUNDING`` of the largest norm of the solution is taken off the true error.
+    """
+    system, s, lift, c = exact.model.system, exact.snapshots, model.fine.lift, run.certificate
+    if lift is None:
+        raise ValueError("the model has no lift")
+    hand, size = 2 * system.layout.n_s, energy_norm(system, s.Z, s.v_s if coupled else None).max()
+    error = true_error(exact, run.trajectory, lift.L_q[:, hand : hand + model.k], coupled) - ROUNDING * size
 
     def share(bound: Array) -> float:
         shown = error > 0
@@ -134,10 +125,8 @@ def question_row(i: int, q: Query) -> HardCase:
     question = make("paper_forward", *MESH, *q.scene, *q.motion) if q.motion else model
     drive, materials = scene_drive(question.scene, model.system.M_hand, 1), certified.materials(*q.at)
     run = certified.run(materials, drive, allow=True)
-    c = run.certificate
-    system, snapshots = full(question, *q.at)
-    error = true_error(system, snapshots, certified, run, model.system.two_way and drive.hand is None)
-    answered, plain = shares(error, c)
+    c, coupled = run.certificate, model.system.two_way and drive.hand is None
+    answered, plain = shares(full(question, *q.at), certified, run, coupled)
     if q.refuse:
         refusal = here(lambda: certified.run(materials, drive).certificate.reduction)
         answered = refusal if refusal.refused else answered
@@ -166,11 +155,9 @@ def greedy_row(i: int, case: str, grid: int, tolerance: float) -> HardCase:
     finally:
         trainer.destroy()
     first, run = model.system.materials[0], certified.run(allow=True)
-    system, snapshots = full(model, first.lam, first.mu)
-    error, c = true_error(system, snapshots, certified, run, False), run.certificate
     text = f"{len(certified.training['rounds'])} rounds, ends by {certified.training['reason']}, "
-    proved, plain = shares(error, c)
-    proved = replace(proved, text=f"{text}bound {c.reduction:.1g}")
+    proved, plain = shares(full(model, first.lam, first.mu), certified, run, False)
+    proved = replace(proved, text=f"{text}bound {run.certificate.reduction:.1g}")
     return HardCase(case, i, proved, plain, 1.0, "a bound holds at every step")
 
 

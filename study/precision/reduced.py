@@ -5,32 +5,29 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.fields.probe import Probe, make_probe
-from softgrasp.fem.mesh.scene_hash import scene_hash
-from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.bases.engines import ENGINES, EngineName, Factor, factor, small_svd
-from softgrasp.reduction.bases.registry import METHODS, possible_sizes
-from softgrasp.reduction.bases.states import States
+from softgrasp.reduction.bases.registry import METHODS
+from softgrasp.reduction.bases.states import states_of
 from softgrasp.reduction.model import ReducedModel
 from softgrasp.reduction.online import Stepper, prepared, run
-from softgrasp.reduction.projection import project
 from softgrasp.reduction.propagator import propagator
-from softgrasp.reduction.replay import FullRun, comparison_of, full_run, replay_inputs
+from softgrasp.reduction.replay import FullRun, full_run, replay_inputs
 from softgrasp.study.precision.fit import slopes
 from softgrasp.study.precision.full import FullRuns, Series, errors_of
 from softgrasp.study.precision.points import BasisPoint, ReducedPoint
 from softgrasp.study.precision.result import Question, Truth
 from softgrasp.study.precision.settings import Setting
-from softgrasp.study.reduce.measure import bases_of, chosen_methods, measure
+from softgrasp.study.reduce.measure import bases_of, chosen_methods, measured
 from softgrasp.study.reduce.result import Point
 from softgrasp.study.shell.timing import repeated
 
@@ -59,18 +56,15 @@ class ReducedRuns:
     def __init__(self, setting: Setting, runs: FullRuns, truth: Truth) -> None:
         self.scene, self.setting, self.runs, self.truth = runs.scene, setting, runs, truth
         self.timed = runs.run(setting)  # the full run behind the models, without its snapshots
-        self._full: tuple[FullRun, Probe, Model] | None = None
+        self._full: tuple[FullRun, Probe] | None = None
 
-    def full(self) -> tuple[FullRun, Probe, Model]:
+    def full(self) -> tuple[FullRun, Probe]:
         """The full run with snapshots, and the places on its mesh."""
         if self._full is None:
-            comm = self.runs.cache.comm
-            model = self.runs.model(self.setting)
-            fresh = Model(
-                self.runs.variant(self.setting, "memory"), model.space, model.system, model.inventory, Stopwatch(comm)
-            )
+            model, scene = self.runs.model(self.setting), self.runs.variant(self.setting, "memory")
+            fresh = replace(model, scene=scene, watch=Stopwatch(self.runs.cache.comm))
             probe = make_probe(fresh.space, self.runs.places.points, self.scene.effects.rotation)
-            self._full = (full_run(fresh, simulate(fresh)), probe, fresh)
+            self._full = full_run(fresh, simulate(fresh)), probe
         return self._full
 
     def points(self, name: str, sizes: Sequence[int]) -> list[ReducedPoint]:
@@ -82,14 +76,9 @@ class ReducedRuns:
         }  # fmt: skip
 
         def sweep() -> list[TimedModel]:
-            against, probe, model = self.full()
-            states = States(model.system, ((model.system, against.snapshots),))
-            fit = possible_sizes(METHODS[name], model.system.layout.n_s, section.N)
-            bases, _ = bases_of(name, states, fit, section, {})
-            outputs, key = make_outputs(model.scene, model.system), scene_hash(model.scene)
-            models = [project(basis, model.system, outputs, key) for basis in bases]
-            shared = comparison_of(models[-1], against) if models else None  # the largest holds the others
-            return [_timed_model(m, measure(m, against, shared), against, probe) for m in models]
+            against, probe = self.full()
+            bases, _ = bases_of(name, states_of(against.model.system, against.snapshots), section.N, section, {})
+            return [_timed_model(model, point, against, probe) for model, point in measured(bases, against, {})]
 
         label = f"{METHODS[name].title}, {self.setting.label}"
         models = self.runs.cache.point(label, "reduced", key, TimedModel, sweep)

@@ -30,7 +30,7 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
-from softgrasp.reduction.errors import full_energy
+from softgrasp.reduction.certified.truth import Tested, tested
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
 from softgrasp.reduction.replay import FullRun
@@ -56,22 +56,6 @@ CAPTIONS = {
     "certified_sizes.png": "Leading parts of the basis: bound over true error at the tests (line: median, bar: from "
     "least to largest), and largest error against the time of an answer, beside the time of a full run.",
 }
-
-
-@dataclass(frozen=True)
-class Tested:
-    """One size at one parameter; errors relative to the largest energy norm of the full run."""
-
-    lam: float  # lam, mu: [Pa]
-    mu: float
-    truth: float  # against the full run
-    bound: float  # proved
-    estimate: float  # difference of the two bases; nan with one
-
-    @property
-    def effectivity(self) -> float:
-        """Bound over truth."""
-        return self.bound / self.truth if self.truth > 0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -101,13 +85,12 @@ class BoxCheck:
 def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
     """Full runs on a grid between the corners of the box, and every size against them. Collective.
 
-    None where the bound is of tissue and hand together (a force on the hand, coupled both ways), or nothing moves.
+    None where the bound is of tissue and hand together (a force on the hand, coupled both ways).
     """
     drive, lift, box, layout = certified.drive, certified.fine.lift, certified.box, model.system.layout
     if drive is None or lift is None or box is None or (certified.fine.two_way and drive.hand is None):
         return None
-    drive, hand, comm = replace(drive, finer=None), 2 * layout.n_s, layout.comm
-    Phi = lift.L_q[:, hand : hand + certified.k2]
+    drive, comm, Phi = replace(drive, finer=None), layout.comm, lift.L_q[:, 2 * layout.n_s :]
     models = {sizes: certified.with_sizes(*sizes) for sizes in sizes_of(certified)}
     tests: dict[tuple[int, int], list[Tested]] = {sizes: [] for sizes in models}
     count = TESTS if layout.n_e < LARGE else FEWER
@@ -118,17 +101,9 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
         runs: list[FullRun] = []
         seconds.append(timed(comm, lambda place=place, runs=runs: runs.append(run_at(model, *place))))  # type: ignore[misc]
         (full,) = runs
-        size, steps = float(np.sqrt(2 * full.energy.max())), full.snapshots.steps
-        if size == 0:
-            return None
         for (k, k2), part in models.items():
             answer = part.run(full.model.system.materials, drive, allow=True)
-            a, b = np.split(answer.trajectory.x[steps, hand:].T, 2)
-            off = full.snapshots.Z - np.vstack([Phi[:, :k] @ a, Phi[:, :k] @ b])
-            error = float(np.sqrt(2 * full_energy(full.model.system, off).max()))
-            c = answer.certificate
-            estimate = float("nan") if c.estimate is None else float(c.estimate.largest) / size
-            tests[k, k2].append(Tested(*place, error / size, float(c.energy.largest) / size, estimate))
+            tests[k, k2].append(tested(full, answer, Phi[:, :k]))
     sizes = {}
     for (k, k2), part in models.items():
         query = median_seconds(comm, lambda part=part: part.run(allow=True), REPEATS)  # type: ignore[misc]
@@ -173,7 +148,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     with watch.stage("tests"):
         check = check_box(model, certified)
     result = certify_result(model, certified, check, watch)
-    told = sentences(certified, check, result)
+    said = sentences(certified, check, result)
 
     def page() -> Page:
         drawn: list[Path] = []
@@ -183,13 +158,13 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
             drawn = draw(session.out, certified, check, tolerance)
         greedy = greedy_table(certified)
         parts = [
-            Section("What holds", text="\n\n".join(told), figures=captioned(drawn, CAPTIONS)),
+            Section("What holds", text="\n\n".join(said), figures=captioned(drawn, CAPTIONS)),
             greedy.section("Each round runs the full model where the proved bound was largest."),
         ]
         tables = {"greedy.csv": greedy} | ({} if check is None else {"tests.csv": tests_table(check)})
-        return Page(f"{scene.name}: certified reduced model", told[:3], parts, tables, [*drawn, file])
+        return Page(f"{scene.name}: certified reduced model", said[:3], parts, tables, [*drawn, file])
 
-    for sentence in told:
+    for sentence in said:
         console.print(sentence, markup=False)
     list_files(console, session.write(scene, result, page))
     return result

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.fem.model.outputs import make_outputs
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
+from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.control import Reduction
 from softgrasp.reduction.bases import registry
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.bases.states import BasisError, States
+from softgrasp.reduction.bases.states import BasisError, States, states_of
 from softgrasp.reduction.bases.truncation import Truncation
 from softgrasp.reduction.errors import ModelComparison
 from softgrasp.reduction.model import ModelError, ReducedModel
@@ -53,6 +51,9 @@ LEAST_MESH = 50  # tissue unknowns: a body of fewer deforms in no useful way
 Progress = Callable[[int, int], None]
 """Called with what is done and what there is."""
 
+Say = Callable[[str, int, int], None]
+"""Called with what is done, its number and how many there are."""
+
 
 def chosen_methods(options: Reduction) -> tuple[str, ...]:
     """Methods of the scene, or the paper's six and further ones. Raises BasisError: a name is unknown."""
@@ -69,10 +70,11 @@ def bases_of(
 
     What does not fit is put into ``refused`` by its N, with the reason. Collective.
     """
-    method = registry.METHODS[name]
+    method, n_s = registry.METHODS[name], states.system.layout.n_s
     inner = None if options.inner == "auto" or not method.snapshots else options.inner
     rule = [Truncation(energy=options.energy)] if method.snapshots else []
-    sizes = list(sizes)
+    refused |= registry.impossible_sizes(method, n_s, sizes)
+    sizes = registry.possible_sizes(method, n_s, sizes)
     while sizes or rule:
         try:
             bases = registry.make_bases(name, states, [*sizes, *rule], inner, options.engine)
@@ -91,14 +93,33 @@ def bases_of(
     return (), None
 
 
-def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison | None = None) -> Point:
+def measured(
+    bases: Sequence[Basis], full: FullRun, refused: dict[int, str], progress: Progress = lambda done, of: None
+) -> Iterator[tuple[ReducedModel, Point]]:
+    """Models of nested bases with their errors and times; one without a run is put into ``refused``. Collective."""
+    if not bases:
+        return
+    system, outputs, key = full.model.system, full.model.outputs, full.model.scene_hash
+    # smaller bases are leading columns of the largest: one factorisation gives the errors of all
+    comparison = comparison_of(project(bases[-1], system, outputs, key), full)
+    for i, basis in enumerate(bases):
+        progress(i, len(bases))
+        model = project(basis, system, outputs, key)
+        try:
+            point = measure(model, full, comparison)
+        except ModelError as error:
+            refused[basis.N] = error.reason
+        else:
+            yield model, point
+
+
+def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison) -> Point:
     """Run one reduced model at the scene's own parameter and compare. Collective.
 
-    ``comparison``: of the largest model of the family; None prepares one for this model alone. Raises ModelError: E or
-    A is singular, so that the model has no run or no equilibrium to start in.
+    ``comparison``: of the largest model of the family. Raises ModelError: E or A is singular, so that the model has no
+    run or no equilibrium to start in.
     """
     layout = full.model.system.layout
-    comparison = comparison or comparison_of(model, full)
     with np.errstate(all="ignore"):  # an unstable model may overflow, and is marked
         small = model.at()
         step, drive = replay_inputs(model, small, full)
@@ -122,41 +143,29 @@ def measure(model: ReducedModel, full: FullRun, comparison: ModelComparison | No
 
 def sweep(name: str, full: FullRun, options: Reduction, progress: Progress = lambda done, of: None) -> MethodSweep:
     """One method at all its N. Collective. Raises SolverError: a factorisation failed."""
-    scene, system, method = full.model.scene, full.model.system, registry.METHODS[name]
-    states = States(system, ((system, full.snapshots),))
-    refused = registry.impossible_sizes(method, system.layout.n_s, options.N)
-    sizes = registry.possible_sizes(method, system.layout.n_s, options.N)
-    bases, kept = bases_of(name, states, sizes, options, refused)
-    outputs, key = make_outputs(scene, system), scene_hash(scene)
+    refused: dict[int, str] = {}
+    bases, kept = bases_of(name, states_of(full.model.system, full.snapshots), options.N, options, refused)
     points: list[Point] = []
     models: dict[int, ReducedModel] = {}
-    # smaller bases are leading columns of the largest: one factorisation gives the errors of all
-    comparison = comparison_of(project(bases[-1], system, outputs, key), full) if bases else None
-    for i, basis in enumerate(bases):
-        progress(i, len(bases))
-        model = project(basis, system, outputs, key)
-        try:
-            points.append(measure(model, full, comparison))
-        except ModelError as error:
-            refused[basis.N] = error.reason
-            continue
-        models[basis.N] = model
+    for model, point in measured(bases, full, refused, progress):
+        points.append(point)
+        models[model.N] = model
         models = {N: models[N] for N in models if N in kept_points(points)}
     sigma, inner = (bases[0].sigma, bases[0].inner) if bases else ((), "")
-    return MethodSweep(method, tuple(points), models, sigma, dict(sorted(refused.items())), kept, inner)
+    about = dict(sorted(refused.items())), kept, inner
+    return MethodSweep(registry.METHODS[name], tuple(points), models, sigma, *about)
 
 
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
-    scene, system, models = full.model.scene, full.model.system, []
-    outputs = make_outputs(scene, system)
+    system, outputs, models = full.model.system, full.model.outputs, []
     for s, _ in by_error(sweeps)[:METHODS_TESTED]:
         sizes = {p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}
         own = [s.models[N] for N in sorted(sizes)]
         models += [TestedModel(s.method, False, model) for model in own]
         if states is None or not s.method.snapshots:
             continue
-        bases, _ = bases_of(s.method.key, states, [model.N for model in own], scene.reduction, {})
+        bases, _ = bases_of(s.method.key, states, [model.N for model in own], full.model.scene.reduction, {})
         models += [TestedModel(s.method, True, project(b, system, outputs)) for b, _ in zip(bases, own, strict=False)]
     return models
 
@@ -197,15 +206,14 @@ def measure_box(full: FullRun, sweeps: Sequence[MethodSweep], progress: Progress
     return BoxTests(tuple(models), tuple(points), tuple(summary), trained_at if training else (), box_of(scene))
 
 
-def measured_run(model: Model, progress: Callable[[Run], None]) -> tuple[FullRun, FullTimes]:
+def measured_run(model: Model, say: Say) -> tuple[FullRun, FullTimes]:
     """The full run, and its seconds in the median of several when it is short. Collective."""
-    first = simulate(model, RunOptions(progress=progress))
-    comm, runs = model.system.layout.comm, [first]
+    comm = model.system.layout.comm
+    first = simulate(model, RunOptions(progress=lambda run: say("full run", run.reached, run.steps)))
     repeats = comm.bcast(FULL_REPEATS if steps_seconds(first) < PATIENCE else 1)
-    runs += [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
-    factors = [run.seconds["factor"] for run in runs]
-    times = FullTimes(statistics.median(map(steps_seconds, runs)), statistics.median(factors))
-    return full_run(model, first), times
+    runs = [first] + [simulate(replace(model, watch=Stopwatch(comm))) for _ in range(repeats - 1)]
+    factor = statistics.median(run.seconds["factor"] for run in runs)
+    return full_run(model, first), FullTimes(statistics.median(map(steps_seconds, runs)), factor)
 
 
 def steps_seconds(run: Trajectory) -> float:
@@ -219,7 +227,7 @@ def speed_of(sweep: MethodSweep, full: FullTimes) -> Speed | None:
     p = nearest(sweep.points) or nearest(sweep.points, stable=False)
     if p is None:
         return None
-    return Speed(sweep.method, p, *full.against(p.time_offline, p.time_setup, p.time_online))
+    return Speed(sweep.method, p, *full.against(p))
 
 
 def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) -> tuple[str, ...]:

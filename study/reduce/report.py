@@ -14,9 +14,11 @@ from softgrasp.study.reduce.result import (
     COMPARED,
     N_NOTE,
     BoxTests,
+    FullTimes,
     MethodSweep,
     Point,
     ReductionStudy,
+    StrainPoint,
     by_error,
     nearest,
 )
@@ -131,22 +133,16 @@ def summary(study: ReductionStudy) -> list[str]:
     ]
 
 
-def time_cells(
-    offline: float, setup: float, online: float, speeds: tuple[float, float, float | None]
-) -> tuple[str, ...]:
+def time_cells(p: Point | StrainPoint, full: FullTimes) -> tuple[str, ...]:
     """Below :data:`TIMES`: seconds, and speed-ups with the runs until offline has paid."""
-    again, new, runs = speeds
-    seconds = (f"{1e3 * online:.2f}", f"{1e3 * (setup + online):.2f}", f"{offline:.2f}")
+    again, new, runs = full.against(p)
+    seconds = f"{1e3 * p.time_online:.2f}", f"{1e3 * (p.time_setup + p.time_online):.2f}", f"{p.time_offline:.2f}"
     return *seconds, short(again, 3), short(new, 3), "never" if runs is None else str(math.ceil(runs))
 
 
 def time_table(study: ReductionStudy, narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
-    rows = []
-    for s in study.speeds:
-        p, pays = s.point, (s.speedup_same_model, s.speedup_new_parameter, s.break_even_runs)
-        cells = time_cells(p.time_offline, p.time_setup, p.time_online, pays)
-        rows.append((title_of(s.method, narrow), _size(p), *cells))
+    rows = [(title_of(s.method, narrow), _size(s.point), *time_cells(s.point, study.times)) for s in study.speeds]
     return Table(("method", "N", *TIMES), rows, "Times")
 
 

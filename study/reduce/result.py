@@ -119,19 +119,47 @@ class BoxTests:
 
 
 @dataclass(frozen=True)
+class StrainPoint:
+    """One model at finite strain; errors are relative and in z unless they say otherwise, times in seconds."""
+
+    N: int  # N, k: dimension with the hand's 2 n_s, and displacements
+    k: int
+    tau: float  # tau, residual: of the weights, asked for and reached
+    residual: float
+    cells: int  # that carry a weight
+    # error_own, error_own_velocity, error_own_energy_norm: on the scene's own run, which trained the model: of z, of v
+    # in M_ee, of (z, v) in (z'K_ee z + v'M_ee v)^(1/2)
+    error_own: float
+    error_own_velocity: float
+    error_own_energy_norm: float
+    error_training: float  # over all training runs
+    error_galerkin: float  # the same of the model on all cells
+    floor: float  # of the basis, on the scene's own run
+    error_materials: float | None  # error_materials, error_motions: largest on held-out runs; None without any
+    error_motions: float | None
+    # largest change of the model's own energy that neither load nor damping explains, over all training runs
+    drift: float
+    evaluations: float  # of the force in a step
+    engine: str  # of the stepper, "C" or "NumPy"
+    time_offline: float  # basis, model on all cells, forces and weights, after the full runs
+    time_setup: float  # time_setup, time_online: a new parameter before its run, and a run
+    time_online: float
+
+
+@dataclass(frozen=True)
 class FullTimes:
     """Seconds of the full model: the steps of a run alone, and the factorisation before them."""
 
     steps: float
     factor: float
 
-    def against(self, offline: float, setup: float, online: float) -> tuple[float, float, float | None]:
+    def against(self, p: Point | StrainPoint) -> tuple[float, float, float | None]:
         """Steps over a run of the same reduced model, factor and steps over a new parameter, runs until offline pays.
 
         The last is None where the reduced model is not faster.
         """
-        whole, new = self.factor + self.steps, setup + online
-        return self.steps / online, whole / new, offline / (whole - new) if whole > new else None
+        whole, new = self.factor + self.steps, p.time_setup + p.time_online
+        return self.steps / p.time_online, whole / new, p.time_offline / (whole - new) if whole > new else None
 
     def to_json(self) -> dict[str, float]:
         """In "time" of ``result.json``."""

@@ -8,17 +8,16 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.model.build import Model, Stopwatch
+from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
+from softgrasp.reduction.replay import FullRun
 from softgrasp.study.pictures.beside import beside
-from softgrasp.study.reduce import report
+from softgrasp.study.reduce import measure, report
 from softgrasp.study.reduce.findings import findings
-from softgrasp.study.reduce.measure import chosen_methods, measure_box, measured_run, speed_notes, speed_of, sweep
-from softgrasp.study.reduce.result import N_NOTE, ReductionStudy, best
+from softgrasp.study.reduce.result import N_NOTE, FullTimes, ReductionStudy, best
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
@@ -36,7 +35,7 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
             f"output.every is {scene.output.every}; it must be 1 with effects.reaction, because the force on the hand "
             "needs every state"
         )
-    return chosen_methods(scene.reduction)
+    return measure.chosen_methods(scene.reduction)
 
 
 def run_reduce(
@@ -63,8 +62,10 @@ def run_reduce(
 
         return run_strain(session, scene)
     model, watch = session.model(scene), Stopwatch(session.comm)
-    with session.progress(MofNCompleteColumn()) as bar:
-        study, drawn = reduce_model(session, model, names, bar, watch)
+    with session.counting("full run") as say:
+        with watch.stage("full"):
+            full, times = measure.measured_run(model, say)
+        study, drawn = reduce_model(session, full, times, names, watch, say)
     chosen = [(s, p) for s in study.sweeps if (p := best(s.points)) is not None]
     models = [out / "models" / f"{s.method.key}.h5" for s, _ in chosen]
     with watch.stage("models"):
@@ -84,25 +85,20 @@ def run_reduce(
 
 
 def reduce_model(
-    session: Session, model: Model, names: Sequence[str], bar: Progress, watch: Stopwatch
+    session: Session, full: FullRun, times: FullTimes, names: Sequence[str], watch: Stopwatch, say: measure.Say
 ) -> tuple[ReductionStudy, Callable[[], list[Path]]]:
-    """Full run, every method, errors over the box, beside which pictures are drawn. Collective.
+    """Every method, and errors over the box, beside which pictures are drawn. Collective.
 
     Returned with the study: what waits for the pictures on rank 0.
     """
-    options, task = model.scene.reduction, bar.add_task("full run", total=None)
+    model, options = full.model, full.model.scene.reduction
     size = len(options.N)
-
-    def say(what: str, done: int, of: int) -> None:
-        bar.update(task, description=what, completed=done, total=of)
 
     def swept(i: int, done: int, of: int) -> None:
         say(names[i], size * i + size * done // of, size * len(names))
 
-    with watch.stage("full"):
-        full, times = measured_run(model, lambda run: say("full run", run.reached, run.steps))
     with watch.stage("sweep"):
-        sweeps = tuple(sweep(name, full, options, partial(swept, i)) for i, name in enumerate(names))
+        sweeps = tuple(measure.sweep(name, full, options, partial(swept, i)) for i, name in enumerate(names))
     drawn: Callable[[], list[Path]] = list
     if session.pictures:
         views = gather_views(model, full, sweeps)
@@ -114,9 +110,9 @@ def reduce_model(
 
         drawn = beside(session.comm, session.out, draw_all)
     with watch.stage("box"):
-        box = measure_box(full, sweeps, partial(say, "other parameters"))
-    speeds = tuple(speed for s in sweeps if (speed := speed_of(s, times)) is not None)
-    notes = speed_notes(model.system.layout.n_e, model.scene.time.steps, times, speeds)
+        box = measure.measure_box(full, sweeps, partial(say, "other parameters"))
+    speeds = tuple(speed for s in sweeps if (speed := measure.speed_of(s, times)) is not None)
+    notes = measure.speed_notes(model.system.layout.n_e, model.scene.time.steps, times, speeds)
     return ReductionStudy(full, sweeps, times, speeds, box, findings(sweeps), notes), drawn
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Stopwatch
@@ -17,8 +16,8 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
 from softgrasp.study.reduce.measure import measured_run
 from softgrasp.study.reduce.report import TIMES, time_cells
-from softgrasp.study.reduce.result import reduce_result
-from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainFamily, StrainPoint, StrainStudy, measure_strain
+from softgrasp.study.reduce.result import StrainPoint, reduce_result
+from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainFamily, StrainStudy, measure_strain
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
@@ -45,16 +44,11 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
             "reduction.methods names linear bases; leave it out with effects.finite_strain, whose models have one basis"
         )
     model, watch = session.model(scene), Stopwatch(session.comm)
-    with session.progress(MofNCompleteColumn()) as bar:
-        task = bar.add_task("full run", total=None)
-
-        def say(what: str, done: int, of: int) -> None:
-            bar.update(task, description=what, completed=done, total=of)
-
+    with session.counting("full run") as say:
         with watch.stage("full"):
-            full, times = measured_run(model, lambda run: say("full run", run.reached, run.steps))
+            full, times = measured_run(model, say)
         with watch.stage("reduced"):
-            study = measure_strain(model, full, times, say)
+            study = measure_strain(full, times, say)
     folder = session.out / "models"
     models = {folder / f"{f.key}_N{N}.h5": rom for f in study.families for N, rom in f.models.items()}
     for path, rom in models.items():
@@ -65,14 +59,14 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         from softgrasp.study.reduce.strain_pictures import draw  # brings Matplotlib
 
         picture = gather_picture(model)
-    told = sentences(study)
+    said = sentences(study)
     result = reduce_result(
         study.full,
         {
             "finite_strain": {f.key: _family(study, f) for f in study.families},
             "error_linear": study.linear,
             "reason_for_none": study.none,
-            "findings": told,
+            "findings": said,
         },
         study.times.to_json() | watch.seconds,
     )
@@ -87,7 +81,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
 
     for table in (error_table(study), time_table(study), cell_table(study)):
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))
-    for sentence in told:
+    for sentence in said:
         session.console.print(sentence, markup=False)
     list_files(session.console, session.write(scene, result, page))
     return result
@@ -112,7 +106,7 @@ def _family(study: StrainStudy, f: StrainFamily) -> dict[str, Any]:
     return {
         "runs": f.runs,
         "box": {key: np.asarray(value).tolist() for key, value in asdict(f.box).items()},
-        "points": [asdict(p) | {"speed_up": dict(zip(names, study.speed_up(p), strict=True))} for p in f.points],
+        "points": [asdict(p) | {"speed_up": dict(zip(names, study.times.against(p), strict=True))} for p in f.points],
         "cells": [asdict(p) for p in f.curves],
         "held_out": [asdict(t) for t in f.tests],
         "refused": f.refused,
@@ -144,11 +138,7 @@ def cell_table(study: StrainStudy) -> Table:
 
 def time_table(study: StrainStudy) -> Table:
     """Seconds and speed-ups, costs counted whole."""
-    rows = [
-        (f.runs, p.N, p.cells, *time_cells(p.time_offline, p.time_setup, p.time_online, study.speed_up(p)))
-        for f in study.families
-        for p in f.points
-    ]
+    rows = [(f.runs, p.N, p.cells, *time_cells(p, study.times)) for f in study.families for p in f.points]
     return Table(("runs", "N", "cells", *TIMES), rows, "Times")
 
 
@@ -202,7 +192,7 @@ def sentences(study: StrainStudy) -> list[str]:
 def summary(study: StrainStudy) -> list[str]:
     """What came out, in three sentences."""
     p, f = min(((p, f) for f in study.families for p in f.points), key=lambda pair: pair[0].error_own)
-    again, new, _ = study.speed_up(p)
+    again, new, _ = study.times.against(p)
     return [
         f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
         f"The most accurate reduced model, {f.title}, is {p.error_own:.2%} off with N = {p.N} columns and "

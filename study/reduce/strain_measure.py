@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,8 @@ from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside,
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.model import StrainModel, TrainedBox
 from softgrasp.reduction.strain.training import Reference, Training, errors_of, reference_of, replay_strain, train
-from softgrasp.study.reduce.result import FullTimes
+from softgrasp.study.reduce.measure import Say
+from softgrasp.study.reduce.result import FullTimes, StrainPoint
 from softgrasp.study.shell.timing import median_seconds
 
 SIZES = (8, 10, 14, 18, 24, 30)  # N unless the scene names some: each more displacement costs cells too
@@ -30,39 +31,8 @@ RUNS, SETUPS = 31, 15  # behind each median of the online time and of the set-up
 Place = tuple[float, float]
 """Lamé constants of the first layer [Pa]."""
 
-Say = Callable[[str, int, int], None]
-"""Called with what is done, its number and how many there are."""
-
 HeldOut = tuple[str, FullRun]
 """A full run that trained no model, after what is new in it: "material" or "motion"."""
-
-
-@dataclass(frozen=True)
-class StrainPoint:
-    """One model; errors are relative and in z unless they say otherwise, times in seconds."""
-
-    N: int  # N, k: dimension with the hand's 2 n_s, and displacements
-    k: int
-    tau: float  # tau, residual: of the weights, asked for and reached
-    residual: float
-    cells: int  # that carry a weight
-    # error_own, error_own_velocity, error_own_energy_norm: on the scene's own run, which trained the model: of z, of v
-    # in M_ee, of (z, v) in (z'K_ee z + v'M_ee v)^(1/2)
-    error_own: float
-    error_own_velocity: float
-    error_own_energy_norm: float
-    error_training: float  # over all training runs
-    error_galerkin: float  # the same of the model on all cells
-    floor: float  # of the basis, on the scene's own run
-    error_materials: float | None  # error_materials, error_motions: largest on held-out runs; None without any
-    error_motions: float | None
-    # largest change of the model's own energy that neither load nor damping explains, over all training runs
-    drift: float
-    evaluations: float  # of the force in a step
-    engine: str  # of the stepper, "C" or "NumPy"
-    time_offline: float  # basis, model on all cells, forces and weights, after the full runs
-    time_setup: float  # time_setup, time_online: a new parameter before its run, and a run
-    time_online: float
 
 
 @dataclass(frozen=True)
@@ -105,17 +75,14 @@ class StrainStudy:
     linear: float  # error in z of linear elasticity on the same scene
     none: str  # why there are no runs at other materials; empty when there are
 
-    def speed_up(self, p: StrainPoint) -> tuple[float, float, float | None]:
-        """See :meth:`softgrasp.study.reduce.result.FullTimes.against`."""
-        return self.times.against(p.time_offline, p.time_setup, p.time_online)
 
-
-def measure_strain(model: Model, own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
+def measure_strain(own: FullRun, times: FullTimes, say: Say) -> StrainStudy:
     """Train, test and time. Collective. Raises SolverError: a run failed. ReductionError: there is no model."""
+    model = own.model
     options, hand = model.scene.reduction, 2 * model.system.layout.n_s
     chosen = options.N if "N" in options.model_fields_set else SIZES
     sizes = sorted({N for N in chosen if hand < N and N % 2 == 0})  # those that a model can have
-    box_runs, held, none = _box_runs(model, own, say)
+    box_runs, held, none = _box_runs(own, say)
     first, near = model.system.materials[0], []
     for share in SHARES if _has_target(model) else ():
         target = [share * x for x in model.scene.motion.target or []]
@@ -123,11 +90,12 @@ def measure_strain(model: Model, own: FullRun, times: FullTimes, say: Say) -> St
     families = [_family("own", model, [own], near, sizes, say)]
     if len(box_runs) > 1:
         families.append(_family("box", model, box_runs, held, sizes, say))
-    return StrainStudy(own, tuple(families), times, linear_error(model, own), none)
+    return StrainStudy(own, tuple(families), times, missed_by_linear(own), none)
 
 
-def linear_error(model: Model, own: FullRun) -> float:
+def missed_by_linear(own: FullRun) -> float:
     """|z - z_linear|_F / |z|_F of linear elasticity on the same scene. Collective."""
+    model = own.model
     effects = model.scene.effects.model_copy(update={"finite_strain": None})
     scene = model.scene.model_copy(update={"effects": effects})
     comm, n = model.system.layout.comm, model.system.layout.n_local
@@ -149,8 +117,9 @@ def _full(model: Model, place: Place, target: list[float] | None) -> FullRun:
         ) from error
 
 
-def _box_runs(model: Model, own: FullRun, say: Say) -> tuple[list[FullRun], list[HeldOut], str]:
+def _box_runs(own: FullRun, say: Say) -> tuple[list[FullRun], list[HeldOut], str]:
     """Training runs over the box of materials and motions, held-out runs inside it, and why there are none."""
+    model = own.model
     reason, first = outside(model), model.system.materials[0]
     places = [] if reason else training_of(model)
     tests = [] if reason else [p for p in grid_of(model) if not any(np.allclose(p, q) for q in places)]

@@ -17,7 +17,8 @@ from softgrasp.reduction.strain.model import StrainModel
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.shapes import hand_polygons, seen, shadow
 from softgrasp.study.reduce.plots import FULL
-from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainPoint, StrainStudy
+from softgrasp.study.reduce.result import StrainPoint
+from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainStudy
 
 
 def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Path]:

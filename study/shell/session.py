@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict
@@ -13,7 +14,7 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from softgrasp.fem.errors import agree
@@ -98,6 +99,13 @@ class Session:
     def progress(self, count: ProgressColumn) -> Progress:
         """Bars with the time left, in a terminal only."""
         return progress_bar(self.console, count, quiet=self.quiet)
+
+    @contextmanager
+    def counting(self, what: str) -> Iterator[Callable[[str, int, int], None]]:
+        """One bar for several things in turn, called with what is done, its number and how many there are."""
+        with self.progress(MofNCompleteColumn()) as bar:
+            task = bar.add_task(what, total=None)
+            yield lambda what, done, of: bar.update(task, description=what, completed=done, total=of)
 
     def write(
         self, scene: Scene, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True

@@ -13,7 +13,7 @@ import pytest
 from mpi4py import MPI
 
 from softgrasp.fem.fields.picture import gather_picture, vertex_displacement
-from softgrasp.fem.fields.series import FullField, SeriesWriter
+from softgrasp.fem.fields.series import SeriesWriter
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.scene.scene import Scene
 
@@ -118,8 +118,7 @@ def test_picture_knows_the_layers(comm: MPI.Intracomm) -> None:
 @pytest.mark.ranks
 def test_full_field_updates_ghosts(comm: MPI.Intracomm) -> None:
     model, q = make_model(comm, 2, 2), hand_of(2)
-    full = FullField(model)
-    u = full.fill(np.zeros(model.system.layout.n_local), q)
+    u = model.displacement(np.zeros(model.system.layout.n_local), q)
     everywhere = model.space.V.tabulate_dof_coordinates()[:, :2]
     np.testing.assert_allclose(u.x.array.reshape(-1, 2), turned(everywhere, q), atol=EXACT)
 

@@ -19,7 +19,7 @@ from softgrasp.fem.errors import MeshError, SceneError
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.mesh.grading import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import MeshArrays, TissueMesh, Whole, make_mesh, spread, structured_mesh
-from softgrasp.fem.model.assembly import cells_of_layers
+from softgrasp.fem.model.assembly import layer_numbers
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.model.refined import lattice, refined_mesh, unknowns
@@ -98,9 +98,10 @@ def test_lines_keep_the_unknowns_of_the_box(comm: MPI.Intracomm) -> None:
 def test_layers_are_inherited(comm: MPI.Intracomm) -> None:
     scene = refined(LAYERED, **ROUGH)
     mesh = refined_mesh(comm, scene)
-    cells = cells_of_layers(mesh, scene)
+    names, numbers = layer_numbers(mesh, scene)
     sizes = {}
-    for name, members in cells.items():
+    for i, name in enumerate(names):
+        members = np.flatnonzero(numbers == i).astype(np.int32)
         dx = ufl.Measure("dx", domain=mesh.mesh, subdomain_data=[(1, members)])(1)
         part = dolfinx.fem.assemble_scalar(dolfinx.fem.form(dolfinx.fem.Constant(mesh.mesh, 1.0) * dx))
         sizes[name] = comm.allreduce(part)
