@@ -71,7 +71,7 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
     if aim is not None:
         boxes += [_box(p) for p in shapes.moved(picture, [picture.points, *polygons], aim)]
     low, high = _box(np.vstack(boxes))
-    lines = [] if aim is None else _outline(picture, picture.points + picture.rigid(aim))
+    lines = [] if aim is None else outline(picture, picture.points + picture.rigid(aim))
     edges = [picture.facets, shapes.interfaces(picture)] if picture.dimension == 2 else [np.zeros((0, 2), dtype=int)]
     return Shot(picture, hands, path, norm, unit, low, high, polygons, np.vstack(edges), lines)
 
@@ -81,17 +81,18 @@ def figure_move(
 ) -> tuple[Path, ...]:
     """The deformed body at a few instants with hand, path and target; PNG and PDF, whose names are returned.
 
-    Bodies that would hide each other get a panel each.
+    The instants are those of :func:`pick_instants`. Bodies that would hide each other get a panel each.
 
     Args:
         picture: the body.
-        states: absolute vertex displacements, shape (k, n, d) [m].
+        states: absolute vertex displacements, shape (k, n, d) [m], as many as there are.
         times: instants of the states, shape (k,) [s].
         table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
         target: hand coordinates aimed at, d or n_s entries, or None.
         out_png: name of the picture; the PDF gets its stem.
     """
-    states = states.astype(np.float64)
+    chosen = shapes.pick_instants(picture, states, times, table)
+    states, times = states[chosen].astype(np.float64), times[chosen]
     shot = make_shot(picture, states, times, table, target)
     with paper_style():
         meet = picture.dimension == 3 or shapes.overlap(picture, states)  # in 3D captions meet bodies
@@ -292,7 +293,7 @@ def _box(x: Array) -> Array:
     return np.stack([flat.min(axis=0), flat.max(axis=0)])
 
 
-def _outline(picture: PictureMesh, x: Array) -> list[Array]:
+def outline(picture: PictureMesh, x: Array) -> list[Array]:
     """Closed lines around a body with its vertices at x, each (k, 2) [m]."""
     if picture.dimension == 2:
         return [x[line] for line in shapes.chained(picture.facets)]
@@ -315,7 +316,7 @@ def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     picture = shot.picture
     x = picture.points + u
     if len(picture.cells) > MANY_CELLS:
-        lines = LineCollection(_outline(picture, x), colors=style.OUTLINE, linewidths=0.6, zorder=3)
+        lines = LineCollection(outline(picture, x), colors=style.OUTLINE, linewidths=0.6, zorder=3)
         ax.add_collection(lines, autolim=False)
         return
     faces, colours = _paint(shot, u, q)

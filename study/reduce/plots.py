@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.study.pictures import style
-from softgrasp.study.pictures.animation import Film, write_gif
-from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
-from softgrasp.study.pictures.shapes import hands_at, seen, shadow, speed_up
+from softgrasp.study.pictures.animation import film, timing, write_gif
+from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
+from softgrasp.study.pictures.shapes import hands_at
 from softgrasp.study.reduce.result import MethodSweep, Point, by_error
 from softgrasp.study.reduce.views import Views
 
@@ -77,9 +77,9 @@ def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | N
     return files
 
 
-def looks(sweeps: Sequence[MethodSweep]) -> dict[str, tuple[str, str, str]]:
+def looks(methods: Iterable[str]) -> dict[str, tuple[str, str, str]]:
     """Colour, dashes and marker of every method; those without a place of their own share one colour."""
-    others = [s.method.key for s in sweeps if s.method.key not in LOOKS]
+    others = [key for key in methods if key not in LOOKS]
     return {**LOOKS, **{key: SPARE[i % len(SPARE)] for i, key in enumerate(others)}}
 
 
@@ -98,7 +98,7 @@ def figure_errors(
     sweeps: Sequence[MethodSweep], quantities: Sequence[tuple[str, str]], out_png: Path
 ) -> tuple[Path, ...]:
     """Errors against N, one below the other; a curve is dotted where its model is unstable, its name is at its end."""
-    single, look = len(quantities) == 1, looks(sweeps)
+    single, look = len(quantities) == 1, looks(s.method.key for s in sweeps)
     with style.paper_style():
         size = (style.COLUMN + 1.6, 3.4 if single else 6.4)
         figure, axes = plt.subplots(len(quantities), 1, figsize=size, sharex=True, squeeze=False)
@@ -127,7 +127,7 @@ def figure_errors(
 
 def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> tuple[Path, ...]:
     """Error of the deformation against online and offline plus online time, with the Pareto front; ``full`` [s]."""
-    look, key = looks(sweeps), QUANTITIES[0][0]
+    look, key = looks(s.method.key for s in sweeps), QUANTITIES[0][0]
     with style.paper_style():
         figure, axes = plt.subplots(2, 1, figsize=(style.COLUMN + 0.9, 5.6), layout="constrained")
         named: dict[str, Line2D] = {}
@@ -170,7 +170,7 @@ def pareto(points: Sequence[tuple[float, float, MethodSweep]]) -> list[tuple[flo
 
 def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...]:
     """Singular values over the first, a line for each part of a decomposition; no figure without any."""
-    look = looks(sweeps)
+    look = looks(s.method.key for s in sweeps)
     known = [s for s in sweeps if any(len(v) for v in s.sigma)]
     groups = [[s for s in known if (s.method.key in PAPER_METHODS) == paper] for paper in (True, False)]
     groups = [g for g in groups if g]
@@ -238,14 +238,6 @@ def figure_modes(views: Views, out_png: Path) -> tuple[Path, ...]:
         return style.save(figure, out_png)
 
 
-def _outline(picture: PictureMesh, displacement: Array) -> Array:
-    """Short lines around the body where it is seen, (m, 2, 2) [m]."""
-    x = picture.points + displacement
-    if picture.dimension == 2:
-        return np.asarray(x[picture.facets])
-    return np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in shadow(seen(x), picture.facets)])
-
-
 def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
     """Axes for every reduced model in the frame of the full one, so that one that grew does not shrink the picture."""
     width = style.WIDTH if len(views.reduced) > 1 else style.COLUMN + 1
@@ -265,11 +257,10 @@ def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
 
 def _draw(axes: Sequence[Any], shot: Shot, views: Views, k: int) -> None:
     """Every reduced model at one frame under the outline of the full one."""
-    outline = _outline(views.picture, views.full[k])
+    lines = outline(views.picture, views.picture.points + views.full[k])
     for ax, view in zip(axes, views.reduced, strict=True):
         draw_scene(ax, shot, view.states[k : k + 1], None, shot.hands[k : k + 1])
-        lines = style.segments(outline, zorder=7, edgecolors=style.ORANGE, linewidths=1.1)
-        ax.add_collection(lines, autolim=False)
+        ax.add_collection(LineCollection(lines, zorder=7, **OUTLINE), autolim=False)
 
 
 def instants(views: Views) -> list[int]:
@@ -303,15 +294,8 @@ def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
 
 def gif_compare(views: Views, out_gif: Path) -> Path:
     """The same in motion."""
-    images = []
+    kept, durations = timing(views.times)
     with style.paper_style():
         figure, axes, shot = _figure(views)
-        film = Film(figure, axes)
-        for k in range(len(views.times)):
-            film.clear()
-            _draw(axes, shot, views, k)
-            images.append(film.frame())
-        plt.close(figure)
-    span = float(views.times[-1] - views.times[0]) / speed_up(views.times)
-    wait = max(20, round(100 * span / max(1, len(images) - 1)) * 10)  # [ms], GIF counts in hundredths of a second
-    return write_gif(images, [wait] * (len(images) - 1) + [wait + 1000], out_gif)
+        images = film(figure, axes, partial(_draw, axes, shot, views), kept)
+    return write_gif(images, durations, out_gif)
