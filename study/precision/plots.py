@@ -31,7 +31,7 @@ from softgrasp.study.precision.points import (
 from softgrasp.study.precision.riccati import TITLES
 from softgrasp.study.precision.tables import PAPER_ARE, PAPER_N, PAPER_SMALL
 from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
-from softgrasp.study.reduce.plots import LOOKS, SPARE
+from softgrasp.study.reduce.plots import looks
 
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s"), 3: (GREEN, "^")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))
@@ -173,10 +173,9 @@ def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out
     Beside them the seconds of the full run, and times of the paper, whose error is one of the state.
     """
     names = list(series_of(points))
-    others = [n for n in names if n not in LOOKS]
     look: dict[str, dict[str, Any]] = {
         name: {"color": colour, "ls": dashes, "marker": marker, "ms": 3.2, "lw": 0.6}
-        for name, (colour, dashes, marker) in {**LOOKS, **dict(zip(others, SPARE * len(others), strict=False))}.items()
+        for name, (colour, dashes, marker) in looks(names).items()
     }
     lines = series_of(sorted(usable(points), key=lambda p: p.N))
     costs = {"seconds": "online time of a run [s]", "scratch": "time from nothing: full run, basis, online [s]"}

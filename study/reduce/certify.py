@@ -33,12 +33,11 @@ from softgrasp.reduction.certified.trainer import (
 from softgrasp.reduction.certified.truth import Tested, tested
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
-from softgrasp.reduction.replay import FullRun
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
-from softgrasp.study.shell.timing import median_seconds, timed
+from softgrasp.study.shell.timing import median_seconds
 
 FILE = "certified.h5"
 REPEATS = 7  # behind the median time of a query
@@ -96,11 +95,10 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
     count = TESTS if layout.n_e < LARGE else FEWER
     inner = (np.arange(count) + 0.5) / count  # of the box; the training has its edges
     lam, mu = (low * (high / low) ** inner for low, high in (box.lam, box.mu))
-    seconds: list[float] = []
-    for place in product(lam.tolist(), mu.tolist()):
-        runs: list[FullRun] = []
-        seconds.append(timed(comm, lambda place=place, runs=runs: runs.append(run_at(model, *place))))  # type: ignore[misc]
-        (full,) = runs
+    watch = Stopwatch(comm)
+    for i, place in enumerate(product(lam.tolist(), mu.tolist())):
+        with watch.stage(f"full run {i}"):
+            full = run_at(model, *place)
         for (k, k2), part in models.items():
             answer = part.run(full.model.system.materials, drive, allow=True)
             tests[k, k2].append(tested(full, answer, Phi[:, :k]))
@@ -108,7 +106,7 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
     for (k, k2), part in models.items():
         query = median_seconds(comm, lambda part=part: part.run(allow=True), REPEATS)  # type: ignore[misc]
         sizes[k, k2] = Size(k, k2, part.coarse.N, query, tuple(tests[k, k2]))
-    return BoxCheck(sizes[certified.k, certified.k2], tuple(sizes.values()), float(median(seconds)))
+    return BoxCheck(sizes[certified.k, certified.k2], tuple(sizes.values()), float(median(watch.seconds.values())))
 
 
 def sizes_of(certified: CertifiedModel) -> list[tuple[int, int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from softgrasp.study.pictures import style
 from softgrasp.study.pictures.animation import Film, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
 from softgrasp.study.pictures.shapes import hands_at, seen, shadow, speed_up
-from softgrasp.study.reduce.result import MethodSweep, Point, by_error
+from softgrasp.study.reduce.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.views import Views
 
 TOP = 1.0  # errors above are drawn at the upper edge
@@ -77,9 +77,9 @@ def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | N
     return files
 
 
-def looks(sweeps: Sequence[MethodSweep]) -> dict[str, tuple[str, str, str]]:
+def looks(keys: Iterable[str]) -> dict[str, tuple[str, str, str]]:
     """Colour, dashes and marker of every method; those without a place of their own share one colour."""
-    others = [s.method.key for s in sweeps if s.method.key not in LOOKS]
+    others = [key for key in keys if key not in LOOKS]
     return {**LOOKS, **{key: SPARE[i % len(SPARE)] for i, key in enumerate(others)}}
 
 
@@ -98,7 +98,7 @@ def figure_errors(
     sweeps: Sequence[MethodSweep], quantities: Sequence[tuple[str, str]], out_png: Path
 ) -> tuple[Path, ...]:
     """Errors against N, one below the other; a curve is dotted where its model is unstable, its name is at its end."""
-    single, look = len(quantities) == 1, looks(sweeps)
+    single, look = len(quantities) == 1, looks(s.method.key for s in sweeps)
     with style.paper_style():
         size = (style.COLUMN + 1.6, 3.4 if single else 6.4)
         figure, axes = plt.subplots(len(quantities), 1, figsize=size, sharex=True, squeeze=False)
@@ -127,7 +127,7 @@ def figure_errors(
 
 def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> tuple[Path, ...]:
     """Error of the deformation against online and offline plus online time, with the Pareto front; ``full`` [s]."""
-    look, key = looks(sweeps), QUANTITIES[0][0]
+    look, key = looks(s.method.key for s in sweeps), QUANTITIES[0][0]
     with style.paper_style():
         figure, axes = plt.subplots(2, 1, figsize=(style.COLUMN + 0.9, 5.6), layout="constrained")
         named: dict[str, Line2D] = {}
@@ -137,7 +137,7 @@ def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> t
                 (unit * (p.time_online + offline * p.time_offline), min(getattr(p, key), TOP), s)
                 for s in sweeps for p in s.points if p.stable and np.isfinite(getattr(p, key))
             ]  # fmt: skip
-            front = pareto(points)
+            front = unbeaten(points)
             for shown, mark in ((points, OTHERS), (front, FRONT)):
                 ax.plot([t for t, _, _ in shown], [e for _, e, _ in shown], **mark)
             for t, e, s in front:
@@ -159,18 +159,9 @@ def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> t
         return style.save(figure, out_png)
 
 
-def pareto(points: Sequence[tuple[float, float, MethodSweep]]) -> list[tuple[float, float, MethodSweep]]:
-    """Those of (time, error, method) that no other beats in both, by time."""
-    front: list[tuple[float, float, MethodSweep]] = []
-    for point in sorted(points, key=lambda p: p[:2]):
-        if not front or point[1] < front[-1][1]:
-            front.append(point)
-    return front
-
-
 def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...]:
     """Singular values over the first, a line for each part of a decomposition; no figure without any."""
-    look = looks(sweeps)
+    look = looks(s.method.key for s in sweeps)
     known = [s for s in sweeps if any(len(v) for v in s.sigma)]
     groups = [[s for s in known if (s.method.key in PAPER_METHODS) == paper] for paper in (True, False)]
     groups = [g for g in groups if g]
