@@ -71,7 +71,7 @@ def make_shot(picture: PictureMesh, states: Array, times: Array, table: Array, t
     if aim is not None:
         boxes += [_box(p) for p in shapes.moved(picture, [picture.points, *polygons], aim)]
     low, high = _box(np.vstack(boxes))
-    lines = [] if aim is None else _outline(picture, picture.points + picture.rigid(aim))
+    lines = [] if aim is None else outline(picture, picture.points + picture.rigid(aim))
     edges = [picture.facets, shapes.interfaces(picture)] if picture.dimension == 2 else [np.zeros((0, 2), dtype=int)]
     return Shot(picture, hands, path, norm, unit, low, high, polygons, np.vstack(edges), lines)
 
@@ -292,7 +292,7 @@ def _box(x: Array) -> Array:
     return np.stack([flat.min(axis=0), flat.max(axis=0)])
 
 
-def _outline(picture: PictureMesh, x: Array) -> list[Array]:
+def outline(picture: PictureMesh, x: Array) -> list[Array]:
     """Closed lines around a body with its vertices at x, each (k, 2) [m]."""
     if picture.dimension == 2:
         return [x[line] for line in shapes.chained(picture.facets)]
@@ -315,7 +315,7 @@ def _draw_3d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
     picture = shot.picture
     x = picture.points + u
     if len(picture.cells) > MANY_CELLS:
-        lines = LineCollection(_outline(picture, x), colors=style.OUTLINE, linewidths=0.6, zorder=3)
+        lines = LineCollection(outline(picture, x), colors=style.OUTLINE, linewidths=0.6, zorder=3)
         ax.add_collection(lines, autolim=False)
         return
     faces, colours = _paint(shot, u, q)

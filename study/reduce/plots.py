@@ -9,17 +9,16 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from softgrasp.fem.fields.picture import PictureMesh
-from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.study.pictures import style
 from softgrasp.study.pictures.animation import Film, write_gif
-from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot
-from softgrasp.study.pictures.shapes import hands_at, seen, shadow, speed_up
+from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
+from softgrasp.study.pictures.shapes import hands_at, speed_up
 from softgrasp.study.reduce.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.views import Views
 
@@ -229,14 +228,6 @@ def figure_modes(views: Views, out_png: Path) -> tuple[Path, ...]:
         return style.save(figure, out_png)
 
 
-def _outline(picture: PictureMesh, displacement: Array) -> Array:
-    """Short lines around the body where it is seen, (m, 2, 2) [m]."""
-    x = picture.points + displacement
-    if picture.dimension == 2:
-        return np.asarray(x[picture.facets])
-    return np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in shadow(seen(x), picture.facets)])
-
-
 def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
     """Axes for every reduced model in the frame of the full one, so that one that grew does not shrink the picture."""
     width = style.WIDTH if len(views.reduced) > 1 else style.COLUMN + 1
@@ -256,11 +247,10 @@ def _figure(views: Views, note: str = "") -> tuple[Any, list[Any], Shot]:
 
 def _draw(axes: Sequence[Any], shot: Shot, views: Views, k: int) -> None:
     """Every reduced model at one frame under the outline of the full one."""
-    outline = _outline(views.picture, views.full[k])
+    lines = outline(views.picture, views.picture.points + views.full[k])
     for ax, view in zip(axes, views.reduced, strict=True):
         draw_scene(ax, shot, view.states[k : k + 1], None, shot.hands[k : k + 1])
-        lines = style.segments(outline, zorder=7, edgecolors=style.ORANGE, linewidths=1.1)
-        ax.add_collection(lines, autolim=False)
+        ax.add_collection(LineCollection(lines, zorder=7, **OUTLINE), autolim=False)
 
 
 def instants(views: Views) -> list[int]:
