@@ -30,9 +30,7 @@ def plan(design: Design, own_end: bool) -> LoopPlan:
     """
     scene, n_s = design.model.scene, design.problem.layout.n_s
     dt, steps = scene.time_end / scene.time.steps, scene.time.steps
-    A = np.zeros((2 * n_s, 2 * n_s))
-    A[:n_s, n_s:] = np.eye(n_s)
-    A[n_s:] = np.linalg.solve(design.problem.M_s, design.gain.K_s)
+    A = np.vstack([np.eye(n_s, 2 * n_s, n_s), np.linalg.solve(design.problem.M_s, design.gain.K_s)])
     slowest = -float(np.linalg.eigvals(A).real.max())
     settle = SETTLED / slowest if slowest > 0 else scene.time_end
     needed = int(np.ceil(settle / dt))

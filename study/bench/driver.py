@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import tempfile
 import time
@@ -19,7 +18,7 @@ from rich.console import Console
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.report.files import write_json
 from softgrasp.study.report.tables import Table
-from softgrasp.study.shell.processes import IN_MPI_JOB, run_ranks
+from softgrasp.study.shell.processes import in_mpi_job, run_ranks
 
 Row = dict[str, Any]
 LIMIT = 3600.0  # [s] of a worker
@@ -170,7 +169,7 @@ def loglog(path: Path, curves: Sequence[Curve], x: str, y: str, title: str = "")
 
 def open_console(width: int) -> Console:
     """A terminal wide enough for the table. Raises typer.BadParameter: the benchmark was started under mpiexec."""
-    if any(variable in os.environ for variable in IN_MPI_JOB):
+    if in_mpi_job():
         raise typer.BadParameter("start the benchmark without mpiexec; it launches its own ranks")
     return Console(highlight=False, width=max(Console().width, width), soft_wrap=True)
 

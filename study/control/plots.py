@@ -18,8 +18,9 @@ from softgrasp.lqr.loop.margins import LoopMargins
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control.result import TITLES, ControlStudy, LoopRuns, Retuned
 from softgrasp.study.pictures import style
+from softgrasp.study.pictures.body import figure_move
 from softgrasp.study.pictures.frames import Frames
-from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories, figure_loop_move
+from softgrasp.study.pictures.loop import Poles, figure_decay, figure_histories
 
 LOOKS = {
     "pod": (style.BLUE, "-", "o"),
@@ -183,7 +184,7 @@ def _move(out: Path, study: ControlStudy, frames: Frames) -> list[Path]:
     states, times, full = np.stack(frames.states), np.array(frames.times), study.loops.full
     table = np.column_stack([full.times, full.q_s])
     target = study.design.target.state.q_s
-    files = [*figure_loop_move(frames.picture, states, times, table, target, out / "move.png")]  # type: ignore[arg-type]
+    files = [*figure_move(frames.picture, states, times, table, target, out / "move.png")]  # type: ignore[arg-type]
     if not frames.few:
         # nothing moves between the settling time and the end of the run
         keep = slice(None) if len(times) < 3 or times[-1] <= 1.5 * times[-2] else slice(-1)

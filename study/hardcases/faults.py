@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
 import tomllib
@@ -23,7 +22,7 @@ from softgrasp.fem.scene.file import load_scene
 from softgrasp.fem.scene.scene import scene_schema
 from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, make, short, textbook
 from softgrasp.study.hardcases.textbook import textbook_midpoint
-from softgrasp.study.shell.processes import IN_MPI_JOB, run_ranks
+from softgrasp.study.shell.processes import in_mpi_job, run_ranks
 
 BAD = ("nan", "inf", "-inf")
 SCENE = """
@@ -214,7 +213,7 @@ def ending(command: list[str], patience: float, healthy: float, sentence: str) -
 
 def rank_rows(quick: bool) -> Iterator[HardCase]:
     """Two ranks, one of them fails; all must end, with a status and a sentence."""
-    if any(variable in os.environ for variable in IN_MPI_JOB):
+    if in_mpi_job():
         return  # an MPI job cannot start another one
     healthy = healthy_seconds()
     reason = "all ranks must end sooner than a healthy run, times what other work may slow it down"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,15 +34,14 @@ def gif_move(
 
     Too many frames are thinned out; for the arguments see :func:`softgrasp.study.pictures.body.figure_move`.
     """
-    kept, ticks = _timing(times)
+    kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
     shot = make_shot(picture, frames, times, table, target)
-    durations = [*(10 * n for n in ticks), int(1000 * REST)]
     return write_gif(_render(shot, frames, times), durations, out_gif, _palette())
 
 
-def _timing(times: Array) -> tuple[list[int], list[int]]:
-    """Frames to show and how long each but the last [1/100 s]; rounding errors do not add up."""
+def timing(times: Array) -> tuple[list[int], list[int]]:
+    """Frames to show, at most 60, and how long each [ms]; rounding errors do not add up, and the last stays longer."""
     chosen = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_FRAMES)).round().astype(int)).tolist()
     at = np.round(100 * (times - times[0]) / speed_up(times)).astype(int)  # GIF counts in hundredths of a second
     kept = chosen[:1]
@@ -51,12 +50,12 @@ def _timing(times: Array) -> tuple[list[int], list[int]]:
             kept.append(i)
     if len(chosen) > 1 and kept[-1] != chosen[-1]:
         kept = [*(kept[:-1] if len(kept) > 1 else kept), chosen[-1]]
-    return kept, [max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)]
+    return kept, [*(10 * max(int(at[j] - at[i]), TICKS) for i, j in pairwise(kept)), int(1000 * REST)]
 
 
 def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
     """One picture per frame, all of one size."""
-    images, fast = [], speed_up(times)
+    fast = speed_up(times)
     digits = int(np.clip(2 - np.floor(np.log10(times[-1] or 1.0)), 0, 6))
     note = f" ({fast:g}×)" if fast != 1 else ""
     with paper_style():
@@ -65,48 +64,43 @@ def _render(shot: Shot, frames: Array, times: Array) -> list[Any]:
         stamp = axes[0].set_title(f"t = {times[-1]:.{digits}f} s{note}", pad=3)
         colour_bar(figure, axes, shot)
         legend(figure, axes, shot)
-        film = Film(figure, axes, [stamp])
-        for t, u, hand in zip(times, frames, shot.hands, strict=True):
-            film.clear()
-            draw_scene(axes[0], shot, u[None], None, hand[None])
-            name_layers(axes[0], shot, u, inside=True)  # beside the body they would change sides
-            stamp.set_text(f"t = {t:.{digits}f} s{note}")
-            images.append(film.frame())
-        plt.close(figure)
-    return images
+
+        def draw(k: int) -> None:
+            draw_scene(axes[0], shot, frames[k : k + 1], None, shot.hands[k : k + 1])
+            name_layers(axes[0], shot, frames[k], inside=True)  # beside the body they would change sides
+            stamp.set_text(f"t = {times[k]:.{digits}f} s{note}")
+
+        return film(figure, axes, draw, range(len(times)), [stamp])
 
 
-class Film:
-    """Frames of one figure: axes, colour bar and legend are drawn once, what moves over them in every frame.
+def film(
+    figure: Any, axes: list[Any], draw: Callable[[int], None], frames: Iterable[int], others: Sequence[Any] = ()
+) -> list[Any]:
+    """Pictures of one figure: axes, colour bar and legend are drawn once, what moves over them in every frame.
 
-    The figure comes without what moves: the collections and texts of ``axes``, and ``others``.
+    The figure comes without what moves, which are the collections and texts that ``draw`` adds to ``axes`` in a frame,
+    and with ``others``, artists that it changes; it is closed.
     """
-
-    def __init__(self, figure: Any, axes: list[Any], others: Sequence[Any] = ()) -> None:
-        self.figure, self.axes, self.others = figure, axes, others
-        figure.set_dpi(DPI)
-        _fit(figure, figure.get_tightbbox().padded(0.08))
-        for artist in (*others, *(line for ax in axes for line in ax.lines)):
-            artist.set_animated(True)  # no part of the background
-        figure.canvas.draw()
-        self.background = figure.canvas.copy_from_bbox(figure.bbox)
-
-    def clear(self) -> None:
-        """Remove what moves."""
-        for ax in self.axes:
-            for artist in [*ax.collections, *ax.texts]:
-                artist.remove()
-
-    def frame(self) -> Any:
-        """The figure as it is now, as a picture."""
-        canvas = self.figure.canvas
-        canvas.restore_region(self.background)
-        for ax in self.axes:
+    canvas, images = figure.canvas, []
+    figure.set_dpi(DPI)
+    _fit(figure, figure.get_tightbbox().padded(0.08))
+    for artist in (*others, *(line for ax in axes for line in ax.lines)):
+        artist.set_animated(True)  # no part of the background
+    canvas.draw()
+    background = canvas.copy_from_bbox(figure.bbox)
+    for k in frames:
+        for artist in [artist for ax in axes for artist in (*ax.collections, *ax.texts)]:
+            artist.remove()
+        draw(k)
+        canvas.restore_region(background)
+        for ax in axes:
             for artist in sorted([*ax.collections, *ax.lines, *ax.texts], key=lambda a: float(a.get_zorder())):
                 ax.draw_artist(artist)
-        for artist in self.others:
+        for artist in others:
             artist.draw(canvas.get_renderer())
-        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+    plt.close(figure)
+    return images
 
 
 def _fit(figure: Any, box: Any) -> None:

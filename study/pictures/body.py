@@ -81,17 +81,18 @@ def figure_move(
 ) -> tuple[Path, ...]:
     """The deformed body at a few instants with hand, path and target; PNG and PDF, whose names are returned.
 
-    Bodies that would hide each other get a panel each.
+    The instants are those of :func:`pick_instants`. Bodies that would hide each other get a panel each.
 
     Args:
         picture: the body.
-        states: absolute vertex displacements, shape (k, n, d) [m].
+        states: absolute vertex displacements, shape (k, n, d) [m], as many as there are.
         times: instants of the states, shape (k,) [s].
         table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
         target: hand coordinates aimed at, d or n_s entries, or None.
         out_png: name of the picture; the PDF gets its stem.
     """
-    states = states.astype(np.float64)
+    chosen = shapes.pick_instants(picture, states, times, table)
+    states, times = states[chosen].astype(np.float64), times[chosen]
     shot = make_shot(picture, states, times, table, target)
     with paper_style():
         meet = picture.dimension == 3 or shapes.overlap(picture, states)  # in 3D captions meet bodies

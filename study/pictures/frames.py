@@ -16,7 +16,7 @@ from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.simulate import Run, frame_steps
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.sealed import AGAIN, read_arrays, write_arrays
-from softgrasp.study.pictures.shapes import pick_instants, way_done
+from softgrasp.study.pictures.shapes import way_done
 
 MANY_VERTICES = 200_000  # above, only the instants of the still picture are kept
 LARGE_RESTART = 2**26  # bytes: no room is kept for a larger restart file, it would stop runs that end well
@@ -160,8 +160,7 @@ class Frames:
             return [] if self.few else [gif_move(picture, states, times, table, target, out / "move.gif")]
 
         moved = beside(self.model.system.layout.comm, directory, moving)
-        chosen = list(range(len(times))) if self.few else pick_instants(picture, states, times, table)
-        files = [*figure_move(picture, states[chosen], times[chosen], table, target, directory / "move.png")]
+        files = [*figure_move(picture, states, times, table, target, directory / "move.png")]
         files += figure_traces(
             run.times, run.outputs, run.columns, run.q_s, directory / "traces.png", rigid=run.outputs_rigid,
             dimension=picture.dimension,

@@ -17,10 +17,7 @@ import numpy.typing as npt
 from matplotlib.lines import Line2D
 
 from softgrasp.fem.columns import AXES, Array, Columns, farthest
-from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures import style
-from softgrasp.study.pictures.body import figure_move
-from softgrasp.study.pictures.shapes import pick_instants
 from softgrasp.study.pictures.style import few_ticks, length_unit, paper_style, save
 
 Poles = npt.NDArray[np.complex128]
@@ -28,7 +25,7 @@ Runs = Mapping[str, tuple[Array, Array]]
 COLOURS = (*style.CYCLE, "#E69F00", style.SKY, "#7f7f7f", "#000000", "#8c564b")  # a hand and a node in space: six
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "^", "s", "D", "v", "P")
-FLOOR = 1e-16  # smallest distance to the target that a double of order one can show
+NEAREST = 1e-16  # smallest distance to the target that a double of order one can show
 BESIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "handlelength": 1.6}  # hides nothing
 AIM: dict[str, Any] = {"color": style.TARGET, "lw": 1.0, "ls": (0, (1, 1.2))}
 LIMIT: dict[str, Any] = {"color": "#999999", "lw": 0.8, "ls": (0, (4, 2))}
@@ -84,7 +81,8 @@ def figure_histories(
                 _lines(ax, times, values, look)
             ax.set_ylabel(panel.label)
             ax.set_xlim(0.0, float(times[-1]) if settle is None else min(settle, float(times[-1])))
-            entries = [Line2D([], [], color=c, label=name) for c, name in zip(COLOURS, panel.names, strict=False)]
+            shown = zip(cycle(COLOURS), panel.names, strict=False)
+            entries = [Line2D([], [], color=colour, label=name) for colour, name in shown]
             for level in panel.levels:
                 ax.axhline(level, zorder=0, **(LIMIT if panel.inputs else AIM))
             if panel.levels and panel.inputs:
@@ -152,7 +150,7 @@ def still_to_come(outputs: Array, target: Array, columns: Columns = ()) -> Array
 
     Args and distance as in :func:`softgrasp.fem.columns.farthest`.
     """
-    distance = np.maximum(farthest(outputs, target, columns), FLOOR)
+    distance = np.maximum(farthest(outputs, target, columns), NEAREST)
     return np.asarray(np.maximum.accumulate(distance[::-1])[::-1])
 
 
@@ -168,17 +166,6 @@ def _lines(ax: Any, times: Array, values: Array, look: dict[str, Any]) -> None:
     shown = np.vstack([values[keep], values[-1:]]) if constant else values[keep]
     for column, colour in zip(shown.T, cycle(COLOURS), strict=False):
         ax.plot(at, column, color=colour, drawstyle="steps-post" if constant else "default", **look)
-
-
-def figure_loop_move(
-    picture: PictureMesh, states: Array, times: Array, table: Array, target: npt.ArrayLike | None, out_png: Path
-) -> tuple[Path, ...]:
-    """The body at a few instants of the move to the target, at equal steps along the path of the hand; PNG and PDF.
-
-    Args and return value as in :func:`softgrasp.study.pictures.body.figure_move`, with as many states as there are.
-    """
-    chosen = pick_instants(picture, np.asarray(states, dtype=np.float64), times, table)
-    return figure_move(picture, np.asarray(states)[chosen], np.asarray(times)[chosen], table, target, out_png)
 
 
 def figure_decay(poles: Mapping[str, Poles], out_png: Path, *, noise: float = 0.0) -> tuple[Path, ...]:

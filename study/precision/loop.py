@@ -20,14 +20,14 @@ from softgrasp.fem.columns import Columns, farthest
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.design.orders import fast_order, orders
+from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
 from softgrasp.lqr.loop.small import ReducedLoop, ReducedLoopTrajectory, galerkin
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain
-from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily, make_family
-from softgrasp.lqr.reduced.riccati import GainReport
+from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.lqr.spectrum.modal_loop import ModalLoop
 from softgrasp.study.control.result import TITLES
 from softgrasp.study.precision.fit import Slope, series_of, slope
@@ -94,21 +94,13 @@ class LoopSweep:
         self.runs, self.layout = runs, runs.layout
         self.scene, self.cache = runs.scene, runs.cache
         self.counts = nested_counts(SHARES, self.scene.time.steps, self.layout.n_e, LOOP_WORK[self.layout.dimension])
-        self.family, self.report, self._finest = cache(self._family), cache(self._report), cache(self._exact)
-
-    def _family(self, name: str) -> BasisFamily:
-        """Bases of one method."""
-        return make_family(name, self.runs.problem, self.runs.design.solution.factor)
-
-    def _report(self, what: Feedback) -> GainReport:
-        """A reduced gain, checked on the full plant."""
-        return self.runs.design.gain_check.report(self.family(what.basis).at(what.N))
+        self._finest = cache(self._exact)
 
     def gain(self, what: Feedback) -> Gain:
         """The optimal gain, or a reduced one. Raises ControlError: its equation has no solution."""
         if not what.basis:
             return self.runs.design.gain
-        report = self.report(what)
+        report = self.runs.report(what.basis, what.N)
         if report.gain is None:
             raise ControlError(report.reason)
         return report.gain
@@ -155,17 +147,16 @@ class LoopSweep:
 
         def measure() -> list[Feedback]:
             sizes = orders(self.runs.design)[0]
-            fast = [N for N in self.family(A_PRIORI).orders(sizes) if fast_order(self.layout.n_s) >= N]
+            fast = [N for N in self.runs.family(A_PRIORI).orders(sizes) if fast_order(self.layout.n_s) >= N]
             try:
-                paper = self.family(PAPER_BASIS).orders(sizes)
+                paper = self.runs.family(PAPER_BASIS).orders(sizes)
             except ControlError:
                 paper = []
             nearest = sorted(paper, key=lambda N: abs(N - PAPER_N))[:1]
             own = [Feedback(A_PRIORI, N) for N in dict.fromkeys([*fast[:2], *fast[-1:]])]
             return own + [Feedback(PAPER_BASIS, N) for N in nearest]
 
-        key = {"gains": list(self.scene.control.N) if self.scene.control else []}
-        return self.cache.get("loop", key, Feedback, measure)
+        return self.cache.get("loop", {"gains": control_of(self.runs.model).N}, Feedback, measure)
 
     def controllers(self) -> list[LoopSetting]:
         """The optimal and the reduced gains on the full plant; a-priori gains with tissue on their own plant."""
@@ -200,7 +191,7 @@ class LoopSweep:
     def _reduced(self, what: LoopSetting, steps: int) -> tuple[ReducedLoopTrajectory, list[float]]:
         """Runs of the reduced plant of an a-priori gain on rank 0."""
         design, problem, n_s = self.runs.design, self.runs.problem, self.layout.n_s
-        plant, shapes = galerkin(problem, self.family(what.gain.basis).at(what.gain.N).modes)
+        plant, shapes = galerkin(problem, self.runs.family(what.gain.basis).at(what.gain.N).modes)
         K = shapes.reduce_gain(problem, self.gain(what.gain))
         start = plant.rest_at(np.zeros(n_s))[0]
         if self.scene.time.start != "equilibrium":
@@ -218,7 +209,7 @@ class LoopSweep:
         """All steps of one controller; not ok unless its gain is certified to stabilise the full plant."""
 
         def measure() -> list[LoopPoint]:
-            stable = not what.gain.basis or self.report(what.gain).stable
+            stable = not what.gain.basis or self.runs.report(what.gain.basis, what.gain.N).stable
             return [self._point(what, steps, stable) for steps in self.counts]
 
         key = {"controller": what.label, "counts": self.counts, "repeats": self.runs.repeats}

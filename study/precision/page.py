@@ -192,9 +192,8 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
     answered = {name: question for name, question in study.questions.items() if question.points}
     feedback = [name for name in answered if name in CONTROL]
     if feedback and len(feedback) == len(answered):
-        sections.insert(
-            0, Section(EQUATION, equation=controlled(study.scene))
-        )  # nothing follows the scene's own motion
+        # nothing follows the scene's own motion
+        sections.insert(0, Section(EQUATION, equation=controlled(study.scene)))
     for name, question in answered.items():
         if feedback and len(feedback) < len(answered) and name == feedback[0]:
             sections.append(Section(f"{EQUATION} under feedback", equation=controlled(study.scene)))

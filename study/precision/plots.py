@@ -31,7 +31,7 @@ from softgrasp.study.precision.points import (
 from softgrasp.study.precision.riccati import TITLES
 from softgrasp.study.precision.tables import PAPER_ARE, PAPER_N, PAPER_SMALL
 from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
-from softgrasp.study.reduce.plots import looks
+from softgrasp.study.reduce.plots import FULL, looks
 
 ORDER_LOOK = {1: (BLUE, "o"), 2: (ORANGE, "s"), 3: (GREEN, "^")}
 SERIES_LOOK = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (PURPLE, "D"), (HAND, "v"))
@@ -40,7 +40,6 @@ GAIN_COLOURS = (HAND, ORANGE, BLUE, GREEN, PURPLE)
 FRONT: dict[str, Any] = {"color": HAND, "lw": 1.6, "alpha": 0.35, "zorder": 1, "marker": "o", "ms": 7, "mfc": "none"}
 THIN: dict[str, Any] = {"lw": 0.6, "alpha": 0.6, "zorder": 2}
 LINE: dict[str, Any] = {"color": "#D00000", "lw": 0.9, "ls": (0, (4, 3)), "zorder": 0}
-FULL: dict[str, Any] = {"color": "#888888", "lw": 0.9, "ls": (0, (4, 3))}
 SOLVERS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 4, "color": HAND}
 CROSS: dict[str, Any] = {"ls": "", "marker": "x", "ms": 5, "mew": 1.1, "color": UNSTABLE}
 EDGE: dict[str, Any] = {"clip_on": False, "in_layout": False}
@@ -187,18 +186,15 @@ def figure_reduced(points: Sequence[ReducedPoint], full: float, paper: bool, out
                 _curve(ax, line, x, "error_outputs_full", fillstyle=fill, **(look[name] | THIN))
             front = _front(ax, points, x, "error_outputs_full")
             _axes_log(ax, label, DEFORMATION if ax is axes[0] else "")
-            ax.axvline(full, zorder=0, **FULL)
-        handles = [_handle(_title(n), **look[n]) for n in names] + front + [_handle("full run", **FULL)]
+            ax.axvline(full, **FULL)
+        titles = {name: METHODS[name].short_title if name in METHODS else name for name in names}
+        handles = [_handle(titles[n], **look[n]) for n in names] + front + [_handle("full run", **FULL)]
         handles += _mark(axes[:1], paper, PAPER_REDUCED, f"paper, N = 14: {PAPER_REDUCED} s", ls=":")
         handles += _mark(axes[1:], paper, PAPER_FULL, f"paper, full: {PAPER_FULL} s")
         rows = -(-len(handles) // 3)
         figure.subplots_adjust(left=0.085, right=0.985, bottom=0.13, top=1 - (0.05 + 0.14 * rows) / 3.7, wspace=0.06)
         figure.legend(handles=handles, loc="upper center", ncols=3, fontsize=6.5, borderaxespad=0.0)
         return save(figure, out_png)
-
-
-def _title(name: str) -> str:
-    return METHODS[name].title.replace(", fixed solid modes", ", fixed") if name in METHODS else name
 
 
 def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) -> tuple[Path, ...]:
@@ -208,11 +204,10 @@ def figure_series(points: Sequence[WorkPoint], x: str, y: str, out_png: Path) ->
         for k, (name, points_of) in enumerate(series_of(points).items()):
             line = [p for p in points_of if np.isfinite(p.error) and p.error > 0]
             colour, marker = SERIES_LOOK[k % len(SERIES_LOOK)]
-            _curve(ax, line, color=colour, lw=0.8, label=_title(name))
+            _curve(ax, line, color=colour, lw=0.8, label=name)
             for p in line:
                 _curve(ax, [p], ls="", marker=marker, ms=3.6, color=colour, mfc=colour if p.ok else "none")
-        _front(ax, points)
-        ax.plot([], [], label="Pareto front", **FRONT)
+        _curve(ax, pareto(points), label="Pareto front", **FRONT)
         _axes_log(ax, x, y)
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=6.5)
         return save(figure, out_png)
@@ -265,9 +260,9 @@ def figure_reduced_riccati(points: Sequence[ReducedRiccatiPoint], paper: bool, o
     """
     good = [replace(p, error=max(p.error, LOW), cost_excess=max(p.cost_excess, LOW)) for p in usable(points)]
     bad = [p for p in points if not p.ok and not p.reason]
-    names = {p.series for p in points}
+    names = series_of(points)
     look: dict[str, dict[str, Any]] = {}
-    for name in [n for n in BASES if n in names]:
+    for name in (*(n for n in BASES if n in names), *(n for n in names if n not in BASES)):
         colour, dashes, marker = BASIS_LOOKS.get(name, (HAND, ":", "x"))
         look[name] = {"color": colour, "ls": dashes, "lw": 1.0, "marker": marker, "ms": 3.4, "mfc": "none"}
     with paper_style():

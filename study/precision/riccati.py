@@ -9,7 +9,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,11 +21,12 @@ from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.feedback import Design, check, design
 from softgrasp.lqr.design.orders import orders
+from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.reduced.bases import A_PRIORI, BASES, BasisFamily, make_family
-from softgrasp.lqr.reduced.riccati import gain_error, reduce_riccati
+from softgrasp.lqr.reduced.riccati import GainReport, gain_error, reduce_riccati
 from softgrasp.lqr.riccati import Method, solve
 from softgrasp.study.control.measure import with_time
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
@@ -74,11 +75,20 @@ class ControlRuns:
     Questions that are named are answered at any size. Collective.
     """
 
-    def __init__(self, model: Model, cache: Cache, named: Sequence[str] = ()) -> None:
-        self.model, self.cache, self.named = model, cache, named
+    def __init__(self, model: Model, points: Cache, named: Sequence[str] = ()) -> None:
+        self.model, self.cache, self.named = model, points, named
         self.scene, self.layout = model.scene, model.system.layout
         self.repeats = self.scene.study.repeats
         self.large = self.layout.n_e > LARGE[self.layout.dimension]
+        self.family, self.report = cache(self._family), cache(self._report)
+
+    def _family(self, name: str) -> BasisFamily:
+        """Bases of one method."""
+        return make_family(name, self.problem, self.design.solution.factor)
+
+    def _report(self, name: str, N: int) -> GainReport:
+        """The gain of one basis and order, checked on the full plant."""
+        return self.design.gain_check.report(self.family(name).at(N))
 
     def refused(self) -> str:
         """Why the questions of control cannot be asked of this scene, in one sentence; empty when they can."""
@@ -238,36 +248,32 @@ def ask_reduced_riccati(runs: ControlRuns) -> Question:
     points: list[ReducedRiccatiPoint] = []
     for name in BASES:
         label = f"reduced Riccati equation, {BASIS_TITLES.get(name, name)}"
-        key = {"basis": name, "N": list(runs.scene.control.N) if runs.scene.control else [], "repeats": runs.repeats}
-        points += runs.cache.point(label, kind, key, ReducedRiccatiPoint, partial(_family, runs, name))
+        key = {"basis": name, "N": control_of(runs.model).N, "repeats": runs.repeats}
+        points += runs.cache.point(label, kind, key, ReducedRiccatiPoint, partial(_orders, runs, name))
     return Question(tuple(points), tuple(reduced_riccati_slopes(points, reference.error)), reference)
 
 
-def _family(runs: ControlRuns, name: str) -> list[ReducedRiccatiPoint]:
+def _orders(runs: ControlRuns, name: str) -> list[ReducedRiccatiPoint]:
     """All orders of one basis; a basis that the plant refuses gives none. Collective."""
-    design, comm = runs.design, runs.layout.comm
-    families: list[BasisFamily] = []
+    comm, spent = runs.layout.comm, runs.design.solution.seconds
     try:
-        seconds = timed(comm, lambda: families.append(make_family(name, runs.problem, design.solution.factor)))
+        seconds = timed(comm, partial(runs.family, name))  # this question is the first to need it
     except ControlError:
         return []
-    spent = design.solution.seconds
     full = float(comm.allreduce(spent.get("total", sum(spent.values())), MPI.MAX))
     before = seconds + (full if name != A_PRIORI else 0.0)
-    sizes = families[0].orders(orders(design)[0])
-    return [_order(runs, families[0], N, seconds, before) for N in sizes]
+    return [_order(runs, name, N, seconds, before) for N in runs.family(name).orders(orders(runs.design)[0])]
 
 
-def _order(runs: ControlRuns, family: BasisFamily, N: int, time_basis: float, before: float) -> ReducedRiccatiPoint:
+def _order(runs: ControlRuns, name: str, N: int, time_basis: float, before: float) -> ReducedRiccatiPoint:
     """One reduced equation: cost of its gain, median seconds to solve it, and those to project and lift. Collective."""
-    report = with_time(runs.problem, runs.design.gain_check.report(family.at(N)))
+    report = with_time(runs.problem, runs.report(name, N))
     seconds, lift, comm = float("inf"), 0.0, runs.layout.comm
     if report.matrices is not None:
-        whole = timed(comm, lambda: reduce_riccati(runs.problem, family.at(N)))
+        whole = timed(comm, lambda: reduce_riccati(runs.problem, runs.family(name).at(N)))
         lift = max(whole - report.time_are, 0.0)  # the rest is solving
         once = partial(solve_reduced, report.matrices)
         seconds = statistics.median(on_root(comm, lambda: repeated(MPI.COMM_SELF, once, runs.repeats, SMALL_SECONDS)))
-    name = family.name
     return ReducedRiccatiPoint(
         name, f"{BASIS_TITLES.get(name, name)}, N = {N}", seconds, report.error_K, report.stable, method=name,
         time_lift=lift, time_basis=time_basis, scratch=seconds + lift + before,

@@ -11,7 +11,7 @@ import numpy as np
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.bases.registry import METHODS
 from softgrasp.study.control.result import TITLES as BASIS_TITLES
-from softgrasp.study.precision.fit import pareto
+from softgrasp.study.precision.fit import Slope, pareto
 from softgrasp.study.precision.points import (
     TITLES,
     BasisPoint,
@@ -46,7 +46,7 @@ def front_of(points: Sequence[WorkPoint]) -> list[WorkPoint]:
     return [*pareto([p for p in points if isinstance(p, ReducedPoint)], y="error_outputs_full")] or pareto(points)
 
 
-def _title(p: WorkPoint) -> str:
+def _title(p: WorkPoint | Slope) -> str:
     return SERIES_TITLES.get(p.question, {}).get(p.series, p.series)
 
 
@@ -132,8 +132,8 @@ def budget_table(budget: ErrorBudget) -> Table:
 def slope_table(study: WorkStudy) -> Table:
     """Question, series, what against what, power, points."""
     rows = [
-        (s.question.replace("_", " "), SERIES_TITLES.get(s.question, {}).get(s.series, s.series), s.against,
-         f"{s.power:+.2f}", "" if s.expected is None else f"{s.expected:+.2f}", s.count)
+        (s.question.replace("_", " "), _title(s), s.against, f"{s.power:+.2f}",
+         "" if s.expected is None else f"{s.expected:+.2f}", s.count)
         for s in study.slopes
     ]  # fmt: skip
     return Table(("question", "series", "of", "power", "theory", "points"), rows, "slopes, x^power")

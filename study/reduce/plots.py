@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,9 @@ from matplotlib.ticker import MaxNLocator
 
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.study.pictures import style
-from softgrasp.study.pictures.animation import Film, write_gif
+from softgrasp.study.pictures.animation import film, timing, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
-from softgrasp.study.pictures.shapes import hands_at, speed_up
+from softgrasp.study.pictures.shapes import hands_at
 from softgrasp.study.reduce.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.views import Views
 
@@ -76,9 +77,9 @@ def draw(out: Path, sweeps: Sequence[MethodSweep], full: float, views: Views | N
     return files
 
 
-def looks(keys: Iterable[str]) -> dict[str, tuple[str, str, str]]:
+def looks(methods: Iterable[str]) -> dict[str, tuple[str, str, str]]:
     """Colour, dashes and marker of every method; those without a place of their own share one colour."""
-    others = [key for key in keys if key not in LOOKS]
+    others = [key for key in methods if key not in LOOKS]
     return {**LOOKS, **{key: SPARE[i % len(SPARE)] for i, key in enumerate(others)}}
 
 
@@ -284,15 +285,8 @@ def figure_compare(views: Views, out_png: Path) -> tuple[Path, ...]:
 
 def gif_compare(views: Views, out_gif: Path) -> Path:
     """The same in motion."""
-    images = []
+    kept, durations = timing(views.times)
     with style.paper_style():
         figure, axes, shot = _figure(views)
-        film = Film(figure, axes)
-        for k in range(len(views.times)):
-            film.clear()
-            _draw(axes, shot, views, k)
-            images.append(film.frame())
-        plt.close(figure)
-    span = float(views.times[-1] - views.times[0]) / speed_up(views.times)
-    wait = max(20, round(100 * span / max(1, len(images) - 1)) * 10)  # [ms], GIF counts in hundredths of a second
-    return write_gif(images, [wait] * (len(images) - 1) + [wait + 1000], out_gif)
+        images = film(figure, axes, partial(_draw, axes, shot, views), kept)
+    return write_gif(images, durations, out_gif)

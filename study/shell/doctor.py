@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from softgrasp.study.shell.processes import IN_MPI_JOB, find_mpiexec, run_limited
+from softgrasp.study.shell.processes import find_mpiexec, in_mpi_job, run_limited
 
 LAUNCH_LIMIT = 30.0  # [s] for two ranks that only say how many they are
 SAY_SIZE = "import sys, softgrasp.fem._stack; from mpi4py import MPI; sys.stdout.write(f'{MPI.COMM_WORLD.size}\\n')"
@@ -111,7 +111,7 @@ def check_launch() -> Check:
     def fault(value: str, cure: str) -> Check:
         return Check("two ranks", False, value, cure)
 
-    if any(variable in os.environ for variable in IN_MPI_JOB):
+    if in_mpi_job():
         value = "Not tried: this is already an MPI job, run doctor without mpiexec to try it."
         return Check("two ranks", True, value)
     path = find_mpiexec()

@@ -15,6 +15,11 @@ from softgrasp.fem.errors import SoftgraspError
 IN_MPI_JOB = ("PMI_RANK", "PMI_SIZE", "PMIX_RANK", "OMPI_COMM_WORLD_SIZE")
 
 
+def in_mpi_job() -> bool:
+    """Whether a launcher of ranks started this process."""
+    return any(variable in os.environ for variable in IN_MPI_JOB)
+
+
 def find_mpiexec() -> str | None:
     """The launcher beside this Python, else the first on PATH."""
     beside = Path(sys.executable).parent / "mpiexec"

@@ -22,6 +22,7 @@ from softgrasp.study.hardcases import riccati as hard_riccati
 from softgrasp.study.hardcases.cases import Family, HardCase, Outcome, here, textbook
 from softgrasp.study.hardcases.run import FAMILIES, choose, run_hardcases
 from softgrasp.study.hardcases.textbook import leapfrog, newmark, solve_twice, staggered_hand, textbook_midpoint
+from softgrasp.study.shell import processes
 from tests.helpers.browser import look
 
 pytestmark = pytest.mark.serial
@@ -226,7 +227,7 @@ def test_a_loaded_machine_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None
         return (1, "cannot be written", 180.0) if "disk" in command else (0, "", 200.0)
 
     monkeypatch.setattr(faults, "job", job)
-    for variable in faults.IN_MPI_JOB:
+    for variable in processes.IN_MPI_JOB:
         monkeypatch.delenv(variable, raising=False)
     (row,) = faults.rank_rows(True)
     assert row.ok

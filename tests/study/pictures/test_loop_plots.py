@@ -86,7 +86,7 @@ def test_long_runs_are_thinned(tmp_path: Path, drawn: list[Any]) -> None:
 
 def test_what_is_still_to_come_never_rises() -> None:
     y = np.array([[3.0], [0.0], [-2.0], [1.0], [0.0]])
-    assert still_to_come(y, np.zeros(1)).tolist() == [3.0, 2.0, 2.0, 1.0, loop_plots.FLOOR]
+    assert still_to_come(y, np.zeros(1)).tolist() == [3.0, 2.0, 2.0, 1.0, loop_plots.NEAREST]
 
 
 def test_move_steps_end_with_the_run() -> None:

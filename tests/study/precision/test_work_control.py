@@ -145,7 +145,7 @@ def test_excess_cost_is_what_the_closed_loop_pays(result: dict[str, Any]) -> Non
     assert extra == pytest.approx(told["cost_excess"], abs=2 * told["error"] * to_come / optimal)
 
 
-def test_unstable_gains_are_marked_and_never_on_the_front() -> None:
+def test_unstable_gains_are_marked_and_never_on_the_front(tmp_path: Path) -> None:
     good = ReducedRiccatiPoint(
         "pod", "POD", 1e-3, 1e-2, method="pod", N=8, error_P=1e-2, error_K=1e-2, cost_excess=0.1,
         abscissa_full=-0.4, time_are=1e-3, stable=True,
@@ -154,6 +154,8 @@ def test_unstable_gains_are_marked_and_never_on_the_front() -> None:
     bad = replace(good, seconds=1e-4, error=1e-9, ok=False, cost_excess=np.inf, abscissa_full=0.4, stable=False)
     assert [r[-1] for r in question_table("reduced_riccati", [bad, good]).rows] == ["unstable", "*"]
     assert [r["pareto"] for r in Question((bad, good)).rows] == [False, True]
+    # a basis that has no look of its own is drawn too
+    assert work_plots.figure_reduced_riccati([replace(good, series="other"), bad], False, tmp_path / "gains.png")
 
 
 # --- closed loop

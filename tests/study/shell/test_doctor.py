@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from softgrasp.study.shell import doctor
+from softgrasp.study.shell import doctor, processes
 
 
 def script(path: Path, text: str) -> str:
@@ -21,7 +21,7 @@ def script(path: Path, text: str) -> str:
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """No sign of an MPI job around us."""
-    for name in doctor.IN_MPI_JOB:
+    for name in processes.IN_MPI_JOB:
         monkeypatch.delenv(name, raising=False)
 
 
