@@ -16,7 +16,7 @@ import dolfinx.mesh
 import numpy as np
 from mpi4py import MPI
 
-from softgrasp.fem.errors import MeshError, SceneError
+from softgrasp.fem.errors import MeshError
 from softgrasp.fem.mesh.check import (
     FLAT,
     Floats,
@@ -190,16 +190,15 @@ def box_axes(scene: Scene) -> tuple[BoxAxis, ...]:
     """What the lines of a structured box must meet.
 
     Lines meet the box of the contact zone, the boxes of layers and the points of outputs, and the zone ends at its
-    sides and at its box. Raises SceneError: the scene has no structured box.
+    sides and at its box.
     """
     tissue, contact = scene.tissue, scene.contact
-    if tissue.size is None:
-        raise SceneError("tissue.refine.method = 'lines' needs tissue.size; a mesh file can only be bisected.")
-    d = len(tissue.size)
+    size = tissue.size or []
+    d = len(size)
     origin = tissue.origin or [0.0] * d
     sides = contact.axes(d)
     result = []
-    for axis, (low, length) in enumerate(zip(origin, tissue.size, strict=True)):
+    for axis, (low, length) in enumerate(zip(origin, size, strict=True)):
         high = low + length
 
         def inner(values: Sequence[float], low: float = low, high: float = high) -> list[float]:
@@ -220,9 +219,9 @@ def box_axes(scene: Scene) -> tuple[BoxAxis, ...]:
     return tuple(result)
 
 
-def even_cells(axis: BoxAxis, h: float) -> int:
-    """Number of cells no longer than h between the cuts."""
-    return sum(int(np.ceil((b - a) / h - SAME)) for a, b in pairwise(axis.cuts))
+def even_cells(scene: Scene, h: float) -> list[int]:
+    """Numbers of cells along the sides of the box, none longer than h between the cuts."""
+    return [sum(int(np.ceil((b - a) / h - SAME)) for a, b in pairwise(axis.cuts)) for axis in box_axes(scene)]
 
 
 def box_of_lines(comm: MPI.Intracomm, scene: Scene, cells: Sequence[int], mu: float, radius: float) -> TissueMesh:

@@ -23,7 +23,6 @@ from softgrasp.fem.mesh.grading import (
     SLACK,
     SizeField,
     bisect_to,
-    box_axes,
     box_of_lines,
     distribute,
     even_cells,
@@ -93,7 +92,7 @@ def _lined(comm: MPI.Intracomm, scene: Scene, refine: Refine, goal: float | None
     if goal is not None:
         across = LINES_ACROSS[d][p] * (1e-2 / goal) ** (1 / (2 * p))
         while True:
-            cells = [even_cells(axis, short / across) for axis in box_axes(scene)]
+            cells = even_cells(scene, short / across)
             if lattice(cells, p) <= refine.most:
                 break
             if across <= 1:
@@ -128,7 +127,7 @@ def _base(scene: Scene, refine: Refine, aim: float | None) -> Whole:
     size, cells = scene.tissue.size, scene.tissue.cells
     if size is not None and aim is not None:
         across, *_ = aims(refine, scene.tissue.order, len(size), aim)
-        cells = [even_cells(axis, min(size) / across) for axis in box_axes(scene)]
+        cells = even_cells(scene, min(size) / across)
     return marked(_even(scene, cells), scene)
 
 

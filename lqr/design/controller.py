@@ -10,6 +10,7 @@ from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.feedback import Design, loop_words
 from softgrasp.lqr.design.orders import BasisGains, fast_order, orders, reduce_gains
+from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.loop.controller import Controller, layout_hash
 from softgrasp.lqr.loop.small import galerkin, m_orthonormal
 from softgrasp.lqr.plant.block import Block
@@ -80,7 +81,7 @@ def certified_controller(design: Design, basis: BasisGains | None, order: int | 
         x_bar,
         u_bar,
         plant,
-        1e-3 if scene.control is None else 1 / scene.control.loop.rate,
+        1 / control_of(design.model).loop.rate,
         design.actuation.bound(layout.n_s),
         scene_hash(scene),
         layout_hash(layout),

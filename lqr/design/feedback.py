@@ -9,7 +9,7 @@ from typing import cast
 
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.model.build import Model, Stopwatch
-from softgrasp.lqr.design.scene import actuation, problem, sampling, scene_target
+from softgrasp.lqr.design.scene import actuation, control_of, problem, sampling, scene_target
 from softgrasp.lqr.diagnosis import Diagnosis, diagnose
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.plant.block import Block
@@ -67,7 +67,7 @@ def check(model: Model) -> tuple[RiccatiProblem, Diagnosis, bool]:
     actuation(model)
     plant = problem(model)
     diagnosis = diagnose(plant)
-    modal = model.scene.control is not None and model.scene.control.method == "modal"
+    modal = control_of(model).method == "modal"
     diagnosis.require(but=("damping",) if modal else ())
     return plant, diagnosis, modal
 
@@ -122,11 +122,11 @@ def _modal(plant: RiccatiProblem, diagnosis: Diagnosis) -> RiccatiSolution:
 
 
 def _solve(model: Model, plant: RiccatiProblem, progress: Progress | None, checkpoint: Path | None) -> RiccatiSolution:
-    control = model.scene.control
-    method = cast(Method, "auto" if control is None else control.method.replace("-", "_"))
+    control = control_of(model)
+    method = cast(Method, control.method.replace("-", "_"))
     tol = None
     # galerkin measures the change of its gain, not the residual
-    if control is not None and "tolerance" in control.model_fields_set and choose(plant, method).method != "galerkin":
+    if "tolerance" in control.model_fields_set and choose(plant, method).method != "galerkin":
         tol = control.tolerance
     return solve(plant, method, tol, progress, checkpoint)
 

@@ -10,6 +10,7 @@ import numpy as np
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.lqr.design.duration import LoopPlan
 from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.loop.gap import duality_gaps
 from softgrasp.lqr.loop.responses import Notify as Notify
 from softgrasp.lqr.plant.block import Block
@@ -23,7 +24,6 @@ FAST_STATES = 8  # of the tissue, up to which a gain is offered for the control 
 MANY_STATES = 200_000  # above, few orders are tried: every gain is certified by solves with the full plant
 WHOLE_SPECTRUM = 500  # n_e from which the Schur form of all modes for every gain takes seconds, so few orders are tried
 FEW_ORDERS = 3
-ORDERS = (4, 6, 8, 10, 12, 16, 20, 30, 40)  # of a scene without a [control] table
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ def fast_order(n_s: int) -> int:
 
 def orders(design: Design) -> tuple[list[int], str]:
     """Orders to try and, where checking a gain takes long, why they are few."""
-    control, layout = design.model.scene.control, design.problem.layout
-    every = list(ORDERS) if control is None else sorted(set(control.N))
+    layout, every = design.problem.layout, sorted(set(control_of(design.model).N))
     dense = design.gain_check.loop.complete and layout.n_e > WHOLE_SPECTRUM
     if (layout.states <= MANY_STATES and not dense) or len(every) <= FEW_ORDERS:
         return every, ""

@@ -18,6 +18,11 @@ from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.spectrum.sampled import Sampling
 
 
+def control_of(model: Model) -> Control:
+    """The scene's ``[control]`` table; where it has none, the defaults of one without outputs."""
+    return model.scene.control or Control.model_construct(outputs=[])
+
+
 def weight(value: float | list[list[float]], size: int, key: str) -> Array:
     """A number as multiple of the identity, a matrix as it is. Raises SceneError: the matrix has the wrong size."""
     if isinstance(value, list):
@@ -46,9 +51,9 @@ def problem(model: Model) -> RiccatiProblem:
     scene, system = model.scene, model.system
     outputs = make_outputs(scene, system)
     C_z = output_columns(outputs, system.layout.n_local)
-    control, columns = scene.control, tuple(column for output in outputs for column in output.columns)
-    Q = weight(1.0 if control is None else control.Q, C_z.shape[1], "control.Q")
-    R = weight(1.0 if control is None else control.R, system.layout.n_s, "control.R")
+    control, columns = control_of(model), tuple(column for output in outputs for column in output.columns)
+    Q = weight(control.Q, C_z.shape[1], "control.Q")
+    R = weight(control.R, system.layout.n_s, "control.R")
     return RiccatiProblem(system, np.vstack([o.C_s for o in outputs]), C_z, Q, R, columns)
 
 
@@ -73,10 +78,7 @@ def actuation(model: Model) -> Actuation:
 
     Raises ControlError: rate, delay or limit do not fit.
     """
-    scene = model.scene
-    if scene.control is None:
-        return Actuation()
-    loop, layout = scene.control.loop, model.system.layout
+    scene, loop, layout = model.scene, control_of(model).loop, model.system.layout
     turns = layout.n_s - layout.dimension
     if loop.limit_torque is not None and turns == 0:
         raise ControlError(

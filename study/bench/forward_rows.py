@@ -22,6 +22,7 @@ from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import make_solver
 from softgrasp.study.bench.peers import BareSolve, PlainCholesky, PymorLoop, ScipyLoop, TextbookLoop, has_pymor
+from softgrasp.study.effects.measure import RepeatableRun
 from softgrasp.study.report.origin import peak_memory_mb
 from softgrasp.study.shell.timing import interleave, medians, timed, warm
 
@@ -105,22 +106,17 @@ def _builds(comm: MPI.Intracomm, scene: Scene, repeats: int) -> tuple[Model, dic
     begin, memory, pace = time.perf_counter(), 0.0, 0.0
     for i in range(repeats):
         model = build(scene, comm=comm)
-        run = Run(model, RunOptions())
+        run = RepeatableRun(model)
         for name, values in seconds.items():
             values.append(model.watch.seconds[name])
         if i == 0:
-            ts = make_ts(run)
-            run.start()
-            run.advance_to(ts, 3)
-            n = comm.bcast(int(np.clip(0.05 * run.reached / run.seconds, 1, 400)))
-            pace = timed(comm, lambda: run.advance_to(ts, 3 + n)) / n  # noqa: B023  (called at once)
-            memory = peak_memory_mb(comm)
-            ts.destroy()
-        run.midpoint.destroy()
+            few = comm.bcast(int(np.clip(0.05 / run.seconds_per_step(3), 1, 400)))
+            pace, memory = run.seconds_per_step(few), peak_memory_mb(comm)
+        run.destroy()
         gc.collect()
         if comm.bcast(time.perf_counter() - begin) > BUILD_SECONDS:
             break
-    return model, seconds, memory, float(comm.bcast(pace))
+    return model, seconds, memory, pace
 
 
 def _repeated(comm: MPI.Intracomm, loop: Any, count: int) -> Callable[[], float]:

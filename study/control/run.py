@@ -19,7 +19,7 @@ from softgrasp.lqr.design.duration import plan
 from softgrasp.lqr.design.feedback import Design, design
 from softgrasp.lqr.design.linearise import finite_problem, linearised
 from softgrasp.lqr.design.orders import BasisGains, bases_with_bounds, orders, reduce_gains
-from softgrasp.lqr.design.scene import with_control
+from softgrasp.lqr.design.scene import control_of, with_control
 from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, report
@@ -30,7 +30,6 @@ from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import pairs
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
-GOAL = 1e-10  # of the solver when the scene names none: the right end of its progress bar
 RESTART_STATES = 10_000  # below, the Riccati equation takes seconds and writes no restart files
 
 
@@ -167,7 +166,7 @@ def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[]
 
 def unused_rate(model: Model) -> str:
     """Says that a rate other than the default does nothing, where the loop is not sampled."""
-    loop = Loop() if model.scene.control is None else model.scene.control.loop
+    loop = control_of(model).loop
     if loop.sampling == "held" or loop.rate == Loop().rate:
         return ""
     return f"control.loop.rate = {loop.rate:g} Hz has no effect: set control.loop.sampling = 'held' to sample the loop"
@@ -175,8 +174,7 @@ def unused_rate(model: Model) -> str:
 
 def solver_bar(bar: Progress, model: Model) -> Callable[[dict[str, float]], None]:
     """Progress of an iteration: how far its residual has fallen on the way to the tolerance."""
-    control = model.scene.control
-    goal = -np.log10(GOAL if control is None else control.tolerance)
+    goal = -np.log10(control_of(model).tolerance)
     task = bar.add_task("Riccati equation", total=float(goal))
     least = [1.0]
 

@@ -151,15 +151,15 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     def everywhere(size: float, obj: PETSc.Object) -> float:
         return float(comm.allreduce(size)) if obj.comm.size < comm.size else size
 
-    for name, value in held:
+    # arrays last, for some are views of vectors
+    for name, value in sorted(held, key=lambda entry: isinstance(entry[1], np.ndarray)):
         if isinstance(value, PETSc.Mat) and value.handle not in seen:
             seen.add(value.handle)
             sizes[name] = everywhere(matrix_memory(value), value)
         elif isinstance(value, PETSc.Vec):
             seen.add(value.array_r.ctypes.data)
             sizes[name] = everywhere(8.0 * value.getSize(), value)
-    for name, value in held:  # last, for some are views of vectors
-        if isinstance(value, np.ndarray):
+        elif isinstance(value, np.ndarray):
             new = value.ctypes.data not in seen or value.size == 0
             seen.add(value.ctypes.data)
             sizes[name] = sizes.get(name, 0.0) + float(comm.allreduce(value.nbytes * new))

@@ -32,21 +32,21 @@ Changes = dict[str, tuple[Change, float | None]]  # of the outputs, and under a 
 
 
 @dataclass(frozen=True)
-class Shown:
+class Displacements:
     """Where a run takes its outputs, angles of the hand left out."""
 
     places: Array  # displacements, (steps + 1, outputs, d) [m]
     rigid: Array  # their share of the hand's rigid motion [m]
 
 
-def shown(model: Model, run: Trajectory) -> Shown:
+def displacements(model: Model, run: Trajectory) -> Displacements:
     """Displacements of the outputs of a run."""
     moves = [not column.rotation for column in run.columns]
     shape = len(run.times), -1, model.system.layout.dimension
-    return Shown(run.outputs[:, moves].reshape(shape), run.outputs_rigid[:, moves].reshape(shape))
+    return Displacements(run.outputs[:, moves].reshape(shape), run.outputs_rigid[:, moves].reshape(shape))
 
 
-def compare(a: Shown, b: Shown) -> Change:
+def compare(a: Displacements, b: Displacements) -> Change:
     """Change between two runs of the same outputs."""
 
     def gap(x: Array, y: Array) -> tuple[float, float]:
@@ -87,9 +87,9 @@ class Experiments:
         self.comm = own.system.layout.comm
         later = scene.control is not None and scene.motion.drive == "motion"
         self.force = force_of_motion(scene, own) if later else None
-        self.runs: dict[tuple[Names, bool], Shown] = {}
+        self.runs: dict[tuple[Names, bool], Displacements] = {}
         self.first: Trajectory = simulate(own, RunOptions())
-        self.runs[self.on, False] = shown(own, self.first)
+        self.runs[self.on, False] = displacements(own, self.first)
 
     def model(self, on: Names) -> Model:
         """The model with exactly these effects on; one that is new is not kept. Collective."""
@@ -103,11 +103,11 @@ class Experiments:
         gc.collect()
         return build(scene, comm=self.comm)
 
-    def of(self, on: Names, forced: bool = False) -> Shown:
+    def of(self, on: Names, forced: bool = False) -> Displacements:
         """Outputs with exactly these effects on. Collective. Raises SolverError: a solve failed."""
         if (on, forced) not in self.runs:
             model = self.model(on)
-            self.runs[on, forced] = shown(model, simulate(model, RunOptions(), self.force if forced else None))
+            self.runs[on, forced] = displacements(model, simulate(model, RunOptions(), self.force if forced else None))
         return self.runs[on, forced]
 
     def change(self, a: Names, b: Names) -> Change:
@@ -309,7 +309,7 @@ def check_elements(model: Model, trajectory: Trajectory, tolerance: float) -> El
     if model.scene.tissue.order != 1 or nu <= LOCKING + 1e-9:
         return None
     other = build(quadratic(model), comm=model.system.layout.comm)
-    change = compare(shown(model, trajectory), shown(other, simulate(other, RunOptions())))
+    change = compare(displacements(model, trajectory), displacements(other, simulate(other, RunOptions())))
     needed = change.outputs > tolerance
     text = (
         f"Measured at nu = {nu:.4g}: on the same mesh tissue.order = 2 changes the outputs by {change.outputs:.2g} and "

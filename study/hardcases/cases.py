@@ -17,6 +17,7 @@ from softgrasp import package_version
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import PETSc, to_scipy
+from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import machine
 
@@ -220,7 +221,7 @@ def textbook(work: Callable[..., float | Outcome], *arguments: Any) -> Outcome:
 
 def make(name: str, *overrides: str, comm: MPI.Intracomm = MPI.COMM_SELF) -> Model:
     """Build a shipped scene with overrides of the form `section.key=value`. Collective."""
-    return build(name, overrides, comm)
+    return build(shipped_scenes()[name], overrides, comm)
 
 
 def scaled_condition(A: PETSc.Mat) -> float:

@@ -189,26 +189,15 @@ def interrupted(model: Model, stop: int) -> tuple[Trajectory, Trajectory]:
 def from_state_only(model: Model, stop: int) -> tuple[Array, Array]:
     """Last states of an unbroken run, and of one that goes on from the exact q_s, v_s, z, v of a step alone."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        whole = simulate(model, RunOptions(folder / "whole"))
-        first = Run(model, RunOptions(folder / "a"))
-        ts = make_ts(first)
-        first.start()
-        first.advance_to(ts, stop)
+        whole = simulate(model, RunOptions(Path(name) / "whole"))
+        run = Run(model, RunOptions(Path(name) / "part"))
+        ts = make_ts(run)
+        run.start()
+        run.advance_to(ts, stop)
+        run.midpoint.start(run.state)  # M v and K z anew from the state
+        run.advance_to(ts, run.steps)
         ts.destroy()
-        second = Run(model, RunOptions(folder / "b"))
-        ts = make_ts(second)
-        second.start()
-        for name in ("q", "v"):
-            getattr(second.drive, name)[: stop + 1] = getattr(first.drive, name)[: stop + 1]
-        second.reached = stop
-        second.state = second.store.target(stop)
-        second.state.array[:] = first.state.array
-        second.midpoint.start(second.state)  # M v and K z anew from the state
-        ts.setStepNumber(stop)
-        second.advance_to(ts, second.steps)
-        ts.destroy()
-    return whole.final, second.state.array
+    return whole.final, run.state.array
 
 
 def restart_rows(quick: bool) -> Iterator[HardCase]:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -28,11 +28,16 @@ class Cache:
     """Frozen dataclasses by hash in a folder, each file one list of a class.
 
     The hash is of the scene (without name, description and what the point does not depend on), the setting, the number
-    of ranks and the version. The guard is asked before a point. Collective.
+    of ranks and the version. ``progress`` is called with the label of the point that comes and the share of points
+    done. Collective.
     """
 
-    def __init__(self, folder: Path, comm: MPI.Intracomm, scene: Scene, guard: Guard | None = None) -> None:
-        self.folder, self.comm, self.guard = folder, comm, guard or Guard(comm)
+    def __init__(
+        self, folder: Path, comm: MPI.Intracomm, scene: Scene, progress: Callable[[str, float], None] | None = None
+    ) -> None:
+        self.folder, self.comm, self.progress = folder, comm, progress
+        self.stop: list[bool] = []  # filled by the first Ctrl-C
+        self.count, self.done = 1, 0  # points in all, as far as they are known, and those begun
         self.scene = ""  # rank 0 looks for the files
         with agree(comm):
             if comm.rank == 0:
@@ -48,8 +53,15 @@ class Cache:
     def point[T](
         self, label: str, kind: str, key: dict[str, Any], of: type[T], measure: Callable[[], Sequence[T]]
     ) -> list[T]:
-        """:meth:`get` of a point with a label, unless the study is stopped before it."""
-        self.guard.next(label)
+        """:meth:`get` of a point with a label. Raises Interrupted: Ctrl-C has stopped the study before it."""
+        share = min(self.done / self.count, 1.0)
+        if self.comm.allreduce(bool(self.stop), MPI.LOR):
+            raise Interrupted(
+                f"stopped before '{label}' with {100 * share:.0f} % done; the same command goes on from there"
+            )
+        if self.progress is not None:
+            self.progress(label, share)
+        self.done += 1
         return self.get(kind, key, of, measure)
 
     def get[T](self, kind: str, key: dict[str, Any], of: type[T], measure: Callable[[], Sequence[T]]) -> list[T]:
@@ -92,30 +104,3 @@ def _value(kind: Any, value: Any) -> Any:
     if get_origin(kind) is tuple and value is not None:
         return tuple(value)
     return np.array(value, dtype=float) if kind == Array else value
-
-
-@dataclass
-class Guard:
-    """Says between two points whether to go on, and how far the study is."""
-
-    comm: MPI.Intracomm  # ranks
-    # called with the name of the point that comes and the share of points done
-    progress: Callable[[str, float], None] | None = None
-    count: int = 1  # points in all, as far as they are known
-    done: int = 0  # of them
-    stop: list[bool] = field(default_factory=list)  # filled by the first Ctrl-C
-
-    def next(self, label: str) -> None:
-        """Before a point. Collective.
-
-        Raises:
-            Interrupted: by Ctrl-C.
-        """
-        share = min(self.done / self.count, 1.0)
-        if self.comm.allreduce(bool(self.stop), MPI.LOR):
-            raise Interrupted(
-                f"stopped before '{label}' with {100 * share:.0f} % done; the same command goes on from there"
-            )
-        if self.progress is not None:
-            self.progress(label, share)
-        self.done += 1

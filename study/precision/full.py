@@ -53,14 +53,9 @@ class Probed:
 
     times: Array  # (steps + 1,) [s]
     own: Array  # displacements against the hand, (steps + 1, p) [m], on every rank
-    rigid: Array  # the part that moves with the hand, same shape
+    y: Array  # displacements, same shape
     stamps: Array  # seconds of every step on the slowest rank, (steps,)
     factor: float  # seconds of the factorisation
-
-    @property
-    def y(self) -> Array:
-        """Displacements, (steps + 1, p) [m]."""
-        return self.own + self.rigid
 
 
 def find_places(scene: Scene, model: Model) -> Places:
@@ -136,7 +131,7 @@ def run_probed(model: Model, probe: Probe, until: int | None = None) -> Probed:
         rigid = run.drive.q[: last + 1] @ probe.C_s.T
         own = total(comm, run.local_outputs[: last + 1])
         times = run.end * np.arange(last + 1) / run.steps
-        return Probed(times, own, rigid, stamps, model.watch.seconds["factor"])
+        return Probed(times, own, own + rigid, stamps, model.watch.seconds["factor"])
     finally:
         ts.destroy()
         run.midpoint.destroy()

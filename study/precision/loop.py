@@ -20,6 +20,7 @@ from softgrasp.fem.columns import Columns, farthest
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.design.orders import fast_order, orders
+from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import predicted_cost
 from softgrasp.lqr.loop.full import ClosedLoop, LoopTrajectory
@@ -155,8 +156,7 @@ class LoopSweep:
             own = [Feedback(A_PRIORI, N) for N in dict.fromkeys([*fast[:2], *fast[-1:]])]
             return own + [Feedback(PAPER_BASIS, N) for N in nearest]
 
-        key = {"gains": list(self.scene.control.N) if self.scene.control else []}
-        return self.cache.get("loop", key, Feedback, measure)
+        return self.cache.get("loop", {"gains": control_of(self.runs.model).N}, Feedback, measure)
 
     def controllers(self) -> list[LoopSetting]:
         """The optimal and the reduced gains on the full plant; a-priori gains with tissue on their own plant."""

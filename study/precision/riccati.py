@@ -21,6 +21,7 @@ from softgrasp.fem.petsc import on_root
 from softgrasp.lqr.dense.care import solve_reduced
 from softgrasp.lqr.design.feedback import Design, check, design
 from softgrasp.lqr.design.orders import orders
+from softgrasp.lqr.design.scene import control_of
 from softgrasp.lqr.design.scene import problem as make_problem
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
@@ -247,7 +248,7 @@ def ask_reduced_riccati(runs: ControlRuns) -> Question:
     points: list[ReducedRiccatiPoint] = []
     for name in BASES:
         label = f"reduced Riccati equation, {BASIS_TITLES.get(name, name)}"
-        key = {"basis": name, "N": list(runs.scene.control.N) if runs.scene.control else [], "repeats": runs.repeats}
+        key = {"basis": name, "N": control_of(runs.model).N, "repeats": runs.repeats}
         points += runs.cache.point(label, kind, key, ReducedRiccatiPoint, partial(_orders, runs, name))
     return Question(tuple(points), tuple(reduced_riccati_slopes(points, reference.error)), reference)
 

@@ -20,7 +20,7 @@ from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.reduced.bases import BASES
 from softgrasp.reduction.bases.engines import ENGINES
 from softgrasp.study.precision.answer import Answers
-from softgrasp.study.precision.cache import Cache, Guard
+from softgrasp.study.precision.cache import Cache
 from softgrasp.study.precision.forward import SHARES, ask_forward, mesh_series, solver_settings
 from softgrasp.study.precision.full import FullRuns, find_places
 from softgrasp.study.precision.loop import CONTROLLERS, ask_loop
@@ -95,8 +95,7 @@ def study_scene(
     request = request or Request()
     names = request.questions
     model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
-    guard = Guard(comm, progress)
-    store = Cache(cache, comm, scene, guard)
+    store = Cache(cache, comm, scene, progress)
     runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store)
     control = ControlRuns(model, store, request.names)
     refused = control.refused() if set(names) & set(CONTROL) else ""
@@ -104,8 +103,8 @@ def study_scene(
     truth: Truth | None = None
     answers: list[Answer] = []
     measured: list[RunPoint] = []
-    with interruptible(False) as guard.stop:
-        guard.count = count_points(scene, control, [name for name in names if not (refused and name in CONTROL)])
+    with interruptible(False) as store.stop:
+        store.count = count_points(scene, control, [name for name in names if not (refused and name in CONTROL)])
         if set(names) - set(CONTROL):
             truth = make_truth(runs, request.tolerance)
             questions |= forward_questions(model, runs, truth, names)

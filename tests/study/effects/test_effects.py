@@ -39,13 +39,13 @@ from softgrasp.study.effects.result import Change, EffectResult, EffectsStudy
 from softgrasp.study.effects.run import run_effects, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
 from softgrasp.study.effects.verdict import (
+    Displacements,
     Experiments,
     Names,
-    Shown,
     advised_together,
     compare,
+    displacements,
     finite_strain_beside,
-    shown,
     verdict_of,
 )
 from tests.helpers.browser import find_chromium, look
@@ -235,9 +235,9 @@ class Table(Experiments):
         self.force = None if forced is None else lambda n, t, q, v: q
         self.formulas = {False: output, True: forced or output}
 
-    def of(self, on: Names, forced: bool = False) -> Shown:
+    def of(self, on: Names, forced: bool = False) -> Displacements:
         y = np.full((1, 1, 2), self.formulas[forced](on))
-        return Shown(y, 0 * y)
+        return Displacements(y, 0 * y)
 
 
 def test_pairs_that_hide_below_the_tolerance_one_by_one() -> None:
@@ -319,7 +319,8 @@ def test_hand_outputs_compare_places_and_not_angles(comm: MPI.Intracomm) -> None
     assert b.outputs.shape[1] == a.outputs.shape[1] + 1
     node = np.linalg.norm(b.outputs[:, 3:] - a.outputs[:, 2:], axis=1).max()
     assert node > 0.1  # [m]; the turn moves the tip
-    assert compare(shown(plain, a), shown(turning, b)).absolute == pytest.approx(node, rel=1e-12)  # the same sums
+    change = compare(displacements(plain, a), displacements(turning, b))
+    assert change.absolute == pytest.approx(node, rel=1e-12)  # the same sums
 
 
 @pytest.mark.ranks(2)
