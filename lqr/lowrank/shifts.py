@@ -45,7 +45,7 @@ class ShiftRange:
 
 
 def frequency_estimate(system: BlockSystem) -> float:
-    """Highest frequency [1/s] by omega_max^2 >= max K_ii / M_ii, within a factor of 4 for Lagrange elements. Collective."""
+    """Highest frequency [1/s], omega_max^2 >= max K_ii / M_ii, to a factor of 4 for Lagrange elements. Collective."""
     K, M = system.K_ee.getDiagonal(), system.M_ee.getDiagonal()
     local = float((K.array_r / M.array_r).max(initial=0.0))
     K.destroy()
