@@ -39,6 +39,11 @@ class Snapshots:
         """Absolute velocity v_e = v_z + T v_s, local rows (n_local, m)."""
         return np.asarray(self.Z[self.layout.n_local :] + T @ self.v_s)
 
+    def columns(self, pick: np.ndarray) -> Snapshots:
+        """Those with these numbers."""
+        Z = np.asfortranarray(self.Z[:, pick])
+        return Snapshots(self.layout, self.steps[pick], self.times[pick], self.q_s[:, pick], self.v_s[:, pick], Z)
+
 
 class NoStore:
     """Nothing is stored: one working state for the whole run."""
