@@ -97,15 +97,7 @@ def run_with(model: Model, materials: tuple[LayerMaterial, ...]) -> FullRun:
 def thinned(snapshots: Snapshots, count: int) -> Snapshots:
     """About ``count`` of the snapshots, evenly spread, first and last among them."""
     m = snapshots.Z.shape[1]
-    pick = np.unique(np.linspace(0, m - 1, min(count, m)).round().astype(int))
-    return replace(
-        snapshots,
-        steps=snapshots.steps[pick],
-        times=snapshots.times[pick],
-        q_s=snapshots.q_s[:, pick],
-        v_s=snapshots.v_s[:, pick],
-        Z=np.asfortranarray(snapshots.Z[:, pick]),
-    )
+    return snapshots.columns(np.unique(np.linspace(0, m - 1, min(count, m)).round().astype(int)))
 
 
 def training_states(own: FullRun, parameters: Sequence[tuple[float, float]]) -> States:

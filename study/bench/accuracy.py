@@ -126,7 +126,7 @@ def median(task: Callable[[], object]) -> float:
     return statistics.median([cpu_seconds(task) for _ in range(REPEATS + 1)][1:])
 
 
-def controlled(sets: list[str]) -> Design:
+def optimal_feedback(sets: list[str]) -> Design:
     """The optimal feedback of paper_lqr on a mesh. Collective."""
     model = build(load_scene("paper_lqr", [*CONTROL, *sets]), comm=MPI.COMM_WORLD)
     return design(model, Stopwatch(MPI.COMM_WORLD))
@@ -139,7 +139,7 @@ def measure(name: str, sets: list[str], exact: Array, cost: float) -> MeshPoint:
     full = simulate(model)
     rom = reduce_linear(model, [full_run(model, full)], METHOD, N)
     small = replay_linear(rom, model, full)
-    feedback = controlled(sets)
+    feedback = optimal_feedback(sets)
     solution = feedback.solution
     return MeshPoint(
         name, model.system.layout.n_e, median(lambda: build(scene, comm=comm)), median(lambda: simulate(model)),
@@ -189,7 +189,7 @@ def main(
     """Measure every mesh and print the tables."""
     console = driver.open_console(150)
     exact = deformation(simulate(build(paper(graded(3, REFERENCE)), comm=MPI.COMM_WORLD)))
-    cost = controlled(graded(3, REFERENCE_COST)).gain_check.optimal
+    cost = optimal_feedback(graded(3, REFERENCE_COST)).gain_check.optimal
     reached, rows = [reach(goal, exact) for goal in TOLERANCES], []
     for name, sets in meshes().items():
         rows.append(measure(name, sets, exact, cost))

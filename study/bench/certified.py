@@ -63,7 +63,7 @@ class AnswerCost:
     of_full: float | None = None  # answer over the full run
 
 
-def trained(nx: int) -> tuple[Model, CertifiedModel]:
+def certified_on(nx: int) -> tuple[Model, CertifiedModel]:
     """The scene on nx x 2 nx cells, and the model of its first K2 modes by the greedy on few points."""
     changes = [
         f"tissue.cells=[{nx}, {2 * nx}]", "effects.damping={kind='kelvin-voigt', beta=0.002}",
@@ -96,7 +96,7 @@ def in_state_space(model: CertifiedModel, materials: Materials, drive: Drive) ->
 
 def measure(nx: int, repeats: int) -> Iterator[AnswerCost]:
     """All answers on one mesh."""
-    model, two = trained(nx)
+    model, two = certified_on(nx)
     estimate, alone = replace(two, certify="estimate"), [two.with_sizes(k, k) for k in ALONE]
     assert two.drive is not None
     short = replace(two.drive, finer=None)

@@ -93,7 +93,7 @@ def full(model: Model, lam: float, mu: float) -> FullRun:
 
 
 @cache
-def trained(scene: tuple[str, ...], k: int, k2: int) -> tuple[Model, CertifiedModel]:
+def certified_for(scene: tuple[str, ...], k: int, k2: int) -> tuple[Model, CertifiedModel]:
     """A scene and its certified model."""
     model = make("paper_forward", *MESH, *scene)
     return model, certified_model(model, pod(model, k2), k=k, tolerance=TOLERANCE)
@@ -121,7 +121,7 @@ def shares(exact: FullRun, model: CertifiedModel, run: CertifiedRun, coupled: bo
 
 def question_row(i: int, q: Query) -> HardCase:
     """One question: the bound against the truth, and the difference of two bases taken for the error."""
-    model, certified = trained(q.scene, q.k, q.k2)
+    model, certified = certified_for(q.scene, q.k, q.k2)
     question = make("paper_forward", *MESH, *q.scene, *q.motion) if q.motion else model
     drive, materials = scene_drive(question.scene, model.system.M_hand, 1), certified.materials(*q.at)
     run = certified.run(materials, drive, allow=True)
@@ -163,7 +163,7 @@ def greedy_row(i: int, case: str, grid: int, tolerance: float) -> HardCase:
 
 def file_rows(first: int) -> Iterator[HardCase]:
     """Model files that are not what was written, or of another mesh."""
-    certified = trained((KV,), 12, 36)[1]
+    certified = certified_for((KV,), 12, 36)[1]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "certified.h5"
         save_certified(certified, path)

@@ -101,10 +101,7 @@ def scale_rows(quick: bool) -> Iterator[HardCase]:
 
 
 def _columns(case: FullRun, pick: NDArray[Any]) -> States:
-    s = case.snapshots
-    Z, steps, times = np.asfortranarray(s.Z[:, pick]), s.steps[pick], s.times[pick]
-    chosen = replace(s, steps=steps, times=times, Z=Z, q_s=s.q_s[:, pick], v_s=s.v_s[:, pick])
-    return states_of(case.model.system, chosen)
+    return states_of(case.model.system, case.snapshots.columns(pick))
 
 
 def deficient_rows(quick: bool) -> Iterator[HardCase]:

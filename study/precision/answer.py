@@ -114,7 +114,7 @@ class Answers:
             if first is None or runs == TRIES or (best is not None and best[1].seconds <= first.seconds):
                 return best
             point = self.measure(first.setting)
-            if self.meets(point, tolerance):  # cheap as predicted, or a prediction that told too little
+            if self.meets(point, tolerance):  # cheap as predicted, or the prediction was too large
                 return (first, point) if best is None or point.seconds <= best[1].seconds else best
         return None
 

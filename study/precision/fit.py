@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgrasp.study.precision.points import WorkPoint
+from softgrasp.study.reduce.result import unbeaten
 from softgrasp.study.shell.timing import power_law
 
 GAIN = 0.01  # of the error: what a slower point must gain to be on the front
@@ -33,14 +34,8 @@ def usable[P: WorkPoint](points: Sequence[P]) -> list[P]:
 
 def pareto[P: WorkPoint](points: Sequence[P], x: str = "seconds", y: str = "error") -> list[P]:
     """Points that no other beats in the attributes x and y at once, by x; less than :data:`GAIN` counts as none."""
-    front: list[P] = []
-    lowest = float("inf")
     good = [(getattr(p, x), getattr(p, y), p) for p in points if p.ok]
-    good = [(a, b, p) for a, b, p in good if np.isfinite(a) and np.isfinite(b) and a > 0]
-    for _, value, p in sorted(good, key=lambda row: row[:2]):
-        if value < (1 - GAIN) * lowest:
-            front, lowest = [*front, p], value
-    return front
+    return [p for *_, p in unbeaten([c for c in good if np.isfinite(c[0]) and np.isfinite(c[1]) and c[0] > 0], GAIN)]
 
 
 def series_of[P: WorkPoint](points: Sequence[P], name: Callable[[P], str] | None = None) -> dict[str, list[P]]:

@@ -10,7 +10,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.precision.fit import interpolate, usable
 from softgrasp.study.precision.forward import over_steps, step_counts
 from softgrasp.study.precision.points import ForwardPoint, ReducedPoint, RiccatiPoint, RunPoint, WorkPoint
-from softgrasp.study.precision.result import ErrorBudget, Part
+from softgrasp.study.precision.result import ErrorBudget, Source
 from softgrasp.study.precision.settings import GOALS, POINT_WORK, Group, Setting, least_steps
 
 LARGEST = {2: 300_000, 3: 60_000}  # unknowns of a setting that no run of the diagram tried
@@ -116,7 +116,7 @@ class Predictor:
 ROUNDING = 1e-16  # digits end there
 
 
-def balanced(label: str, parts: Sequence[Part], missing: Sequence[tuple[str, str]] = ()) -> ErrorBudget:
+def with_shares(label: str, parts: Sequence[Source], missing: Sequence[tuple[str, str]] = ()) -> ErrorBudget:
     """Shares and wasted digits of parts whose errors are known."""
     whole, largest = (max(f(p.error for p in parts), ROUNDING) for f in (sum, max))
     done = [
@@ -142,9 +142,9 @@ def error_budget(
     finer = [p for p in map(predictor.predict, dict.fromkeys(other)) if p.error - time <= space / 2]
     mesh = min(finer, key=lambda p: p.seconds, default=None)
     parts = [
-        Part("the mesh", space, halved_by=mesh.setting.mesh if mesh else "",
+        Source("the mesh", space, halved_by=mesh.setting.mesh if mesh else "",
              cost=mesh.seconds / now.seconds if mesh else None),
-        Part("the time step", time, halved_by=f"{steps} steps",
+        Source("the time step", time, halved_by=f"{steps} steps",
              cost=predictor.predict(replace(setting, steps=steps)).seconds / now.seconds),
         *_halved("the reduced model", companion(now.error, reduced), reduced, lambda p: p.error_outputs_full),
         *_solver(scene, forward),
@@ -153,28 +153,28 @@ def error_budget(
     names = {"reduced": "the reduced model", "riccati": "the Riccati equation"}
     there = {p.name for p in parts}
     missing = [(name, skipped.get(key, "not asked for")) for key, name in names.items() if name not in there]
-    return balanced(setting.label, parts, missing)
+    return with_shares(setting.label, parts, missing)
 
 
-def _halved[P: WorkPoint](name: str, point: P | None, others: Sequence[P], error: Callable[[P], float]) -> list[Part]:
+def _halved[P: WorkPoint](name: str, point: P | None, others: Sequence[P], error: Callable[[P], float]) -> list[Source]:
     """A part that a point of a question tells, with the fastest one of half its error."""
     if point is None or not isfinite(error(point)):
         return []
     better = min((p for p in usable(others) if error(p) <= error(point) / 2), key=lambda p: p.seconds, default=None)
     if better is None:
-        return [Part(name, error(point))]
+        return [Source(name, error(point))]
     by = better.label.removesuffix(f", {better.setting.label}") if isinstance(better, RunPoint) else better.label
-    return [Part(name, error(point), halved_by=by, cost=better.seconds / point.seconds)]
+    return [Source(name, error(point), halved_by=by, cost=better.seconds / point.seconds)]
 
 
-def _solver(scene: Scene, forward: Sequence[ForwardPoint]) -> list[Part]:
+def _solver(scene: Scene, forward: Sequence[ForwardPoint]) -> list[Source]:
     """How far the scene's solver is from another one on the same mesh and steps."""
     iterative, rtol = scene.time.solver == "cg", scene.time.rtol
     own = [p for p in forward if p.error_solver is not None and (p.solver == "cg") == iterative]
     if iterative:
         own = sorted(own, key=lambda p: abs(log10((p.rtol or rtol) / rtol)))[:1]
     by = "a smaller time.rtol" if iterative else ""
-    return [Part("the linear solver", max(p.error_solver or 0.0 for p in own), halved_by=by)] if own else []
+    return [Source("the linear solver", max(p.error_solver or 0.0 for p in own), halved_by=by)] if own else []
 
 
 def _tight(scene: Scene, points: Sequence[RiccatiPoint]) -> RiccatiPoint | None:

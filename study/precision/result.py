@@ -172,7 +172,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Part:
+class Source:
     """One source of error."""
 
     name: str  # of the source
@@ -188,7 +188,7 @@ class ErrorBudget:
     """Where the digits of one setting are lost; the largest part first."""
 
     label: str  # the setting in words
-    parts: tuple[Part, ...]  # sources of error
+    parts: tuple[Source, ...]  # sources of error
     missing: tuple[tuple[str, str], ...] = ()  # sources that are no part of it, with the reason
 
     @property

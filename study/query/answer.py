@@ -89,7 +89,7 @@ class QueryResult:
     model: CertifiedModel
     each: Sequence[CertifiedAnswer]
     seconds: float  # of the reduced model
-    many: bool  # asked by a table of parameters
+    many: bool  # by a table of parameters
 
     @property
     def counts(self) -> tuple[int, int, int]:

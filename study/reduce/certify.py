@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import median
@@ -33,12 +34,11 @@ from softgrasp.reduction.certified.trainer import (
 from softgrasp.reduction.certified.truth import Tested, tested
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
-from softgrasp.reduction.replay import FullRun
 from softgrasp.study.reduce.result import reduce_result
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 from softgrasp.study.shell.session import Page, Session, list_files
-from softgrasp.study.shell.timing import median_seconds, timed
+from softgrasp.study.shell.timing import median_seconds
 
 FILE = "certified.h5"
 REPEATS = 7  # behind the median time of a query
@@ -91,24 +91,23 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
     if drive is None or lift is None or box is None or (certified.fine.two_way and drive.hand is None):
         return None
     drive, comm, Phi = replace(drive, finer=None), layout.comm, lift.L_q[:, 2 * layout.n_s :]
-    models = {sizes: certified.with_sizes(*sizes) for sizes in sizes_of(certified)}
-    tests: dict[tuple[int, int], list[Tested]] = {sizes: [] for sizes in models}
+    models = [certified.with_sizes(*sizes) for sizes in sizes_of(certified)]
+    tests: list[list[Tested]] = [[] for _ in models]
     count = TESTS if layout.n_e < LARGE else FEWER
     inner = (np.arange(count) + 0.5) / count  # of the box; the training has its edges
     lam, mu = (low * (high / low) ** inner for low, high in (box.lam, box.mu))
-    seconds: list[float] = []
-    for place in product(lam.tolist(), mu.tolist()):
-        runs: list[FullRun] = []
-        seconds.append(timed(comm, lambda place=place, runs=runs: runs.append(run_at(model, *place))))  # type: ignore[misc]
-        (full,) = runs
-        for (k, k2), part in models.items():
-            answer = part.run(full.model.system.materials, drive, allow=True)
-            tests[k, k2].append(tested(full, answer, Phi[:, :k]))
-    sizes = {}
-    for (k, k2), part in models.items():
-        query = median_seconds(comm, lambda part=part: part.run(allow=True), REPEATS)  # type: ignore[misc]
-        sizes[k, k2] = Size(k, k2, part.coarse.N, query, tuple(tests[k, k2]))
-    return BoxCheck(sizes[certified.k, certified.k2], tuple(sizes.values()), float(median(seconds)))
+    watch = Stopwatch(comm)
+    for i, place in enumerate(product(lam.tolist(), mu.tolist())):
+        with watch.stage(f"full run {i}"):
+            full = run_at(model, *place)
+        for part, own in zip(models, tests, strict=True):
+            own.append(tested(full, part.run(full.model.system.materials, drive, allow=True), Phi[:, : part.k]))
+    sizes = []
+    for part, own in zip(models, tests, strict=True):
+        query = median_seconds(comm, partial(part.run, allow=True), REPEATS)
+        sizes.append(Size(part.k, part.k2, part.coarse.N, query, tuple(own)))
+    built = next(s for s in sizes if (s.k, s.k2) == (certified.k, certified.k2))
+    return BoxCheck(built, tuple(sizes), float(median(watch.seconds.values())))
 
 
 def sizes_of(certified: CertifiedModel) -> list[tuple[int, int]]:
@@ -208,7 +207,7 @@ def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | No
         full = run_at(model, first.lam, first.mu)
     run = certified.run(allow=True)
     certificate, training = run.certificate, certified.training
-    query = median_seconds(comm, lambda: certified.run(allow=True), REPEATS)
+    query = median_seconds(comm, partial(certified.run, allow=True), REPEATS)
     own = {
         **{key: getattr(certificate, key) for key in ("reduction", "proved", "effectivity_at_most", "time_step")},
         "estimate": None if certificate.estimate is None else certificate.estimate.relative,

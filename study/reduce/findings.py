@@ -28,7 +28,7 @@ def leader(sweeps: Sequence[MethodSweep], N: int, key: str, stable: bool = True)
     return min(models)[2:] if models else None
 
 
-def sizes_of(sweeps: Sequence[MethodSweep]) -> list[int]:
+def all_sizes(sweeps: Sequence[MethodSweep]) -> list[int]:
     """All N of any method, ascending."""
     return sorted({p.N for s in sweeps for p in s.points})
 
@@ -42,7 +42,7 @@ def findings(sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:
 def _best(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
     seen: dict[tuple[tuple[str, int], ...], str] = {}
     for key, name in MEASURES:
-        best = [b for N in sizes_of(sweeps) if (b := leader(sweeps, N, key)) is not None]
+        best = [b for N in all_sizes(sweeps) if (b := leader(sweeps, N, key)) is not None]
         order = tuple((s.method.key, p.N) for s, p in best)
         if order in seen:
             yield f"In {name} the same methods lead as in {seen[order]}."
@@ -72,7 +72,7 @@ def _stability(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
 
 
 def _structure(sweeps: Sequence[MethodSweep]) -> Iterator[str]:
-    N = min(sizes_of(sweeps), key=lambda N: (abs(N - COMPARED), N))
+    N = min(all_sizes(sweeps), key=lambda N: (abs(N - COMPARED), N))
     groups = [
         [(s, p) for s in sweeps if s.method.preserving == keeps for p in s.points if p.N == N and p.stable]
         for keeps in (True, False)
@@ -113,7 +113,7 @@ def _statement(
 ) -> Iterator[str]:
     pairs = [
         (N, a, b)
-        for N in sizes_of([*left, *right])
+        for N in all_sizes([*left, *right])
         if (a := leader(left, N, "error", stable=False)) and (b := leader(right, N, "error", stable=False))
     ]
     if not pairs:

@@ -20,7 +20,7 @@ from softgrasp.study.pictures import style
 from softgrasp.study.pictures.animation import film, timing, write_gif
 from softgrasp.study.pictures.body import Shot, colour_bar, draw_scene, make_axes, make_shot, outline
 from softgrasp.study.pictures.shapes import hands_at
-from softgrasp.study.reduce.result import MethodSweep, Point, by_error
+from softgrasp.study.reduce.result import MethodSweep, Point, by_error, unbeaten
 from softgrasp.study.reduce.views import Views
 
 TOP = 1.0  # errors above are drawn at the upper edge
@@ -137,7 +137,7 @@ def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> t
                 (unit * (p.time_online + offline * p.time_offline), min(getattr(p, key), TOP), s)
                 for s in sweeps for p in s.points if p.stable and np.isfinite(getattr(p, key))
             ]  # fmt: skip
-            front = pareto(points)
+            front = unbeaten(points)
             for shown, mark in ((points, OTHERS), (front, FRONT)):
                 ax.plot([t for t, _, _ in shown], [e for _, e, _ in shown], **mark)
             for t, e, s in front:
@@ -157,15 +157,6 @@ def figure_times(sweeps: Sequence[MethodSweep], full: float, out_png: Path) -> t
         ]
         figure.legend(handles=[*named.values(), *rest], loc="outside upper center", ncols=2)
         return style.save(figure, out_png)
-
-
-def pareto(points: Sequence[tuple[float, float, MethodSweep]]) -> list[tuple[float, float, MethodSweep]]:
-    """Those of (time, error, method) that no other beats in both, by time."""
-    front: list[tuple[float, float, MethodSweep]] = []
-    for point in sorted(points, key=lambda p: p[:2]):
-        if not front or point[1] < front[-1][1]:
-            front.append(point)
-    return front
 
 
 def figure_sigma(sweeps: Sequence[MethodSweep], out_png: Path) -> tuple[Path, ...]:

@@ -38,7 +38,7 @@ class Point:
     error: float  # the same of X = [q_s, v_s, q_e, v_e], for every basis the paper's error [SBRH21]
     error_canonical: float  # the same of X = [q_s, p_s, q_e, p_e]
     error_energy: float  # largest error of the tissue's energy over its largest value
-    # projection_error_deformation, projection_error: the floors that the basis sets to the first two
+    # projection_error_deformation, projection_error: what the basis alone leaves of the first two
     projection_error_deformation: float
     projection_error: float
     time_offline: float  # basis and projection; one factorisation of the snapshots serves all N
@@ -260,6 +260,18 @@ def best(points: Sequence[Point]) -> Point | None:
     """The stable point with the least error of the deformation."""
     chosen = [p for p in points if p.stable and np.isfinite(p.error_deformation)]
     return min(chosen, key=lambda p: p.error_deformation, default=None)
+
+
+def unbeaten[T](points: Sequence[tuple[float, float, T]], gain: float = 0.0) -> list[tuple[float, float, T]]:
+    """The Pareto front: those of (cost, error, what) that no other beats in both, by cost.
+
+    A larger cost must gain more than the share ``gain`` of the error.
+    """
+    front: list[tuple[float, float, T]] = []
+    for point in sorted(points, key=lambda p: p[:2]):
+        if not front or point[1] < (1 - gain) * front[-1][1]:
+            front.append(point)
+    return front
 
 
 def kept_points(points: Sequence[Point]) -> set[int]:

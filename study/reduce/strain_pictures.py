@@ -23,7 +23,7 @@ from softgrasp.study.reduce.strain_measure import CELLS_AT, StrainStudy
 
 def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Path]:
     """Figures. Rank 0 only."""
-    files = list(figure_errors(study, out / "strain_errors.png"))
+    files = list(figure_strain_errors(study, out / "strain_errors.png"))
     last = study.families[-1]
     shown = [last.models[N] for N in CELLS_AT if N in last.models]
     if picture is not None and shown:
@@ -31,7 +31,7 @@ def draw(out: Path, study: StrainStudy, picture: PictureMesh | None) -> list[Pat
     return files
 
 
-def figure_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
+def figure_strain_errors(study: StrainStudy, out_png: Path) -> tuple[Path, ...]:
     """Errors against N, and against the number of cells."""
     colours = dict(zip((f.key for f in study.families), (style.BLUE, style.ORANGE), strict=False))
     with style.paper_style():

@@ -12,6 +12,7 @@ from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.bases.registry import PAPER_METHODS
 from softgrasp.reduction.model import ReducedModel
+from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.replay import FullRun, replay_linear
 from softgrasp.study.reduce.result import MethodSweep, Point, by_error, nearest
 
@@ -61,10 +62,8 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
     if model.space.mesh.mesh.geometry.index_map().size_global > MANY_VERTICES:
         return None
     picture = gather_picture(model)
-    snapshots, n = run.snapshots, model.system.layout.n_local
-    chosen = np.unique(np.linspace(0, len(snapshots.steps) - 1, FRAMES + 1).round().astype(int))
-    steps = snapshots.steps[chosen]
-    full = vertex_displacement(model, snapshots.Z[:n, chosen], snapshots.q_s[:, chosen])
+    frames = thinned(run.snapshots, FRAMES + 1)
+    steps, full = frames.steps, vertex_displacement(model, frames.Z[: model.system.layout.n_local], frames.q_s)
     views = []
     for s, point in compared(sweeps):
         reduced = s.models[point.N]
@@ -81,7 +80,7 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
         return None
     table = np.column_stack([run.trajectory.times, run.trajectory.q_s])
     shown = tuple((title, shapes, free) for title, shapes, free in modes if shapes is not None and len(shapes))
-    return Views(picture, snapshots.times[chosen], table, full, tuple(views), shown)
+    return Views(picture, frames.times, table, full, tuple(views), shown)
 
 
 def _modes(model: Model, rom: ReducedModel) -> Array | None:

@@ -36,8 +36,8 @@ from softgrasp.study.precision.fit import interpolate, pareto, usable
 from softgrasp.study.precision.forward import step_counts, too_slow
 from softgrasp.study.precision.full import find_places, largest, run_probed
 from softgrasp.study.precision.points import ForwardPoint, Request, WorkPoint
-from softgrasp.study.precision.predict import balanced
-from softgrasp.study.precision.result import Part, WorkStudy
+from softgrasp.study.precision.predict import with_shares
+from softgrasp.study.precision.result import Source, WorkStudy
 from softgrasp.study.precision.run import run_study, study_scene
 from softgrasp.study.precision.settings import (
     FASTEST,
@@ -233,7 +233,7 @@ def test_error_budget_names_the_part_that_costs_the_digits(result: dict[str, Any
 
 
 def test_wasted_digits_are_those_below_a_tenth_of_the_largest_part() -> None:
-    budget = balanced("x", [Part("a", 1e-5), Part("b", 0.03), Part("c", 0.004), Part("d", 0.0)])
+    budget = with_shares("x", [Source("a", 1e-5), Source("b", 0.03), Source("c", 0.004), Source("d", 0.0)])
     assert [(p.name, p.wasted) for p in budget.parts] == [("b", 0), ("c", 0), ("a", 2), ("d", 13)]
     assert budget.parts[0].share == pytest.approx(0.03 / 0.03401)
     assert budget.sentence == "Of the error of x, b carries 88 %. Wasted digits: 2 of a, 13 of d."
