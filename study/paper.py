@@ -70,13 +70,13 @@ def at(points: list[dict[str, Any]], N: int) -> dict[str, Any]:
     return min(points, key=lambda p: (abs(p["N"] - N), p["N"]))
 
 
-def number(value: float | None, unit: str = "") -> str:
+def digits(value: float | None, unit: str = "") -> str:
     """Three digits; null in JSON stands for a number that is not finite."""
     return "not finite" if value is None else f"{value:.3g}{unit}"
 
 
 def _span(values: list[float], unit: str) -> str:
-    return f"{number(min(values))} to {number(max(values), unit)}" if values else "none"
+    return f"{digits(min(values))} to {digits(max(values), unit)}" if values else "none"
 
 
 def verdict(same: bool) -> str:
@@ -97,7 +97,7 @@ def mesh_rows(forward: dict[str, Any], accurate: dict[str, Any]) -> list[Row]:
     """The error of the deformation, on the paper's and on the graded one."""
     here = [
         f"about {percent(error['estimate'])} (bound {percent(error['bound'])}) at n_e = {error['n_e']} in "
-        f"{number(result['time']['factor'] + result['time']['steps'], ' s')}"
+        f"{digits(result['time']['factor'] + result['time']['steps'], ' s')}"
         for result in (forward, accurate) if (error := result["mesh_error"])
     ]  # fmt: skip
     zone, cells = "the contact zone ends within two sides", "quadratic cells that shrink towards these ends"
@@ -115,20 +115,20 @@ def forward_rows(forward: dict[str, Any], reduced: dict[str, Any]) -> list[Row]:
     paper = [name for name in OF_PAPER if points.get(name)]
     online, again = [p["time_online"] for name in paper for p in points[name]], speed["psd"]["speedup_same_model"]
     errors = (
-        f"{number(psd['error'])} in (q, v), {number(psd['error_canonical'])} in (q, p), "
-        f"{number(psd['error_deformation'])} in the deformation"
+        f"{digits(psd['error'])} in (q, v), {digits(psd['error_canonical'])} in (q, p), "
+        f"{digits(psd['error_deformation'])} in the deformation"
     )
     near, chosen = any(3e-4 < (psd[key] or 0) < 3e-3 for key in ("error", "error_canonical")), f"PSD, N = {psd['N']}"
     return [
         ("states 2n", "1916", str(states), verdict(states == 1916), "the same mesh, contact zone and elements"),
-        ("full run, 600 steps", "16.22 s", number(full, " s"), less(full, 16.22),
+        ("full run, 600 steps", "16.22 s", digits(full, " s"), less(full, 16.22),
          "the matrix is factored once, by compiled kernels on another machine"),
-        (f"reduced run, {chosen}", "0.097 s", number(psd["time_online"], " s"), less(psd["time_online"], 0.097),
+        (f"reduced run, {chosen}", "0.097 s", digits(psd["time_online"], " s"), less(psd["time_online"], 0.097),
          "a step is one small product, everything else is done before"),
         ("reduced runs, all six methods and N", "0.097 to 0.101 s", _span(online, " s"),
          less(max(online, default=None), 0.101), "as above; N matters more here"),
-        (f"speed-up, {chosen}", "167", f"{number(again)} for the same model again, "
-         f"{number(speed['psd']['speedup_new_parameter'])} for a new parameter", less(-again, -167),
+        (f"speed-up, {chosen}", "167", f"{digits(again)} for the same model again, "
+         f"{digits(speed['psd']['speedup_new_parameter'])} for a new parameter", less(-again, -167),
          "the full run is fast itself"),
         (f"error of {chosen}", "about 1e-3", errors, verdict(near),
          "hand mass and motion are not in the paper; in (q, p) the rigid motion hides the deformation"),
@@ -158,9 +158,9 @@ def _best(points: dict[str, Any], about: dict[str, Any], names: list[str]) -> Ro
     errors = {name: at(points[name], N_FORWARD) for name in names if points.get(name)}
     stable = {name: e for name, e in errors.items() if e["stable"]} or errors
     best = min(stable, key=lambda name: stable[name]["error"])
-    here = f"{about[best]['title']}: {number(errors[best]['error'])}; PSD: "
+    here = f"{about[best]['title']}: {digits(errors[best]['error'])}; PSD: "
     here += ", ".join(
-        f"{number(errors[name]['error'])} {label}"
+        f"{digits(errors[name]['error'])} {label}"
         for name, label in (("psd", "without fixed solid modes"), ("psd_fixed", "with"))
         if name in errors
     )
@@ -174,7 +174,7 @@ def _structure(points: dict[str, Any], names: list[str]) -> Row:
     kept = {name: e for name, e in errors.items() if name not in PAPER_PLAIN}
     lost = {name: e for name, e in errors.items() if name in PAPER_PLAIN}
     texts = [
-        f"{label}: " + ", ".join(f"{number(e['error'])}{'' if e['stable'] else ' unstable'}" for e in group.values())
+        f"{label}: " + ", ".join(f"{digits(e['error'])}{'' if e['stable'] else ' unstable'}" for e in group.values())
         for label, group in (("preserving", kept), ("not preserving", lost))
         if group
     ]
@@ -189,7 +189,7 @@ def _structure(points: dict[str, Any], names: list[str]) -> Row:
 
 def _flat(points: list[dict[str, Any]]) -> Row:
     near, last = at(points, N_FLAT), max(points, key=lambda p: p["N"])
-    here = f"{number(near['error'])} at N = {near['N']}, {number(last['error'])} at N = {last['N']}"
+    here = f"{digits(near['error'])} at N = {near['N']}, {digits(last['error'])} at N = {last['N']}"
     reason = "canonical momenta of a stable integrator: the singular values go on falling"
     same = BETTER if _error(last) < _error(near) / 2 else REPRODUCED
     return (f"PSD beyond N = {N_FLAT}", "no improvement", here, same, reason)
@@ -203,24 +203,24 @@ def control_rows(control: dict[str, Any]) -> list[Row]:
     gained = seconds / first["time_are"]
     rows: list[Row] = [
         ("states 2n", "880", str(states), verdict(states == 880), "the same"),
-        ("full Riccati equation", "84.53 s", number(seconds, " s"), less(seconds, 84.53), "of low rank; "
+        ("full Riccati equation", "84.53 s", digits(seconds, " s"), less(seconds, 84.53), "of low rank; "
          "Kelvin-Voigt damping of 0.002 s, without which the problem is ill-posed in double precision"),
         ("reduced equations, five methods, all N", "0.051 to 0.057 s", _span(times, " s"),
          less(max(times, default=None), 0.057), "a direct solver"),
-        (f"speed-up, POD of P, N = {first['N']}", "1600", number(gained), less(-gained, -1600),
+        (f"speed-up, POD of P, N = {first['N']}", "1600", digits(gained), less(-gained, -1600),
          "the full equation is solved in low rank; both need P for the basis"),
-        ("target reached at T = 300, optimal gain", "yes", f"{number(away)} m off", verdict((away or 1.0) < NEAR), ""),
+        ("target reached at T = 300, optimal gain", "yes", f"{digits(away)} m off", verdict((away or 1.0) < NEAR), ""),
     ]  # fmt: skip
     for run in control["loop"].get("reduced", ()):
         told = run["method"] == "pod"
-        end = run["reason"] or f"{number(run['distance_final'])} m off, excess cost {number(run['cost'] / best - 1)}"
+        end = run["reason"] or f"{digits(run['distance_final'])} m off, excess cost {digits(run['cost'] / best - 1)}"
         name = f"target reached, {TITLES[run['method']]}, N = {run['N']}"
         same = verdict(not run["reason"]) if told else NOT_TOLD
         rows.append((name, "yes, N not told" if told else "not shown", end, same, "the stable gain of least cost"))
     for name, points in reduced.items():
         p, five = at(points, N_RICCATI), name in (*FREE, *FIXED)
         paper = "0.053 s" if name == "pod" else "0.051 to 0.057 s" if five else "not in the paper"
-        here = f"{number(p['time_are'], ' s')}; error of P {number(p['error_P'])}, of K {number(p['error_K'])}, "
+        here = f"{digits(p['time_are'], ' s')}; error of P {digits(p['error_P'])}, of K {digits(p['error_K'])}, "
         here += "stable" if p["stable"] else "not stable"
         same = less(p["time_are"], 0.051) if five else NOT_TOLD
         why = "a direct solver for the small equation; damping and hand mass are chosen here"
@@ -236,7 +236,7 @@ def _small(reduced: dict[str, Any]) -> Row:
     return (
         f"smallest error of P at N = {N_RICCATI}",
         "without fixed solid modes",
-        ", ".join(f"{number(value)} {label}" for label, value in best.items()),
+        ", ".join(f"{digits(value)} {label}" for label, value in best.items()),
         verdict(best["without"] < best["with"]),
         "with damping P has another decay than in the paper, whose damping and weights are not told",
     )

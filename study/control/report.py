@@ -17,7 +17,7 @@ from softgrasp.lqr.reduced.riccati import GainQuality
 from softgrasp.study.control.result import TITLES, ControlStudy, GainStudy, Retuned, radius_of, settled
 from softgrasp.study.forward.result import trajectory_header
 from softgrasp.study.pictures.shapes import speed_up
-from softgrasp.study.report.equation import controlled
+from softgrasp.study.report.equation import control_equation
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
 
@@ -251,7 +251,7 @@ def sections(study: ControlStudy, seconds: Mapping[str, float], drawn: Sequence[
         Section("", figures=pick("move.png", "move.gif")),
         *([Section("Notes", text=notes)] if notes else []),
         Section("Result", rows=result_rows(study, seconds), figures=pick("histories.png", "decay.png")),
-        Section("Equation", equation=controlled(study.design.model.scene)),
+        Section("Equation", equation=control_equation(study.design.model.scene)),
     ]
     if study.bases:
         parts += _reduced(study, pick("errors.png"))

@@ -37,7 +37,7 @@ def gif_move(
     kept, durations = timing(times)
     frames, times = frames[kept].astype(np.float64), times[kept]
     shot = make_shot(picture, frames, times, table, target)
-    return write_gif(_render(shot, frames, times), durations, out_gif, _palette())
+    return write_gif(_render(shot, frames, times), durations, out_gif)
 
 
 def timing(times: Array) -> tuple[list[int], list[int]]:
@@ -119,12 +119,9 @@ def _fit(figure: Any, box: Any) -> None:
         placed.set_bbox_to_anchor(tuple(anchor), transform=figure.transFigure)
 
 
-def write_gif(images: list[Any], durations: list[int], out_gif: Path, palette: Any = None) -> Path:
-    """Write frames of one size, each with its duration [ms], smaller if they would take more than 3 MB.
-
-    Without a palette the colours are the 256 of the frame in the middle.
-    """
-    palette = palette or _palette_of(images[len(images) // 2])
+def write_gif(images: list[Any], durations: list[int], out_gif: Path) -> Path:
+    """Write frames of one size, each with its duration [ms], smaller if they would take more than 3 MB."""
+    palette = _palette()
     for scale in (1.0, 0.8, 0.6, 0.45):
         size = tuple(round(scale * n) for n in images[0].size)
         scaled = images if scale == 1.0 else [image.resize(size, Image.Resampling.LANCZOS) for image in images]
@@ -135,15 +132,6 @@ def write_gif(images: list[Any], durations: list[int], out_gif: Path, palette: A
             break
     out_gif.write_bytes(buffer.getvalue())
     return out_gif
-
-
-def _palette_of(image: Any) -> Any:
-    """The 256 colours of a picture, its paper pure white."""
-    palette = image.quantize(256)
-    colours = np.reshape(palette.getpalette(), (-1, 3))
-    colours[colours.sum(axis=1).argmax()] = 255
-    palette.putpalette(colours.ravel().tolist())
-    return palette
 
 
 def _palette() -> Any:

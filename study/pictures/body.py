@@ -23,7 +23,7 @@ from matplotlib.tri import Triangulation
 from softgrasp.fem.columns import Array
 from softgrasp.fem.fields.picture import PictureMesh
 from softgrasp.study.pictures import shapes, style
-from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, save, segments
+from softgrasp.study.pictures.style import colour_map, length_unit, paper_style, save
 
 MANY_CELLS = 300_000  # above, a picture shows the outline only
 PAD, GAP, LINE = 0.1, 0.14, 0.18  # around the scene, between panels, height of a line of text [inch]
@@ -307,7 +307,7 @@ def _draw_2d(ax: Any, shot: Shot, u: Array, q: Array) -> None:
         look: dict[str, Any] = {"cmap": colour_map(), "norm": shot.norm, "rasterized": True, "zorder": 2}
         body = TriMesh(Triangulation(x[:, 0], x[:, 1], picture.cells), array=shot.values(u, q), **look)
         ax.add_collection(body, autolim=False)
-    ax.add_collection(segments(x[shot.edges], edgecolors=style.OUTLINE, linewidths=0.5, zorder=3), autolim=False)
+    ax.add_collection(LineCollection(x[shot.edges], colors=style.OUTLINE, linewidths=0.5, zorder=3), autolim=False)
     hand = PolyCollection(shapes.moved(picture, shot.hand, q), color=style.HAND, linewidths=0.3, zorder=4)
     ax.add_collection(hand, autolim=False)
 

@@ -11,14 +11,11 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from cycler import cycler
-from PIL import Image
 
 from softgrasp.study.pictures import PDF
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.collections import PathCollection
-from matplotlib.path import Path as Curve
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe and Ito
@@ -53,12 +50,6 @@ def colour_map() -> Any:
     """Light for small values, dark for large ones, so that the dark hand stands out against the held tissue."""
     colours = mpl.colormaps["viridis_r"]([0.02 + 0.9 * i / 255 for i in range(256)])
     return mpl.colors.ListedColormap(colours, name="softgrasp")
-
-
-def segments(ends: Any, **look: Any) -> Any:
-    """Many short lines, each (2, 2) [m], as one artist."""
-    codes = np.tile(np.array([Curve.MOVETO, Curve.LINETO], dtype=Curve.code_type), len(ends))
-    return PathCollection([Curve(ends.reshape(-1, 2), codes)], facecolors="none", **look)
 
 
 def few_ticks(axis: Any) -> None:
@@ -107,25 +98,10 @@ def direct_labels(ax: Any, ends: Sequence[tuple[float, float, str, str]], size: 
 
 
 def save(figure: Any, out_png: Path) -> tuple[Path, ...]:
-    """Write the figure as PNG and, where :data:`PDF` is set, beside it as PDF; close it and return the names.
-
-    Draws once, where ``bbox_inches="tight"`` draws twice.
-    """
-    arranged = figure.get_layout_engine() is not None  # then all lies within the figure
-    if arranged:
-        figure.canvas.draw()
-    box = figure.get_tightbbox().padded(0.04)
-    if arranged:
-        height = figure.canvas.get_width_height()[1]
-        low, high = np.round(figure.dpi * box.get_points()).astype(int).tolist()
-        whole = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-        inside = (max(low[0], 0), max(height - high[1], 0), min(high[0], whole.width), min(height - low[1], height))
-        whole.crop(inside).save(out_png, dpi=(DPI, DPI))
-    else:
-        figure.savefig(out_png, bbox_inches=box)
+    """Write the figure as PNG and, where :data:`PDF` is set, beside it as PDF; close it and return the names."""
     files = (out_png, out_png.with_suffix(".pdf")) if PDF.get() else (out_png,)
-    for file in files[1:]:
-        figure.savefig(file, bbox_inches=box)
+    for file in files:
+        figure.savefig(file, bbox_inches="tight", pad_inches=0.04)
     plt.close(figure)
     return files
 

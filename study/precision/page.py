@@ -37,7 +37,7 @@ from softgrasp.study.precision.tables import (
     slope_table,
 )
 from softgrasp.study.reduce.measure import PAPER_FULL, PAPER_REDUCED
-from softgrasp.study.report.equation import controlled
+from softgrasp.study.report.equation import control_equation
 from softgrasp.study.report.files import to_json
 from softgrasp.study.report.origin import command_line, origin, peak_memory_mb
 from softgrasp.study.report.page import EQUATION, Section
@@ -193,10 +193,10 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
     feedback = [name for name in answered if name in CONTROL]
     if feedback and len(feedback) == len(answered):
         # nothing follows the scene's own motion
-        sections.insert(0, Section(EQUATION, equation=controlled(study.scene)))
+        sections.insert(0, Section(EQUATION, equation=control_equation(study.scene)))
     for name, question in answered.items():
         if feedback and len(feedback) < len(answered) and name == feedback[0]:
-            sections.append(Section(f"{EQUATION} under feedback", equation=controlled(study.scene)))
+            sections.append(Section(f"{EQUATION} under feedback", equation=control_equation(study.scene)))
         drawn = [(figures[f"work_{name}"], CAPTIONS[name])] if f"work_{name}" in figures else []
         text = reference_text(question, paper_of(study.scene) == "control")
         sections.append(question_table(name, question.points).section(text, TITLES[name], drawn))

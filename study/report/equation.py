@@ -158,7 +158,7 @@ def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
     return tuple(result)
 
 
-def controlled(scene: Scene) -> Equation:
+def control_equation(scene: Scene) -> Equation:
     """The scene's equation with a force on the hand, then cost, Riccati equation and gain.
 
     u_target holds the body at rest at the target: the hand's weight, else nothing.

@@ -142,7 +142,7 @@ def _prepared(section: Section) -> dict[str, Any]:
         {"data": embed(file), "caption": caption, "moving": file.suffix == ".gif", "width": _width(file)}
         for file, caption in section.figures
     ]
-    rows = [[shown(cell) for cell in row] for row in section.rows]
+    rows = [[cell_text(cell) for cell in row] for row in section.rows]
     return {
         "title": section.title,
         "paragraphs": [part.strip() for part in section.text.split("\n\n") if part.strip()],
@@ -159,13 +159,13 @@ def _prepared(section: Section) -> dict[str, Any]:
 
 def _column(cells: Sequence[Any]) -> str:
     """Class of a column: "n" for numbers, "t" for text long enough to be broken into lines."""
-    texts = [shown(cell) for cell in cells]
+    texts = [cell_text(cell) for cell in cells]
     if all(not t or (isinstance(c, NUMBERS) and not isinstance(c, bool)) for c, t in zip(cells, texts, strict=True)):
         return "n"
     return "t" if max(map(len, texts)) > LONG else ""
 
 
-def shown(cell: Any) -> str:
+def cell_text(cell: Any) -> str:
     """Text of a cell: numbers with four digits, counts in full, nothing for None."""
     if cell is None:
         return ""

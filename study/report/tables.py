@@ -13,7 +13,7 @@ import rich.box
 import rich.table
 from rich.markup import escape
 
-from softgrasp.study.report.page import NUMBERS, Section, shown
+from softgrasp.study.report.page import NUMBERS, Section, cell_text
 
 
 @dataclass(frozen=True)
@@ -48,24 +48,24 @@ class Table:
 
     def markdown(self) -> str:
         """The table as a README shows it."""
-        lines = [self.header, ["---"] * len(self.header), *([shown(cell) for cell in row] for row in self.rows)]
+        lines = [self.header, ["---"] * len(self.header), *([cell_text(cell) for cell in row] for row in self.rows)]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
     def terminal(self, *, wrap: Sequence[int] = (), width: int = 80) -> rich.table.Table:
         """The table for a terminal of some width: numbers to the right; ``wrap``: columns that may break, in order."""
         table = rich.table.Table(box=None, padding=(0, 1, 0, 0), title=self.title or None, title_justify="left")
-        columns = [[name, *(shown(row[i]) for row in self.rows)] for i, name in enumerate(self.header)]
+        columns = [[name, *(cell_text(row[i]) for row in self.rows)] for i, name in enumerate(self.header)]
         widths = [max(map(len, cells)) for cells in columns]
         for i in wrap:
             words = [self.header[i], *(word for cell in columns[i] for word in cell.split())]
             excess = sum(widths) + len(widths) - width
             widths[i] -= max(0, min(excess, widths[i] - max(map(len, words))))
         for i, name in enumerate(self.header):
-            right = bool(self.rows) and all(number(row[i]) for row in self.rows)
+            right = bool(self.rows) and all(numeric(row[i]) for row in self.rows)
             fixed = widths[i] if i in wrap else None
             table.add_column(escape(name), justify="right" if right else "left", no_wrap=i not in wrap, width=fixed)
         for row in self.rows:
-            table.add_row(*(escape(shown(cell)) for cell in row))
+            table.add_row(*(escape(cell_text(cell)) for cell in row))
         return table
 
 
@@ -82,7 +82,7 @@ def pairs(rows: Sequence[Sequence[str]]) -> rich.table.Table:
     return table
 
 
-def number(cell: Any) -> bool:
+def numeric(cell: Any) -> bool:
     """A number, the text of one with its unit, or an empty cell."""
     if cell is None or cell in ("", "-") or (isinstance(cell, NUMBERS) and not isinstance(cell, bool)):
         return True

@@ -12,7 +12,7 @@ from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.report.origin import origin
-from softgrasp.study.report.page import SHOWN, Section, shown
+from softgrasp.study.report.page import SHOWN, Section, cell_text
 from softgrasp.study.report.tables import Table
 from softgrasp.study.runs.sweep import METHOD, Sweep, SweepPoint, parse_axis, run_sweep_points
 from softgrasp.study.shell.session import Page, Session, list_files, show_warnings
@@ -40,7 +40,7 @@ def short_table(points: Sequence[SweepPoint], width: int) -> Table:
     rows = [{**p.values, **{n: x for n, x in p.numbers.items() if " end " not in n and n not in UNITS}} for p in points]
     names = {key: key if " " in key else key.rsplit(".", 1)[-1] for row in rows for key in row}
     while len(names) > 1:
-        cells = {key: [*name.split(), *(shown(row.get(key)) for row in rows)] for key, name in names.items()}
+        cells = {key: [*name.split(), *(cell_text(row.get(key)) for row in rows)] for key, name in names.items()}
         if sum(1 + max(map(len, texts)) for texts in cells.values()) <= width:
             break
         names.popitem()

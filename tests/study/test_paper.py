@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from softgrasp.study.paper import at, number, write_page
+from softgrasp.study.paper import at, digits, write_page
 
 POINT = {"N": 14, "error": 1e-3, "error_canonical": 1e-2, "error_deformation": 0.1, "time_online": 2e-4, "stable": True}
 REDUCED = {"N": 8, "time_are": 4e-4, "error_P": None, "error_K": 0.1, "stable": False, "reason": ""}
@@ -115,5 +115,5 @@ def test_every_reference_is_cited_and_every_citation_is_listed() -> None:
 
 def test_nearest_point_and_numbers() -> None:
     assert at([{"N": 4}, {"N": 10}, {"N": 12}], 8)["N"] == 10
-    assert number(None) == "not finite"
-    assert number(0.12345, " s") == "0.123 s"
+    assert digits(None) == "not finite"
+    assert digits(0.12345, " s") == "0.123 s"

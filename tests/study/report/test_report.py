@@ -12,7 +12,7 @@ from rich.console import Console
 from softgrasp.fem.scene.file import load_scene, shipped_scenes
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.forward.run import run_simulate
-from softgrasp.study.report.equation import Equation, controlled, equation
+from softgrasp.study.report.equation import Equation, control_equation, equation
 from softgrasp.study.report.origin import versions
 from softgrasp.study.report.page import Section, outside, write_report
 from softgrasp.study.report.typeset import equation_html, prose, terms
@@ -39,7 +39,7 @@ def test_lines_break_before_operators() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
-@pytest.mark.parametrize("kind", [equation, controlled])
+@pytest.mark.parametrize("kind", [equation, control_equation])
 def test_every_symbol_of_every_scene_is_set(name: str, kind: Callable[[Scene], Equation]) -> None:
     """Nothing of the notation of LaTeX or of text is left in the page: no dollar, backslash, underscore or power."""
     html = str(equation_html(kind(load_scene(shipped_scenes()[name]))))
@@ -57,7 +57,7 @@ def test_a_terminal_shows_no_latex(name: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
 def test_control_has_its_cost_and_riccati_equation(name: str) -> None:
-    rows = controlled(load_scene(shipped_scenes()[name]))
+    rows = control_equation(load_scene(shipped_scenes()[name]))
     assert "prescribed" not in " ".join(rows.where)  # a force moves the hand, whatever moves it in `simulate`
     assert any(line.startswith("  hand:   M_hand q_s''") for line in rows.plain().lines())
     html = str(equation_html(rows))
