@@ -8,11 +8,11 @@ import dolfinx.la
 import dolfinx.plot
 import numpy as np
 
-from softgrasp.fem.disk import check_room
 from softgrasp.fem.fields.stress import CellStress
 from softgrasp.fem.fields.vtu import Collection, Field, Grid, write_vtu
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.petsc import Array, on_root
+from softgrasp.fem.resources import check_room
 
 KINDS = {(2, 1): 5, (2, 2): 22, (2, 3): 69, (3, 1): 10, (3, 2): 24, (3, 3): 71}  # (d, order): VTK's kind of cell
 

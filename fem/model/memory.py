@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import psutil
 from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError, shortened
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.resources import free_memory
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.solvers import choose_solver, factor_on_every_rank
 
@@ -25,7 +24,6 @@ LAYER_BYTES = {(2, 1): 600.0, (2, 2): 3900.0, (2, 3): 10800.0, (3, 1): 900.0, (3
 # Gradients, tangent and law of finite strain on each rank that holds the whole tissue; cubic ones by points and nodes.
 STRAIN_BYTES = {(2, 1): 1650.0, (2, 2): 12000.0, (2, 3): 40000.0, (3, 1): 5200.0, (3, 2): 97000.0, (3, 3): 420000.0}
 GIB = 2.0**30
-CONTAINER = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
@@ -81,19 +79,7 @@ def need(scene: Scene, dimension: int, cells: int, comm: MPI.Intracomm, run: boo
 
 def free_bytes(scene: Scene) -> float:
     """Memory that a run may take on this node [byte]: ``output.memory``, or what is free."""
-    if scene.output.memory != "auto":
-        return scene.output.memory * GIB
-    free = float(psutil.virtual_memory().available)
-    for limit, used in (
-        ("memory.max", "memory.current"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
-    ):
-        try:  # of the container
-            numbers = [float((CONTAINER / name).read_text()) for name in (limit, used)]
-        except (OSError, ValueError):
-            continue
-        free = min(free, max(numbers[0] - numbers[1], 0.0))
-    return free
+    return free_memory() if scene.output.memory == "auto" else scene.output.memory * GIB
 
 
 def check_memory(scene: Scene, comm: MPI.Intracomm, run: bool, dimension: int, cells: int) -> None:

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import psutil
 
-from softgrasp.fem.disk import check_room
 from softgrasp.fem.errors import CheckpointError, ResourceError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
+from softgrasp.fem.resources import check_room, free_memory
 from softgrasp.fem.run.midpoint import TissueState, state_on
 from softgrasp.fem.system import BlockSystem
 
@@ -88,7 +87,7 @@ class MemoryStore(NoStore):
         layout = system.layout
         count = steps // every + 1
         needed = 16 * layout.n_e * count
-        free = layout.comm.bcast(psutil.virtual_memory().available)
+        free = layout.comm.bcast(free_memory())
         if needed > 0.8 * free:
             raise ResourceError(
                 f"output.snapshots: {count} columns of {2 * layout.n_e} doubles need {needed} bytes "

@@ -10,7 +10,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-import psutil
 import scipy.sparse
 import scipy.sparse.linalg
 from mpi4py import MPI
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from softgrasp.fem.errors import ResourceError, SolverError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, Complex, PETSc, petsc_options, whole_copy
+from softgrasp.fem.resources import free_memory
 from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.plant.checks import MODAL_KEY
 
@@ -378,7 +378,7 @@ def factor_bytes(n: int, dimension: int) -> float:
 def check_memory(layout: BlockLayout) -> None:
     """The factor of S(p) fits in the memory that is free now. Collective. Raises ResourceError: it does not."""
     needed = factor_bytes(layout.n_e, layout.dimension) / 2**30
-    free = float(layout.comm.bcast(psutil.virtual_memory().available)) / 2**30
+    free = layout.comm.bcast(free_memory()) / 2**30
     if needed > free:
         raise ResourceError(
             f"the factor of the shifted tissue matrix (n_e = {layout.n_e} in {layout.dimension}D) needs about "

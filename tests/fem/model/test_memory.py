@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from mpi4py import MPI
 
+from softgrasp.fem import resources
 from softgrasp.fem.errors import ResourceError
 from softgrasp.fem.mesh.tissue_mesh import make_mesh
-from softgrasp.fem.model import memory
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import box_simplices, check_memory, free_bytes, need
 from softgrasp.fem.strain.body import Body
@@ -95,7 +95,7 @@ def test_a_container_limits_what_is_free(monkeypatch: pytest.MonkeyPatch, tmp_pa
     before = free_bytes(make_scene())
     (tmp_path / "memory.max").write_text("3000000\n")
     (tmp_path / "memory.current").write_text("1000000\n")
-    monkeypatch.setattr(memory, "CONTAINER", tmp_path)
+    monkeypatch.setattr(resources, "CONTAINER", tmp_path)
     assert free_bytes(make_scene()) == 2e6 < before
     (tmp_path / "memory.max").write_text("max\n")
     assert free_bytes(make_scene()) > 2e6

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from softgrasp.fem.disk import MARGIN, check_room
 from softgrasp.fem.errors import CheckpointError, Interrupted, ResourceError
 from softgrasp.fem.model.build import build
+from softgrasp.fem.resources import MARGIN, check_room
 from softgrasp.fem.run.checkpoint import FORMAT
 from softgrasp.fem.run.simulate import RunOptions, simulate
 from softgrasp.fem.run.trajectory import Trajectory
@@ -168,7 +168,7 @@ def test_room_counts_all_ranks_and_the_size_so_far(
     with pytest.raises(ResourceError, match=f"may pass {limit} bytes"):
         check_room(comm, [own], 1001)
     monkeypatch.setattr(
-        "softgrasp.fem.disk.shutil.disk_usage", lambda path: SimpleNamespace(free=MARGIN + 100 * comm.size + 7)
+        "softgrasp.fem.resources.shutil.disk_usage", lambda path: SimpleNamespace(free=MARGIN + 100 * comm.size + 7)
     )
     check_room(comm, [own], 100, reserve=7)
     with pytest.raises(ResourceError, match="are free on the disk"):

@@ -303,7 +303,7 @@ def test_snapshots_that_cannot_fit_are_refused_before_the_run(
         available = 1000
 
     model = small(comm)  # which would not be built either
-    monkeypatch.setattr("softgrasp.fem.run.snapshots.psutil.virtual_memory", lambda: Tiny)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: Tiny)
     needed = 16 * model.system.layout.n_e * 41
     with pytest.raises(ResourceError, match=f"need {needed} bytes"):
         simulate(model)

@@ -28,7 +28,7 @@ def test_fields_without_room_leave_a_restart_file(
     model = build(scene, comm=comm)
     frames = Frames(model, mpi_tmp_path, pictures=False)
     free = iter([2**30, 2**30, 2**30, 100])
-    monkeypatch.setattr("softgrasp.fem.disk.shutil.disk_usage", lambda path: SimpleNamespace(free=next(free)))
+    monkeypatch.setattr("softgrasp.fem.resources.shutil.disk_usage", lambda path: SimpleNamespace(free=next(free)))
     options = RunOptions(mpi_tmp_path, frame=frames, begin=frames.begin, keep=frames.keep)
     with pytest.raises(ResourceError, match=r"100 are free on the disk; free the disk; .*go on from step 6"):
         simulate(model, options)

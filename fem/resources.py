@@ -1,4 +1,4 @@
-"""Free disk space, checked before fields are written: the libraries that write them end the program on a full disk."""
+"""Free memory, and free disk space before fields are written: their libraries end the program on a full disk."""
 
 from __future__ import annotations
 
@@ -7,11 +7,28 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import psutil
 from mpi4py import MPI
 
 from softgrasp.fem.errors import ResourceError, agree
 
 MARGIN = 2**18  # bytes: tables of contents that the libraries add, more when they close a file
+CONTAINER = Path("/sys/fs/cgroup")
+
+
+def free_memory() -> int:
+    """Memory that is free on this node, or that its container leaves, at least 1 [byte]."""
+    free = int(psutil.virtual_memory().available)
+    for limit, used in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
+        try:
+            most, taken = (int((CONTAINER / name).read_text()) for name in (limit, used))
+        except (OSError, ValueError):
+            continue
+        free = min(free, max(most - taken, 1))
+    return free
 
 
 def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve: int = 0) -> None:
