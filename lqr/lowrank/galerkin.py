@@ -13,7 +13,7 @@ from softgrasp.fem.petsc import Array, normalising, on_root, total
 from softgrasp.lqr.lowrank import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
-from softgrasp.lqr.lowrank.shifts import shift_range
+from softgrasp.lqr.lowrank.shifts import frequency_estimate
 from softgrasp.lqr.lowrank.solver import Iterate, LowRankSolver
 from softgrasp.lqr.plant.block import Block
 
@@ -163,7 +163,7 @@ class StructuredGalerkin(LowRankSolver[tuple[Space, Array]]):
         space, omega = start
         # where the modes do not decouple, the responses have to cover their range too
         low = float(omega[-1] if plant.viscous is None else omega[0])
-        high = max(shift_range(plant, []).fastest, 2 * low)
+        high = max(frequency_estimate(plant.system), 2 * low)
         grid = frequencies(low, high, self.per_step * self.max_iterations).tolist()
         # two-way the reaction of the hand loads the tissue as well
         loads = np.hstack([plant.C_z, plant.G]) if plant.two_way else plant.C_z

@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.petsc import Array, on_root, total
+from softgrasp.fem.system import BlockSystem
 from softgrasp.lqr.lowrank.adjoint import Right
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.plant.block import Block
@@ -26,11 +27,10 @@ AXIS = 1e-9  # a shift keeps at least this share of its modulus away from the im
 
 @dataclass(frozen=True)
 class ShiftRange:
-    """Moduli that a shift may have [1/s], and the estimate of the highest frequency."""
+    """Moduli that a shift may have [1/s]."""
 
     low: float
     high: float
-    fastest: float
 
     def clip(self, values: np.ndarray) -> np.ndarray:
         """Nearest admissible shifts in the left half plane, Im >= 0, (k,)."""
@@ -44,21 +44,20 @@ class ShiftRange:
         return np.asarray(real + 1j * np.where(flat, 0.0, imag))
 
 
-def shift_range(plant: Plant, poles: Sequence[complex] | np.ndarray) -> ShiftRange:
-    """Range between the slowest pole of the modal problem and the fastest tissue mode. Collective.
-
-    The largest frequency is estimated from the diagonals: omega_max^2 >= max K_ii / M_ii, within a factor of about 4
-    for Lagrange elements.
-    """
-    system = plant.system
+def frequency_estimate(system: BlockSystem) -> float:
+    """Highest frequency [1/s], omega_max^2 >= max K_ii / M_ii, to a factor of 4 for Lagrange elements. Collective."""
     K, M = system.K_ee.getDiagonal(), system.M_ee.getDiagonal()
     local = float((K.array_r / M.array_r).max(initial=0.0))
-    largest = np.sqrt(plant.comm.allreduce(local, op=MPI.MAX))
     K.destroy()
     M.destroy()
-    fastest = max(largest, system.damping.beta * largest**2)
+    return float(np.sqrt(system.layout.comm.allreduce(local, op=MPI.MAX)))
+
+
+def shift_range(plant: Plant, poles: np.ndarray) -> ShiftRange:
+    """Range between the slowest pole of the modal problem and the fastest tissue mode. Collective."""
+    largest = frequency_estimate(plant.system)
     slowest = float(np.min(np.abs(poles))) if len(poles) else 1e-3 * largest
-    return ShiftRange(LOWEST * slowest, HIGHEST * fastest, float(largest))
+    return ShiftRange(LOWEST * slowest, HIGHEST * max(largest, plant.system.damping.beta * largest**2))
 
 
 def ritz_pairs(plant: Plant, V: Block, W: Block, gain: Right | None) -> tuple[np.ndarray, Array]:

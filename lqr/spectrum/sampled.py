@@ -10,8 +10,7 @@ import numpy as np
 from softgrasp.fem.petsc import Array, on_root
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.controller import Controller
-from softgrasp.lqr.lowrank.plant import Plant
-from softgrasp.lqr.lowrank.shifts import shift_range
+from softgrasp.lqr.lowrank.shifts import frequency_estimate
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.operators import modes_couple
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -208,7 +207,7 @@ class SampledLoop:
         A[w, v] = -tail.drag * force @ M_s
         B[v], B[w] = np.linalg.inv(M_s), -force
         k = np.hstack([K.hand.T, (K_z / omega[:, None]).T, K_v.T])
-        fastest = 4 * shift_range(Plant(self.problem), []).fastest  # estimated within a factor of 4
+        fastest = 4 * frequency_estimate(self.problem.system)  # estimated within a factor of 4
         left_out = np.geomspace(omega[-1], max(fastest, 2 * omega[-1]), FREQUENCIES)
         size = float(np.hypot(tail.rest_z / omega[-1], tail.rest_v) * tail.rest_force)
         return _Parts(A, B, k, False, _Rest(size, left_out, tail.alpha + tail.beta * left_out**2, tail.drag))

@@ -194,7 +194,7 @@ def main(
     for name, sets in meshes().items():
         rows.append(measure(name, sets, exact, cost))
         console.print(f"{name}: n_e = {rows[-1].n_e}, error {rows[-1].error:.2e}", style="dim")
-    content: dict[str, Any] = {"rows": driver.as_rows(rows), "reached": driver.as_rows(reached)}
+    content: dict[str, Any] = {"rows": rows, "reached": reached}
     table = driver.table_of(rows, COLUMNS, "error of the deformation against time")
     tolerances = driver.table_of(reached, COLUMNS_REACHED, "what tissue.refine.tolerance reaches")
     for part in (table, tolerances):

@@ -209,7 +209,7 @@ def main(
     points, failed = driver.of(EnginePoint, rows), driver.failures(rows)
     console.print(driver.table_of(points, COLUMNS, f"factoring snapshots: {KEPT} vectors, median seconds").terminal())
     driver.show_goals(console, goals(points))
-    content = {"command": "bench_bases", "rows": driver.as_rows(points), "failed": driver.as_rows(failed)}
+    content = {"command": "bench_bases", "rows": points, "failed": failed}
     content |= {"goals": driver.goal_rows(goals(points))}
     files = driver.write_bench(out, "bench_bases", content, driver.table_of(points, CSV))
     driver.list_bench(console, files, failed)

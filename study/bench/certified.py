@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -164,6 +164,6 @@ def main(
     console.print(table.terminal())
     goals = goals_of(rows)
     driver.show_goals(console, goals)
-    numbers = [{key: x for key, x in row.items() if x is not None} for row in driver.as_rows(rows)]
+    numbers = [{key: x for key, x in row.items() if x is not None} for row in map(asdict, rows)]
     content = {"command": "bench_certified", "repeats": repeats, "rows": numbers, "goals": driver.goal_rows(goals)}
     driver.list_bench(console, driver.write_bench(out, "bench_certified", content, table))

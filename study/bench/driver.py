@@ -7,7 +7,7 @@ import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -194,11 +194,6 @@ def write_bench(out: Path, name: str, content: Row, table: Table, markdown: str 
         files.append(out / f"{name}.md")
         files[-1].write_text(markdown)
     return files
-
-
-def as_rows(points: Sequence[Any]) -> list[Row]:
-    """Points as the JSON file has them."""
-    return [asdict(point) for point in points]
 
 
 def list_bench(console: Console, files: Sequence[Path], failed: Sequence[Failure] = ()) -> None:

@@ -153,8 +153,8 @@ def main(
         rows += driver.measure(console, ForwardCost, "forward", spec, k, problem)
     points, failed = driver.of(ForwardCost, rows), driver.failures(rows)
     show(console, points)
-    content: dict[str, Any] = {"command": "bench_forward", "rows": driver.as_rows(points)}
-    content |= {"failed": driver.as_rows(failed), "exponents": exponents(points)}
+    content: dict[str, Any] = {"command": "bench_forward", "rows": points}
+    content |= {"failed": failed, "exponents": exponents(points)}
     content |= {"goals": driver.goal_rows(goals(points))}
     table = driver.table_of(points, CSV)
     files = driver.write_bench(out, "bench", content, table, table_of(points).markdown())

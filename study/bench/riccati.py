@@ -237,9 +237,9 @@ class Record:
         """Write the file."""
         self.file.parent.mkdir(parents=True, exist_ok=True)
         peers = driver.of(SolverPoint, self.peers)
-        report = {"command": "bench_riccati", "beta": self.beta, "rows": driver.as_rows(self.points)}
-        report |= {"peers": driver.as_rows(peers), "exponents": exponents(self.points)}
-        report |= {"failed": driver.as_rows(driver.failures([*self.rows, *self.peers]))}
+        report = {"command": "bench_riccati", "beta": self.beta, "rows": self.points}
+        report |= {"peers": peers, "exponents": exponents(self.points)}
+        report |= {"failed": driver.failures([*self.rows, *self.peers])}
         write_json(self.file, report | {"goals": driver.goal_rows(goals(self.points))})
 
 

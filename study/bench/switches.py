@@ -312,5 +312,5 @@ def main(
     points, failed = driver.of(SwitchPoint, rows), driver.failures(rows)
     title = "two methods around the sizes of a switch, median seconds"
     console.print(driver.table_of(points, COLUMNS, title).terminal())
-    content = {"command": "bench_switches", "rows": driver.as_rows(points), "failed": driver.as_rows(failed)}
+    content = {"command": "bench_switches", "rows": points, "failed": failed}
     driver.list_bench(console, driver.write_bench(out, "bench_switches", content, driver.table_of(points, CSV)), failed)

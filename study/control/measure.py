@@ -33,7 +33,6 @@ from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
 from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
 from softgrasp.lqr.reduced.riccati import GainCheck, GainReport
 from softgrasp.lqr.riccati import solve
-from softgrasp.lqr.spectrum.modal_loop import LOWEST_MODES, ModalLoop
 from softgrasp.reduction.parameters import grid_of, materials_at, outside
 from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, ReducedLoopRun, Retuned
 from softgrasp.study.pictures.frames import Frames
@@ -68,7 +67,7 @@ def a_priori(bases: Sequence[BasisGains]) -> BasisGains | None:
 def tick_seconds(controller: Controller) -> float:
     """Median seconds of a tick of ten."""
     at_rest = np.zeros(controller.n_s)
-    ten = repeated(MPI.COMM_SELF, lambda: [controller.step(at_rest, at_rest) for _ in range(10)], TICKS // 10, np.inf)
+    ten = repeated(MPI.COMM_SELF, lambda: [controller.step(at_rest, at_rest) for _ in range(10)], TICKS // 10)
     controller.reset()
     return float(np.median(ten)) / 10
 
@@ -206,7 +205,7 @@ def retune(
 
 def _gain_check(problem: RiccatiProblem, design: Design) -> GainCheck:
     """With the full solution at other materials. Collective."""
-    return GainCheck(problem, solve(problem), design.error, ModalLoop(problem, LOWEST_MODES), design.gain_check.law)
+    return GainCheck(problem, solve(problem), design.error, law=design.gain_check.law)
 
 
 def _at(tuner: Retuner, materials: Materials, gain_check: Callable[[], GainCheck]) -> RetunedGain:

@@ -6,7 +6,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -91,7 +91,7 @@ class HardCase:
         return {
             "case": self.case, "x": self.x, "group": self.group, "bound": self.bound,
             "must_be_refused": self.bound is None, "may_be_refused": self.may_refuse, "reason": self.reason,
-            "ours": asdict(self.here), "plain": asdict(self.textbook), "verdict": self.verdict_text, "ok": self.ok,
+            "ours": self.here, "plain": self.textbook, "verdict": self.verdict_text, "ok": self.ok,
         }  # fmt: skip
 
 

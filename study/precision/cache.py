@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -77,7 +76,7 @@ class Cache:
             self.hits += 1
             return [_revived(of, row) for row in rows]
         self.misses += 1
-        rows = json.loads(json.dumps([to_json(asdict(value)) for value in measure()]))  # type: ignore[call-overload]
+        rows = json.loads(json.dumps(to_json(list(measure()))))
         with agree(self.comm):
             if self.comm.rank == 0:
                 self._write(self.path(kind, key), {"kind": kind, "key": key, "value": rows})

@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import statistics
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -265,8 +265,7 @@ class FullRuns:
 
     def model(self, setting: Setting) -> Model:
         """The model of a setting, with the mesh that was built for it."""
-        model, _, _ = self._built(setting, 1)
-        return Model(self.variant(setting), model.space, model.system, model.inventory, model.watch)
+        return replace(self._built(setting, 1)[0], scene=self.variant(setting))
 
     def _measure(self, setting: Setting, repeats: int) -> TimedRun:
         _, probe, built = self._built(setting, repeats)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from softgrasp.fem.scene.scene import Scene
 
 
 def to_json(value: Any) -> Any:
-    """A value that JSON can hold: what is not finite becomes None."""
+    """A value that JSON can hold: what is not finite becomes None, a dataclass the table of its fields."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, dict):
         return {str(k): to_json(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,12 +15,15 @@ from mpi4py import MPI
 
 def timed(comm: MPI.Intracomm, call: Callable[[], Any]) -> float:
     """Seconds of a call on the slowest rank, after a collection of garbage. Collective."""
-    return repeated(comm, call, 1, 0.0)[0]
+    gc.collect()
+    return repeated(comm, call, 1)[0]
 
 
-def repeated(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int, seconds: float) -> list[float]:
-    """Seconds of a call, once and again while it was called fewer times and took less time in all. Collective."""
-    gc.collect()  # once: it takes longer than short calls do
+def repeated(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int, seconds: float = math.inf) -> list[float]:
+    """Seconds of a call on the slowest rank, once and again while it was called fewer times and took less in all.
+
+    Collective. Garbage is not collected between the calls, which takes longer than short ones do.
+    """
     times: list[float] = []
     while not times or (len(times) < repeats and sum(times) < seconds):
         comm.Barrier()
@@ -29,13 +33,21 @@ def repeated(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int, seconds
     return times
 
 
+def median_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -> float:
+    """Median seconds of a call on the slowest rank. Collective."""
+    return statistics.median(repeated(comm, call, repeats))
+
+
 def warm(count: int) -> int:
     """Steps before the timed ones: the method before left the caches full of its own factor."""
     return max(1, count // 20)
 
 
 def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
-    """Call every method once a repeat, in rotated order, so that noise hits all alike; what each returned."""
+    """Call every method once a repeat, in rotated order, so that noise hits all alike; what each returned.
+
+    Collective if the methods are.
+    """
     samples: dict[str, list[float]] = {name: [] for name in methods}
     for i in range(repeats):
         for name in rotated(methods, i):
@@ -53,16 +65,6 @@ def rotated(names: Iterable[str], i: int) -> list[str]:
 def medians(samples: Mapping[str, list[float]]) -> dict[str, float]:
     """Median of each list."""
     return {name: float(statistics.median(values)) for name, values in samples.items()}
-
-
-def median_seconds(comm: MPI.Intracomm, call: Callable[[], Any], repeats: int) -> float:
-    """Median seconds of a short call, on the slowest rank; nothing between the calls. Collective."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - begin)
-    return float(comm.allreduce(statistics.median(seconds), MPI.MAX))
 
 
 def power_law(x: Sequence[float | None], y: Sequence[float | None]) -> float | None:

@@ -160,7 +160,7 @@ def test_energy_products_are_those_of_the_dense_matrices(name: str) -> None:
 
 
 def test_clip_and_choice_of_shifts() -> None:
-    limits = ShiftRange(0.01, 100.0, 50.0)
+    limits = ShiftRange(0.01, 100.0)
     assert limits.clip(np.array([-5.6e-11 + 0j]))[0] == -0.01  # the spurious Ritz value of the hand's zero poles
     assert abs(limits.clip(np.array([-1e4 + 1e4j]))[0]) == pytest.approx(100.0)
     assert limits.clip(np.array([2.0 - 3.0j]))[0] == pytest.approx(-2.0 + 3.0j)
