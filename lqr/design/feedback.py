@@ -18,7 +18,7 @@ from softgrasp.lqr.plant.problem import RiccatiProblem, RiccatiSolution
 from softgrasp.lqr.plant.target import Target, hand_target, rest
 from softgrasp.lqr.reduced.riccati import GainCheck
 from softgrasp.lqr.riccati import Method, choose, modal_lqr, solve
-from softgrasp.lqr.spectrum.modal_loop import LOWEST_MODES, LoopQuality, ModalLoop
+from softgrasp.lqr.spectrum.modal_loop import LoopQuality
 from softgrasp.lqr.spectrum.sampled import Sampling
 
 Progress = Callable[[dict[str, float]], None]
@@ -101,7 +101,7 @@ def design(
         solution = _modal(plant, diagnosis) if modal else _solve(model, plant, progress, checkpoint)
     with watch.stage("judge"):
         error = (start - target.state).block
-        gain_check = GainCheck(plant, solution, error, ModalLoop(plant, LOWEST_MODES), sampling(model))
+        gain_check = GainCheck(plant, solution, error, law=sampling(model))
         quality = gain_check.quality(solution.gain)
     if quality.certified and not quality.abscissa < 0 and not modal:
         raise SolverError(

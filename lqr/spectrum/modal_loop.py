@@ -14,9 +14,8 @@ from softgrasp.lqr.dense.modal import ModalPlant, TissueMatrices, dense_modes, g
 from softgrasp.lqr.plant.block import Block
 from softgrasp.lqr.plant.problem import RiccatiProblem
 
-ALL_MODES = 250  # up to here every mode is kept by default: Schur forms of order 500, tenths of a second each
 DENSE_LIMIT = 1300  # up to here all modes can be kept when asked for: order 2600, for those who wait
-LOWEST_MODES = 150  # of a larger plant
+LOWEST_MODES = 150  # kept by default: Schur forms of order 300, tenths of a second each
 
 
 @dataclass(frozen=True)
@@ -59,15 +58,14 @@ class ModalLoop:
     :func:`softgrasp.lqr.spectrum.certificate.abscissa` for large scenes.
 
     Args:
-        modes: how many; None keeps all up to :data:`ALL_MODES`, else the lowest :data:`LOWEST_MODES`. All modes are
-            allowed up to :data:`DENSE_LIMIT`.
+        modes: how many; all where the plant has no more of them, up to :data:`DENSE_LIMIT`.
     """
 
-    def __init__(self, problem: RiccatiProblem, modes: int | None = None) -> None:
+    def __init__(self, problem: RiccatiProblem, modes: int = LOWEST_MODES) -> None:
         self.problem, self.comm = problem, problem.layout.comm
         n_e = problem.layout.n_e
-        self.complete = n_e <= (ALL_MODES if modes is None else min(modes, DENSE_LIMIT))
-        self.plant = _all(problem) if self.complete else lowest_plant(problem, min(modes or LOWEST_MODES, n_e))
+        self.complete = n_e <= min(modes, DENSE_LIMIT)
+        self.plant = _all(problem) if self.complete else lowest_plant(problem, min(modes, n_e))
         space = self.plant.space
         solved = np.linalg.solve(space.E, np.hstack([space.A, space.B]))
         self.A, self.B = solved[:, : len(space.A)], solved[:, len(space.A) :]

@@ -33,7 +33,6 @@ from softgrasp.lqr.reduced.bases import A_PRIORI, BasisFamily
 from softgrasp.lqr.reduced.retune import Materials, RetunedGain, Retuner, retuned_gain
 from softgrasp.lqr.reduced.riccati import GainCheck, GainReport
 from softgrasp.lqr.riccati import solve
-from softgrasp.lqr.spectrum.modal_loop import LOWEST_MODES, ModalLoop
 from softgrasp.reduction.parameters import grid_of, materials_at, outside
 from softgrasp.study.control.result import ControlStudy, FiniteLoop, GainStudy, LoopRuns, ReducedLoopRun, Retuned
 from softgrasp.study.pictures.frames import Frames
@@ -206,7 +205,7 @@ def retune(
 
 def _gain_check(problem: RiccatiProblem, design: Design) -> GainCheck:
     """With the full solution at other materials. Collective."""
-    return GainCheck(problem, solve(problem), design.error, ModalLoop(problem, LOWEST_MODES), design.gain_check.law)
+    return GainCheck(problem, solve(problem), design.error, law=design.gain_check.law)
 
 
 def _at(tuner: Retuner, materials: Materials, gain_check: Callable[[], GainCheck]) -> RetunedGain:

@@ -32,11 +32,11 @@ from softgrasp.study.reduce.result import (
     FullTimes,
     MethodSweep,
     Point,
-    Speed,
     TestedModel,
     by_error,
     kept_points,
     nearest,
+    timed_points,
 )
 from softgrasp.study.shell.timing import median_seconds
 
@@ -222,15 +222,7 @@ def steps_seconds(run: Trajectory) -> float:
     return run.seconds["steps"] / max(n - 1, 1) * n
 
 
-def speed_of(sweep: MethodSweep, full: FullTimes) -> Speed | None:
-    """Compare times; None for a method without points."""
-    p = nearest(sweep.points) or nearest(sweep.points, stable=False)
-    if p is None:
-        return None
-    return Speed(sweep.method, p, *full.against(p))
-
-
-def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) -> tuple[str, ...]:
+def speed_notes(n_e: int, steps: int, full: FullTimes, sweeps: Sequence[MethodSweep]) -> tuple[str, ...]:
     """What the speed-up is measured against, the mesh that pays, and the paper's figure beside ours."""
     against = (
         f"Full model, prefactored: {steps} steps in {1e3 * full.steps:.1f} ms; its factorisation takes "
@@ -239,13 +231,12 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
         "sides. x new: factorisation and steps over new. Break-even runs = offline / (full - new), at new parameters; "
         "the full run that gives the snapshots is one more."
     )
-    stable = [s for s in speeds if s.point.stable]
-    chosen = next((s for s in stable if s.method.key == "psd"), None) or next(iter(stable), None)
-    if chosen is None:
+    stable = [(method, p) for method, p in timed_points(sweeps) if p.stable]
+    if not stable:
         return (against,)
+    method, p = next((chosen for chosen in stable if chosen[0].key == "psd"), stable[0])
     # tissue unknowns at which a full run would take as long as a reduced one, at this mesh's time per unknown
-    p = chosen.point
-    mesh, model = n_e * p.time_online / full.steps, f"{chosen.method.title}, N = {p.N}"
+    mesh, model = n_e * p.time_online / full.steps, f"{method.title}, N = {p.N}"
     if mesh < LEAST_MESH:
         pays = f"the reduced run ({model}) is faster than a full run on every mesh"
     else:
@@ -257,5 +248,5 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, speeds: Sequence[Speed]) 
         f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
         f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
         f"{1e3 * (full.factor + full.steps):.1f} ms against {1e3 * (p.time_setup + p.time_online):.2f} ms, "
-        f"a speed-up of {chosen.speedup_new_parameter:.0f} for a new parameter ({model}).",
+        f"a speed-up of {full.against(p).new:.0f} for a new parameter ({model}).",
     )

@@ -21,6 +21,7 @@ from softgrasp.study.reduce.result import (
     StrainPoint,
     by_error,
     nearest,
+    timed_points,
 )
 from softgrasp.study.report.page import Section, captioned
 from softgrasp.study.report.tables import Table
@@ -122,27 +123,28 @@ def summary(study: ReductionStudy) -> list[str]:
     if not (chosen := by_error(study.sweeps)):
         return ["No method has a stable model."]
     s, point = chosen[0]
-    speed = next(v for v in study.speeds if v.method == s.method)
+    speed = study.times.against(point)
     held = [s for s in study.sweeps if s.points and all(p.stable for p in s.points)]
     return [
         f"At N = {point.N} the most accurate stable model is {s.method.title}: its deformation is "
         f"{point.error_deformation:.2%} off the full run.",
-        f"It runs {speed.speedup_same_model:.3g} times as fast as the full model, and "
-        f"{speed.speedup_new_parameter:.3g} times at a new parameter.",
+        f"It runs {speed.again:.3g} times as fast as the full model, and {speed.new:.3g} times at a new parameter.",
         f"{len(held)} of {len(study.sweeps)} methods are stable at every N that was tried.",
     ]
 
 
 def time_cells(p: Point | StrainPoint, full: FullTimes) -> tuple[str, ...]:
     """Below :data:`TIMES`: seconds, and speed-ups with the runs until offline has paid."""
-    again, new, runs = full.against(p)
+    up = full.against(p)
+    runs = "never" if up.break_even_runs is None else str(math.ceil(up.break_even_runs))
     seconds = f"{1e3 * p.time_online:.2f}", f"{1e3 * (p.time_setup + p.time_online):.2f}", f"{p.time_offline:.2f}"
-    return *seconds, short(again, 3), short(new, 3), "never" if runs is None else str(math.ceil(runs))
+    return *seconds, short(up.again, 3), short(up.new, 3), runs
 
 
 def time_table(study: ReductionStudy, narrow: bool = False) -> Table:
     """Seconds and speed-ups."""
-    rows = [(title_of(s.method, narrow), _size(s.point), *time_cells(s.point, study.times)) for s in study.speeds]
+    chosen = timed_points(study.sweeps)
+    rows = [(title_of(method, narrow), _size(p), *time_cells(p, study.times)) for method, p in chosen]
     return Table(("method", "N", *TIMES), rows, "Times")
 
 

@@ -147,46 +147,31 @@ class StrainPoint:
 
 
 @dataclass(frozen=True)
+class SpeedUp:
+    """The full model's time over that of a reduced one."""
+
+    again: float  # steps over a run of the same model again, both with everything prefactored
+    new: float  # factorisation and steps over set-up and run
+    # time_offline / (full run - reduced run) at new parameters; None when the reduced is not faster
+    break_even_runs: float | None
+
+
+@dataclass(frozen=True)
 class FullTimes:
     """Seconds of the full model: the steps of a run alone, and the factorisation before them."""
 
     steps: float
     factor: float
 
-    def against(self, p: Point | StrainPoint) -> tuple[float, float, float | None]:
-        """Steps over a run of the same reduced model, factor and steps over a new parameter, runs until offline pays.
-
-        The last is None where the reduced model is not faster.
-        """
+    def against(self, p: Point | StrainPoint) -> SpeedUp:
+        """What a reduced model gains."""
         whole, new = self.factor + self.steps, p.time_setup + p.time_online
-        return self.steps / p.time_online, whole / new, p.time_offline / (whole - new) if whole > new else None
+        runs = p.time_offline / (whole - new) if whole > new else None
+        return SpeedUp(self.steps / p.time_online, whole / new, runs)
 
     def to_json(self) -> dict[str, float]:
         """In "time" of ``result.json``."""
         return {"full_steps_median": self.steps, "full_factor_median": self.factor}
-
-
-@dataclass(frozen=True)
-class Speed:
-    """One method against the full model at the stable N nearest to the one compared."""
-
-    method: Method
-    point: Point  # its times; not stable where the method has no stable model
-    speedup_same_model: float  # full steps over a reduced run of the same model again, both with everything prefactored
-    speedup_new_parameter: float  # full factorisation and steps over reduced set-up and run
-    # time_offline / (full run - reduced run) at new parameters; None when the reduced is not faster
-    break_even_runs: float | None
-
-    def to_json(self) -> dict[str, Any]:
-        """One entry of "speed" in ``result.json``."""
-        keys = ("N", "N_tissue", "stable", "time_offline", "time_setup", "time_online")
-        pays = ("speedup_same_model", "speedup_new_parameter", "break_even_runs")
-        return {
-            "method": self.method.key,
-            "title": self.method.title,
-            **{key: getattr(self.point, key) for key in keys},
-            **{key: getattr(self, key) for key in pays},
-        }
 
 
 @dataclass(frozen=True)
@@ -196,10 +181,22 @@ class ReductionStudy:
     full: FullRun  # the full run
     sweeps: tuple[MethodSweep, ...]  # every method
     times: FullTimes  # of the full model
-    speeds: tuple[Speed, ...]  # every method with a model against the full model
     box: BoxTests  # errors at other parameters
     findings: tuple[str, ...]  # what the numbers show, in sentences
     speed_notes: tuple[str, ...]  # what the times are measured against
+
+    def speed(self, method: Method, p: Point) -> dict[str, Any]:
+        """One entry of "speed" in ``result.json``."""
+        keys = ("N", "N_tissue", "stable", "time_offline", "time_setup", "time_online")
+        up = self.times.against(p)
+        return {
+            "method": method.key,
+            "title": method.title,
+            **{key: getattr(p, key) for key in keys},
+            "speedup_same_model": up.again,
+            "speedup_new_parameter": up.new,
+            "break_even_runs": up.break_even_runs,
+        }
 
     def result(self, seconds: dict[str, float]) -> dict[str, Any]:
         """The keys of ``result.json``; ``seconds`` of the stages. Collective."""
@@ -221,7 +218,7 @@ class ReductionStudy:
                     for s in self.sweeps
                 },
                 "findings": self.findings,
-                "speed": [speed.to_json() for speed in self.speeds],
+                "speed": [self.speed(method, p) for method, p in timed_points(self.sweeps)],
                 "speed_notes": self.speed_notes,
                 "box": self.box.to_json(),
             },
@@ -254,6 +251,12 @@ def by_error(sweeps: Sequence[MethodSweep]) -> list[tuple[MethodSweep, Point]]:
     """Methods with their stable point nearest to the N compared, the least error of the deformation first."""
     chosen = [(s, p) for s in sweeps if (p := nearest(s.points)) is not None]
     return sorted(chosen, key=lambda c: np.nan_to_num(c[1].error_deformation, nan=np.inf))
+
+
+def timed_points(sweeps: Sequence[MethodSweep]) -> list[tuple[Method, Point]]:
+    """Methods with the point whose times are shown: the stable one nearest to the N compared, else any."""
+    chosen = [(s.method, nearest(s.points) or nearest(s.points, stable=False)) for s in sweeps]
+    return [(method, p) for method, p in chosen if p is not None]
 
 
 def best(points: Sequence[Point]) -> Point | None:

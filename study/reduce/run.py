@@ -111,9 +111,8 @@ def reduce_model(
         drawn = beside(session.comm, session.out, draw_all)
     with watch.stage("box"):
         box = measure.measure_box(full, sweeps, partial(say, "other parameters"))
-    speeds = tuple(speed for s in sweeps if (speed := measure.speed_of(s, times)) is not None)
-    notes = measure.speed_notes(model.system.layout.n_e, model.scene.time.steps, times, speeds)
-    return ReductionStudy(full, sweeps, times, speeds, box, findings(sweeps), notes), drawn
+    notes = measure.speed_notes(model.system.layout.n_e, model.scene.time.steps, times, sweeps)
+    return ReductionStudy(full, sweeps, times, box, findings(sweeps), notes), drawn
 
 
 def show(console: Console, study: ReductionStudy) -> None:

@@ -102,11 +102,10 @@ def sections(study: StrainStudy, files: Sequence[Path]) -> list[Section]:
 
 def _family(study: StrainStudy, f: StrainFamily) -> dict[str, Any]:
     """One entry of "finite_strain" in ``result.json``."""
-    names = ("again", "new", "break_even_runs")
     return {
         "runs": f.runs,
         "box": {key: np.asarray(value).tolist() for key, value in asdict(f.box).items()},
-        "points": [asdict(p) | {"speed_up": dict(zip(names, study.times.against(p), strict=True))} for p in f.points],
+        "points": [asdict(p) | {"speed_up": asdict(study.times.against(p))} for p in f.points],
         "cells": [asdict(p) for p in f.curves],
         "held_out": [asdict(t) for t in f.tests],
         "refused": f.refused,
@@ -192,10 +191,10 @@ def sentences(study: StrainStudy) -> list[str]:
 def summary(study: StrainStudy) -> list[str]:
     """What came out, in three sentences."""
     p, f = min(((p, f) for f in study.families for p in f.points), key=lambda pair: pair[0].error_own)
-    again, new, _ = study.times.against(p)
+    speed = study.times.against(p)
     return [
         f"Linear elasticity misses the deformation of this scene by {study.linear:.2%}.",
         f"The most accurate reduced model, {f.title}, is {p.error_own:.2%} off with N = {p.N} columns and "
         f"{p.cells} sampled cells.",
-        f"It runs {again:.3g} times as fast as the full model, and {new:.3g} times at a new parameter.",
+        f"It runs {speed.again:.3g} times as fast as the full model, and {speed.new:.3g} times at a new parameter.",
     ]

@@ -24,7 +24,7 @@ from softgrasp.reduction.bases.states import BasisError, States
 from softgrasp.reduction.parameters import grid_of, outside, training_of, training_states
 from softgrasp.reduction.projection import project
 from softgrasp.reduction.replay import FullRun, full_run, replay_linear
-from softgrasp.study.reduce.measure import FURTHER, box_models, measure_box, speed_of, sweep
+from softgrasp.study.reduce.measure import FURTHER, box_models, measure_box, sweep
 from softgrasp.study.reduce.plots import instants
 from softgrasp.study.reduce.result import FullTimes
 from softgrasp.study.reduce.run import run_reduce
@@ -447,11 +447,9 @@ def test_speed_counts_runs_to_break_even(small: FullRun) -> None:
     swept = sweep("craig_bampton", small, wanted(small, [6]))
     p = swept.points[0]
     new = p.time_setup + p.time_online
-    found = speed_of(swept, FullTimes(steps=new + 0.4, factor=0.1))
-    assert found is not None
+    found = FullTimes(steps=new + 0.4, factor=0.1).against(p)
     assert found.break_even_runs == pytest.approx(2 * p.time_offline)
-    assert found.speedup_new_parameter == pytest.approx((new + 0.5) / new)
-    slow = speed_of(swept, FullTimes(steps=p.time_online / 2, factor=p.time_setup / 2))
-    assert slow is not None
+    assert found.new == pytest.approx((new + 0.5) / new)
+    slow = FullTimes(steps=p.time_online / 2, factor=p.time_setup / 2).against(p)
     assert slow.break_even_runs is None
-    assert slow.speedup_same_model == pytest.approx(0.5)
+    assert slow.again == pytest.approx(0.5)
