@@ -47,11 +47,12 @@ def run_limited(command: list[str], limit: float, environment: dict[str, str] | 
 
 
 def run_ranks(command: list[str], ranks: int, limit: float) -> tuple[int | None, str]:
-    """:func:`run_limited` of this Python with arguments on several ranks, one thread each unless threads are set.
+    """:func:`run_limited` of this Python with arguments on several ranks, one thread each.
 
     Raises SoftgraspError: there is no launcher.
     """
     mpiexec = find_mpiexec()
     if mpiexec is None:
         raise SoftgraspError("no mpiexec found; `softgrasp doctor` says what to do")
-    return run_limited([mpiexec, "-n", str(ranks), sys.executable, *command], limit, child_environment())
+    environment = child_environment() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    return run_limited([mpiexec, "-n", str(ranks), sys.executable, *command], limit, environment)
