@@ -146,6 +146,13 @@ def _by_blocks(A: PETSc.Mat, X: Array, result: Array, blocks: int) -> None:
         dense.destroy()
 
 
+def normalising(gram: Array, share: float, least: float = 0.0) -> Array:
+    """S with S'gram S = I on the eigenvectors of gram above ``least`` and a share of the largest eigenvalue."""
+    sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
+    keep = sizes > max(least, share * float(sizes.max(initial=0.0)))
+    return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
+
+
 def led(
     comm: MPI.Intracomm, call: Callable[[Array], Array], method: Callable[[Callable[[Array], Array]], Array]
 ) -> Array:

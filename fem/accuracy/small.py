@@ -20,7 +20,7 @@ import scipy.linalg
 
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import make_outputs, output_columns
-from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.run.motion import force_values, free_table
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 
@@ -90,9 +90,7 @@ def reduced(model: Model) -> Small:
                 last, K_last = last - V @ known, K_last - K_V @ known
                 gram = total(comm, last.T @ K_last)
                 scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-                squares, Q = np.linalg.eigh((gram + gram.T) / 2 / np.outer(scale, scale))
-                kept = squares > DROPPED
-                Q = comm.bcast((Q[:, kept] / np.sqrt(squares[kept])) / scale[:, None])
+                Q = comm.bcast(normalising((gram + gram.T) / 2 / np.outer(scale, scale), 0.0, DROPPED) / scale[:, None])
                 last, K_last = last @ Q, K_last @ Q
             V, K_V = np.hstack([V, last]), np.hstack([K_V, K_last])
     damping = system.damping

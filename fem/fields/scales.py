@@ -9,7 +9,7 @@ from softgrasp.fem.effects.gate import SMALL_SHARE, Gradient, Problem, Sag
 from softgrasp.fem.effects.gravity import EARTH, acceleration
 from softgrasp.fem.layout import bounding_box
 from softgrasp.fem.model.build import Model
-from softgrasp.fem.petsc import Array, times_columns, total
+from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
@@ -65,11 +65,9 @@ def slowest(system: BlockSystem, Z: Array) -> float:
     """
     comm, centre = system.layout.comm, np.eye(Z.shape[1]) - 1 / Z.shape[1]
     M, K = (total(comm, Z.T @ times_columns(A, Z)) for A in (system.M_ee, system.K_ee))
-    squares, Q = np.linalg.eigh(centre @ (M + M.T) @ centre / 2)
-    kept = squares > SEEN * np.trace(M)
-    if not kept.any():
+    Q = centre @ normalising(centre @ (M + M.T) @ centre / 2, 0.0, SEEN * np.trace(M))
+    if not Q.size:
         return 0.0
-    Q = centre @ (Q[:, kept] / np.sqrt(squares[kept]))
     return float(np.sqrt(max(np.linalg.eigvalsh(Q.T @ (K + K.T) @ Q / 2)[0], 0.0)))
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from softgrasp.fem.columns import labels
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, PETSc, on_root, times_columns, total
+from softgrasp.fem.petsc import Array, PETSc, normalising, on_root, times_columns, total
 from softgrasp.lqr.dense.modal import TissueMatrices, assemble_space
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.loop.cost import accumulated_cost
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
-from softgrasp.lqr.plant.operators import damp, normalising
+from softgrasp.lqr.plant.operators import damp
 from softgrasp.lqr.plant.problem import RiccatiProblem
 from softgrasp.lqr.plant.target import steady_input
 from softgrasp.reduction.lti import LTI, make_lti

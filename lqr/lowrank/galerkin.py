@@ -9,14 +9,13 @@ import numpy as np
 import scipy.linalg
 
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.petsc import Array, on_root, total
+from softgrasp.fem.petsc import Array, normalising, on_root, total
 from softgrasp.lqr.lowrank import modal_start
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.shifted import ShiftedTissue
 from softgrasp.lqr.lowrank.shifts import frequency_estimate
 from softgrasp.lqr.lowrank.solver import Iterate, LowRankSolver
 from softgrasp.lqr.plant.block import Block
-from softgrasp.lqr.plant.operators import normalising
 
 NEW = 1e-9  # share of a response that must be new to the space; smaller parts are rounding of the solve
 ROUNDING = 1e-13  # of a Gram matrix: columns independent to 3e-7

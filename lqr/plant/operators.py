@@ -74,13 +74,6 @@ def inputs_adjoint(problem: RiccatiProblem, Z: Block) -> Array:
     return v_s if problem.B_z is None else total(problem.layout.comm, problem.B_z.T @ v)
 
 
-def normalising(gram: Array, share: float, least: float = 0.0) -> Array:
-    """S with S'gram S = I on the eigenvectors of gram above ``least`` and a share of the largest eigenvalue."""
-    sizes, vectors = np.linalg.eigh((gram + gram.T) / 2)
-    keep = sizes > max(least, share * float(sizes.max(initial=0.0)))
-    return np.asarray(vectors[:, keep] / np.sqrt(sizes[keep]))
-
-
 def outputs(problem: RiccatiProblem, X: Block) -> Array:
     """C X, (p, k), on every rank. Collective."""
     q_s, _, z, _ = X.parts

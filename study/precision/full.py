@@ -189,14 +189,18 @@ def largest(values: Array, d: int) -> tuple[float, float]:
     return float(lengths[0]), float(lengths[1])
 
 
+def relative(values: Array, scale: tuple[float, float], d: int) -> tuple[float, float]:
+    """:func:`largest` over a scale of both halves; 0 where that is 0."""
+    first, second = (length / s if s > 0 else 0.0 for length, s in zip(largest(values, d), scale, strict=True))
+    return first, second
+
+
 def errors_of(series: Series, true: Series) -> tuple[float, float]:
     """Largest error over the largest value: of the deformation, the measure of a study, and of the displacement.
 
     The rigid motion of the hand is many times the deformation, and hides it in the second.
     """
-    scale = largest(true.values, true.dimension)
-    gap = largest(series.values - true.at(series.times), true.dimension)
-    return tuple(g / s if s > 0 else 0.0 for g, s in zip(gap, scale, strict=True))  # type: ignore[return-value]
+    return relative(series.values - true.at(series.times), largest(true.values, true.dimension), true.dimension)
 
 
 @dataclass(frozen=True)

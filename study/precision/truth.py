@@ -19,9 +19,8 @@ from itertools import pairwise
 import numpy as np
 
 from softgrasp.fem.errors import SceneError
-from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.study.precision.full import FullRuns, Series, TimedRun, largest
+from softgrasp.study.precision.full import FullRuns, Series, TimedRun, largest, relative
 from softgrasp.study.precision.result import Truth
 from softgrasp.study.precision.settings import Setting, contraction, edges, few_steps, fits
 
@@ -84,17 +83,14 @@ def combine(scene: Scene, meshes: dict[Setting, TimedRun], middle: Setting, half
             "told; name a point of the tissue, in a scene that moves"
         )
 
-    def relative(values: Array) -> tuple[float, float]:
-        return tuple(g / s if s > 0 else 0.0 for g, s in zip(largest(values, d), scale, strict=True))  # type: ignore[return-value]
-
-    changes = [relative(b - a) for a, b in pairwise(values)] or [(1.0, 1.0)]
+    changes = [relative(b - a, scale, d) for a, b in pairwise(values)] or [(1.0, 1.0)]
     sizes = [r.n_e for r in meshes.values()]
     q = contraction([change[0] for change in changes], sizes[-1] / sizes[-2] if len(sizes) > 1 else 1.0)
-    steps, mesh = relative(fine.series.at(few) - coarse), relative(last - coarse)
+    steps, mesh = (relative(v - coarse, scale, d) for v in (fine.series.at(few), last))
     truth = Truth(
         Series(t, total, d),
         space=tuple(c * q / (1 - q) for c in changes[-1]),  # type: ignore[arg-type]
-        time=relative(time_part),
+        time=relative(time_part, scale, d),
         mixed=tuple(float(np.prod(pair)) for pair in zip(steps, mesh, strict=True)),  # type: ignore[arg-type]
         settings=(*meshes, replace(middle, steps=half.steps), replace(middle, steps=fine.steps)),
         note="",

@@ -115,7 +115,7 @@ def _motion(scene: Scene) -> str:
 def _definitions(scene: Scene, dragged: bool, free: bool) -> tuple[str, ...]:
     effects, layers = scene.effects, "sum over layers of " if scene.tissue.layers else ""
     finite = effects.finite_strain
-    strain = [] if finite is None else [rf"$f(z) = dW/dz$, $W(F)$ {finite.law}, $F = I + \text{{grad }} z$"]
+    strain = [] if finite is None else [rf"$f(z) = dW/dz$, $W(F)$ {finite.law}, $F = I + \text{{grad }}z$"]
     result = [
         *strain,
         "$q_s$: translations" + (" and small angles" if effects.rotation else "") + " of the hand",

@@ -44,7 +44,10 @@ def warm(count: int) -> int:
 
 
 def interleave(methods: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
-    """Call every method once a repeat, in rotated order, so that noise hits all alike; what each returned."""
+    """Call every method once a repeat, in rotated order, so that noise hits all alike; what each returned.
+
+    Collective if the methods are.
+    """
     samples: dict[str, list[float]] = {name: [] for name in methods}
     for i in range(repeats):
         for name in rotated(methods, i):

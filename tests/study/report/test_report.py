@@ -55,6 +55,11 @@ def test_a_terminal_shows_no_latex(name: str) -> None:
     assert not any(mark in text for mark in ("\\", "$", "{", "}"))
 
 
+def test_finite_strain_has_its_energy_in_a_terminal() -> None:
+    scene = load_scene(shipped_scenes()["paper_forward"], ["effects.finite_strain={law='neo-hooke'}"])
+    assert equation(scene).plain().where[0] == "f(z) = dW/dz, W(F) neo-hooke, F = I + grad z"
+
+
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))
 def test_control_has_its_cost_and_riccati_equation(name: str) -> None:
     rows = control_equation(load_scene(shipped_scenes()[name]))
