@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -238,7 +238,7 @@ class WorkStudy:
     def to_dict(self) -> dict[str, Any]:
         """For JSON, without the answers."""
         references = {
-            name: asdict(q.reference)
+            name: q.reference
             for name, q in self.questions.items()
             if isinstance(q.reference, RiccatiReference | ReducedReference | LoopReference)
         }
@@ -249,8 +249,8 @@ class WorkStudy:
                 "references": references,
                 "points": {name: self.questions[name].rows for name in self.points},
                 "pareto": {name: [p.label for p in pareto(points)] for name, points in self.points.items()},
-                "slopes": [asdict(s) for s in self.slopes],
-                "error_budgets": [asdict(b) for b in self.error_budgets],
+                "slopes": self.slopes,
+                "error_budgets": self.error_budgets,
                 "skipped": self.skipped,
                 "measured_for_the_answers": [p.to_row() for p in self.measured_for_the_answers],
                 "runs": {"measured": self.measured, "cached": self.cached},

@@ -218,16 +218,13 @@ def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | No
         "reasons": certificate.reasons,
     }
     about = {
-        **{key: getattr(certified, key) for key in ("k", "k2", "certify", "tolerance", "norm")},
+        **{key: getattr(certified, key) for key in ("k", "k2", "certify", "tolerance", "norm", "box", "mesh")},
         "N": certified.coarse.N,
         "N2": certified.fine.N,
-        "box": None if certified.box is None else asdict(certified.box),
-        "mesh": None if certified.mesh is None else asdict(certified.mesh),
         "own": own,
         **{key: value for key, value in training.items() if key not in ("known", "points", "key")},
     }
-    tests = None if check is None else asdict(check)
-    return reduce_result(full, {"certified": about, "tests": tests}, {**watch.seconds, "query": query})
+    return reduce_result(full, {"certified": about, "tests": check}, {**watch.seconds, "query": query})
 
 
 def _shown(bound: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -114,8 +114,7 @@ class BoxTests:
             | {"errors": [m | {"error_deformation": e} for m, e in zip(models, p.errors, strict=True)]}
             for p in self.points
         ]
-        summary = [asdict(e) for e in self.summary]
-        return {"reason_for_none": self.none, "trained_at": self.trained_at, "summary": summary, "points": points}
+        return {"reason_for_none": self.none, "trained_at": self.trained_at, "summary": self.summary, "points": points}
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,7 @@ class ReductionStudy:
             self.full,
             {
                 "N_means": N_NOTE,
-                "methods": {s.method.key: [asdict(p) for p in s.points] for s in self.sweeps},
+                "methods": {s.method.key: s.points for s in self.sweeps},
                 "about": {
                     s.method.key: {
                         "title": s.method.title,

@@ -104,10 +104,10 @@ def _family(study: StrainStudy, f: StrainFamily) -> dict[str, Any]:
     """One entry of "finite_strain" in ``result.json``."""
     return {
         "runs": f.runs,
-        "box": {key: np.asarray(value).tolist() for key, value in asdict(f.box).items()},
-        "points": [asdict(p) | {"speed_up": asdict(study.times.against(p))} for p in f.points],
-        "cells": [asdict(p) for p in f.curves],
-        "held_out": [asdict(t) for t in f.tests],
+        "box": f.box,
+        "points": [asdict(p) | {"speed_up": study.times.against(p)} for p in f.points],
+        "cells": f.curves,
+        "held_out": f.tests,
         "refused": f.refused,
     }
 
