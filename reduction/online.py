@@ -87,7 +87,10 @@ def prepared(model: SmallModel | Propagator, dt: float | None, driven: bool) -> 
 
 
 def consistent(q: Array, v: Array, dt: float) -> Array:
-    """Positions that the midpoint rule reaches with the velocities v: q_0 + dt sum (v_n + v_{n+1}) / 2."""
+    """Positions that the midpoint rule reaches with the velocities v: q_0 + dt sum (v_n + v_{n+1}) / 2.
+
+    A table of an analytic motion differs from them by O(dt^2); the tissue feels velocities and accelerations.
+    """
     return np.vstack([q[:1], q[0] + dt * np.cumsum((v[1:] + v[:-1]) / 2, axis=0)])
 
 

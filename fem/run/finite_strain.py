@@ -210,7 +210,7 @@ class FiniteStrainMidpoint(TissueMidpoint):
         return root if root.spent < 1 or moved is None else root._replace(x=moved)
 
     def _balance(self, root: Root) -> Array | None:
-        """W moved to w'R = 0 by a small part of a correction made before; None where none is large enough."""
+        """The step w moved to w'R = 0 by a small part of a correction made before; None where none is large enough."""
         pairs = self.newton.pairs
         if not pairs.order:
             return None

@@ -50,7 +50,7 @@ def midpoint_matrix(system: BlockSystem, dt: float) -> PETSc.Mat:
 
 
 def viscosity(system: BlockSystem, s: float) -> PETSc.Mat:
-    """S D with D = alpha M + beta K [+ layers], with the pattern of M. Collective."""
+    """The matrix s D with D = alpha M + beta K [+ layers], with the pattern of M. Collective."""
     damping = system.damping
     layers = [] if damping.matrix is None else [(s, damping.matrix)]
     return combine([(s * damping.alpha, system.M_ee), (s * damping.beta, system.K_ee), *layers])
@@ -202,7 +202,7 @@ class TissueMidpoint:
         self.r.axpy(0.5, self.k)
 
     def _set_momentum(self, state: TissueState) -> None:
-        """R = s M v, no load pending. Collective."""
+        """Set r = s M v with no load pending. Collective."""
         self.join(state)
         y = state.z.duplicate()
         self.system.M_ee.mult(state.v, y)

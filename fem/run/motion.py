@@ -164,12 +164,8 @@ class TableDrive:
 
     def __init__(self, system: BlockSystem, table: HandTable, force: Array | None = None) -> None:
         self.q, self.v, self.u = table.q, table.v, force
-        c = table.a.copy()
-        if system.gravity is not None:
-            c -= system.gravity
-        if system.damping.in_space:
-            c += system.damping.alpha * (table.v[1:] + table.v[:-1]) / 2
-        self.c = -c
+        c = table.a - system.fall + system.damping.drag * (table.v[1:] + table.v[:-1]) / 2
+        self.c = np.ascontiguousarray(-c)  # a row a step
 
     def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
         """One product with the n_s columns of G and one solve. Collective."""
@@ -190,6 +186,8 @@ class ForceDrive:
     c_0 = alpha v - g, theta = s^2 + alpha s. With finite strain w is no linear function of c; the hand's equation
     M_hand a + M_rigid c = u + weight - G'(theta w - s v) then turns the load of the tissue into -G c = G (c_1 + C G'w)
     with C = kappa theta (M_hand + kappa M_rigid)^-1, and the tissue's step is solved under it.
+
+    Making one is collective.
     """
 
     def __init__(
@@ -205,16 +203,15 @@ class ForceDrive:
         self.kappa = 1 + self.alpha * self.dt / 2
         s = midpoint.s
         self.theta = s * s + self.alpha * s
-        self.lhs = system.M_hand
+        inertia, finite = system.M_hand, system.two_way and system.points is not None
         if system.two_way:
-            self.Y = midpoint.make_responses()
-            GY = total(system.layout.comm, system.G.T @ self.Y)
+            Y = midpoint.make_responses()  # which the midpoint keeps: corrections of finite strain need it
+            GY = total(system.layout.comm, system.G.T @ Y)
             self.GY = (GY + GY.T) / 2
-            self.lhs = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
-        finite = system.two_way and system.points is not None
+            inertia = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
         if finite:
-            self.lhs = system.M_hand + self.kappa * system.M_rigid
-        self.inverse = np.linalg.inv(self.lhs)
+            inertia = system.M_hand + self.kappa * system.M_rigid
+        self.inverse = np.linalg.inv(inertia)
         # chosen once, not in every step
         self.solve = self._finite if finite else self._two_way if system.two_way else self._one_way
 

@@ -62,7 +62,7 @@ class NoStore:
         return 2**62
 
     def flush(self, step: int) -> None:
-        """Write out what is buffered, up to a step."""
+        """Write out what is buffered, up to a step. Collective."""
 
     def kept(self, step: int) -> Array:
         """Columns in memory that a restart needs."""
@@ -218,25 +218,35 @@ class Hdf5Store(NoStore):
             raise CheckpointError(f"{path} is damaged ({error}); run again without --resume") from error
 
     def finish(self, times: Array, q: Array, v: Array) -> Snapshots | None:
-        """Write ``snapshots.h5`` over the rank files. Collective."""
+        """Write ``snapshots.h5`` over the rank files. Collective.
+
+        Raises ResourceError: the file cannot be written.
+        """
         layout, s = self.system.layout, self.steps
         sizes = layout.comm.gather(layout.n_local)
         nodes = layout.comm.gather(layout.nodes)
-        if sizes is not None and nodes is not None:  # rank 0
-            with h5py.File(self.directory / "snapshots.h5", "w") as file:
+        with agree(layout.comm):
+            if sizes is not None and nodes is not None:  # rank 0
+                self._join(sizes, nodes, times[s], q[s], v[s])
+        return None
+
+    def _join(self, sizes: list[int], nodes: list[Array], times: Array, q: Array, v: Array) -> None:
+        path, count = self.directory / "snapshots.h5", len(self.steps)
+        try:
+            with h5py.File(path, "w") as file:
                 for key, part in (("z", 0), ("v", 1)):
-                    joined = h5py.VirtualLayout((len(s), layout.n_e), dtype="f8")
+                    joined = h5py.VirtualLayout((count, sum(sizes)), dtype="f8")
                     at = 0
                     for rank, n in enumerate(sizes):
-                        source = h5py.VirtualSource(f"snapshots-rank{rank}.h5", "Z", (len(s), 2 * n))
+                        source = h5py.VirtualSource(f"snapshots-rank{rank}.h5", "Z", (count, 2 * n))
                         joined[:, at : at + n] = source[:, part * n : (part + 1) * n]
                         at += n
                     file.create_virtual_dataset(key, joined)
                 file["nodes"] = np.vstack(nodes)
-                file["times"], file["steps"] = times[s], s
-                file["q_s"], file["v_s"] = q[s], v[s]
-        layout.comm.Barrier()
-        return None
+                file["times"], file["steps"] = times, self.steps
+                file["q_s"], file["v_s"] = q, v
+        except OSError as error:
+            raise ResourceError(f"{path} cannot be written ({error}); remove it or free the disk") from error
 
 
 def make_store(system: BlockSystem, kind: str, steps: int, every: int, directory: Path, run: str | None) -> NoStore:

@@ -121,7 +121,7 @@ class Body:
         return float(self.points.vol @ self.law.energy(self.gradient(z), self.lam, self.mu))
 
     def force(self, z: PETSc.Vec, f: PETSc.Vec) -> None:
-        """F = B' (vol P(B z)) [N]. Collective."""
+        """Force f = B' (vol P(B z)) [N]. Collective."""
         self._collect(self.law.stress(self.gradient(z), self.lam, self.mu), f)
 
     def sound(self, z: PETSc.Vec) -> bool:

@@ -44,7 +44,7 @@ class Points:
         return LAWS[self.law]
 
     def lame(self, materials: tuple[LayerMaterial, ...]) -> tuple[Array, Array]:
-        """Lam and mu of every point [Pa], (Q,) each."""
+        """The numbers lam and mu of every point [Pa], (Q,) each."""
         lam, mu = (np.array([getattr(m, key) for m in materials]) for key in ("lam", "mu"))
         return lam[self.layer], mu[self.layer]
 

@@ -225,8 +225,8 @@ def load_gain(path: Path, layout: BlockLayout, scene_hash: str | None = None) ->
             except (KeyError, IndexError, ValueError) as error:
                 raise ControlError(f"{path} holds no full-order gain ({error}); save it again") from error
     K_s, q_s, v_s, rows = layout.comm.scatter(pieces)
-    K_z, K_v, (z, v_z) = (*np.split(rows[:, :-2], 2, axis=1), rows[:, -2:].T)
-    return Gain(K_s, np.asfortranarray(K_z), np.asfortranarray(K_v)), PlantState(q_s, v_s, z.copy(), v_z.copy())
+    K_z, K_v = (np.asfortranarray(part) for part in np.split(rows[:, :-2], 2, axis=1))
+    return Gain(K_s, K_z, K_v), PlantState(q_s, v_s, rows[:, -2].copy(), rows[:, -1].copy())
 
 
 def _named(path: Path) -> Path:

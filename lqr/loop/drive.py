@@ -25,7 +25,7 @@ class PlantStep:
         L a = u + f,   L = M_hand [+ kappa (M_rigid - theta G'Y)],
         f = weight [- M_rigid c_0 - G'(theta (x - Y c_0) - s v_z)],   theta = s^2 + alpha s
 
-    ([...] two-way only). No matrix of the closed loop is ever factored.
+    ([...] two-way only). No matrix of the closed loop is ever factored. Making one is collective.
 
     ``midpoint``: factored step, before its start: its vectors are used as scratch.
     """
@@ -34,9 +34,7 @@ class PlantStep:
         self.system, self.midpoint = system, midpoint
         self.comm, self.dt, self.s = system.layout.comm, midpoint.dt, midpoint.s
         n_s = system.layout.n_s
-        self.g = np.zeros(n_s) if system.gravity is None else system.gravity
-        self.weight = system.M_hand @ self.g if system.hand_weight else np.zeros(n_s)
-        self.alpha = system.damping.alpha if system.damping.in_space else 0.0
+        self.g, self.weight, self.alpha = system.fall, system.weight, system.damping.drag
         self.kappa = 1 + self.alpha * self.dt / 2
         self.theta = self.s**2 + self.alpha * self.s
         self.Y = midpoint.make_responses()
@@ -95,7 +93,7 @@ class LoopDrive(ABC):
 
 
 class GainDrive(LoopDrive):
-    """The input is u_bar + K (x - x_bar) = offset + K x, with or without limits."""
+    """The input is u_bar + K (x - x_bar) = offset + K x, with or without limits. Making one is collective."""
 
     def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, steps)
@@ -195,7 +193,7 @@ class FiniteStep:
         u = u_bar + K_q (q + dt/2 v - q_bar) + K_v v + K_z'(z - z_bar) + F a + N'w,
 
     and the hand's equation (M_hand [+ kappa M_rigid] - F) a = .. + N'w [- theta G'w] turns the load -G c of the tissue,
-    c = kappa a + c_0, into G (c_1 + C p). ``gain``: None for inputs that are known.
+    c = kappa a + c_0, into G (c_1 + C p). ``gain``: None for inputs that are known. Making one is collective.
     """
 
     def __init__(self, plant: PlantStep, gain: Gain | None) -> None:

@@ -52,8 +52,8 @@ class LoopTrajectory:
     """What a closed-loop run returns; small arrays are on every rank."""
 
     times: Array  # grid [s], (steps + 1,)
-    q_s: Array  # hand, (steps + 1, n_s)
-    v_s: Array
+    q_s: Array  # displacement of the hand [m, rad], (steps + 1, n_s)
+    v_s: Array  # its velocity [m/s, rad/s], alike
     inputs: Array  # u of each step [N, N m], (steps, n_s)
     outputs: Array  # y = C_s q_s + C_z' z [m, rad], (steps + 1, p)
     outputs_rigid: Array  # C_s q_s, the same without deformation, (steps + 1, p)

@@ -166,8 +166,7 @@ static int solve(Body *b, const double *S, const double *h, double tol, double r
 /* counts: evaluations, restarts, point with J <= 0 of a failure. Returns 0, step + 1 that failed, or -1 without memory. */
 int softgrasp_march(int law, int d, int k, int p, const double *B, const double *weight, const double *lam,
                     const double *mu, const double *S, double s, const double *load, int steps, double tol,
-                    double rounding,
-                    double *J, double *A, double *V, long *counts) {
+                    double rounding, double *J, double *A, double *V, long *counts) {
   const int n = d * d, chunks = p / LANES;
   Lane *lanes = calloc((size_t)((n + 2) * chunks + k), sizeof(Lane));
   double *room = calloc((size_t)(11 * k + k * k), sizeof(double));

@@ -264,6 +264,14 @@ def test_streamed_snapshots_equal_those_in_memory(comm: MPI.Intracomm, mpi_tmp_p
         assert np.array_equal(file["nodes"][start // 2 : (start + n) // 2], memory.layout.nodes)
 
 
+def test_snapshots_that_cannot_be_joined_end_every_rank(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
+    if comm.rank == 0:
+        (mpi_tmp_path / "snapshots.h5").mkdir()
+    comm.Barrier()
+    with pytest.raises(ResourceError, match=r"snapshots\.h5 cannot be written"):
+        simulate(small(comm, 'output.snapshots="hdf5"'), RunOptions(directory=mpi_tmp_path))
+
+
 def test_resume_without_or_with_foreign_checkpoint(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
         simulate(small(comm), RunOptions(directory=mpi_tmp_path, resume=True))
