@@ -29,9 +29,9 @@ def compiled() -> Any:
 
 
 class Kernel:
-    """Points of one rank with their nodes.
+    """Points of one rank, on a communicator of this rank alone, with their nodes.
 
-    ``lam``, ``mu``: in every point [Pa], (Q,).
+    ``lam``, ``mu``: in every point [Pa], (Q,); ``code``: from :func:`compiled`.
 
     Attributes:
         J: det F at the end of the step tried last, (Q,).

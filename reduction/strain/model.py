@@ -20,7 +20,7 @@ from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.strain.cells import Cells, Potential
-from softgrasp.reduction.strain.stepper import StrainProblem, march
+from softgrasp.reduction.strain.stepper import StrainProblem, march_strain
 
 TOLERANCE = 1e-10  # of a step's residual: the drift of a model's own energy stays near it
 SLACK = 1e-9  # of the edges of the box: rounding of the user's own arithmetic
@@ -150,7 +150,7 @@ class SmallStrainModel:
             hand: q_s and v_s, (steps + 1, n_s) each.
             a0: start at rest, (k,); None is the undeformed body.
             tol: residual of a step over the largest load seen.
-            engine: see :func:`softgrasp.reduction.strain.stepper.march`.
+            engine: see :func:`softgrasp.reduction.strain.stepper.march_strain`.
 
         Raises:
             ModelError: shapes do not fit, or the hand or the run leaves the training box.
@@ -166,7 +166,7 @@ class SmallStrainModel:
             c = c + model.alpha * (v[1:] + v[:-1]) / 2
         load = -c @ model.G.T
         start = np.zeros(model.k) if a0 is None else a0
-        done = march(self.problem, load, start, np.zeros(model.k), tol, engine)
+        done = march_strain(self.problem, load, start, np.zeros(model.k), tol, engine)
         refuse(model.box.refuse_states(done.a), self.outside)
         y = done.a @ model.outputs.C_z.T + q @ model.outputs.C_s.T
         times = dt * np.arange(float(len(q)))

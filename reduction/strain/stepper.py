@@ -58,7 +58,7 @@ class March:
     engine: str  # "C" or "NumPy"
 
 
-def march(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
+def march_strain(problem: StrainProblem, load: Array, a0: Array, v0: Array, tol: float, engine: str = "") -> March:
     """All steps from a0, v0 (k,) under loads l (steps, k) at their midpoints. Collective if the potential is.
 
     Args:

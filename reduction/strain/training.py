@@ -105,7 +105,7 @@ class Reference:
 
     def errors(self, a: Array, v: Array) -> StrainErrors:
         """Errors of one run."""
-        return errors_of([self.missed(a, v)])
+        return pooled_errors([self.missed(a, v)])
 
     def projection_error(self, k: int) -> float:
         """min_A |Z - Phi A|_F / |Z|_F over the first k columns."""
@@ -114,7 +114,7 @@ class Reference:
         return ratio(max(self.flat.square - float(np.sum(cross * best)), 0.0), self.flat.square)
 
 
-def errors_of(missed: list[Array]) -> StrainErrors:
+def pooled_errors(missed: list[Array]) -> StrainErrors:
     """Errors over several runs together, from what :meth:`Reference.missed` gives of each."""
     sums = np.sum(missed, axis=0)
     return StrainErrors(*(ratio(max(float(part), 0.0), float(whole)) for part, whole in sums))
@@ -213,7 +213,7 @@ class Training:
     def galerkin_error(self, k: int) -> float:
         """Error in z of :meth:`galerkin` over all training runs. Collective."""
         pairs = zip(self.references, self.galerkin(k), strict=True)
-        return errors_of([reference.missed(run.a, run.v) for reference, run in pairs]).z
+        return pooled_errors([reference.missed(run.a, run.v) for reference, run in pairs]).z
 
     def reduce(self, N: int, tau: float | None = None) -> StrainModel:
         """A model of dimension N on sampled cells. Collective; the weights are found on one rank.

@@ -16,7 +16,7 @@ from softgrasp.reduction.bases.basis import ReductionError
 from softgrasp.reduction.parameters import grid_of, mirrored, moved_to, outside, run_at, training_of
 from softgrasp.reduction.replay import FullRun, full_run
 from softgrasp.reduction.strain.model import StrainModel, TrainedBox
-from softgrasp.reduction.strain.training import Reference, Training, errors_of, reference_of, replay_strain, train
+from softgrasp.reduction.strain.training import Reference, Training, pooled_errors, reference_of, replay_strain, train
 from softgrasp.study.reduce.measure import Say
 from softgrasp.study.reduce.result import FullTimes, StrainPoint
 from softgrasp.study.shell.timing import median_seconds
@@ -190,7 +190,7 @@ def _measure(
 ) -> StrainPoint:
     """Errors on training runs and on held-out ones, drift, times."""
     done = [replay_strain(rom, run, outside=True) for run in training.runs]
-    trained = errors_of([r.missed(x.a, x.v) for r, x in zip(training.references, done, strict=True)])
+    trained = pooled_errors([r.missed(x.a, x.v) for r, x in zip(training.references, done, strict=True)])
     own = training.references[0].errors(done[0].a, done[0].v)
     worst: dict[str, list[float]] = {"material": [], "motion": []}
     for (kind, _), error in zip(held, missed, strict=True):

@@ -24,7 +24,7 @@ from softgrasp.reduction.strain import stepper
 from softgrasp.reduction.strain.cells import Cells, Potential
 from softgrasp.reduction.strain.model import StrainModel, TrainedBox
 from softgrasp.reduction.strain.nnls import nnls
-from softgrasp.reduction.strain.stepper import March, StrainProblem, march
+from softgrasp.reduction.strain.stepper import March, StrainProblem, march_strain
 
 pytestmark = pytest.mark.serial
 LAYERS = (LayerMaterial(50.0, 50.0, 1.0), LayerMaterial(80.0, 20.0, 1.0))
@@ -53,7 +53,7 @@ def loads(problem: StrainProblem, steps: int, size: float = 100.0) -> Array:
 
 
 def run(problem: StrainProblem, load: Array, tol: float = 1e-11, engine: str = "NumPy") -> March:
-    return march(problem, load, np.zeros(load.shape[1]), np.zeros(load.shape[1]), tol, engine)
+    return march_strain(problem, load, np.zeros(load.shape[1]), np.zeros(load.shape[1]), tol, engine)
 
 
 def test_weights_are_those_of_scipy_where_the_least_residual_is_asked_for() -> None:
