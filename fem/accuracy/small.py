@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -23,9 +22,6 @@ from softgrasp.fem.model.outputs import make_outputs, output_columns
 from softgrasp.fem.petsc import Array, normalising, times_columns, total
 from softgrasp.fem.run.motion import force_values, free_table
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
-
-if TYPE_CHECKING:
-    pass
 
 BLOCKS = 4
 DROPPED = 1e-12  # of the largest squared length in a block: directions that are rounding only

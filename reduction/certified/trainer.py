@@ -358,5 +358,5 @@ def validate(trainer: Trainer, model: CertifiedModel, n: int) -> Validation:
     for place in trainer.random(n, SEED + 1):
         full = run_with(trainer.models[0], place)
         tests.append(tested(full, model.run(place, trainer.drives[0], allow=True), modes))
-    factor, worst = max(t.truth / t.estimate for t in tests), max(t.truth for t in tests)
+    factor, worst = max(t.truth / t.estimate if t.estimate else np.inf for t in tests), max(t.truth for t in tests)
     return Validation(n, factor, worst, float(1 - 0.05 ** (1 / n)))

@@ -117,7 +117,7 @@ def operator_hashes(model: Model, run: Run) -> dict[str, str]:
         matrices["D_ee"] = system.damping.matrix
     arrays: dict[str, list[Array]] = {name: list(A.getValuesCSR()) for name, A in matrices.items()}
     arrays |= {name: [getattr(system, name)] for name in ("T", "G", "M_hand", "M_rigid")}
-    arrays["hand"] = [getattr(run.drive, name) for name in ("c", "lhs", "Y") if hasattr(run.drive, name)]
+    arrays["hand"] = [getattr(run.drive, name) for name in ("c", "inverse", "GY") if hasattr(run.drive, name)]
     return {name: "".join(comm.allgather(digest(*parts))) for name, parts in arrays.items()}
 
 
