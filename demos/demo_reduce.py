@@ -49,7 +49,7 @@ assert here < there < 0.15  # the shapes of lambda = mu do not span those of lam
 
 # %%
 if speak:
-    sg.save(replace(rom, lift=None), "out/rom.h5")  # without the way back to the mesh
+    sg.save(replace(rom, reconstruction=None), "out/rom.h5")  # without the way back to the mesh
     online = sg.load("out/rom.h5")
     for mu in (40.0, 50.0, 60.0):
         small = online.at(tuple(replace(m, mu=mu) for m in online.materials))

@@ -1,4 +1,4 @@
-"""One HDF5 file for a reduced model of any kind: small matrices, the lift with its nodes, SHA-256 of all of it."""
+"""One HDF5 file for a reduced model of any kind: small matrices, reconstruction and its nodes, SHA-256 of all of it."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
-from softgrasp.reduction.operators import Lift
+from softgrasp.reduction.operators import Reconstruction
 
 if TYPE_CHECKING:
     from softgrasp.reduction.strain.model import StrainModel
 
 LINEAR, STRAIN = "softgrasp reduced model 2", "softgrasp reduced model at finite strain 2"
-SEALS = ("sha256", "sha256_lift")  # attributes: of everything but the lift, and of the lift
-ROWS = 1 << 16  # rows of the lift read at a time: 30 MB for 60 columns
+SEALS = ("sha256", "sha256_lift")  # attributes: of everything but the reconstruction, and of the reconstruction
+ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 columns
 # what a file says of a model in JSON, beside its materials and the names of its outputs
 LINEAR_KEYS = (
     "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
@@ -43,10 +43,10 @@ STRAIN_ARRAYS = {
 
 
 def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
-    """Write a reduced model to one HDF5 file, atomically. Collective when the model holds a lift.
+    """Write a reduced model to one HDF5 file, atomically. Collective when the model holds a reconstruction.
 
-    The file holds the small matrices in full precision, the outputs, and the lift (2 or 3 arrays of n_e x N) beside the
-    coordinates of the nodes it belongs to; every rank adds its rows in turn.
+    The file holds the small matrices in full precision, the outputs, and the reconstruction (2 or 3 arrays of n_e x N)
+    by the coordinates of its nodes; every rank adds its rows in turn.
 
     >>> import tempfile, softgrasp as sg
     >>> model = sg.build("paper_forward", ["tissue.cells=[4, 8]", "time.steps=100"])
@@ -63,12 +63,12 @@ def save(model: ReducedModel | StrainModel, path: str | Path) -> None:
         OSError: the file cannot be written.
     """
     if isinstance(model, ReducedModel):
-        kind, lift = LINEAR, model.lift
+        kind, reconstruction = LINEAR, model.reconstruction
     else:
-        kind, lift = STRAIN, None
+        kind, reconstruction = STRAIN, None
         if model.Phi is not None and model.layout is not None:
-            lift = Lift(model.layout, model.Phi, model.Phi[:, :0])
-    write_model(Path(path), kind, about(model), lift, partial(write_small, model))
+            reconstruction = Reconstruction(model.layout, model.Phi, model.Phi[:, :0])
+    write_model(Path(path), kind, about(model), reconstruction, partial(write_small, model))
 
 
 def about(model: ReducedModel | StrainModel) -> dict[str, Any]:
@@ -80,7 +80,7 @@ def about(model: ReducedModel | StrainModel) -> dict[str, Any]:
 
 
 def write_small(model: ReducedModel | StrainModel, file: h5py.File) -> None:
-    """The arrays of a model that are no lift."""
+    """The arrays of a model that are no reconstruction."""
     if isinstance(model, ReducedModel):
         groups = {"parts": model.parts}
     else:
@@ -103,7 +103,7 @@ def load(
 
     Args:
         path: file of :func:`save`.
-        layout: where the lift goes, by node coordinates: any rank count; None leaves the lift out (online use).
+        layout: where the reconstruction goes, by node coordinates: any rank count; None leaves it out (online use).
         scene_hash: refuse a model of another scene.
 
     Raises:
@@ -121,9 +121,9 @@ def load(
 
 def read_linear(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> ReducedModel:
     """A linear model of an open file and its :func:`about`."""
-    shared, lift = _read_shared(file, data), None if layout is None else read_lift(file, layout)
+    shared, reconstruction = _read_shared(file, data), None if layout is None else read_reconstruction(file, layout)
     parts = {key: value[()] for key, value in file["parts"].items()}
-    return ReducedModel(**data | shared | {"split": tuple(data["split"])}, parts=parts, lift=lift)
+    return ReducedModel(**data | shared | {"split": tuple(data["split"])}, parts=parts, reconstruction=reconstruction)
 
 
 def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | None) -> StrainModel:
@@ -133,7 +133,7 @@ def read_strain(file: h5py.File, data: dict[str, Any], layout: BlockLayout | Non
 
     cells, box, parts = ({key: file[f"{group}/{key}"][()] for key in keys} for group, keys in STRAIN_ARRAYS.items())
     shared, law = _read_shared(file, data), data.pop("law")
-    Phi = None if layout is None else np.asarray(read_lift(file, layout).L_q)
+    Phi = None if layout is None else np.asarray(read_reconstruction(file, layout).L_q)
     return StrainModel(
         cells=Cells(law, **cells), box=TrainedBox(**box), **parts, **shared, **data, layout=layout, Phi=Phi
     )
@@ -147,13 +147,17 @@ def _read_shared(file: h5py.File, data: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_model(
-    path: Path, kind: str, about: dict[str, Any], lift: Lift | None, small: Callable[[h5py.File], None]
+    path: Path,
+    kind: str,
+    about: dict[str, Any],
+    reconstruction: Reconstruction | None,
+    small: Callable[[h5py.File], None],
 ) -> None:
     """Write a file of kind :data:`LINEAR` or :data:`STRAIN` beside its place and move it there whole.
 
-    Collective with a lift, whose rows every rank adds in turn; ``small`` writes the arrays. Raises OSError.
+    Collective with a reconstruction, whose rows every rank adds in turn; ``small`` writes the arrays. Raises OSError.
     """
-    comm = MPI.COMM_SELF if lift is None else lift.layout.comm
+    comm = MPI.COMM_SELF if reconstruction is None else reconstruction.layout.comm
     unfinished = path.with_name(path.name + ".part")
     try:
         with agree(comm):
@@ -165,8 +169,8 @@ def write_model(
         for rank in range(comm.size):
             # one file, one writer at a time: the file library here is not a parallel one
             with agree(comm):
-                if lift is not None and comm.rank == rank:
-                    _write_rows(lift, unfinished)
+                if reconstruction is not None and comm.rank == rank:
+                    _write_rows(reconstruction, unfinished)
         with agree(comm):
             if comm.rank == 0:
                 with h5py.File(unfinished, "r+") as file:
@@ -191,7 +195,7 @@ def reading(
             with h5py.File(path, "r") as file:
                 if file.attrs.get("format") not in (LINEAR, STRAIN):
                     raise ModelError(f"{path} is no reduced model of this version ({LINEAR!r}); reduce the scene again")
-                # one rank reads a lift twice, not all of them
+                # one rank reads a reconstruction twice, not all of them
                 for name in SEALS if layout is not None and comm.rank == 0 else SEALS[:1]:
                     if file.attrs[name] != _digest(file, name == SEALS[1]):
                         raise ModelError(f"{path} is damaged: it is not what was written; reduce the scene again")
@@ -211,14 +215,14 @@ def seal(file: h5py.File) -> None:
         file.attrs[name] = _digest(file, name == SEALS[1])
 
 
-def _digest(file: h5py.File, lift: bool) -> str:
-    """SHA-256 of the numbers of the lift, or of all others with their attributes."""
+def _digest(file: h5py.File, reconstruction: bool) -> str:
+    """SHA-256 of the numbers of the reconstruction, or of all others with their attributes."""
     names: list[str] = []
     file.visit(names.append)
     digest = hashlib.sha256()
     for name in ["/", *sorted(names)]:
         item = file[name]
-        if name.startswith("lift") is lift:
+        if name.startswith("lift") is reconstruction:
             attributes = sorted((key, str(value)) for key, value in item.attrs.items() if key not in SEALS)
             digest.update(repr((name, attributes)).encode())
             if isinstance(item, h5py.Dataset):
@@ -228,9 +232,9 @@ def _digest(file: h5py.File, lift: bool) -> str:
     return digest.hexdigest()
 
 
-def _write_rows(lift: Lift, path: Path) -> None:
-    layout, d = lift.layout, lift.layout.dimension
-    parts = {"nodes": layout.nodes, "L_q": lift.L_q, "L_v": lift.L_v, "W_G": lift.W_G}
+def _write_rows(reconstruction: Reconstruction, path: Path) -> None:
+    layout, d = reconstruction.layout, reconstruction.layout.dimension
+    parts = {"nodes": layout.nodes, "L_q": reconstruction.L_q, "L_v": reconstruction.L_v, "W_G": reconstruction.W_G}
     with h5py.File(path, "r+") as file:
         for key, part in parts.items():
             if part is None:
@@ -241,7 +245,7 @@ def _write_rows(lift: Lift, path: Path) -> None:
                 rows[start + at : start + min(at + ROWS, len(part))] = part[at : at + ROWS]
 
 
-def read_lift(file: h5py.File, layout: BlockLayout) -> Lift:
+def read_reconstruction(file: h5py.File, layout: BlockLayout) -> Reconstruction:
     """Rows of this rank, found by the coordinates of its nodes."""
     path, d = file.filename, layout.dimension
     if "lift" not in file:
@@ -259,7 +263,7 @@ def read_lift(file: h5py.File, layout: BlockLayout) -> Lift:
         raise ModelError(f"{path} belongs to another mesh: its nodes lie elsewhere; load it with its own scene")
     rows = (index[:, None] * d + np.arange(d)).ravel()
     arrays = {key: _pick(file[f"lift/{key}"], rows) for key in ("L_q", "L_v", "W_G") if f"lift/{key}" in file}
-    return Lift(layout, arrays["L_q"], arrays["L_v"], arrays.get("W_G"))
+    return Reconstruction(layout, arrays["L_q"], arrays["L_v"], arrays.get("W_G"))
 
 
 def _pick(dataset: h5py.Dataset, rows: np.ndarray) -> Array:

@@ -31,13 +31,21 @@ from softgrasp.fem.petsc import Array, times_columns, total
 from softgrasp.fem.solve.statics import solve_columns
 from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.operators import Lift, Operators, Parameters, Parts, layer_products, relative_rows, symmetric
+from softgrasp.reduction.operators import (
+    Operators,
+    Parameters,
+    Parts,
+    Reconstruction,
+    layer_products,
+    relative_rows,
+    symmetric,
+)
 
 MASS_RTOL = 1e-13  # of cg, where no direct solver fits: the lifted velocity inherits it
 
 
-def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Lift]:
-    """Small matrices at the densities of ``system``, and the lift. Collective.
+def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstruction]:
+    """Small matrices at the densities of ``system``, and the reconstruction. Collective.
 
     Raises:
         SoftgraspError: the hand's own columns reach into the tissue.
@@ -73,7 +81,7 @@ def canonical_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Lift]:
         parts |= {f"K_{key}": each for each in stiffness}
     if system.damping.alpha:
         parts["WM"] = total(comm, W.T @ times_columns(system.M_ee, L_q))
-    return parts, Lift(layout, L_q, Y, W_G if basis.frame == "absolute" else None)
+    return parts, Reconstruction(layout, L_q, Y, W_G if basis.frame == "absolute" else None)
 
 
 def hand_velocity(parts: Parts, p: Parameters, fixed: bool, absolute: bool) -> Array:

@@ -16,7 +16,15 @@ import numpy as np
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.system import BlockSystem, LayerMaterial, coupling
 from softgrasp.reduction.bases.basis import Basis
-from softgrasp.reduction.operators import Lift, Operators, Parameters, Parts, layer_products, relative_rows, symmetric
+from softgrasp.reduction.operators import (
+    Operators,
+    Parameters,
+    Parts,
+    Reconstruction,
+    layer_products,
+    relative_rows,
+    symmetric,
+)
 
 
 def unit_coupling(system: BlockSystem) -> tuple[list[Array], list[Array]]:
@@ -26,8 +34,8 @@ def unit_coupling(system: BlockSystem) -> tuple[list[Array], list[Array]]:
     return [g for g, _ in pairs], [r for _, r in pairs]
 
 
-def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Lift]:
-    """Small matrices from which every parameter is assembled, and the lift. Collective.
+def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Reconstruction]:
+    """Small matrices from which every parameter is assembled, and the reconstruction. Collective.
 
     The rows of the tissue are tested with V_v itself (the paper), or with V_v - T V_sv where virtual work asks for it:
     two-way coupling, and bases of second order, whose models stay symmetric that way.
@@ -52,7 +60,7 @@ def galerkin_parts(basis: Basis, system: BlockSystem) -> tuple[Parts, Lift]:
         if system.damping.active:
             (parts[f"D_{key}"],) = layer_products(system, f"K_{key}", Z_v, W)
     parts["M"], parts["energy_M"] = layer_products(system, "M_1", Z_v, W, Z_v)
-    return parts, Lift(system.layout, Z, Z_v)
+    return parts, Reconstruction(system.layout, Z, Z_v)
 
 
 def galerkin_operators(parts: Parts, p: Parameters) -> Operators:

@@ -14,7 +14,7 @@ from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, 
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators
 from softgrasp.reduction.lti import LTI, make_lti
-from softgrasp.reduction.operators import Lift, Operators, Parameters, Parts
+from softgrasp.reduction.operators import Operators, Parameters, Parts, Reconstruction
 from softgrasp.reduction.spectrum import Spectrum, spectrum
 
 
@@ -171,7 +171,7 @@ class ReducedModel:
     hand_weight: bool = False  # gravity acts on the hand's own mass
     two_way: bool = False  # the hand feels the tissue
     gravity: Array | None = None  # acceleration of free fall in the hand's degrees of freedom, (n_s,), or None
-    lift: Lift | None = None  # how states return to the mesh, or None
+    reconstruction: Reconstruction | None = None  # how states return to the mesh, or None
     scene_hash: str = ""  # of the scene the model was made for
     seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage
 
@@ -248,14 +248,14 @@ class ReducedModel:
             v_s: hand velocity (n_s, m); None takes S_v x.
 
         Raises:
-            ModelError: the model was loaded without its lift.
+            ModelError: the model was loaded without its reconstruction.
         """
-        lift = self.lift
-        if lift is None:
+        reconstruction = self.reconstruction
+        if reconstruction is None:
             raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh", self.name)
-        z, v_z = lift.L_q @ x, lift.L_v @ x
+        z, v_z = reconstruction.L_q @ x, reconstruction.L_v @ x
         if small.scale != 1.0:
             v_z /= small.scale
-        if lift.W_G is not None:
-            v_z -= lift.W_G @ (small.operators.S_v @ x if v_s is None else v_s)
+        if reconstruction.W_G is not None:
+            v_z -= reconstruction.W_G @ (small.operators.S_v @ x if v_s is None else v_s)
         return z, v_z

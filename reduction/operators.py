@@ -1,4 +1,4 @@
-"""What projections share: products with every layer, the lift, and what online assembly takes and gives."""
+"""What projections share: products with every layer, the reconstruction, and what online assembly takes and gives."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Parts = dict[str, Array]
 
 
 @dataclass(frozen=True)
-class Lift:
+class Reconstruction:
     """Rows that turn reduced states into tissue states relative to the hand; the only distributed part of a model."""
 
     layout: BlockLayout  # sizes and ownership

@@ -15,7 +15,7 @@ from softgrasp.reduction.bases.basis import Basis
 from softgrasp.reduction.canonical import canonical_parts
 from softgrasp.reduction.galerkin import galerkin_parts
 from softgrasp.reduction.model import Outputs, ReducedModel
-from softgrasp.reduction.operators import Lift
+from softgrasp.reduction.operators import Reconstruction
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.outputs import Output
@@ -37,7 +37,7 @@ def project(basis: Basis, system: BlockSystem, outputs: Sequence[Output] = (), s
     layout = system.layout
     layout.comm.Barrier()
     begin = time.perf_counter()
-    parts, lift = (galerkin_parts if basis.coordinates == "qv" else canonical_parts)(basis, system)
+    parts, reconstruction = (galerkin_parts if basis.coordinates == "qv" else canonical_parts)(basis, system)
     # sums over ranks may differ in the last bit from rank to rank
     parts = layout.comm.bcast(parts)
     damping = system.damping
@@ -51,7 +51,7 @@ def project(basis: Basis, system: BlockSystem, outputs: Sequence[Output] = (), s
         fixed_solid=basis.fixed_solid,
         parts=parts,
         materials=system.materials,
-        outputs=project_outputs(outputs, lift),
+        outputs=project_outputs(outputs, reconstruction),
         split=basis.split,
         alpha=damping.alpha,
         in_space=damping.in_space,
@@ -59,18 +59,18 @@ def project(basis: Basis, system: BlockSystem, outputs: Sequence[Output] = (), s
         hand_weight=system.hand_weight,
         two_way=system.two_way,
         gravity=system.gravity,
-        lift=lift,
+        reconstruction=reconstruction,
         scene_hash=scene_hash,
         seconds={**basis.seconds, "projection": seconds},
     )
 
 
-def project_outputs(outputs: Sequence[Output], lift: Lift) -> Outputs:
+def project_outputs(outputs: Sequence[Output], reconstruction: Reconstruction) -> Outputs:
     """C_z = C_e L_q on every rank, with the rigid parts. Collective."""
-    n_s, N = lift.layout.n_s, lift.L_q.shape[1]
-    rows = [o.weight * lift.L_q[o.dofs].sum(axis=0) for o in outputs]
+    n_s, N = reconstruction.layout.n_s, reconstruction.L_q.shape[1]
+    rows = [o.weight * reconstruction.L_q[o.dofs].sum(axis=0) for o in outputs]
     local = np.concatenate(rows) if rows else np.zeros((0, N))
-    C_z = lift.layout.comm.bcast(total(lift.layout.comm, local))
+    C_z = reconstruction.layout.comm.bcast(total(reconstruction.layout.comm, local))
     C_s = np.vstack([o.C_s for o in outputs]) if rows else np.zeros((0, n_s))
     names = tuple(name for o in outputs for name in o.names)
     return Outputs(C_z, C_s, names)

@@ -146,14 +146,14 @@ def errors(
     True
 
     Args:
-        rom: reduced model, with its lift.
+        rom: reduced model, with its reconstruction.
         reduced_run: its run on the time grid of the full one, at the materials of ``model``.
         model: scene at the materials of both runs.
         run: the full run.
 
     Raises:
         SceneError: see :func:`softgrasp.reduction.replay.full_run`.
-        ModelError: the reduced run is shorter than the full one, or the model was loaded without its lift.
+        ModelError: the reduced run is shorter than the full one, or the model was loaded without its reconstruction.
     """
     full = as_full(model, run)
     if isinstance(rom, ReducedModel):

@@ -212,11 +212,11 @@ def control_rows(control: dict[str, Any]) -> list[Row]:
         ("target reached at T = 300, optimal gain", "yes", f"{digits(away)} m off", verdict((away or 1.0) < NEAR), ""),
     ]  # fmt: skip
     for run in control["loop"].get("reduced", ()):
-        told = run["method"] == "pod"
+        named = run["method"] == "pod"
         end = run["reason"] or f"{digits(run['distance_final'])} m off, excess cost {digits(run['cost'] / best - 1)}"
         name = f"target reached, {TITLES[run['method']]}, N = {run['N']}"
-        same = verdict(not run["reason"]) if told else NOT_TOLD
-        rows.append((name, "yes, N not told" if told else "not shown", end, same, "the stable gain of least cost"))
+        same = verdict(not run["reason"]) if named else NOT_TOLD
+        rows.append((name, "yes, N not told" if named else "not shown", end, same, "the stable gain of least cost"))
     for name, points in reduced.items():
         p, five = at(points, N_RICCATI), name in (*FREE, *FIXED)
         paper = "0.053 s" if name == "pod" else "0.051 to 0.057 s" if five else "not in the paper"

@@ -138,7 +138,6 @@ def real_columns(p: complex, q: int) -> tuple[Complex, float]:
     """Coefficients c of the real columns Z = Re(V c) of a shift or its conjugate pair, and g in W <- W + g E'Z_1.
 
     p = a + ib, g = 2 sqrt(-a), d = a/b: Z = [g (Re V + d Im V), g sqrt(d^2 + 1) Im V] [BKS13], Z_1 its first q columns.
-
     """
     one = np.eye(q, dtype=complex)
     if p.imag == 0:

@@ -16,7 +16,7 @@ from softgrasp.lqr.plant.block import Block
 
 
 class Right(Block):
-    """A right-hand side W; below its rows z, as they stand, and v_z those of a = K_ee^{-1} W_z, (3 n_local, k)."""
+    """A right-hand side W with a third part in ``tall``: rows z, v_z, those of a = K_ee^{-1} W_z, (3 n_local, k)."""
 
     @property
     def block(self) -> Block:

@@ -362,12 +362,12 @@ def make_shifted(system: BlockSystem, name: str = "auto") -> ShiftedTissue:
     if name == "gathered":
         return GatheredTissue(system)
     if name == "distributed":
-        check_memory(system.layout)
+        check_shifted_memory(system.layout)
         return DistributedTissue(system)
     raise SolverError(f"the shifted solver {name!r} is unknown; choose auto, gathered or distributed")
 
 
-def factor_bytes(n: int, dimension: int) -> float:
+def shifted_factor_bytes(n: int, dimension: int) -> float:
     """What MUMPS asks for to factor S(p) of order n, all ranks together: 240 n log2 n in 2D, 800 n^(4/3) in 3D.
 
     Fitted to n = 6 558 to 103 038 in 2D and n = 7 227 to 52 857 in 3D.
@@ -375,9 +375,9 @@ def factor_bytes(n: int, dimension: int) -> float:
     return 240 * n * float(np.log2(max(n, 2))) if dimension < 3 else 800 * n ** (4 / 3)
 
 
-def check_memory(layout: BlockLayout) -> None:
+def check_shifted_memory(layout: BlockLayout) -> None:
     """The factor of S(p) fits in the memory that is free now. Collective. Raises ResourceError: it does not."""
-    needed = factor_bytes(layout.n_e, layout.dimension) / 2**30
+    needed = shifted_factor_bytes(layout.n_e, layout.dimension) / 2**30
     free = layout.comm.bcast(free_memory()) / 2**30
     if needed > free:
         raise ResourceError(

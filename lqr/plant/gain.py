@@ -16,9 +16,9 @@ class PlantState:
     """x = [q_s, v_s, z, v_z] with z = q_e - T q_s."""
 
     q_s: Array  # hand [m, rad], (n_s,), on every rank
-    v_s: Array  # [m/s, rad/s]
-    z: Array  # displacement of the tissue [m], local rows (n_local,)
-    v_z: Array  # [m/s]
+    v_s: Array  # its velocity [m/s, rad/s], (n_s,)
+    z: Array  # displacement of the tissue relative to the hand [m], local rows (n_local,)
+    v_z: Array  # its velocity [m/s], (n_local,)
 
     def __sub__(self, other: PlantState) -> PlantState:
         return PlantState(self.q_s - other.q_s, self.v_s - other.v_s, self.z - other.z, self.v_z - other.v_z)

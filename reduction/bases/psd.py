@@ -39,7 +39,7 @@ class Canonical:
     C_y: Array
     rate: float  # c
     scale: float  # power of two taken out of the snapshots
-    lift: bool  # whether V_p needs the factor A (canonical coordinates)
+    momenta: bool  # whether V_p needs the factor A (canonical coordinates)
 
     def vectors(self, C: Array) -> Array:
         """Q L^-T C, local rows."""
@@ -53,7 +53,7 @@ class Canonical:
         """Columns of V from q~ and y~ rows. Collective."""
         root = self.rate**0.5
         ((s_q, e_q),) = self.rows.split(E_q / root if root != 1.0 else E_q)
-        E_p = self.weigh(E_y) if self.lift else E_y
+        E_p = self.weigh(E_y) if self.momenta else E_y
         ((s_p, e_p),) = self.rows.split(E_p * root if root != 1.0 else E_p)
         return Columns(s_q, s_p, e_q, e_p)
 
@@ -64,12 +64,12 @@ def canonical(request: PartsRequest) -> Canonical:
     rows, m = Rows(system.layout, 1, request.hand), b.e_q.shape[1]
     both = weights(system, request.inner)
     by = None if both is None else both[0]
-    lift = request.coordinates == "qp"
+    momenta = request.coordinates == "qp"
     comm = system.layout.comm
     scale = magnitude(comm, b.s_q, b.s_p, b.e_q, b.e_p) if request.hand else magnitude(comm, b.e_q, b.e_p)
     Z = np.empty((rows.local, 2 * m), order="F")
     rows.fill(Z[:, :m], 0, b.s_q, b.e_q)
-    if by is not None and lift:
+    if by is not None and momenta:
         hand = np.linalg.solve(by.hand, b.s_p / scale)
         rows.fill(Z[:, m:], 0, hand, solve_columns(by.tissue, system.layout, b.e_p / scale))
         Z[:, m:] *= scale
@@ -77,14 +77,14 @@ def canonical(request: PartsRequest) -> Canonical:
         rows.fill(Z[:, m:], 0, b.s_p, b.e_p)
     Z /= scale
     rate = 1.0
-    if by is not None and lift:
+    if by is not None and momenta:
         rate = _rate(rows, Z, by, m)
         Z[:, :m] *= rate**0.5
         Z[:, m:] /= rate**0.5
     f, L = weighted_factor(rows, Z, None if by is None else (by,), request.engine)
     inverse = None if L is None else scipy.linalg.solve_triangular(L.T, np.eye(len(L)))
     C = f.R if L is None else L.T @ f.R
-    return Canonical(rows, by, f, inverse, C[:, :m], C[:, m:], rate, scale * f.scale, lift)
+    return Canonical(rows, by, f, inverse, C[:, :m], C[:, m:], rate, scale * f.scale, momenta)
 
 
 def _rate(rows: Rows, Z: Array, by: Weight, m: int) -> float:
@@ -154,9 +154,9 @@ def svd_like_parts(request: PartsRequest) -> tuple[Part, ...]:
     def columns(k: int) -> tuple[Columns, ...]:
         pairs = (S[:, :k], S[:, half : half + k])
         E_q, E_y = (c.vectors(np.hstack(part)) for part in ([P[:r] for P in pairs], [P[r:] for P in pairs]))
-        W_y = c.weigh(E_y) if c.lift else E_y
+        W_y = c.weigh(E_y) if c.momenta else E_y
         B = total(comm, E_q.T @ W_y)
-        if c.lift or c.by is None:
+        if c.momenta or c.by is None:
             # products with Q and A leave rounding times |s|^2
             C = on_root(comm, lambda: symplectic_repair(B - B.T))
             E_q, E_y = E_q @ C, E_y @ C

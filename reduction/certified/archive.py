@@ -28,7 +28,7 @@ GROUP = "certificate"
 
 
 def save_certified(model: CertifiedModel, path: str | Path) -> None:
-    """Write a certified model to one HDF5 file, atomically. Collective when it holds a lift.
+    """Write a certified model to one HDF5 file, atomically. Collective when it holds a reconstruction.
 
     Raises:
         OSError: the file cannot be written.
@@ -38,7 +38,7 @@ def save_certified(model: CertifiedModel, path: str | Path) -> None:
         write_small(model.fine, file)
         _write(model, file.create_group(GROUP))
 
-    write_model(Path(path), LINEAR, about(model.fine), model.fine.lift, small)
+    write_model(Path(path), LINEAR, about(model.fine), model.fine.reconstruction, small)
 
 
 def _write(model: CertifiedModel, group: h5py.Group) -> None:
@@ -77,8 +77,8 @@ def load_certified(path: str | Path, layout: BlockLayout | None = None) -> Certi
 
     Args:
         path: file of :func:`save_certified`.
-        layout: where the lift goes, see :func:`softgrasp.reduction.archive.load`; None leaves it out, which runs do
-        without.
+        layout: where the reconstruction goes, see :func:`softgrasp.reduction.archive.load`; None leaves it out: runs do
+            without.
 
     Raises:
         ModelError: the file is missing, damaged, without a certificate, or of another mesh.

@@ -85,7 +85,7 @@ class Motion:
 
 
 def leading(model: ReducedModel, k: int) -> ReducedModel:
-    """The second-order model of the first k modes, without its lift."""
+    """The second-order model of the first k modes, without its reconstruction."""
     hand = 2 * len(model.parts["M_hand"])
     half = (model.N - hand) // 2
     pick = np.r_[: hand + k, hand + half : hand + half + k]
@@ -96,7 +96,7 @@ def leading(model: ReducedModel, k: int) -> ReducedModel:
                 X = np.asarray(X.take(pick, axis))
         parts[key] = X
     outputs = Outputs(model.outputs.C_z[:, pick], model.outputs.C_s, model.outputs.names)
-    return replace(model, N=len(pick), parts=parts, outputs=outputs, split=(2 * k,), lift=None)
+    return replace(model, N=len(pick), parts=parts, outputs=outputs, split=(2 * k,), reconstruction=None)
 
 
 def padded(x: Array, N: int, n_s: int) -> Array:

@@ -86,7 +86,7 @@ class Trainer:
 
     Args:
         model: the scene; ``reduction`` says how.
-        earlier: a model with lift, of the same :func:`train_key`, to go on from; None: none.
+        earlier: a model with reconstruction, of the same :func:`train_key`, to go on from; None: none.
 
     Raises:
         SceneError: the scene's own material lies outside the box, or its motions cannot be trained.
@@ -116,9 +116,9 @@ class Trainer:
         self.Phi = np.zeros((model.system.layout.n_local, 0))
         self._runs: dict[int, list[Array]] = {}
         self.full_runs, self.added = 0, list[int]()
-        if earlier is not None and earlier.fine.lift is not None:
+        if earlier is not None and earlier.fine.reconstruction is not None:
             hand = 2 * model.system.layout.n_s
-            self._append(earlier.fine.lift.L_q[:, hand : hand + earlier.k2])
+            self._append(earlier.fine.reconstruction.L_q[:, hand : hand + earlier.k2])
             for i in earlier.training["added"]:
                 self.add(i)
 

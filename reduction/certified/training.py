@@ -102,8 +102,8 @@ def certified_any(model: Model, rom: ReducedModel, **about: Any) -> CertifiedMod
         ModelError: the model holds no basis on the mesh, or its basis has no certificate.
     """
     columns = slice(2 * model.system.layout.n_s, None)
-    assert rom.lift is not None
-    L_q, L_v = (np.asfortranarray(L[:, columns]) for L in (rom.lift.L_q, rom.lift.L_v))
+    assert rom.reconstruction is not None
+    L_q, L_v = (np.asfortranarray(L[:, columns]) for L in (rom.reconstruction.L_q, rom.reconstruction.L_v))
     space = ResidualSpace(model.system, rom.materials)
     try:
         space.extend(L_q)

@@ -202,7 +202,7 @@ class StrainModel:
     tau: float = 0.0
     residual: float = 0.0
     error_galerkin: float = 0.0  # in z of the model with all cells, over the training runs
-    # layout, Phi: local rows of the lift (n_local, k), or None
+    # layout, Phi: local rows of the reconstruction (n_local, k), or None
     layout: BlockLayout | None = None
     Phi: Array | None = None
     scene_hash: str = ""  # of the scene it was made for
@@ -254,7 +254,7 @@ class StrainModel:
     def displacement(self, a: Array) -> Array:
         """Deformation z = Phi a, local rows (n_local, m), of coordinates (m, k).
 
-        Raises ModelError: the model was loaded without its lift.
+        Raises ModelError: the model was loaded without its reconstruction.
         """
         if self.Phi is None:
             raise ModelError("the model holds no basis on the mesh; load it with the layout of its mesh")

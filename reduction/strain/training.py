@@ -35,7 +35,7 @@ from softgrasp.reduction.bases.states import BasisError
 from softgrasp.reduction.errors import column_blocks, ratio
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import ReducedTrajectory
-from softgrasp.reduction.operators import Lift, layer_products, symmetric
+from softgrasp.reduction.operators import Reconstruction, layer_products, symmetric
 from softgrasp.reduction.parameters import thinned
 from softgrasp.reduction.projection import project_outputs
 from softgrasp.reduction.replay import FullRun
@@ -156,7 +156,7 @@ class Training:
         system, Phi = self.model.system, self.Phi
         comm, layout = system.layout.comm, system.layout
         K_mu, K_lambda = (symmetric(layer_products(system, key, Phi, Phi)[0]) for key in ("K_mu", "K_lambda"))
-        outputs = project_outputs(self.model.outputs, Lift(layout, Phi, Phi))
+        outputs = project_outputs(self.model.outputs, Reconstruction(layout, Phi, Phi))
         G, K_mu, K_lambda = comm.bcast((total(comm, Phi.T @ system.G), K_mu, K_lambda))
         count = comm.allreduce(int(self.cells.cell.max(initial=-1)) + 1)
         return StrainModel(

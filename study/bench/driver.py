@@ -53,8 +53,8 @@ def launch_worker(name: str, spec: Row, ranks: int) -> Row:
                 error = {"error": f"no result after {LIMIT:g} s"}
             elif status:
                 lines = output.strip().splitlines() or ["no output"]
-                said = next((line for line in lines if "Error: " in line and not line.startswith(" ")), lines[-1])
-                error = {"error": f"exit status {status}: {said}"}
+                last = next((line for line in lines if "Error: " in line and not line.startswith(" ")), lines[-1])
+                error = {"error": f"exit status {status}: {last}"}
         lines = file.read_text().splitlines() if file.is_file() else []
     return {"points": [json.loads(line) for line in lines], **error}
 

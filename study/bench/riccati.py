@@ -115,7 +115,7 @@ def measure(nx: int, beta: float, methods: Sequence[Method], repeats: int) -> It
     reference: Gain | None = None
     for name in methods:
         solved: list[RiccatiSolution] = []
-        solve = partial(lambda solver, to: to.append(solver.solve(problem)), make_solver(name), solved)
+        solve = partial(lambda name, to: to.append(make_solver(name).solve(problem)), name, solved)
         try:
             seconds = float(np.median(repeated(comm, solve, repeats, REPEAT_SECONDS)))
         except SoftgraspError as error:

@@ -15,7 +15,7 @@ from rich.progress import MofNCompleteColumn
 from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
-from softgrasp.fem.model.memory import free_bytes
+from softgrasp.fem.model.memory import free_bytes, size_text
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
@@ -130,8 +130,9 @@ def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, 
     needed = 2 * count * explanation.solver.factor_bytes
     if needed > 0.8 * free:
         raise ResourceError(
-            f"effects: {count} variants of the scene need about {needed:.3g} bytes at once and {free:.3g} are free; "
-            "judge the effects on a coarser mesh, e.g. --set tissue.cells"
+            f"effects: {count} variants of the scene need about {size_text(needed)} at once, where "
+            f"{size_text(0.8 * free)} may be taken; judge the effects on a coarser mesh, e.g. --set tissue.cells, "
+            "or allow more with --set output.memory=GIB"
         )
 
 

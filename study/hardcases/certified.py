@@ -104,11 +104,11 @@ def shares(exact: FullRun, model: CertifiedModel, run: CertifiedRun, coupled: bo
 
     ``ROUNDING`` of the largest norm of the solution is taken off the true error.
     """
-    system, s, lift, c = exact.model.system, exact.snapshots, model.fine.lift, run.certificate
-    if lift is None:
-        raise ValueError("the model has no lift")
+    system, s, reconstruction, c = exact.model.system, exact.snapshots, model.fine.reconstruction, run.certificate
+    if reconstruction is None:
+        raise ValueError("the model has no reconstruction")
     hand, size = 2 * system.layout.n_s, energy_norm(system, s.Z, s.v_s if coupled else None).max()
-    error = true_error(exact, run.trajectory, lift.L_q[:, hand : hand + model.k], coupled) - ROUNDING * size
+    error = true_error(exact, run.trajectory, reconstruction.L_q[:, hand : hand + model.k], coupled) - ROUNDING * size
 
     def share(bound: Array) -> float:
         shown = error > 0

@@ -85,7 +85,7 @@ def figure_move(
 
     Args:
         picture: the body.
-        states: absolute vertex displacements, shape (k, n, d) [m], as many as there are.
+        states: absolute vertex displacements, shape (k, n, d) [m], to choose from.
         times: instants of the states, shape (k,) [s].
         table: the whole hand motion, columns time and q_s, shape (steps, 1 + n_s) [s, m, rad].
         target: hand coordinates aimed at, d or n_s entries, or None.

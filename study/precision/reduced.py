@@ -111,8 +111,9 @@ def _timed_model(model: ReducedModel, point: Point, against: FullRun, probe: Pro
     with np.errstate(all="ignore"):  # an unstable model may overflow, and is marked
         step, drive = replay_inputs(model, small, against)
         move = run(step, allow_unstable=True, **drive)
-        lift = model.lift
-        C = probe.of_rows(comm, lift.L_q) if lift is not None else np.zeros((len(probe.weights), small.N))
+        reconstruction = model.reconstruction
+        rows = len(probe.weights), small.N
+        C = np.zeros(rows) if reconstruction is None else probe.of_rows(comm, reconstruction.L_q)
         own = move.x @ C.T
         y = own + move.q_s @ probe.C_s.T
         stamps = _steps(model, against) if small.stable else np.full(1, np.nan)

@@ -75,8 +75,8 @@ class ControlRuns:
     Questions that are named are answered at any size. Collective.
     """
 
-    def __init__(self, model: Model, points: Cache, named: Sequence[str] = ()) -> None:
-        self.model, self.cache, self.named = model, points, named
+    def __init__(self, model: Model, store: Cache, named: Sequence[str] = ()) -> None:
+        self.model, self.cache, self.named = model, store, named
         self.scene, self.layout = model.scene, model.system.layout
         self.repeats = self.scene.study.repeats
         self.large = self.layout.n_e > LARGE[self.layout.dimension]
@@ -266,17 +266,17 @@ def _orders(runs: ControlRuns, name: str) -> list[ReducedRiccatiPoint]:
 
 
 def _order(runs: ControlRuns, name: str, N: int, time_basis: float, before: float) -> ReducedRiccatiPoint:
-    """One reduced equation: cost of its gain, median seconds to solve it, and those to project and lift. Collective."""
+    """One reduced equation: cost of its gain, median seconds to solve it, and those of the rest. Collective."""
     report = with_time(runs.problem, runs.report(name, N))
-    seconds, lift, comm = float("inf"), 0.0, runs.layout.comm
+    seconds, rest, comm = float("inf"), 0.0, runs.layout.comm
     if report.matrices is not None:
         whole = timed(comm, lambda: reduce_riccati(runs.problem, runs.family(name).at(N)))
-        lift = max(whole - report.time_are, 0.0)  # the rest is solving
+        rest = max(whole - report.time_are, 0.0)  # project and reconstruct
         once = partial(solve_reduced, report.matrices)
         seconds = statistics.median(on_root(comm, lambda: repeated(MPI.COMM_SELF, once, runs.repeats, SMALL_SECONDS)))
     return ReducedRiccatiPoint(
         name, f"{BASIS_TITLES.get(name, name)}, N = {N}", seconds, report.error_K, report.stable, method=name,
-        time_lift=lift, time_basis=time_basis, scratch=seconds + lift + before,
+        time_lift=rest, time_basis=time_basis, scratch=seconds + rest + before,
         **report_dict(report),
     )  # fmt: skip
 

@@ -72,12 +72,12 @@ def run_query(
         why = "it is a folder" if out.is_dir() else f"there is no folder {out.parent}"
         raise SceneError(f"--csv {out}: {why}; name a file in a folder that is there")
     own = parse_settings(settings)
-    every = [own] if batch is None else [{**own, **row} for row in read_batch(batch)]
+    questions = [own] if batch is None else [{**own, **row} for row in read_batch(batch)]
     if not h5py.is_hdf5(path):
         what = "is no HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "is not there"
         raise SceneError(f"{path} {what}; name the certified model that softgrasp reduce SCENE --tolerance wrote")
     model = load_certified(path)
-    many = [materials_of(model, setting) for setting in every]
+    many = [materials_of(model, setting) for setting in questions]
     drive = drive_of(model, motion, dt)
     with agree(MPI.COMM_WORLD):
         if folder is not None and MPI.COMM_WORLD.rank == 0:

@@ -87,10 +87,11 @@ def check_box(model: Model, certified: CertifiedModel) -> BoxCheck | None:
 
     None where the bound is of tissue and hand together (a force on the hand, coupled both ways).
     """
-    drive, lift, box, layout = certified.drive, certified.fine.lift, certified.box, model.system.layout
-    if drive is None or lift is None or box is None or (certified.fine.two_way and drive.hand is None):
+    drive, reconstruction, box = certified.drive, certified.fine.reconstruction, certified.box
+    if drive is None or reconstruction is None or box is None or (certified.fine.two_way and drive.hand is None):
         return None
-    drive, comm, Phi = replace(drive, finer=None), layout.comm, lift.L_q[:, 2 * layout.n_s :]
+    layout = model.system.layout
+    drive, comm, Phi = replace(drive, finer=None), layout.comm, reconstruction.L_q[:, 2 * layout.n_s :]
     models = [certified.with_sizes(*sizes) for sizes in sizes_of(certified)]
     tests: list[list[Tested]] = [[] for _ in models]
     count = TESTS if layout.n_e < LARGE else FEWER
@@ -147,7 +148,7 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
     with watch.stage("tests"):
         check = check_box(model, certified)
     result = certify_result(model, certified, check, watch)
-    said = sentences(certified, check, result)
+    lines = sentences(certified, check, result)
 
     def page() -> Page:
         drawn: list[Path] = []
@@ -157,13 +158,13 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
             drawn = draw(session.out, certified, check, tolerance)
         greedy = greedy_table(certified)
         parts = [
-            Section("What holds", text="\n\n".join(said), figures=captioned(drawn, CAPTIONS)),
+            Section("What holds", text="\n\n".join(lines), figures=captioned(drawn, CAPTIONS)),
             greedy.section("Each round runs the full model where the proved bound was largest."),
         ]
         tables = {"greedy.csv": greedy} | ({} if check is None else {"tests.csv": tests_table(check)})
-        return Page(f"{scene.name}: certified reduced model", said[:3], parts, tables, [*drawn, file])
+        return Page(f"{scene.name}: certified reduced model", lines[:3], parts, tables, [*drawn, file])
 
-    for sentence in said:
+    for sentence in lines:
         console.print(sentence, markup=False)
     list_files(console, session.write(scene, result, page))
     return result
@@ -197,7 +198,7 @@ def _earlier(model: Model, file: Path) -> CertifiedModel | None:
         old = load_certified(file, model.system.layout)
     except ModelError:
         return None
-    return old if old.training.get("key") == train_key(model) and old.fine.lift is not None else None
+    return old if old.training.get("key") == train_key(model) and old.fine.reconstruction is not None else None
 
 
 def certify_result(model: Model, certified: CertifiedModel, check: BoxCheck | None, watch: Stopwatch) -> dict[str, Any]:

@@ -59,14 +59,14 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
         from softgrasp.study.reduce.strain_pictures import draw  # brings Matplotlib
 
         picture = gather_picture(model)
-    said = sentences(study)
+    lines = sentences(study)
     result = reduce_result(
         study.full,
         {
             "finite_strain": {f.key: _family(study, f) for f in study.families},
             "error_linear": study.linear,
             "reason_for_none": study.none,
-            "findings": said,
+            "findings": lines,
         },
         study.times.to_json() | watch.seconds,
     )
@@ -81,7 +81,7 @@ def run_strain(session: Session, scene: Scene) -> dict[str, Any]:
 
     for table in (error_table(study), time_table(study), cell_table(study)):
         session.console.print(table.terminal(wrap=(0,), width=session.console.width))
-    for sentence in said:
+    for sentence in lines:
         session.console.print(sentence, markup=False)
     list_files(session.console, session.write(scene, result, page))
     return result

@@ -86,9 +86,9 @@ def gather_views(model: Model, run: FullRun, sweeps: Sequence[MethodSweep]) -> V
 def _modes(model: Model, rom: ReducedModel) -> Array | None:
     """First displacement columns of a basis at the vertices, each with largest entry 1. Collective."""
     layout = model.system.layout
-    if rom.lift is None:
+    if rom.reconstruction is None:
         return None
-    Q = rom.lift.L_q[:, 2 * layout.n_s :]
+    Q = rom.reconstruction.L_q[:, 2 * layout.n_s :]
     largest = layout.comm.allreduce(np.abs(Q).max(axis=0, initial=0.0), np.maximum)
     kept = np.flatnonzero(largest > 1e-12 * largest.max(initial=0.0))[:MODES]
     shapes = vertex_displacement(model, Q[:, kept] / largest[kept], np.zeros((layout.n_s, len(kept))))

@@ -33,16 +33,21 @@ def child_environment() -> dict[str, str]:
 
 
 def run_limited(command: list[str], limit: float, environment: dict[str, str] | None = None) -> tuple[int | None, str]:
-    """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough."""
+    """Run a command and all its children for at most ``limit`` [s]; status None when that was not enough.
+
+    The children end with this program too: they do not hear Ctrl-C themselves.
+    """
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True, env=environment
     ) as process:
         try:
             output, _ = process.communicate(timeout=limit)
-        except subprocess.TimeoutExpired:
+        except BaseException as reason:
             os.killpg(process.pid, signal.SIGKILL)
             output, _ = process.communicate()
-            return None, output
+            if isinstance(reason, subprocess.TimeoutExpired):
+                return None, output
+            raise
     return process.returncode, output
 
 

@@ -53,13 +53,13 @@ def error_to(
     system: BlockSystem, full: Trajectory, certified: CertifiedModel, run: CertifiedRun, coupled: bool = False
 ) -> tuple[Array, float]:
     """Energy norm of the error of a run at every step, and the largest of the solution."""
-    n, x, lift = system.layout.n_local, run.trajectory.x.T, certified.fine.lift
+    n, x, reconstruction = system.layout.n_local, run.trajectory.x.T, certified.fine.reconstruction
     hand, k, k2 = 2 * system.layout.n_s, certified.k, certified.k2
     if certified.fine.structure == "second_order":
-        Phi = lift.L_q[:, hand : hand + k2][:, :k]
+        Phi = reconstruction.L_q[:, hand : hand + k2][:, :k]
         z, v = Phi @ x[hand : hand + k], Phi @ x[hand + k :]
     else:
-        z, v = lift.L_q @ x, lift.L_v @ x / certified.fine.at(system.materials).scale
+        z, v = reconstruction.L_q @ x, reconstruction.L_v @ x / certified.fine.at(system.materials).scale
     Z, V = full.snapshots.Z[:n], full.snapshots.Z[n:]
     pair = (full.v_s.T - run.trajectory.v_s.T, full.v_s.T) if coupled else (None, None)
     return energy_norm(system, Z - z, V - v, pair[0]), float(energy_norm(system, Z, V, pair[1]).max())

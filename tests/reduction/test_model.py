@@ -362,6 +362,6 @@ def test_three_dimensions(comm: MPI.Intracomm) -> None:
 
 def test_model_without_lift_cannot_return_to_the_mesh(comm: MPI.Intracomm) -> None:
     model = model_of(comm, TINY)
-    rom: ReducedModel = replace(reduced(model, some_basis(model, "qv", "absolute", True)), lift=None)
+    rom: ReducedModel = replace(reduced(model, some_basis(model, "qv", "absolute", True)), reconstruction=None)
     with pytest.raises(ModelError, match="no basis on the mesh"):
         rom.reconstruct(rom.at(), np.zeros((rom.N, 1)))

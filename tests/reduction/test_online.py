@@ -256,7 +256,7 @@ def test_file_keeps_everything(comm: MPI.Intracomm, mpi_tmp_path: Path) -> None:
             assert (other.at().operators.A == rom.at().operators.A).all()
             assert (other.at().f == rom.at().f).all()
             assert other.outputs.names == rom.outputs.names
-        assert online.lift is None
+        assert online.reconstruction is None
         x = np.cos(np.arange(rom.N))[:, None]
         z, v = rom.reconstruct(rom.at(), x)
         for mine, theirs in zip((z, v), again.reconstruct(again.at(), x), strict=True):

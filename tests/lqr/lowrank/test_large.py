@@ -21,7 +21,7 @@ from softgrasp.lqr.lowrank.galerkin import StructuredGalerkin
 from softgrasp.lqr.lowrank.newton import Iteration, NewtonADI, load_state
 from softgrasp.lqr.lowrank.plant import Plant
 from softgrasp.lqr.lowrank.radi import RADI
-from softgrasp.lqr.lowrank.shifted import factor_bytes, make_shifted
+from softgrasp.lqr.lowrank.shifted import make_shifted, shifted_factor_bytes
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.riccati import choose, solve
 from tests.helpers.models import make_scene
@@ -163,7 +163,7 @@ def test_large_undamped_scene_is_diagnosed_not_refused_for_its_size() -> None:
 
 def test_factor_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = problem_of("cube")
-    needed = factor_bytes(problem.layout.n_e, 3)
+    needed = shifted_factor_bytes(problem.layout.n_e, 3)
     for free, fits in ((1.01 * needed, True), (0.99 * needed, False)):
         monkeypatch.setattr("psutil.virtual_memory", lambda free=free: SimpleNamespace(available=free))
         if fits:

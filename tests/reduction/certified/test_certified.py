@@ -202,7 +202,7 @@ def test_the_bound_holds_at_every_step(comm: MPI.Intracomm, name: str) -> None:
         for sizes in ((4, 10), (2, 4), (1, 1)):
             part = replace(certified.with_sizes(*sizes), fine=certified.with_sizes(*sizes).fine)
             run = part.run(materials, allow=True)
-            error, size = error_to(system, full, _lifted(part, certified), run)
+            error, size = error_to(system, full, _reconstructible(part, certified), run)
             assert holds(run.certificate.energy.values, error, size), (lam, mu, sizes)
             off = np.abs(full.outputs - run.trajectory.outputs)
             assert (run.certificate.outputs.values >= off - ROUNDING * np.abs(full.outputs).max()).all()
@@ -224,9 +224,9 @@ def test_one_rank_and_all_say_the_same(comm: MPI.Intracomm, force: dict[str, Any
     assert np.abs(values[0] - values[1]).max() <= 1e-10 * np.abs(values[0]).max()
 
 
-def _lifted(part: Any, whole: Any) -> Any:
-    """A smaller model with the lift of the whole, which error_to takes its modes from."""
-    return replace(part, fine=replace(part.fine, lift=whole.fine.lift))
+def _reconstructible(part: Any, whole: Any) -> Any:
+    """A smaller model with the reconstruction of the whole, which error_to takes its modes from."""
+    return replace(part, fine=replace(part.fine, reconstruction=whole.fine.reconstruction))
 
 
 @pytest.mark.ranks
@@ -267,7 +267,7 @@ def test_the_static_bound_is_far_below_the_textbooks(comm: MPI.Intracomm) -> Non
     certified = ritz(model, 12, 12)
     run = certified.run(allow=True)
     system, full = full_at(model, certified.fine.materials)
-    x, Phi, drive = run.trajectory.x.T, certified.fine.lift.L_q[:, 4:16], certified.drive
+    x, Phi, drive = run.trajectory.x.T, certified.fine.reconstruction.L_q[:, 4:16], certified.drive
     c = np.diff(drive.hand[1], axis=0).T / drive.dt
     textbook = mass_bound(system, Phi, x[4:16], x[16:], c, drive.dt)
     error, size = error_to(system, full, certified, run)

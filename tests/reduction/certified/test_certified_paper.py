@@ -93,7 +93,8 @@ def compared(
     system: BlockSystem, full: Trajectory, whole: CertifiedModel, own: CertifiedModel, run: CertifiedRun, where: object
 ) -> tuple[float, float, float]:
     """True and proved error over the solution, and their ratio; asserts the bound at every step."""
-    error, scale = error_to(system, full, replace(own, fine=replace(own.fine, lift=whole.fine.lift)), run)
+    on_mesh = replace(own, fine=replace(own.fine, reconstruction=whole.fine.reconstruction))
+    error, scale = error_to(system, full, on_mesh, run)
     bound = run.certificate.energy.values
     assert (bound >= error - ROUNDING * scale).all(), where
     assert run.certificate.reduction >= error.max() / scale - ROUNDING, where
@@ -167,7 +168,8 @@ def test_one_rank_and_two_say_the_same(damping: str, mpi_tmp_path: Path) -> None
     save_certified(whole, mpi_tmp_path / "model.h5")
     alone = build(model.scene, comm=MPI.COMM_SELF)
     hand = 2 * alone.system.layout.n_s
-    Phi = load_certified(mpi_tmp_path / "model.h5", alone.system.layout).fine.lift.L_q[:, hand : hand + whole.k2]
+    fine = load_certified(mpi_tmp_path / "model.h5", alone.system.layout).fine
+    Phi = fine.reconstruction.L_q[:, hand : hand + whole.k2]
     space = ResidualSpace(alone.system, whole.norms.reference)
     space.extend(Phi)
     own = certified_model(alone, Phi, space=space)

@@ -8,6 +8,7 @@ import io
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from mpi4py import MPI
 from rich.console import Console
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import SolverError
+from softgrasp.fem.errors import ResourceError, SolverError
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
 from softgrasp.fem.petsc import PETSc
@@ -36,7 +37,7 @@ from softgrasp.study.effects.measure import (
 )
 from softgrasp.study.effects.page import show
 from softgrasp.study.effects.result import Change, EffectResult, EffectsStudy
-from softgrasp.study.effects.run import run_effects, study_effects
+from softgrasp.study.effects.run import check_variants, run_effects, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
 from softgrasp.study.effects.verdict import (
     Displacements,
@@ -86,6 +87,12 @@ def measured(model: Any) -> MeasuredScene:
 
 
 # --- scenes that are set wrong
+
+
+def test_variants_that_do_not_fit_are_refused_with_the_limit_of_the_scene(comm: MPI.Intracomm) -> None:
+    explanation: Any = SimpleNamespace(solver=SimpleNamespace(factor_bytes=2.0**30))
+    with pytest.raises(ResourceError, match=r"10.* GiB at once, where 2.* GiB may be taken; .* output.memory=GIB"):
+        check_variants(make_scene(output={"memory": 2.5}), comm, explanation, 5)
 
 
 def test_damping_without_effect_is_wasted(comm: MPI.Intracomm) -> None:

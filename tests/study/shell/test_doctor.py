@@ -2,10 +2,14 @@ from __future__ import annotations
 
 import io
 import os
+import signal
+import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 from rich.console import Console
 
@@ -146,3 +150,23 @@ def test_show_tells_the_cure_and_whether_all_is_well(monkeypatch: pytest.MonkeyP
     assert "value [1]" in out.getvalue()
     assert ("softgrasp[solver]" in out.getvalue()) is not ok
     assert os.linesep in out.getvalue()
+
+
+def test_an_interrupted_program_takes_its_children_along(tmp_path: Path) -> None:
+    """Ctrl-C reaches the program alone: what it started has a session of its own."""
+    note = tmp_path / "child"
+    shell = f"sleep 60 & echo $! > {note}.part; mv {note}.part {note}; wait"
+    text = f"from softgrasp.study.shell.processes import run_limited; run_limited(['sh', '-c', {shell!r}], 50)"
+    with subprocess.Popen([sys.executable, "-c", text], env=processes.child_environment()) as program:
+        wait_for(note.exists)
+        program.send_signal(signal.SIGINT)
+        assert program.wait(10) != 0
+    child = int(note.read_text())
+    wait_for(lambda: not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE)
+
+
+def wait_for(what: Callable[[], bool]) -> None:
+    end = time.monotonic() + 10
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.02)
