@@ -24,7 +24,7 @@ from softgrasp.study.report.page import Section, write_report
 
 Row = tuple[str, str, str, str, str]
 HEADER = ("quantity", "paper", "here", "verdict", "why different")
-REPRODUCED, BETTER, DIFFERS, NOT_TOLD = "reproduced", "better", "differs", ""
+REPRODUCED, BETTER, DIFFERS, UNKNOWN = "reproduced", "better", "differs", ""
 NEAR = 0.05  # [m] of a way of 5.8: within 1 %
 N_FORWARD, N_RICCATI, N_FLAT = 14, 8, 25  # the paper's examples, and where its errors fall no more
 OF_PAPER = ("global_pod", "componentwise_pod", "pod_fixed", "componentwise_pod_fixed", "psd", "psd_fixed")
@@ -102,8 +102,8 @@ def mesh_rows(forward: dict[str, Any], accurate: dict[str, Any]) -> list[Row]:
     ]  # fmt: skip
     zone, cells = "the contact zone ends within two sides", "quadratic cells that shrink towards these ends"
     return [
-        ("error of the deformation through the mesh", "not told", here[0], NOT_TOLD, zone),
-        ("the same, scene paper_accurate", "-", here[1], NOT_TOLD, cells),
+        ("error of the deformation through the mesh", "not told", here[0], UNKNOWN, zone),
+        ("the same, scene paper_accurate", "-", here[1], UNKNOWN, cells),
     ]
 
 
@@ -140,7 +140,7 @@ def _method_rows(points: dict[str, Any], about: dict[str, Any], paper: list[str]
     stable = [about[name]["title"] for name, rows in points.items() if all(p["stable"] for p in rows)]
     energies = "; ".join(f"{about[name]['title']}: {about[name]['N_energy']}" for name in paper)
     return [
-        ("N for 99.9 % of the energy", "used, not told", energies, NOT_TOLD, "of the snapshots of each method"),
+        ("N for 99.9 % of the energy", "used, not told", energies, UNKNOWN, "of the snapshots of each method"),
         _best(points, about, paper),
         _structure(points, paper),
         _flat(points["psd"]),
@@ -148,7 +148,7 @@ def _method_rows(points: dict[str, Any], about: dict[str, Any], paper: list[str]
             "stable at every N tried",
             "not told",
             "; ".join(stable),
-            NOT_TOLD,
+            UNKNOWN,
             "spectral abscissa of every reduced model",
         ),
     ]
@@ -215,14 +215,14 @@ def control_rows(control: dict[str, Any]) -> list[Row]:
         named = run["method"] == "pod"
         end = run["reason"] or f"{digits(run['distance_final'])} m off, excess cost {digits(run['cost'] / best - 1)}"
         name = f"target reached, {TITLES[run['method']]}, N = {run['N']}"
-        same = verdict(not run["reason"]) if named else NOT_TOLD
+        same = verdict(not run["reason"]) if named else UNKNOWN
         rows.append((name, "yes, N not told" if named else "not shown", end, same, "the stable gain of least cost"))
     for name, points in reduced.items():
         p, five = at(points, N_RICCATI), name in (*FREE, *FIXED)
         paper = "0.053 s" if name == "pod" else "0.051 to 0.057 s" if five else "not in the paper"
         here = f"{digits(p['time_are'], ' s')}; error of P {digits(p['error_P'])}, of K {digits(p['error_K'])}, "
         here += "stable" if p["stable"] else "not stable"
-        same = less(p["time_are"], 0.051) if five else NOT_TOLD
+        same = less(p["time_are"], 0.051) if five else UNKNOWN
         why = "a direct solver for the small equation; damping and hand mass are chosen here"
         rows.append((f"{TITLES[name]}, N = {p['N']}", paper, here, same, why))
     return [*rows, _small(reduced)]

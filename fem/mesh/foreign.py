@@ -69,13 +69,13 @@ def read_foreign(path: Path, limit: float | None = None) -> meshio.Mesh:
 
 
 def _read(path: str, kind: str | None) -> meshio.Mesh:
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
         # meshio prints its complaints and may end the process; one sentence is enough.
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             return meshio.read(path, kind)
     except (Exception, SystemExit) as error:
-        reason = " ".join(f"{error if not isinstance(error, SystemExit) else ''} {said.getvalue()}".split())
+        reason = " ".join(f"{error if not isinstance(error, SystemExit) else ''} {printed.getvalue()}".split())
         raise ValueError(reason or type(error).__name__) from error
 
 

@@ -31,7 +31,7 @@ EngineName = Literal["tsqr", "svd", "gram"]
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 EPS = float(np.finfo(float).eps)
 # sqrt(eps) is where eigenvalues of X'X drown; 4 keeps U = X V / s well enough conditioned for one repair step
-GRAM_FLOOR = 4 * EPS**0.5
+GRAM_LIMIT = 4 * EPS**0.5
 BLOCK_ROWS = 20_000  # rows of one LAPACK QR: fits the cache better than one tall one
 SVD_PREFIX = "softgrasp_svd_"
 SVD_TOLERANCE = 1e-13
@@ -78,7 +78,7 @@ def factor(comm: MPI.Intracomm, X: Array, engine: EngineName = "tsqr", k: int | 
         raise BasisError("all snapshots are zero; there is nothing to build a basis from")
     rows = int(comm.allreduce(X.shape[0]))
     if engine == "gram":
-        Q, R, noise = *_gram(comm, X, k), GRAM_FLOOR
+        Q, R, noise = *_gram(comm, X, k), GRAM_LIMIT
     else:
         # LAPACK's own bound on an absolute error in sigma, with its usual factor sqrt of the size
         noise = EPS * max(X.shape[1], 100) ** 0.5
@@ -189,7 +189,7 @@ def _gram(comm: MPI.Intracomm, X: Array, k: int | None) -> tuple[Array, Array]:
     C = total(comm, X.T @ X)
     s2, V = on_root(comm, lambda: scipy.linalg.eigh(C))
     s, V = np.sqrt(np.maximum(s2[::-1], 0.0)), V[:, ::-1]
-    keep = s > GRAM_FLOOR * s[0]
+    keep = s > GRAM_LIMIT * s[0]
     if k is not None:
         keep[k + k // 2 + 10 :] = False  # the last of those kept are not converged by the Rayleigh-Ritz step
     U = X @ (V[:, keep] / s[keep])

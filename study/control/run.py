@@ -197,10 +197,10 @@ def counted(bar: Progress, text: str) -> Callable[[int, int], None]:
     return note
 
 
-def show(console: Console, study: GainStudy, seconds: dict[str, float], said: str) -> None:
-    """Notes but the one that was ``said`` at the start, summary, and the reduced gains."""
+def show(console: Console, study: GainStudy, seconds: dict[str, float], printed: str) -> None:
+    """Notes but the one that was ``printed`` at the start, summary, and the reduced gains."""
     if isinstance(study, ControlStudy):
-        for sentence in (*study.findings, *(note for note in study.notes if note != said)):
+        for sentence in (*study.findings, *(note for note in study.notes if note != printed)):
             console.print(f"note: {sentence}", soft_wrap=True, markup=False)
     console.print(pairs(report.result_rows(study, seconds)))
     if isinstance(study, ControlStudy) and study.bases:

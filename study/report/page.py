@@ -113,14 +113,14 @@ def write_report(
         TEMPLATE.read_text(encoding="utf-8")
     )
     prepared = [_prepared(section) for section in given]
-    told = " ".join((*summary, *(part for s in prepared for part in (s["title"], *s["paragraphs"], *s["header"]))))
-    told += " ".join(str(row[0]) for s in prepared for row in s["rows"])
+    text = " ".join((*summary, *(part for s in prepared for part in (s["title"], *s["paragraphs"], *s["header"]))))
+    text += " ".join(str(row[0]) for s in prepared for row in s["rows"])
     html = page.render(
         title=title,
         subtitle=subtitle,
         summary=summary,
         sections=prepared,
-        words=words_of(told),
+        words=words_of(text),
         files=[file.relative_to(path.parent).as_posix() for file in files if file.is_relative_to(path.parent)],
         scene="" if scene is None else resolved_toml(scene).strip(),
         reproduce=reproduce.strip(),
