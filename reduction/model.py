@@ -164,7 +164,7 @@ class ReducedModel:
     parts: Parts  # small matrices, the same bits on every rank
     materials: tuple[LayerMaterial, ...]  # those of the projection
     outputs: Outputs  # of the scene
-    split: tuple[int, ...] = ()  # columns of every part of the basis, as in its ``split``
+    split: tuple[int, ...] = ()  # columns of every part of the decomposition, see ``Basis.split``
     alpha: float = 0.0  # mass-proportional damping [1/s]
     in_space: bool = False  # alpha drags the rigid motion too
     damped: bool = False  # damping terms were projected

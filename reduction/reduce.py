@@ -79,9 +79,9 @@ def reduce(
         return reduce_linear(model, fulls, method or "psd_fixed", N, inner, engine)
     from softgrasp.reduction.strain.training import train
 
-    if method is not None or inner is not None or not isinstance(N, int):
+    if method is not None or inner is not None or engine != "tsqr" or not isinstance(N, int):
         raise ReductionError(
-            f"scene {model.scene.name} has effects.finite_strain, whose models have one basis; give N and no method"
+            f"scene {model.scene.name} has effects.finite_strain, whose models have one basis; give N alone"
         )
     return train(model, fulls, N).reduce(N)
 

@@ -90,12 +90,9 @@ def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots
     """
     v, dt = trajectory.v_s, trajectory.times[1] - trajectory.times[0]
     a = np.diff(v, axis=0) / dt
-    u = a @ system.M_hand.T
-    g = np.zeros(len(system.M_hand)) if system.gravity is None else system.gravity
-    if system.hand_weight:
-        u -= system.M_hand @ g
+    u = a @ system.M_hand.T - system.weight
     if system.two_way:
-        alpha = system.damping.alpha if system.damping.in_space else 0.0
+        g, alpha = system.fall, system.damping.drag
         momentum = total(system.layout.comm, system.G.T @ snapshots.Z[system.layout.n_local :]).T
         u += (a + alpha * (v[1:] + v[:-1]) / 2 - g) @ system.M_rigid.T
         u += np.diff(momentum, axis=0) / dt + alpha * (momentum[1:] + momentum[:-1]) / 2

@@ -23,7 +23,7 @@ import scipy.linalg
 from mpi4py import MPI
 from slepc4py import SLEPc
 
-from softgrasp.fem.errors import SolverError
+from softgrasp.fem.errors import SolverError, agree
 from softgrasp.fem.petsc import Array, PETSc, on_root, total
 from softgrasp.reduction.bases.states import BasisError
 
@@ -162,10 +162,12 @@ def _flat(comm: MPI.Intracomm, X: Array) -> tuple[Array, Array]:
     Q_local, R_local = np.linalg.qr(X)
     if comm.size == 1:
         return np.asfortranarray(Q_local), R_local
-    parts = comm.gather(R_local)
-    Q, R = on_root(comm, lambda: np.linalg.qr(np.vstack(parts or [])))
-    first = comm.exscan(len(R_local)) or 0
-    return np.asfortranarray(Q_local @ Q[first : first + len(R_local)]), R
+    parts, blocks, R = comm.gather(R_local), None, None
+    with agree(comm):
+        if parts is not None:
+            Q, R = np.linalg.qr(np.vstack(parts))
+            blocks = np.split(Q, np.cumsum([len(part) for part in parts])[:-1])
+    return np.asfortranarray(Q_local @ comm.scatter(blocks)), np.asarray(comm.bcast(R))
 
 
 def triangle(comm: MPI.Intracomm, X: Array, top: Array | None = None) -> Array:

@@ -170,8 +170,10 @@ def test_a_file_brings_the_lift_back_on_any_rank_count(trained: Training, tmp_pa
 
 @pytest.mark.serial
 def test_what_does_not_fit_is_refused(own: FullRun, trained: Training) -> None:
-    with pytest.raises(ReductionError, match="one basis; give N and no method"):
+    with pytest.raises(ReductionError, match="one basis; give N alone"):
         reduce(own.model, own, "psd")
+    with pytest.raises(ReductionError, match="one basis; give N alone"):
+        reduce(own.model, own, engine="svd")
     with pytest.raises(ReductionError, match=r"softgrasp.reduce\(model, runs, N=N\)"):
         reduce_linear(own.model, [own])
     linear = built(*SMALL[:2])

@@ -156,7 +156,8 @@ def test_an_interrupted_program_takes_its_children_along(tmp_path: Path) -> None
     """Ctrl-C reaches the program alone: what it started has a session of its own."""
     note = tmp_path / "child"
     shell = f"sleep 60 & echo $! > {note}.part; mv {note}.part {note}; wait"
-    text = f"from softgrasp.study.shell.processes import run_limited; run_limited(['sh', '-c', {shell!r}], 50)"
+    text = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which jobs of a shell ignore
+    text += f"from softgrasp.study.shell.processes import run_limited; run_limited(['sh', '-c', {shell!r}], 50)"
     with subprocess.Popen([sys.executable, "-c", text], env=processes.child_environment()) as program:
         wait_for(note.exists)
         program.send_signal(signal.SIGINT)
