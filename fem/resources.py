@@ -17,18 +17,29 @@ CONTAINER = Path("/sys/fs/cgroup")
 
 
 def free_memory() -> int:
-    """Memory that is free on this node, or that its container leaves, at least 1 [byte]."""
+    """Memory that is free on this node, or that its container leaves, at least 1 [byte].
+
+    Contents of files that the system gives back when memory is short count as free.
+    """
     free = int(psutil.virtual_memory().available)
-    for limit, used in (
-        ("memory.max", "memory.current"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    for limit, used, table, key in (
+        ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
     ):
         try:
             most, taken = (int((CONTAINER / name).read_text()) for name in (limit, used))
         except (OSError, ValueError):
             continue
-        free = min(free, max(most - taken, 1))
+        free = min(free, max(most - taken + _entry(CONTAINER / table, key), 1))
     return free
+
+
+def _entry(table: Path, key: str) -> int:
+    """The number behind a word in a table of lines "word number"; 0 without one."""
+    try:
+        return next((int(number) for word, number in map(str.split, table.read_text().splitlines()) if word == key), 0)
+    except (OSError, ValueError):
+        return 0
 
 
 def check_room(comm: MPI.Intracomm, files: Sequence[Path], needed: int, reserve: int = 0) -> None:

@@ -84,7 +84,7 @@ class RetunedGain(GainQuality):
     """The gain at one setting of the box, against the full Riccati solution there."""
 
     materials: Materials  # of all layers
-    seconds: float = NAN  # of the re-tuning, for who measures it
+    seconds: float = NAN  # of the re-tuning; nan unless the caller measures it
 
 
 def retuned_gain(retuner: Retuner, materials: Materials, gain_check: Callable[[], GainCheck]) -> RetunedGain:

@@ -177,7 +177,7 @@ class GainCheck:
     def quality(self, gain: Gain) -> LoopQuality:
         """Abscissa, excess cost and sampled radius of any gain. Collective.
 
-        Small plants take all modes. Large ones take the abscissa from
+        Plants of no more modes than ``loop`` keeps take all. Larger ones take the abscissa from
         :func:`softgrasp.lqr.spectrum.certificate.abscissa` and the cost from the lowest modes; where
         the certificate fails, all modes are taken up to :data:`softgrasp.lqr.spectrum.modal_loop.DENSE_LIMIT`.
 

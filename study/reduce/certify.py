@@ -281,10 +281,11 @@ def sentences(certified: CertifiedModel, check: BoxCheck | None, result: dict[st
         lines.append(f"Of the random parameters {added} had a larger bound than the grid and were trained on too.")
     if "validation" in about:
         v = Validation(**about["validation"])
-        lines.append(
-            f"In {v.n} random full runs the error was at most {v.factor:.3g} times the estimate; with 95 % confidence "
-            f"it is larger on at most {v.share:.1%} of the box."
-        )
+        if v.factor is not None:  # null in result.json where there is no estimate
+            lines.append(
+                f"In {v.n} random full runs the error was at most {v.factor:.3g} times the estimate; with 95 % "
+                f"confidence it is larger on at most {v.share:.1%} of the box."
+            )
     query, full = time["query"], time["full"]
     lines += [
         f"At the scene's own material: {about['own']['sentence']}.",
