@@ -11,8 +11,9 @@ from scipy.interpolate import CubicSpline
 
 from softgrasp.fem.columns import hand_columns
 from softgrasp.fem.errors import SceneError, SolverError
-from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState
+from softgrasp.fem.petsc import Array
+from softgrasp.fem.run.hand import HandStep
+from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.scene.text import read_table
 from softgrasp.fem.system import BlockSystem
@@ -176,44 +177,17 @@ class TableDrive:
 
 
 class ForceDrive:
-    """Hand driven by a force; with two-way coupling the Schur complement of the tissue acts on it.
-
-    Two-way, with x = S^{-1}(h), Y = S^{-1} G, c = kappa a + alpha v - g and kappa = 1 + alpha dt/2 (alpha = 0 unless
-    damping drags in space), w = x - Y c and
-
-        (M_hand + kappa (M_rigid - theta G'Y)) a = u + weight - M_rigid c_0 - G'(theta (x - Y c_0) - s v),
-
-    c_0 = alpha v - g, theta = s^2 + alpha s. With finite strain w is no linear function of c; the hand's equation
-    M_hand a + M_rigid c = u + weight - G'(theta w - s v) then turns the load of the tissue into -G c = G (c_1 + C G'w)
-    with C = kappa theta (M_hand + kappa M_rigid)^-1, and the tissue's step is solved under it.
-
-    Making one is collective.
-    """
+    """Hand driven by a force, see :class:`softgrasp.fem.run.hand.HandStep`. Making one is collective."""
 
     def __init__(
         self, system: BlockSystem, force: Force, midpoint: TissueMidpoint, steps: int, q0: Array, v0: Array
     ) -> None:
         n_s = system.layout.n_s
-        self.system, self.dt = system, midpoint.dt
+        self.system, self.dt, self.step = system, midpoint.dt, HandStep(system, midpoint)
         self.force: Force = self._checked(force)
         self.q, self.v, self.c = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
         self.u = np.zeros((steps, n_s))
         self.q[0], self.v[0] = q0, v0
-        self.g, self.weight, self.alpha = system.fall, system.weight, system.damping.drag
-        self.kappa = 1 + self.alpha * self.dt / 2
-        s = midpoint.s
-        self.theta = s * s + self.alpha * s
-        inertia, finite = system.M_hand, system.two_way and system.points is not None
-        if system.two_way:
-            Y = midpoint.make_responses()  # which the midpoint keeps: corrections of finite strain need it
-            GY = total(system.layout.comm, system.G.T @ Y)
-            self.GY = (GY + GY.T) / 2
-            inertia = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
-        if finite:
-            inertia = system.M_hand + self.kappa * system.M_rigid
-        self.inverse = np.linalg.inv(inertia)
-        # chosen once, not in every step
-        self.solve = self._finite if finite else self._two_way if system.two_way else self._one_way
 
     def _checked(self, force: Force) -> Force:
         """The force, with a look at the shape of its first value."""
@@ -228,9 +202,14 @@ class ForceDrive:
 
         return first
 
-    def _applied(self, n: int) -> Array:
-        self.u[n] = self.force(n, (n + 0.5) * self.dt, self.q[n], self.v[n])
-        return np.asarray(self.u[n])
+    def solve(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
+        """One step of tissue and hand. Collective."""
+        v = self.v[n]
+        self.u[n] = self.force(n, (n + 0.5) * self.dt, self.q[n], v)
+        a = self.step.push(v, self.u[n], state)
+        self.c[n] = midpoint.c
+        self.v[n + 1] = v + self.dt * a
+        self.q[n + 1] = self.q[n] + self.dt * (v + self.v[n + 1]) / 2
 
     def check(self, begin: int, end: int) -> None:
         """Look at the forces taken in these steps, once a segment: a step spends nothing on it.
@@ -244,46 +223,6 @@ class ForceDrive:
                 f"the force on the hand is {self.u[n, j]} in {axis} in step {n + 1}, at t = {(n + 0.5) * self.dt:.6g} "
                 "s; it must be finite"
             )
-
-    def _one_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
-        """One solve. Collective."""
-        v = self.v[n]
-        a = self.inverse @ (self._applied(n) + self.weight)
-        self.c[n] = -(self.kappa * a + self.alpha * v - self.g)
-        midpoint.solve_midpoint(self.c[n])
-        self._move(n, a)
-
-    def _two_way(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
-        """One solve and one small reduction. Collective."""
-        v = self.v[n]
-        u = self._applied(n) + self.weight
-        c0 = self.alpha * v - self.g
-        G, layout = self.system.G, self.system.layout
-        x = midpoint.respond()
-        relative = self.theta * x - midpoint.s * state.array[layout.n_local :]
-        pull = total(layout.comm, G.T @ relative) - self.theta * (self.GY @ c0)
-        a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
-        c = self.kappa * a + c0
-        self.c[n] = -c
-        midpoint.accelerate(c)
-        self._move(n, a)
-
-    def _finite(self, n: int, midpoint: TissueMidpoint, state: TissueState) -> None:
-        """The same with finite strain: the hand's equation is part of the tissue's. Collective."""
-        v, layout = self.v[n], self.system.layout
-        u = self._applied(n) + self.weight
-        c0 = self.alpha * v - self.g
-        pull = -midpoint.s * total(layout.comm, self.system.G.T @ state.array[layout.n_local :])
-        a = self.inverse @ (u - self.system.M_rigid @ c0 - pull)
-        feedback = Feedback(self.kappa * self.theta * self.inverse, midpoint.G, np.array(midpoint.s**2 / self.theta))
-        midpoint.solve_midpoint(-(self.kappa * a + c0), feedback)
-        self.c[n] = midpoint.c
-        self._move(n, -(midpoint.c + c0) / self.kappa)
-
-    def _move(self, n: int, a: Array) -> None:
-        v = self.v[n]
-        self.v[n + 1] = v + self.dt * a
-        self.q[n + 1] = self.q[n] + self.dt * (v + self.v[n + 1]) / 2
 
 
 def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float) -> Array:

@@ -3,59 +3,22 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
 
 from softgrasp.fem.petsc import Array, total
-from softgrasp.fem.run.midpoint import Feedback, TissueMidpoint, TissueState
-from softgrasp.fem.system import BlockSystem
+from softgrasp.fem.run.hand import HandStep
+from softgrasp.fem.run.midpoint import Feedback, TissueState
 from softgrasp.lqr.loop.actuation import Actuation, ImplicitInput
 from softgrasp.lqr.plant.gain import Gain
 from softgrasp.lqr.plant.target import Target
 
 
-class PlantStep:
-    """What every gain shares: factor of S, responses Y = S^{-1} G and the hand seen through them.
-
-    With x = S^{-1} h, c = kappa a + c_0, c_0 = alpha v - g and kappa = 1 + alpha dt/2 (alpha = 0 unless damping drags
-    in space) the tissue moves by w = x - Y c in half a step, and the hand by
-
-        L a = u + f,   L = M_hand [+ kappa (M_rigid - theta G'Y)],
-        f = weight [- M_rigid c_0 - G'(theta (x - Y c_0) - s v_z)],   theta = s^2 + alpha s
-
-    ([...] two-way only). No matrix of the closed loop is ever factored. Making one is collective.
-
-    ``midpoint``: factored step, before its start: its vectors are used as scratch.
-    """
-
-    def __init__(self, system: BlockSystem, midpoint: TissueMidpoint) -> None:
-        self.system, self.midpoint = system, midpoint
-        self.comm, self.dt, self.s = system.layout.comm, midpoint.dt, midpoint.s
-        n_s = system.layout.n_s
-        self.g, self.weight, self.alpha = system.fall, system.weight, system.damping.drag
-        self.kappa = 1 + self.alpha * self.dt / 2
-        self.theta = self.s**2 + self.alpha * self.s
-        self.Y = midpoint.make_responses()
-        self.GY = np.zeros((n_s, n_s))
-        self.L = system.M_hand
-        if system.two_way:
-            GY = total(self.comm, system.G.T @ self.Y)
-            self.GY = (GY + GY.T) / 2
-            self.L = system.M_hand + self.kappa * (system.M_rigid - self.theta * self.GY)
-        self.inverse = np.linalg.inv(self.L)
-
-    @cached_property
-    def finite(self) -> FiniteStep:
-        """The step of a pushed hand that feels a tissue of finite strain, made at its first use. Collective then."""
-        return FiniteStep(self, None)
-
-
 class LoopDrive(ABC):
     """Solves one step for hand and tissue; ``q``, ``v`` and ``u`` are the histories."""
 
-    def __init__(self, plant: PlantStep, steps: int) -> None:
+    def __init__(self, plant: HandStep, steps: int) -> None:
         self.plant, n_s = plant, plant.system.layout.n_s
         self.q, self.v, self.u = np.zeros((steps + 1, n_s)), np.zeros((steps + 1, n_s)), np.zeros((steps, n_s))
 
@@ -76,26 +39,13 @@ class LoopDrive(ABC):
 
     def push(self, n: int, u: Array, state: TissueState) -> None:
         """One step of hand and tissue under an input that is known before it. Collective."""
-        plant, midpoint, system = self.plant, self.plant.midpoint, self.plant.system
-        c_0 = plant.alpha * self.v[n] - plant.g
-        if system.two_way and system.points is not None:
-            self.move(n, u, plant.finite.respond(self.v[n], u, np.zeros(len(u), dtype=bool), state)[0])
-            return
-        if not system.two_way:
-            a = plant.inverse @ (u + plant.weight)
-            midpoint.solve_midpoint(-(plant.kappa * a + c_0))
-            self.move(n, u, a)
-            return
-        x = midpoint.respond()
-        relative = plant.theta * x - plant.s * state.array[system.layout.n_local :]
-        pull = total(plant.comm, system.G.T @ relative) - plant.theta * (plant.GY @ c_0)
-        self.finish(n, u, plant.inverse @ (u + plant.weight - system.M_rigid @ c_0 - pull))
+        self.move(n, u, self.plant.push(self.v[n], u, state))
 
 
 class GainDrive(LoopDrive):
     """The input is u_bar + K (x - x_bar) = offset + K x, with or without limits. Making one is collective."""
 
-    def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
+    def __init__(self, plant: HandStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, steps)
         self.gain, n_s = gain, plant.system.layout.n_s
         self.bound = actuation.bound(n_s)
@@ -116,7 +66,7 @@ class ImplicitDrive(GainDrive):
     tissue solve and one small reduction a step.
     """
 
-    def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
+    def __init__(self, plant: HandStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, gain, target, actuation, steps)
         n_s, dt = plant.system.layout.n_s, plant.dt
         self.N = gain.K_z + plant.s * gain.K_v
@@ -153,7 +103,7 @@ class HeldDrive(GainDrive):
     ``target``: x_bar and u_bar; u_bar acts until the first command arrives.
     """
 
-    def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
+    def __init__(self, plant: HandStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, gain, target, actuation, steps)
         self.every, self.delay = actuation.ticks(plant.dt), actuation.delay
         self.K = np.vstack([gain.K_z, gain.K_v])
@@ -175,7 +125,7 @@ class HeldDrive(GainDrive):
 class OpenDrive(LoopDrive):
     """Input that is given for every step. ``inputs``: u of each step [N, N m], (steps, n_s)."""
 
-    def __init__(self, plant: PlantStep, inputs: Array) -> None:
+    def __init__(self, plant: HandStep, inputs: Array) -> None:
         super().__init__(plant, len(inputs))
         self.u = inputs
 
@@ -193,19 +143,15 @@ class FiniteStep:
         u = u_bar + K_q (q + dt/2 v - q_bar) + K_v v + K_z'(z - z_bar) + F a + N'w,
 
     and the hand's equation (M_hand [+ kappa M_rigid] - F) a = .. + N'w [- theta G'w] turns the load -G c of the tissue,
-    c = kappa a + c_0, into G (c_1 + C p). ``gain``: None for inputs that are known. Making one is collective.
+    c = kappa a + c_0, into G (c_1 + C p). Making one is collective.
     """
 
-    def __init__(self, plant: PlantStep, gain: Gain | None) -> None:
+    def __init__(self, plant: HandStep, gain: Gain) -> None:
         system, dt, n_s = plant.system, plant.dt, plant.system.layout.n_s
         self.plant, self.midpoint = plant, cast(Any, plant.midpoint)  # that of finite strain
         self.inertia = system.M_hand + (plant.kappa * system.M_rigid if system.two_way else 0.0)
-        K_z = K_v = np.zeros_like(system.G)
-        self.F = np.zeros((n_s, n_s))
-        if gain is not None:
-            K_z, K_v = gain.K_z, plant.s * gain.K_v
-            self.F = dt**2 / 4 * gain.K_s[:, :n_s] + dt / 2 * gain.K_s[:, n_s:]
-        self.N = self.midpoint.hold(np.hstack([K_z, K_v, system.G]))
+        self.F = dt**2 / 4 * gain.K_s[:, :n_s] + dt / 2 * gain.K_s[:, n_s:]
+        self.N = self.midpoint.hold(np.hstack([gain.K_z, plant.s * gain.K_v, system.G]))
         self.speed = np.repeat([0.0, 1.0, plant.s**2 / plant.theta], n_s)
 
     def respond(self, v: Array, known: Array, free: Array, state: TissueState) -> tuple[Array, Array]:
@@ -231,7 +177,7 @@ class FiniteDrive(GainDrive):
     Inputs beyond their limits are fixed there, and the step is solved once more.
     """
 
-    def __init__(self, plant: PlantStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
+    def __init__(self, plant: HandStep, gain: Gain, target: Target, actuation: Actuation, steps: int) -> None:
         super().__init__(plant, gain, target, actuation, steps)
         self.step = FiniteStep(plant, gain)
         self.limit = np.full(len(self.offset), np.inf) if self.bound is None else self.bound

@@ -14,13 +14,14 @@ from mpi4py import MPI
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, total
+from softgrasp.fem.run.hand import HandStep
 from softgrasp.fem.run.midpoint import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.solve.solvers import Reproducible, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
-from softgrasp.lqr.loop.drive import FiniteDrive, HeldDrive, ImplicitDrive, LoopDrive, PlantStep
+from softgrasp.lqr.loop.drive import FiniteDrive, HeldDrive, ImplicitDrive, LoopDrive
 from softgrasp.lqr.plant.checks import ControlError
 from softgrasp.lqr.plant.gain import Gain, PlantState
 from softgrasp.lqr.plant.problem import RiccatiProblem
@@ -112,7 +113,7 @@ class ClosedLoop:
         self.midpoint = make_midpoint(problem.system, dt, self.solver[0], rtol, reproducible)
         self.solver = self.solver[0], self.solver[1] + self.midpoint.solver.remark
         try:
-            self.plant = PlantStep(problem.system, self.midpoint)
+            self.plant = HandStep(problem.system, self.midpoint, responses=True)
         except Exception:
             self.midpoint.destroy()
             raise

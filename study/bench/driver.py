@@ -6,7 +6,7 @@ import json
 import re
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +17,8 @@ from rich.console import Console
 
 from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.report.files import write_json
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Table, number
+from softgrasp.study.report.tables import table_of as table_of
 from softgrasp.study.shell.processes import in_mpi_job, run_ranks
 
 Row = dict[str, Any]
@@ -115,36 +116,6 @@ def cpu_seconds(call: Callable[[], object]) -> float:
     begin = time.process_time()
     call()
     return time.process_time() - begin
-
-
-def number(value: float | None) -> str:
-    """Three digits, or all before the point; a dash for None."""
-    if value is None:
-        return "-"
-    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
-
-
-def entry(row: Any, path: str) -> Any:
-    """What a row has at a path of attributes or keys, "step_us.ts"; None where it has nothing."""
-    for key in path.split("."):
-        row = row.get(key) if isinstance(row, dict) else getattr(row, key, None)
-    return row
-
-
-def table_of(rows: Sequence[Any], columns: Mapping[str, str], title: str = "") -> Table:
-    """One line a row: for each heading the entry at a path, formatted as behind a blank it says, ``drift .0e``.
-
-    The format 3 is that of :func:`number`; without one the entry stands as it is.
-    """
-
-    def cell(row: Any, column: str) -> Any:
-        path, _, form = column.partition(" ")
-        value = entry(row, path)
-        if not form:
-            return value
-        return number(value) if form == "3" or value is None else f"{value:{form}}"
-
-    return Table(tuple(columns), [[cell(row, column) for column in columns.values()] for row in rows], title)
 
 
 Curve = tuple[str, Sequence[tuple[float, float]], dict[str, Any]]  # label, points, look

@@ -10,9 +10,9 @@ import typer
 from rich.console import Console
 
 from softgrasp.study.bench import driver
-from softgrasp.study.bench.driver import Failure, Goal, number
+from softgrasp.study.bench.driver import Failure, Goal
 from softgrasp.study.bench.forward_rows import ForwardCost
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Table, number
 from softgrasp.study.shell.timing import power_law
 
 SIZES = "2d:1000,2d:10000,2d:100000,3d:50000"

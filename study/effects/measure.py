@@ -117,7 +117,8 @@ def operator_hashes(model: Model, run: Run) -> dict[str, str]:
         matrices["D_ee"] = system.damping.matrix
     arrays: dict[str, list[Array]] = {name: list(A.getValuesCSR()) for name, A in matrices.items()}
     arrays |= {name: [getattr(system, name)] for name in ("T", "G", "M_hand", "M_rigid")}
-    arrays["hand"] = [getattr(run.drive, name) for name in ("c", "inverse", "GY") if hasattr(run.drive, name)]
+    hand = (run.drive, getattr(run.drive, "step", None))
+    arrays["hand"] = [getattr(part, name) for part in hand for name in ("c", "inverse", "GY") if hasattr(part, name)]
     return {name: "".join(comm.allgather(digest(*parts))) for name, parts in arrays.items()}
 
 
@@ -140,6 +141,7 @@ def holdings(model: Model, run: Run) -> dict[str, float]:
     """
     system, comm, midpoint = model.system, model.system.layout.comm, run.midpoint
     holders: list[tuple[str, Any]] = [("", system), ("", system.damping), ("step.", midpoint), ("hand.", run.drive)]
+    holders.append(("hand.", getattr(run.drive, "step", None)))
     holders += [("step.", midpoint.held), ("step.order.", midpoint.held.order)]
     holders += [("points.", system.points), ("points.", getattr(midpoint, "body", None))]
     for layer in system.layers:

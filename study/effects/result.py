@@ -7,6 +7,8 @@ from typing import Any
 
 from softgrasp.study.forward.explain import EffectReport, Explanation
 
+COUNTED = 1e-3  # relative growth of work or memory that counts as a cost; gravity's n_s numbers do not
+
 
 @dataclass(frozen=True)
 class Change:
@@ -19,43 +21,36 @@ class Change:
 
 @dataclass(frozen=True)
 class Company:
-    """One effect tried beside all others that are advised."""
+    """One effect switched alone, all others as advised."""
 
-    change: Change  # of the outputs when it alone is switched, the others as advised
-    control: float | None  # the same under a force [1]; None when that is no question
-    # effects whose switching makes it show, though it does not show in the scene as it is
-    partners: tuple[str, ...] = ()
-    either: bool = False  # it and its partner are on, each can go, but not both
+    change: Change  # of the outputs of the run
+    control: float | None  # of the outputs under a force [1]; None when that is no question
+    partners: tuple[str, ...] = ()  # effects beside which it shows, though it does not in the scene as it is
+    either: bool = False  # it and its partner are on; each can go, but not both
     together: float = 0.0  # change that made it count beside the partners [1]
     forced: bool = False  # it shows only when a force moves the hand
 
 
-COUNTED = 1e-3  # relative growth of work or memory that counts as a cost; gravity's n_s numbers do not
-
-
 @dataclass(frozen=True)
 class Cost:
-    """What the effect adds: the scene with it minus the scene without it."""
+    """The scene with the effect minus the scene without it; times are medians of paired samples."""
 
-    # assembly, setup, step: seconds, medians of paired samples; setup is factor and solves before the first step
-    assembly: float
-    setup: float
-    # assembly_range, setup_range: smallest and largest paired sample [s]
-    assembly_range: tuple[float, float]
-    setup_range: tuple[float, float]
-    step: float
-    step_relative: float  # added share of a step's time [1]
-    # step_low, step_high: smallest and largest paired share [1]
-    step_low: float
-    step_high: float
-    step_noise: float  # share that a step of the scene differs from itself by [1]
+    assembly: float  # seconds of the assembly
+    setup: float  # seconds of the factor and the solves before the first step
+    assembly_range: tuple[float, float]  # least and largest paired sample [s]
+    setup_range: tuple[float, float]  # least and largest paired sample [s]
+    step: float  # seconds of a step
+    step_relative: float  # share of the step time [1]
+    step_low: float  # least paired share of the step time [1]
+    step_high: float  # largest paired share of the step time [1]
+    step_noise: float  # share by which a step of the scene differs from itself [1]
     step_quartiles: tuple[float, float]  # lower and upper quartile of the paired shares [1]
-    flops: float  # added operations of PETSc in a step [1]; flops_relative: their share
-    flops_relative: float
-    memory: float  # added memory [byte]; memory_relative: its share
-    memory_relative: float
+    flops: float  # operations of PETSc in a step [1]
+    flops_relative: float  # share of the operations [1]
+    memory: float  # memory that the run holds [byte]
+    memory_relative: float  # share of the memory [1]
     holds: tuple[str, ...]  # names of what only the scene with the effect holds
-    objects: dict[str, int]  # what PETSc counts as created more, by class
+    objects: dict[str, int]  # objects that PETSc counts as created, by class
 
     @property
     def any(self) -> bool:
@@ -70,13 +65,14 @@ class Cost:
 
 @dataclass(frozen=True)
 class OffProof:
-    """What is counted to show that an effect that is off costs nothing; times are too noisy for it."""
+    """What is counted to show that an effect that is off costs nothing; times are too noisy for it.
 
-    # the hashes of all operators are the same before the effect was tried, after it, and with the effect named at
-    # strength zero, where it has one
-    same_operators: bool
-    same_objects: bool  # PETSc's log counts the same objects in these three, by class, and none in the steps
-    same_work: bool  # as many operations in a step after the trial as before
+    Compared are the scene before the effect was tried, after it, and with the effect at strength zero, if it has one.
+    """
+
+    same_operators: bool  # hashes of all operators
+    same_objects: bool  # PETSc objects by class, none of them made in the steps
+    same_work: bool  # operations of a step, before and after the trial
 
     @property
     def holds(self) -> bool:
@@ -97,7 +93,7 @@ class Elements:
 
 @dataclass(frozen=True)
 class EffectResult:
-    """One effect."""
+    """One effect; what was not tried is None."""
 
     name: str  # the effect
     on: bool  # the scene has it on
@@ -105,12 +101,11 @@ class EffectResult:
     gate: EffectReport  # number, threshold and sentence of its gate, with what explain says
     verdict: str  # needed, optional, wasted, or not tried
     advice: str  # one sentence
-    change: Change | None  # of the outputs of the run; None when not tried
-    # change of the outputs when a force moves the hand; None when that is no question, or not needed to judge
-    control: float | None
-    company: Company | None  # the same tried again beside all other advised effects; None when not tried
-    cost: Cost | None  # None when not tried
-    proof: OffProof | None  # for an effect that is off
+    change: Change | None = None  # of the outputs of the run when it is switched alone
+    control: float | None = None  # the same when a force moves the hand, where that is a question
+    company: Company | None = None  # the same beside all other advised effects
+    cost: Cost | None = None  # of having it on
+    proof: OffProof | None = None  # for an effect that is off
 
     @property
     def label(self) -> str:
@@ -141,13 +136,23 @@ class EffectsStudy:
     advised: tuple[str, ...]  # effects that are on when every advice is followed, for control alone included
     explanation: Explanation  # of the scene as it is; its warnings are repeated in the report
     tolerance: float  # relative change that counts [1]
-    repeats: int  # samples behind each median of a step; builds may have fewer
+    repeats: int  # samples behind each median of a step
     builds: int  # samples behind each median of assembly and factor
-    noise: tuple[float, float]  # step times of the scene against itself, smallest and largest paired ratio less 1 [1]
+    noise: tuple[float, float]  # step times of the scene against itself, least and largest paired ratio less 1 [1]
     noise_quartiles: tuple[float, float]  # the middle half of them [1]
-    base: dict[str, float]  # medians of the scene as it is: assembly, setup, step [s], and memory [byte]
+    base: dict[str, float]  # the scene as it is: medians of mesh, assembly, setup, step [s], memory [byte], flops
     sizes: dict[str, int]  # n_s, n_e, states, steps and cells of the scene
     elements: Elements | None  # what P2 changes; None unless P1 may lock
+
+    @property
+    def tried(self) -> list[EffectResult]:
+        """Effects that could be switched."""
+        return [f for f in self.findings if f.cost is not None]
+
+    @property
+    def off(self) -> list[EffectResult]:
+        """Effects that are off, each with its proof."""
+        return [f for f in self.findings if f.proof is not None]
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -159,7 +164,7 @@ class EffectsStudy:
         own = ("tolerance", "repeats", "builds", "noise", "base", "advised", "warnings", "sizes")
         return {name: getattr(self, name) for name in own} | {
             "effects": {f.name: f.to_dict() for f in self.findings},
-            "off_is_free": all(f.proof.holds for f in self.findings if f.proof is not None),
+            "off_is_free": all(f.proof.holds for f in self.off if f.proof),
             "missing": self.explanation.missing,
             "idle": self.explanation.idle,
             "elements": None if self.elements is None else asdict(self.elements),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from softgrasp.fem.model.memory import free_bytes, size_text
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of
-from softgrasp.study.effects.page import compose, show
+from softgrasp.study.effects.page import compose
 from softgrasp.study.effects.result import EffectsStudy
 from softgrasp.study.effects.switch import Scales, Switch, switches
 from softgrasp.study.effects.verdict import (
@@ -60,14 +61,11 @@ def study_effects(
     tried = [s for s in effects if s.other is not None]
     scenes = {SCENE: scene} | {s.name: s.other for s in tried if s.other is not None} | {AGAIN: scene}
     check_variants(scene, comm, explanation, len(scenes))
-    repeats, done = scene.study.repeats, 0
-    work = len(scenes) * (3 * repeats)
+    repeats, steps = scene.study.repeats, count(1)
 
     def tick() -> None:
-        nonlocal done
-        done += 1
         if progress is not None:
-            progress(min(done, work), work)
+            progress(next(steps), (2 * repeats + 1) * len(scenes))
 
     cases = measure_builds(comm, scenes, repeats, tick)
     on = frozenset(s.name for s in effects if s.on)
@@ -87,7 +85,6 @@ def study_effects(
         if name in needed or company.partners:
             together = replace(together, on=(*together.on, name))
     elements = check_elements(runs.models[on], runs.first, scene.study.tolerance)
-    done = 2 * repeats * len(scenes)
     measure_steps(comm, cases, repeats, tick)
     for name, case in cases.items():
         case.objects, case.objects_in_steps = objects_of(comm, scenes[name])
@@ -123,14 +120,14 @@ def _runnable(s: Switch, comm: MPI.Intracomm) -> Switch:
     return s
 
 
-def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, count: int) -> None:
+def check_variants(scene: Scene, comm: MPI.Intracomm, explanation: Explanation, variants: int) -> None:
     """Refuse so many variants of the scene where they would not fit in memory at once. Collective."""
     free = comm.bcast(free_bytes(scene))
     # matrices and vectors need about as much as the factor
-    needed = 2 * count * explanation.solver.factor_bytes
+    needed = 2 * variants * explanation.solver.factor_bytes
     if needed > 0.8 * free:
         raise ResourceError(
-            f"effects: {count} variants of the scene need about {size_text(needed)} at once, where "
+            f"effects: {variants} variants of the scene need about {size_text(needed)} at once, where "
             f"{size_text(0.8 * free)} may be taken; judge the effects on a coarser mesh, e.g. --set tissue.cells, "
             "or allow more with --set output.memory=GIB"
         )
@@ -148,7 +145,5 @@ def run_effects(
         study = study_effects(scene, comm, lambda done, work: bar.update(task, completed=done, total=work))
     result = {"command": "effects", **origin(scene, comm.size), **study.to_dict()}
     result |= {"memory_peak_mb": peak_memory_mb(comm), "time": {}}
-    if comm.rank == 0:
-        show(study, console)
     list_files(console, session.write(scene, result, lambda: compose(study, scene, session)))
     return result

@@ -17,6 +17,7 @@ from softgrasp.fem.scene.scene import Scene
 TRIAL_ZETA = 0.01  # ratio of the first mode; silicone and passive tissue lie above, so it is a careful guess
 TRIAL_LAW = "neo-hooke"
 Table = dict[str, Any]
+Value = tuple[str, float | None, str]  # in words; size where the change grows with it, and unit of the size
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,7 @@ class Switch:
     value: str  # its value in the scene, or the trial value
     other: Scene | None  # the scene with the effect switched; None when there is no such scene
     reason: str = ""  # why there is none; empty otherwise
-    # size of the value in its own unit, for effects whose change grows with it; None for the others
-    strength: float | None = None
+    strength: float | None = None  # size of the value, for effects whose change grows with it
     unit: str = ""  # of the strength
 
 
@@ -59,103 +59,86 @@ def switches(scene: Scene, scales: Scales) -> tuple[Switch, ...]:
 
 def switch(scene: Scene, name: str, scales: Scales) -> Switch:
     """One effect with the scene in which it is switched the other way."""
-    return (_without if EFFECTS[name].active(scene) else _with)(scene, name, scales)
-
-
-def neutral(scene: Scene, name: str, d: int) -> Scene | None:
-    """The scene with the effect named but of strength zero; None for effects that know no strength."""
-    if name == "gravity":
-        return changed(scene, lambda t: t["effects"].update(gravity={"g": [0.0] * d}))
-    if name == "damping":
-        return changed(scene, lambda t: t["effects"].update(damping={"kind": "kelvin-voigt", "beta": 0.0}))
-    return None
-
-
-# --- an effect that is on, taken out
-
-
-def _without(scene: Scene, name: str, scales: Scales) -> Switch:
-    if name == "rotation" and scene.motion.profile == "csv":
-        return Switch(name, True, "on", None, "the columns of motion.csv hold the angles")
-    d, (value, strength, unit) = scales.dimension, _value(scene, name)
+    on, d = EFFECTS[name].active(scene), scales.dimension
+    if reason := _obstacle(scene, name, scales):
+        return Switch(name, on, "on" if on else "", None, reason)
+    entry, (value, strength, unit) = (False, _stated(scene, name)) if on else _trial(scene, name, scales)
 
     def edit(table: Table) -> None:
         if name == "layers":
             table["tissue"]["layers"] = {}
             return
-        table["effects"][name] = False
+        table["effects"][name] = entry
         if name == "gravity":
-            table["time"]["start"] = "rest"
-        elif name == "damping":
+            table["time"]["start"] = "rest" if on else "equilibrium"
+        elif name == "damping" and on:
             for layer in table["tissue"]["layers"].values():
                 layer.pop("beta", None)
         elif name == "rotation":
-            _resize(table, d, d)
+            table["hand"] |= {} if on else {"inertia": _hand_inertia(scene, scales)}
+            _resize(table, d, d if on else d + len(scales.inertia))
 
-    return Switch(name, True, value, changed(scene, edit), "", strength, unit)
+    return Switch(name, on, value, changed(scene, edit), "", strength, unit)
 
 
-def _value(scene: Scene, name: str) -> tuple[str, float | None, str]:
-    """What the scene states; size and unit where the change is proportional to it, for beta while it is small."""
-    gravity, damping = scene.effects.gravity, scene.effects.damping
+def neutral(scene: Scene, name: str, d: int) -> Scene | None:
+    """The scene with the effect named but of strength zero; None for effects that know no strength."""
+    zero = {"gravity": {"g": [0.0] * d}, "damping": {"kind": "kelvin-voigt", "beta": 0.0}}
+    return changed(scene, lambda table: table["effects"].update({name: zero[name]})) if name in zero else None
+
+
+def _obstacle(scene: Scene, name: str, scales: Scales) -> str:
+    """Why the effect cannot be switched; empty where it can."""
+    active = {other for other, effect in EFFECTS.items() if effect.active(scene)}
+    on = name in active
+    if not on and active | {name} >= {"rotation", "finite_strain"}:
+        return "effects.rotation and effects.finite_strain exclude each other"
+    if name == "layers" and not on:
+        return "there is no second material to try: layers cannot be invented"
+    if name == "damping" and not on and scales.omega is None:
+        return "the first frequency, which scales the trial value, is not computed"
+    if name == "rotation" and scene.motion.profile == "csv":
+        return "the columns of motion.csv hold the angles" if on else "motion.csv has no columns for angles"
+    return ""
+
+
+def _stated(scene: Scene, name: str) -> Value:
+    """What the scene says of an effect that is on; the change is proportional to beta while it is small."""
+    gravity, damping, strain = scene.effects.gravity, scene.effects.damping, scene.effects.finite_strain
     if name == "gravity" and gravity is not None:
         return f"g = {_vector(gravity.g)} m/s2", math.hypot(*gravity.g), "m/s2"
     if name == "damping" and damping is not None:
         text = f"beta = {damping.beta:g} s"
         return (f"{text}, alpha = {damping.alpha:g} 1/s", None, "") if damping.alpha else (text, damping.beta, "s")
-    if name == "finite_strain" and scene.effects.finite_strain is not None:
-        return scene.effects.finite_strain.law, None, ""
-    if name == "layers":
-        return f"{', '.join(scene.tissue.layers)} instead of tissue.material everywhere", None, ""
-    return f"hand.inertia = {_inertia(scene.hand.inertia)} kg m2" if name == "rotation" else "on", None, ""
+    texts = {
+        "finite_strain": strain.law if strain is not None else "",
+        "layers": f"{', '.join(scene.tissue.layers)} instead of tissue.material everywhere",
+        "rotation": f"hand.inertia = {_inertia(scene.hand.inertia)} kg m2",
+    }
+    return texts.get(name, "on"), None, ""
 
 
-# --- an effect that is off, put in with a trial value
-
-
-def _with(scene: Scene, name: str, scales: Scales) -> Switch:
-    d = scales.dimension
-    if name == "layers":
-        return Switch(name, False, "", None, "there is no second material to try: layers cannot be invented")
+def _trial(scene: Scene, name: str, scales: Scales) -> tuple[Any, Value]:
+    """Entry of the scene that puts an effect in, and its value."""
     if name == "gravity":
-        g = [0.0] * (d - 1) + [-EARTH]
-
-        def edit(table: Table) -> None:
-            table["effects"]["gravity"] = {"g": g}
-            table["time"]["start"] = "equilibrium"
-
-        return Switch(name, False, f"g = {_vector(g)} m/s2, from equilibrium", changed(scene, edit), "", EARTH, "m/s2")
-    if name == "damping":
-        if scales.omega is None:
-            return Switch(name, False, "", None, "the first frequency, which scales the trial value, is not computed")
+        g = [0.0] * (scales.dimension - 1) + [-EARTH]
+        return {"g": g}, (f"g = {_vector(g)} m/s2, from equilibrium", EARTH, "m/s2")
+    if name == "damping" and scales.omega is not None:
         beta = 2 * TRIAL_ZETA / scales.omega
-        law = {"kind": "kelvin-voigt", "beta": beta}
-        other = changed(scene, lambda table: table["effects"].update(damping=law))
-        return Switch(name, False, f"beta = {beta:.3g} s: zeta_1 = {TRIAL_ZETA:g}", other, "", beta, "s")
-    if {name, *(other for other, effect in EFFECTS.items() if effect.active(scene))} >= {"rotation", "finite_strain"}:
-        return Switch(name, False, "", None, "effects.rotation and effects.finite_strain exclude each other")
-    if name == "rotation":
-        return _turning(scene, scales)
+        value = f"beta = {beta:.3g} s: zeta_1 = {TRIAL_ZETA:g}"
+        return {"kind": "kelvin-voigt", "beta": beta}, (value, beta, "s")
     if name == "finite_strain":
-        other = changed(scene, lambda table: table["effects"].update(finite_strain={"law": TRIAL_LAW}))
-        return Switch(name, False, TRIAL_LAW, other)
-    return Switch(name, False, "on", changed(scene, lambda table: table["effects"].update({name: True})))
+        return {"law": TRIAL_LAW}, (TRIAL_LAW, None, "")
+    if name == "rotation":
+        source = "" if scene.hand.inertia is not None else ", the tissue's radius of gyration"
+        return True, (f"hand.inertia = {_inertia(_hand_inertia(scene, scales))} kg m2{source}", None, "")
+    return True, ("on", None, "")
 
 
-def _turning(scene: Scene, scales: Scales) -> Switch:
-    if scene.motion.profile == "csv":
-        return Switch("rotation", False, "", None, "motion.csv has no columns for angles")
-    d, given = scales.dimension, scene.hand.inertia
+def _hand_inertia(scene: Scene, scales: Scales) -> float | list[float]:
+    """Moments of the hand, given or with the tissue's radius of gyration [kg m2]."""
     estimate = [scene.hand.mass / scales.mass * moment for moment in scales.inertia]
-    inertia = given if given is not None else estimate if d == 3 else estimate[0]
-
-    def edit(table: Table) -> None:
-        table["effects"]["rotation"] = True
-        table["hand"]["inertia"] = inertia
-        _resize(table, d, d + len(scales.inertia))
-
-    source = "" if given is not None else ", the tissue's radius of gyration"
-    return Switch("rotation", False, f"hand.inertia = {_inertia(inertia)} kg m2{source}", changed(scene, edit))
+    return scene.hand.inertia or (estimate if scales.dimension == 3 else estimate[0])
 
 
 def _resize(table: Table, d: int, n_s: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -141,7 +141,16 @@ class Together:
     company: dict[str, Company]  # of each effect that was tried
 
 
-Joined = dict[str, tuple[tuple[str, ...], bool, float, bool]]
+class Shown(NamedTuple):
+    """What brings an effect out that does not show in the scene as it is; attributes as of :class:`Company`."""
+
+    partners: tuple[str, ...] = ()
+    either: bool = False
+    together: float = 0.0
+    forced: bool = False
+
+
+Joined = dict[str, Shown]
 
 
 def advised_together(runs: Experiments, tried: tuple[str, ...], needed: Names, tolerance: float) -> Together:
@@ -156,9 +165,7 @@ def advised_together(runs: Experiments, tried: tuple[str, ...], needed: Names, t
         on |= frozenset(new)
         joined |= new
     company = {
-        name: Company(
-            runs.change(on, on ^ {name}), runs.control(on, on ^ {name}), *joined.get(name, ((), False, 0.0, False))
-        )
+        name: Company(runs.change(on, on ^ {name}), runs.control(on, on ^ {name}), *joined.get(name, Shown()))
         for name in tried
     }
     return Together(tuple(name for name in EFFECTS if name in on), company)
@@ -173,7 +180,7 @@ def _singles(runs: Experiments, tried: tuple[str, ...], on: Names, tolerance: fl
             continue
         others = [p for p in tried if p != name and (p in on) != (p in runs.on)]
         near = [p for p in others if runs.shows(runs.on ^ {p}, runs.on ^ {p, name}, tolerance)]
-        joined[name] = (tuple(near or others), False, *change)
+        joined[name] = Shown(tuple(near or others), False, *change)
     return joined
 
 
@@ -182,9 +189,9 @@ def _pair(runs: Experiments, tried: tuple[str, ...], on: Names, tolerance: float
     for a, b in combinations([name for name in tried if name not in on], 2):
         change = runs.shows(on, on | {a, b}, tolerance)
         if change is not None and {a, b} <= runs.on:
-            return {a: ((b,), True, *change)}
+            return {a: Shown((b,), True, *change)}
         if change is not None:
-            return {a: ((b,), False, *change), b: ((a,), False, *change)}
+            return {a: Shown((b,), False, *change), b: Shown((a,), False, *change)}
     return {}
 
 
@@ -230,8 +237,7 @@ def find(
     gate, tolerance = explanation.effects[s.name], scene.study.tolerance
     proof = None if s.on else prove_off(s.name, cases[SCENE], cases[AGAIN])
     if s.other is None:
-        advice = f"Not tried: {s.reason}."
-        return EffectResult(s.name, s.on, s.value, gate, "not tried", advice, None, None, None, None, proof)
+        return EffectResult(s.name, s.on, s.value, gate, "not tried", f"Not tried: {s.reason}.", proof=proof)
     (change, control), company = changes[s.name], together.company[s.name]
     pair = (cases[SCENE], cases[s.name]) if s.on else (cases[s.name], cases[SCENE])
     cost = cost_of(*pair, noise)

@@ -100,7 +100,7 @@ def sections(result: HardCaseResult, pictures: Mapping[str, Path]) -> list[Secti
         )
         figures = [(pictures[family.name], caption)] if family.name in pictures else []
         table = Table(("case", "bound", "here", "textbook", "verdict"), [brief(case) for case in f.cases])
-        parts.append(table.section(text, family.title, figures))
+        parts.append(table.section(text, family.title, figures=figures))
         texts = [line for case in f.cases for line in at_length(case)]
         if texts:
             parts.append(Section("", "Refusals and remarks in full:", rows=texts))

@@ -199,7 +199,7 @@ def _sections(study: WorkStudy, commands: list[dict[str, str]], figures: dict[st
             sections.append(Section(f"{EQUATION} under feedback", equation=control_equation(study.scene)))
         drawn = [(figures[f"work_{name}"], CAPTIONS[name])] if f"work_{name}" in figures else []
         text = reference_text(question, paper_of(study.scene) == "control")
-        sections.append(question_table(name, question.points).section(text, TITLES[name], drawn))
+        sections.append(question_table(name, question.points).section(text, TITLES[name], figures=drawn))
     sections += [Section("Left out", text=f"{titles}: {reason}.") for titles, reason in _left_out(study)]
     if "work_budget" in figures:
         sections.append(Section("Budget", figures=[(figures["work_budget"], CAPTIONS["budget"])]))

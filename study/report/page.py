@@ -53,6 +53,7 @@ class Section:
     header: Sequence[str] = ()  # names of the columns; without it two columns are label and value
     rows: Sequence[Sequence[Any]] = ()  # a table; every row as long as the header. Numbers are shown with four digits.
     figures: Sequence[tuple[Path, str]] = ()  # (picture file, caption); the files are embedded
+    terminal: bool = False  # a terminal shows the text and the table too
     best: Sequence[int] = ()  # rows of a long table that stand unfolded; the first ones if there are none
 
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import rich.box
 import rich.table
+from rich.console import Console
 from rich.markup import escape
 
 from softgrasp.study.report.page import NUMBERS, Section, cell_text
+
+Columns = Mapping[str, str | Callable[[Any], Any]]
+"""Of each heading, what a row has there: a path of attributes, or a function of the row."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +45,10 @@ class Table:
             writer.writerows(["" if cell is None else cell for cell in row] for row in self.rows)
         return path
 
-    def section(self, text: str = "", title: str | None = None, figures: Sequence[tuple[Path, str]] = ()) -> Section:
-        """The table as a part of a page."""
+    def section(self, text: str = "", title: str | None = None, **more: Any) -> Section:
+        """The table as a part of a page; ``more`` of its attributes."""
         title = self.title if title is None else title
-        return Section(title, text, header=self.header, rows=self.rows, figures=figures, best=self.best)
+        return Section(title, text, header=self.header, rows=self.rows, best=self.best, **more)
 
     def markdown(self) -> str:
         """The table as a README shows it."""
@@ -67,6 +71,51 @@ class Table:
         for row in self.rows:
             table.add_row(*(escape(cell_text(cell)) for cell in row))
         return table
+
+
+def number(value: float | None) -> str:
+    """Three digits, or all before the point; a dash for None."""
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
+
+
+def entry(row: Any, path: str) -> Any:
+    """What a row has at a path of attributes or keys, "step_us.ts"; None where it has nothing."""
+    for key in path.split("."):
+        row = row.get(key) if isinstance(row, dict) else getattr(row, key, None)
+    return row
+
+
+def table_of(rows: Sequence[Any], columns: Columns, title: str = "") -> Table:
+    """One line a row: for each heading a function of the row, or the entry at a path, formatted ``drift .0e``.
+
+    The format 3 is that of :func:`number`; without one the entry stands as it is.
+    """
+
+    def cell(row: Any, column: str | Callable[[Any], Any]) -> Any:
+        if not isinstance(column, str):
+            return column(row)
+        path, _, form = column.partition(" ")
+        value = entry(row, path)
+        if not form or value is None:
+            return value if not form else number(None)
+        return number(value) if form == "3" else f"{value:{form}}"
+
+    return Table(tuple(columns), [[cell(row, column) for column in columns.values()] for row in rows], title)
+
+
+def show_sections(console: Console, sections: Sequence[Section]) -> None:
+    """The parts of a page that a terminal shows too: the text, then the table, whose cells may break."""
+    for part in (s for s in sections if s.terminal):
+        if part.header:
+            table = Table(tuple(part.header), part.rows).terminal(wrap=range(len(part.header)), width=console.width)
+            table.collapse_padding = True
+            console.print(table)
+        elif part.rows:
+            console.print(pairs(part.rows))
+        if part.text:
+            console.print(part.text, style="dim", markup=False, highlight=False)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import write_json, write_scene
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.page import Section, write_report
-from softgrasp.study.report.tables import Table
+from softgrasp.study.report.tables import Table, show_sections
 from softgrasp.study.shell.folder import claim, read_result, remove_files
 
 
@@ -126,6 +126,7 @@ class Session:
                 files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
                 drawing = time.perf_counter(), sum(os.times()[:4])
                 content = page()
+                show_sections(self.console, content.sections)
                 now = time.perf_counter(), sum(os.times()[:4])
                 files += [table.write_csv(self.out / name) for name, table in content.tables.items()]
                 files += content.files

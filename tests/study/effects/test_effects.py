@@ -35,7 +35,7 @@ from softgrasp.study.effects.measure import (
     prove_off,
     read_table,
 )
-from softgrasp.study.effects.page import show
+from softgrasp.study.effects.page import parts
 from softgrasp.study.effects.result import Change, EffectResult, EffectsStudy
 from softgrasp.study.effects.run import check_variants, run_effects, study_effects
 from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
@@ -49,6 +49,7 @@ from softgrasp.study.effects.verdict import (
     finite_strain_beside,
     verdict_of,
 )
+from softgrasp.study.report.tables import show_sections
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import LAYERS, gather_states, make_scene, write_scene
 
@@ -503,6 +504,6 @@ def test_show_says_what_a_proof_misses(comm: MPI.Intracomm) -> None:
         dataclasses.replace(f, proof=f.proof and dataclasses.replace(f.proof, same_work=False)) for f in study.findings
     )
     text = io.StringIO()
-    show(dataclasses.replace(study, findings=broken), Console(file=text, width=100))
-    assert "is not shown to cost nothing: work not the same." in text.getvalue()
+    show_sections(Console(file=text, width=100), parts(dataclasses.replace(study, findings=broken)))
+    assert text.getvalue().count("NOT the same") == sum(f.proof is not None for f in broken)
     assert not dataclasses.replace(study, findings=broken).to_dict()["off_is_free"]
