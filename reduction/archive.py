@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
@@ -163,6 +164,7 @@ def write_model(
         with agree(comm):
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                note(unfinished, path)
                 with h5py.File(unfinished, "w") as file:
                     file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
                     small(file)

@@ -14,7 +14,7 @@ from softgrasp.fem.errors import SoftgraspError
 from softgrasp.study.hardcases import certified, faults, motion, reduction, riccati, statics
 from softgrasp.study.hardcases.cases import Family, FamilyResult, HardCaseResult
 from softgrasp.study.hardcases.page import show, write_files
-from softgrasp.study.shell.folder import claim
+from softgrasp.study.shell.folder import claim, folder_lock
 from softgrasp.study.shell.session import list_files, progress_bar
 
 MODULES: Any = (statics, motion, reduction, certified, riccati, faults)
@@ -28,6 +28,7 @@ def choose(family: str | None) -> list[Family]:
     return [chosen for name, chosen in FAMILIES.items() if family in (None, name)]
 
 
+@folder_lock()
 def run_hardcases(
     out: Path,
     console: Console,
@@ -46,7 +47,6 @@ def run_hardcases(
         raise SoftgraspError("hardcases starts the ranks that it needs by itself; run it without mpiexec")
     families = choose(family)
     claim(out, "hardcases", "", empty=empty)
-    out.mkdir(parents=True, exist_ok=True)
     results = []
     with progress_bar(console, MofNCompleteColumn(), quiet=quiet) as bar:
         task = bar.add_task("hard cases", total=len(families))

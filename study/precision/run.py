@@ -32,11 +32,13 @@ from softgrasp.study.precision.riccati import ControlRuns, ask_reduced_riccati, 
 from softgrasp.study.precision.settings import own_setting, variant
 from softgrasp.study.precision.truth import LADDER, make_truth
 from softgrasp.study.reduce.measure import chosen_methods
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Session
 
 FULL_SNAPSHOTS = 3e8  # entries; beyond them the scene's own run is too large for reduced models in memory
 
 
+@folder_lock()
 def run_study(
     path: Path,
     out: Path,

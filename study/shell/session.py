@@ -19,7 +19,8 @@ from rich.text import Text
 
 from softgrasp.fem.errors import agree
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.scene.file import load_scene_collective
+from softgrasp.fem.owned import follow
+from softgrasp.fem.scene.file import find_scene, load_scene_collective
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.report.files import write_json, write_scene
 from softgrasp.study.report.origin import command_line
@@ -75,7 +76,10 @@ class Session:
         scene = load_scene_collective(self.comm, self.path, self.overrides)
         with agree(self.comm):
             if writes and self.comm.rank == 0:
-                claim(self.out, self.command, scene.name, path=self.path, empty=self.empty)
+                named = [scene.path(file) for file in (scene.tissue.mesh, scene.motion.csv) if file is not None]
+                claim(self.out, self.command, scene.name, inputs=[find_scene(self.path), *named], empty=self.empty)
+        if writes:
+            follow(self.out)
         described = f": {escape(scene.description)}" if scene.description else ""
         self.console.print(f"[bold]{escape(scene.name)}[/bold]{described}", soft_wrap=True)
         return scene
@@ -143,7 +147,7 @@ class Session:
                     )  # fmt: skip
                 result["files"] = [f.relative_to(self.out).as_posix() for f in files if f.is_relative_to(self.out)]
                 write_json(self.out / "result.json", result)
-                remove_files(self.out, set(before) - set(result["files"]))
+                remove_files(self.out, {name for name in before if isinstance(name, str)} - set(result["files"]))
         return files
 
 
