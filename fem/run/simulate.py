@@ -61,14 +61,13 @@ class Run(Stepped):
         scene, system = model.scene, model.system
         self.model = model
         self.end = scene.time_end
-        dt, solver = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
+        dt, (name, reason) = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
         with model.watch.stage("factor"):
-            midpoint = make_midpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
-        solver = solver[0], solver[1] + midpoint.solver.remark
+            midpoint = make_midpoint(system, dt, name, scene.time.rtol, scene.time.reproducible)
         self.name: str = system.layout.comm.bcast(secrets.token_hex(6))
         kept, fresh = scene.output, None if options.resume else self.name
         store = make_store(system, kept.snapshots, scene.time.steps, kept.every, options.directory, fresh)
-        super().__init__(system.layout, dt, scene.time.steps, midpoint, store, solver)
+        super().__init__(system.layout, dt, scene.time.steps, midpoint, store, midpoint.solver.used(reason))
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
         self.points, self.regions = self._recorders()
