@@ -146,13 +146,12 @@ class Run(Stepped):
         with agree(self.layout.comm):  # a callable may differ between the ranks
             self.drive.check(begin, self.reached + 1)
 
-    def force(self) -> Array | None:
+    def force(self) -> Array:
         """Force on the hand in each step, see :class:`Trajectory`. Collective."""
-        system = self.model.system
-        if self.drive.u is not None or not system.two_way:
+        if self.drive.u is not None:
             return self.drive.u
         pulls = self.pulls[1:] if self.midpoint.held.whole else total(self.layout.comm, self.pulls[1:])
-        return force_taken(system, pulls, self.drive.v, self.drive.c, self.dt)
+        return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt)
 
     def watch_energy(self) -> None:
         """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""
