@@ -13,9 +13,9 @@ from softgrasp.fem.owned import LIST, LOCK, begin_list, forget, hold, own_files,
 from softgrasp.fem.scene.text import read_text
 
 
-def default_folder(command: str, scene: Path | None = None) -> Path:
+def default_folder(command: str, scene: Path) -> Path:
     """``out/<scene>-<command>``, the scene by the name of its file."""
-    return Path("out") / (command if scene is None else f"{scene.stem}-{command}")
+    return Path("out") / f"{scene.stem}-{command}"
 
 
 def read_result(folder: Path) -> dict[str, Any]:

@@ -44,7 +44,6 @@ def leave(folder: Path, command: str = "simulate", scene: str = "strip") -> None
 @pytest.mark.serial
 def test_every_scene_and_command_has_its_folder() -> None:
     assert default_folder("reduce", Path("a/strip.toml")) == Path("out/strip-reduce")
-    assert default_folder("hardcases") == Path("out/hardcases")
 
 
 @pytest.mark.serial
