@@ -28,6 +28,12 @@ def read_result(folder: Path) -> dict[str, Any]:
     return result if isinstance(result, dict) and isinstance(result.get("command"), str) else {}
 
 
+def files_of(result: dict[str, Any]) -> list[str]:
+    """The files that a result names; a result that another program wrote may hold anything there."""
+    files = result.get("files")
+    return [name for name in files if isinstance(name, str)] if isinstance(files, list) else []
+
+
 def remove_files(folder: Path, names: Iterable[str]) -> None:
     """Remove files of a run before, which its result.json names, as far as they are in the list of the folder."""
     home, doomed = folder.resolve(), set(names)

@@ -26,7 +26,7 @@ from softgrasp.study.report.files import write_json, write_scene
 from softgrasp.study.report.origin import command_line
 from softgrasp.study.report.page import Section, write_report
 from softgrasp.study.report.tables import Table, show_sections
-from softgrasp.study.shell.folder import claim, read_result, remove_files
+from softgrasp.study.shell.folder import claim, files_of, read_result, remove_files
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Session:
         with agree(self.comm):
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
-                before = read_result(self.out).get("files", [])
+                before = files_of(read_result(self.out))
                 files = [table.write_csv(self.out / name) for name, table in tables.items()]
                 files += [write_scene(self.out, scene), self.out / "result.json"]
                 names = {*before, *(f.relative_to(self.out).as_posix() for f in files)}
@@ -140,7 +140,7 @@ class Session:
         with agree(self.comm):
             if self.comm.rank == 0:
                 self.out.mkdir(parents=True, exist_ok=True)
-                before = read_result(self.out).get("files", [])
+                before = files_of(read_result(self.out))
                 files += [write_json(self.out / "result.json", result), write_scene(self.out, scene)]
                 drawing = time.perf_counter(), sum(os.times()[:4])
                 content = page()
@@ -161,7 +161,7 @@ class Session:
                     )  # fmt: skip
                 result["files"] = [f.relative_to(self.out).as_posix() for f in files if f.is_relative_to(self.out)]
                 write_json(self.out / "result.json", result)
-                remove_files(self.out, {name for name in before if isinstance(name, str)} - set(result["files"]))
+                remove_files(self.out, set(before) - set(result["files"]))
         return files
 
 
