@@ -10,7 +10,7 @@ from mpi4py import MPI
 from rich.console import Console
 from rich.progress import TaskProgressColumn
 
-from softgrasp.fem.accuracy.adapt import build_to_tolerance
+from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.errors import ResourceError, SceneError, SolverError
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.refined import scene_ends
@@ -94,7 +94,7 @@ def study_scene(
     """
     request = request or Request()
     names = request.questions
-    model = build_to_tolerance(variant(scene, own_setting(scene)), comm)
+    model = adapt.build(variant(scene, own_setting(scene)), comm=comm)
     store = Cache(cache, comm, scene, progress)
     runs = FullRuns(scene, find_places(scene, model), model.system.layout.reference, store)
     control = ControlRuns(model, store, request.names)
