@@ -32,9 +32,11 @@ ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 column
 # what a file says of a model in JSON, beside its materials and the names of its outputs
 LINEAR_KEYS = (
     "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
-    "hand_weight", "two_way", "scene_hash", "seconds",
+    "hand_weight", "two_way", "scene_hash", "origin", "seconds",
 )  # fmt: skip
-STRAIN_KEYS = ("cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "seconds")
+STRAIN_KEYS = (
+    "cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "origin", "seconds",
+)  # fmt: skip
 STRAIN_ARRAYS = {
     "cells": ("B", "weight", "xi", "layer", "cell", "centre"),
     "box": ("lam", "mu", "load", "reach"),
