@@ -321,21 +321,6 @@ def effects(**shared: Any) -> None:
     _run(run_effects, **shared)
 
 
-@app.command()
-@takes("out quick family quiet empty pdf")
-def hardcases(
-    out: Path | None,
-    quick: Annotated[bool, typer.Option("--quick", help="the quick half only")] = False,
-    family: Annotated[str | None, typer.Option(help="one family of cases only")] = None,
-    **shared: bool,
-) -> None:
-    """Run the suite of hard cases: stay stable, or refuse with a reason."""
-    from softgrasp.study.hardcases.run import run_hardcases
-
-    result = run_hardcases(out or default_folder("hardcases"), console(), quick=quick, family=family, **shared)
-    raise typer.Exit(0 if result["ok"] else 1)
-
-
 def main() -> None:
     """Entry point. Collective, but for the commands that load no MPI: doctor, scenes, schema, --help, --version."""
     run_command(app)

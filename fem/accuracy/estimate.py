@@ -20,6 +20,7 @@ second for the phase that the modes lose until the end.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import basix
@@ -32,10 +33,12 @@ from mpi4py import MPI
 from softgrasp.fem.accuracy.small import Small, reduced, run_small, static_solves
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.layout import bounding_box
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.build import MeshEstimate, Model, build
 from softgrasp.fem.model.contact import contact_facets
 from softgrasp.fem.petsc import Array, rows_on_root, times_columns
-from softgrasp.fem.scene.tissue import Refine
+from softgrasp.fem.scene.tissue import Material, Refine
+from softgrasp.fem.system import layered_viscosity
 
 if TYPE_CHECKING:
     from softgrasp.fem.scene.scene import Scene
@@ -74,7 +77,8 @@ def estimate(model: Model, coarse: Small | None = None, finer: Small | None = No
     halved = run_small(small, 2 * model.scene.time.steps).deformation[::2]
     late, _ = difference(small, small, halved)
     delta = delta + other.run.rigid - run.rigid
-    omega = small.modes[0][:2] / other.modes[0][:2] - 1
+    seen = min(2, len(small.M), len(other.M))  # a mesh of one free node has one mode that the run can see
+    omega = small.modes[0][:seen] / other.modes[0][:seen] - 1
     return MeshEstimate(
         estimate=relative,
         bound=bound,
@@ -100,7 +104,7 @@ def _compared(model: Model, small: Small) -> tuple[Small, float, Array, float, s
             f"{MOST_COMPARED} of an estimate; run the scene with another tissue.order and compare the outputs."
         )
     for goal in COMPARED[model.system.layout.dimension]:
-        other = reduced(build(comparison(model.scene, goal), comm=model.system.layout.comm))
+        other = reduced(like(model, comparison(model.scene, goal)))
         relative, delta = difference(small, other)
         if other.model.scene.tissue.order == 2:
             offer = (goal, other.model.system.layout.n_e)
@@ -135,9 +139,32 @@ def difference(small: Small, other: Small, finer: Array | None = None) -> tuple[
 def next_order(model: Model) -> Model:
     """The same cells with elements of the next order. Collective."""
     tissue = model.scene.tissue.model_copy(update={"order": model.scene.tissue.order + 1})
-    return build(
-        model.scene.model_copy(update={"tissue": tissue}), comm=model.system.layout.comm, mesh=model.space.mesh
-    )
+    return like(model, model.scene.model_copy(update={"tissue": tissue}), model.space.mesh)
+
+
+def like(model: Model, scene: Scene, mesh: TissueMesh | None = None) -> Model:
+    """The model of another mesh or order with the materials and the damping of a model, linear. Collective.
+
+    Raises SceneError, MeshError, ResourceError: see :func:`softgrasp.fem.model.build.build`.
+    """
+    system, tissue, damping = model.system, scene.tissue, model.system.damping
+    own = {blocks.name: m for blocks, m in zip(system.layers, system.materials, strict=True)}
+
+    def material(name: str, of: Material) -> Material:
+        m = own.get(name)  # None: every cell of the model is in a layer
+        return of if m is None else of.model_copy(update={"lam": m.lam, "mu": m.mu, "rho": m.rho})
+
+    layers = {k: part.model_copy(update={"material": material(k, part.material)}) for k, part in tissue.layers.items()}
+    tissue = tissue.model_copy(update={"layers": layers, "material": material("tissue", tissue.material)})
+    effects = scene.effects.model_copy(update={"finite_strain": None})
+    scene = scene.model_copy(update={"tissue": tissue, "effects": effects})
+    other = build(scene, comm=system.layout.comm, mesh=mesh)
+    if damping.matrix is not None:
+        betas = {name: m.beta for name, m in own.items()}
+        pairs = zip(other.system.layers, other.system.materials, strict=True)
+        viscous = tuple(replace(m, beta=betas.get(blocks.name, m.beta)) for blocks, m in pairs)
+        damping = replace(damping, matrix=layered_viscosity(other.system.layers, viscous))
+    return replace(other, system=replace(other.system, damping=damping))
 
 
 def next_unknowns(model: Model) -> int:

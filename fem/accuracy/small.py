@@ -24,7 +24,7 @@ from softgrasp.fem.run.motion import force_values, free_table
 from softgrasp.fem.solve.solvers import choose_solver, make_solver
 
 BLOCKS = 4
-DROPPED = 1e-12  # of the largest squared length in a block: directions that are rounding only
+DROPPED = 1e-12  # of the squared length before the projection: directions that are rounding only, or known already
 PREFIX = "softgrasp_accuracy_"
 
 Solve = Callable[[Array], Array]
@@ -70,7 +70,10 @@ def static_solves(model: Model) -> Iterator[Solve]:
 
 
 def reduced(model: Model) -> Small:
-    """The small model of a model, with `BLOCKS` static solves of each column. Collective."""
+    """The small model of a model, with `BLOCKS` static solves of each column. Collective.
+
+    A mesh with fewer unknowns than columns ends in a basis of its whole space, where the small model is the full one.
+    """
     system, comm = model.system, model.system.layout.comm
     outputs = make_outputs(model.scene, system)
     C = output_columns(outputs, system.layout.n_local)
@@ -82,10 +85,11 @@ def reduced(model: Model) -> Small:
                 last = solve(times_columns(system.M_ee, last))
             for _ in range(2):  # once is not enough where blocks are nearly dependent
                 K_last = times_columns(system.K_ee, last)
+                lengths = total(comm, np.einsum("ij,ij->j", last, K_last))
                 known = total(comm, V.T @ K_last)
                 last, K_last = last - V @ known, K_last - K_V @ known
                 gram = total(comm, last.T @ K_last)
-                scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+                scale = np.sqrt(np.maximum(lengths, 1e-300))
                 Q = comm.bcast(normalising((gram + gram.T) / 2 / np.outer(scale, scale), 0.0, DROPPED) / scale[:, None])
                 last, K_last = last @ Q, K_last @ Q
             V, K_V = np.hstack([V, last]), np.hstack([K_V, K_last])

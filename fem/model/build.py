@@ -132,7 +132,7 @@ class Model:
     def with_materials(self, lam: float | None = None, mu: float | None = None, rho: float | None = None) -> Model:
         """The same mesh with other numbers in every layer: K = mu K_mu + lambda K_lambda, M = rho M_1. Collective.
 
-        Only sums of matrices that are there; nothing is assembled.
+        Only sums of matrices that are there; nothing is assembled. The error of the mesh is another and is left out.
 
         Args:
             lam, mu: Lame parameters [Pa]; None keeps those of each layer.
@@ -149,7 +149,7 @@ class Model:
                     f"lambda = {m.lam}, mu = {m.mu}, rho = {m.rho} is no material; mu, rho and lambda + 2 mu / {d} "
                     "must be positive"
                 )
-        return replace(self, system=self.system.with_materials(materials))
+        return replace(self, system=self.system.with_materials(materials), accuracy=None)
 
 
 def layer_materials(scene: Scene, layers: tuple[LayerBlocks, ...]) -> tuple[LayerMaterial, ...]:

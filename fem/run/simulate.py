@@ -61,14 +61,13 @@ class Run(Stepped):
         scene, system = model.scene, model.system
         self.model = model
         self.end = scene.time_end
-        dt, solver = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
+        dt, (name, reason) = self.end / scene.time.steps, choose_solver(system.layout, scene.time.solver)
         with model.watch.stage("factor"):
-            midpoint = make_midpoint(system, dt, solver[0], scene.time.rtol, scene.time.reproducible)
-        solver = solver[0], solver[1] + midpoint.solver.remark
+            midpoint = make_midpoint(system, dt, name, scene.time.rtol, scene.time.reproducible)
         self.name: str = system.layout.comm.bcast(secrets.token_hex(6))
         kept, fresh = scene.output, None if options.resume else self.name
         store = make_store(system, kept.snapshots, scene.time.steps, kept.every, options.directory, fresh)
-        super().__init__(system.layout, dt, scene.time.steps, midpoint, store, solver)
+        super().__init__(system.layout, dt, scene.time.steps, midpoint, store, midpoint.solver.used(reason))
         self.outputs: tuple[Output, ...] = make_outputs(scene, system)
         self.local_outputs = np.zeros((self.steps + 1, sum(o.size for o in self.outputs)))
         self.points, self.regions = self._recorders()
@@ -147,13 +146,12 @@ class Run(Stepped):
         with agree(self.layout.comm):  # a callable may differ between the ranks
             self.drive.check(begin, self.reached + 1)
 
-    def force(self) -> Array | None:
+    def force(self) -> Array:
         """Force on the hand in each step, see :class:`Trajectory`. Collective."""
-        system = self.model.system
-        if self.drive.u is not None or not system.two_way:
+        if self.drive.u is not None:
             return self.drive.u
         pulls = self.pulls[1:] if self.midpoint.held.whole else total(self.layout.comm, self.pulls[1:])
-        return force_taken(system, pulls, self.drive.v, self.drive.c, self.dt)
+        return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt)
 
     def watch_energy(self) -> None:
         """Sample the energy for the scale of the drift, and stop a run that is no longer finite. Collective."""

@@ -13,7 +13,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.snapshots import NoStore
-from softgrasp.fem.solve.solvers import SolverName
+from softgrasp.fem.solve.solvers import SolverUsed
 
 
 class Stepped(ABC):
@@ -23,7 +23,7 @@ class Stepped(ABC):
         dt: step [s].
         midpoint: factored step.
         store: where the states go.
-        solver: name and reason.
+        solver: name, reason and package.
 
     Attributes:
         state: at the last step taken.
@@ -40,7 +40,7 @@ class Stepped(ABC):
         steps: int,
         midpoint: TissueMidpoint,
         store: NoStore,
-        solver: tuple[SolverName, str],
+        solver: SolverUsed,
     ) -> None:
         self.layout, self.dt, self.steps = layout, dt, steps
         self.midpoint, self.store, self.solver = midpoint, store, solver

@@ -11,7 +11,7 @@ import numpy as np
 
 from softgrasp.fem.accuracy.adapt import estimated
 from softgrasp.fem.accuracy.estimate import next_unknowns
-from softgrasp.fem.errors import SceneError, SoftgraspError
+from softgrasp.fem.errors import SoftgraspError
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import MeshEstimate, Model
@@ -24,33 +24,28 @@ BASE = {2: 0.3, 3: 0.9}
 BASE_FILE = {2: 0.3, 3: 3.5}
 PER_UNKNOWN = {2: 1.5e-5, 3: 4e-5}
 PER_STEP = 3e-5  # of the small models that are run
+NOT_LINEAR = "The error of mesh and time step is estimated for linear elasticity only"
 
 
-def estimate_error(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | None, list[str]]:
+def estimate_error(model: Model, seconds: float, certify: bool) -> tuple[MeshEstimate | None, str]:
     """The estimate of a model's mesh where it is there, cheap or asked for, and why it is not. Collective.
 
-    ``seconds``: what its run took, equal on all ranks; ``certify``: estimate whatever it costs, and raise
-    SoftgraspError where that fails.
+    ``seconds``: what its run took, equal on all ranks; ``certify``: estimate whatever it costs.
     """
     if model.system.points is not None:  # the small models are of linear elasticity
-        reason = "The error of mesh and time step is estimated for linear elasticity only"
-        if certify:
-            raise SceneError(f"{reason}: leave out --certify, or set effects.finite_strain to false")
-        return None, [f"{reason}; with effects.finite_strain compare with a finer mesh and more steps."]
+        return None, f"{NOT_LINEAR}; with effects.finite_strain compare with a finer mesh and more steps."
     if model.accuracy is not None:
-        return model.accuracy, []
+        return model.accuracy, ""
     d, n_e = model.system.layout.dimension, model.system.layout.n_e
     box = model.scene.tissue.size is not None
     base, n = (BASE, n_e) if box else (BASE_FILE, next_unknowns(model))
     cost = base[d] + PER_UNKNOWN[d] * n + PER_STEP * model.scene.time.steps
     if not certify and cost > max(CHEAP, seconds):
-        return None, []
+        return None, ""
     try:
-        return estimated(model), []
-    except SoftgraspError as error:
-        if certify:
-            raise
-        return None, [f"The error of the mesh could not be estimated: {error}"]
+        return estimated(model), ""
+    except (SoftgraspError, np.linalg.LinAlgError) as error:
+        return None, f"The error of the mesh could not be estimated: {error}"
 
 
 @dataclass(frozen=True)

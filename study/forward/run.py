@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -11,10 +12,10 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.effects import EFFECTS
-from softgrasp.fem.errors import Interrupted, ResourceError, SceneError
+from softgrasp.fem.errors import Interrupted, ResourceError, SceneError, SolverError
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.study.forward.accuracy import accuracy_report, draw, estimate_error
+from softgrasp.study.forward.accuracy import NOT_LINEAR, accuracy_report, draw, estimate_error
 from softgrasp.study.forward.cautions import run_warnings
 from softgrasp.study.forward.result import Simulation, simulate_result
 from softgrasp.study.pictures.frames import Frames
@@ -46,7 +47,10 @@ def run_simulate(
     if resume and flags.get("empty"):
         raise SceneError("--empty removes what --resume goes on from; give one of them")
     session = Session("simulate", path, overrides, out, console, **flags)
-    model = session.model(session.scene())
+    scene = session.scene()
+    if certify and scene.effects.finite_strain is not None:
+        raise SceneError(f"{NOT_LINEAR}: leave out --certify, or set effects.finite_strain to false")
+    model = session.model(scene)
     scene, frames = model.scene, Frames(model, out, session.pictures)
 
     def join(run: Run) -> None:
@@ -70,10 +74,12 @@ def run_simulate(
                 list_files(console, files)
             raise
     fields = frames.close()
+    result = simulate_result(model, run, run_warnings(model, run, frames.most[1:]))
+    tables = {"trajectory.csv": result.trajectory()}
+    session.keep(scene, result.to_json(), tables)
     mesh_error, unknown = estimate_error(model, run.seconds["steps"], certify)
     accuracy = accuracy_report(mesh_error, run)
-    warnings = [*run_warnings(model, run, frames.most[1:]), *accuracy.warnings, *unknown]
-    result = simulate_result(model, run, warnings)
+    result = replace(result, warnings=(*result.warnings, *accuracy.warnings, *([unknown] if unknown else [])))
     rows = [*result.rows(), *accuracy.rows]
 
     def page() -> Page:
@@ -81,13 +87,14 @@ def run_simulate(
         if session.pictures and mesh_error is not None:
             drawn += draw(out / "mesh_error.png", run, mesh_error)
         sections = _sections(result, rows, drawn)
-        tables = {"trajectory.csv": result.trajectory()}
         return Page(scene.name, [*result.summary(), *accuracy.summary], sections, tables, [*fields, *drawn])
 
     numbers = {**result.to_json(), **accuracy.keys}
     console.print(pairs(rows))
-    show_warnings(console, warnings)
+    show_warnings(console, result.warnings[len(model.space.mesh.notes) :])  # those were shown with the mesh
     list_files(console, session.write(scene, numbers, page))
+    if certify and mesh_error is None:
+        raise SolverError(unknown)
     return numbers
 
 

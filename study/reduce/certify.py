@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
@@ -20,6 +19,7 @@ from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.certified.archive import load_certified, save_certified
 from softgrasp.reduction.certified.greedy import REASONS, Greedy
 from softgrasp.reduction.certified.model import CertifiedModel
+from softgrasp.reduction.certified.motion import Materials
 from softgrasp.reduction.certified.trainer import (
     PLACES,
     SHARE,
@@ -140,15 +140,16 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
                 training["validation"] = asdict(validate(trainer, certified, options.validation))
     finally:
         trainer.destroy()
-    places = list(dict.fromkeys(trainer.parameters[r["at"]] for r in training["rounds"]))[:PLACES]
-    with watch.stage("mesh"), suppress(SoftgraspError):  # some meshes have no estimate
-        certified = replace(certified, mesh=mesh_number(model, places))
     certified = replace(certified, training=training)
+    save_certified(certified, file)  # before an estimate, which may fail
+    places = list(dict.fromkeys(trainer.parameters[r["at"]] for r in training["rounds"]))[:PLACES]
+    with watch.stage("mesh"):
+        certified, unknown = _with_mesh(certified, model, places)
     save_certified(certified, file)
     with watch.stage("tests"):
         check = check_box(model, certified)
     result = certify_result(model, certified, check, watch)
-    lines = sentences(certified, check, result)
+    lines = [*sentences(certified, check, result), *([unknown] if unknown else [])]
 
     def page() -> Page:
         drawn: list[Path] = []
@@ -168,6 +169,14 @@ def run_certify(session: Session, scene: Scene) -> dict[str, Any]:
         console.print(sentence, markup=False)
     list_files(console, session.write(scene, result, page))
     return result
+
+
+def _with_mesh(certified: CertifiedModel, model: Model, places: list[Materials]) -> tuple[CertifiedModel, str]:
+    """The model with the estimate of its mesh, or without one and the reason. Collective."""
+    try:
+        return replace(certified, mesh=mesh_number(model, places)), ""
+    except SoftgraspError as error:
+        return certified, f"The error of the mesh could not be estimated: {error}"
 
 
 def _saver(bar: Progress, trainer: Trainer, file: Path, goal: float) -> Callable[[Greedy, CertifiedModel], None]:

@@ -245,7 +245,7 @@ def speed_notes(n_e: int, steps: int, full: FullTimes, sweeps: Sequence[MethodSw
     return (
         against,
         f"Break-even mesh: {pays}, at this mesh's time per unknown. The reduced time does not grow with the mesh, see "
-        "python -m softgrasp.study.bench meshes.",
+        "python -m benchmarks meshes.",
         f"The paper reports {PAPER_FULL} s against {PAPER_REDUCED} s at 2n = 1916 and N = 14, a speed-up of "
         f"{PAPER_FULL / PAPER_REDUCED:.0f}; here the same comparison, each side from its matrices on, gives "
         f"{1e3 * (full.factor + full.steps):.1f} ms against {1e3 * (p.time_setup + p.time_online):.2f} ms, "

@@ -11,9 +11,9 @@ from typing import Any
 from softgrasp.fem.errors import SceneError
 
 
-def default_folder(command: str, scene: Path | None = None) -> Path:
+def default_folder(command: str, scene: Path) -> Path:
     """``out/<scene>-<command>``, the scene by the name of its file."""
-    return Path("out") / (command if scene is None else f"{scene.stem}-{command}")
+    return Path("out") / f"{scene.stem}-{command}"
 
 
 def read_result(folder: Path) -> dict[str, Any]:

@@ -107,6 +107,20 @@ class Session:
             task = bar.add_task(what, total=None)
             yield lambda what, done, of: bar.update(task, description=what, completed=done, total=of)
 
+    def keep(self, scene: Scene, result: dict[str, Any], tables: Mapping[str, Table]) -> None:
+        """Write result.json, scene.toml and tables before work that may fail; `write` replaces them. Collective.
+
+        Raises OSError on all ranks: the folder cannot be written.
+        """
+        with agree(self.comm):
+            if self.comm.rank == 0:
+                self.out.mkdir(parents=True, exist_ok=True)
+                before = read_result(self.out).get("files", [])
+                files = [table.write_csv(self.out / name) for name, table in tables.items()]
+                files += [write_scene(self.out, scene), self.out / "result.json"]
+                names = {*before, *(f.relative_to(self.out).as_posix() for f in files)}
+                write_json(self.out / "result.json", {**result, "files": sorted(names)})
+
     def write(
         self, scene: Scene, result: dict[str, Any], page: Callable[[], Page], *, clock: bool = True
     ) -> list[Path]:

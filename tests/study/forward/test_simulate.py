@@ -6,14 +6,15 @@ import io
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 from rich.console import Console
 
-from softgrasp.fem.errors import CheckpointError, Interrupted
+from softgrasp.fem.errors import CheckpointError, Interrupted, SceneError, SolverError
+from softgrasp.fem.model.build import Model
 from softgrasp.fem.scene.file import shipped_scenes
 from softgrasp.study.forward.run import run_simulate
 from tests.helpers.models import rough_save
@@ -98,3 +99,37 @@ def test_the_force_that_the_motion_takes_is_written(comm: MPI.Intracomm, mpi_tmp
     peak = json.loads((mpi_tmp_path / "result.json").read_text())["force_peak"]
     assert peak == dict(zip(("x", "y", "rz"), np.abs(forces).max(axis=0).tolist(), strict=True))
     assert f"rz {peak['rz']:.4g} N m" in said
+
+
+def test_results_are_written_before_the_estimate(
+    comm: MPI.Intracomm, mpi_tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An estimate that ends the program leaves result and trajectory; one that fails also page and sentence."""
+
+    def ends(_: Model) -> NoReturn:
+        raise RuntimeError("no estimate")
+
+    def fails(_: Model) -> NoReturn:
+        raise np.linalg.LinAlgError("not definite")
+
+    ended, failed = mpi_tmp_path / "ended", mpi_tmp_path / "failed"
+    monkeypatch.setattr("softgrasp.study.forward.accuracy.estimated", ends)
+    with pytest.raises(RuntimeError, match="no estimate"):
+        run(ended, pictures=False)
+    monkeypatch.setattr("softgrasp.study.forward.accuracy.estimated", fails)
+    with pytest.raises(SolverError, match="could not be estimated: not definite"):
+        run(failed, pictures=False, certify=True)
+    if comm.rank > 0:
+        return
+    early, whole = (json.loads((folder / "result.json").read_text()) for folder in (ended, failed))
+    assert (ended / "trajectory.csv").read_bytes() == (failed / "trajectory.csv").read_bytes()
+    assert whole.keys() - early.keys() == set()
+    assert early["files"] == ["result.json", "scene.toml", "trajectory.csv"]
+    assert "The error of the mesh could not be estimated: not definite" in whole["warnings"]
+    assert "not definite" in (failed / "report.html").read_text()
+
+
+def test_certify_at_finite_strain_is_refused_before_the_run(mpi_tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="for linear elasticity only: leave out --certify"):
+        run(mpi_tmp_path / "out", "effects.finite_strain={law='neo-hooke'}", certify=True)
+    assert not (mpi_tmp_path / "out").exists()

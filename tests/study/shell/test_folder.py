@@ -21,7 +21,6 @@ def leave(folder: Path, command: str = "simulate", scene: str = "strip") -> None
 
 def test_every_scene_and_command_has_its_folder() -> None:
     assert default_folder("reduce", Path("a/strip.toml")) == Path("out/strip-reduce")
-    assert default_folder("hardcases") == Path("out/hardcases")
 
 
 def test_a_folder_of_another_run_is_refused_or_emptied(tmp_path: Path) -> None:
