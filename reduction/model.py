@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.errors import SoftgraspError
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.bases.basis import Coordinates, Frame, ReductionError, Structure
 from softgrasp.reduction.canonical import canonical_operators
 from softgrasp.reduction.galerkin import galerkin_operators

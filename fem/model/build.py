@@ -17,8 +17,10 @@ from softgrasp.fem.effects.damping import operator as damping_operator
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SceneError
+from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.mesh.make import make_mesh
 from softgrasp.fem.mesh.scene_hash import scene_hash, scene_keys
-from softgrasp.fem.mesh.tissue_mesh import TissueMesh, make_mesh
+from softgrasp.fem.mesh.tissue_mesh import TissueMesh
 from softgrasp.fem.model.assembly import Discretisation, Inventory, assemble, discretise, make_points
 from softgrasp.fem.model.contact import rigid_modes
 from softgrasp.fem.model.memory import box_simplices, check_memory
@@ -26,7 +28,7 @@ from softgrasp.fem.model.outputs import Output, make_outputs, output_columns
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.file import load_scene_collective
 from softgrasp.fem.scene.scene import Scene, check_dimension
-from softgrasp.fem.system import BlockSystem, LayerBlocks, LayerMaterial, coupling, tissue_matrices
+from softgrasp.fem.system import BlockSystem, LayerBlocks, coupling, tissue_matrices
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.model import ModelError, Outputs
 from softgrasp.reduction.online import ReducedTrajectory, checked_hand
 from softgrasp.reduction.strain.cells import Cells, Potential
