@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from softgrasp.fem.accuracy.estimate import estimate, marked_cells, next_order
-from softgrasp.fem.accuracy.small import Small, reduced
+from softgrasp.fem.accuracy.krylov import KrylovModel, krylov_model
 from softgrasp.fem.errors import SceneError, agree
 from softgrasp.fem.mesh.grading import bisect, distribute
 from softgrasp.fem.mesh.tissue_mesh import TissueMesh, Whole
@@ -70,7 +70,7 @@ def build(
     passes, aim, accepted = 0, refine.tolerance, ACCEPTED
     last: tuple[Array, Array] | None = None
     while True:
-        small, finer = reduced(model), reduced(next_order(model))
+        small, finer = krylov_model(model), krylov_model(next_order(model))
         result, outputs = estimate(model, small, finer), small.run.deformation
         if last is not None:
             accepted = _effectivity(last[1], outputs + result.delta - last[0], result.delta)
@@ -132,7 +132,7 @@ def _check_steps(scene: Scene, tolerance: float, error: float) -> None:
         )
 
 
-def _finer(small: Small, finer: Small, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
+def _finer(small: KrylovModel, finer: KrylovModel, refine: Refine, aim: float, factor: float) -> TissueMesh | None:
     """The next mesh, or None if it has too many unknowns. Collective."""
     model = small.model
     comm, scene = model.system.layout.comm, model.scene

@@ -15,7 +15,7 @@ import softgrasp as sg
 from softgrasp.fem.accuracy import adapt
 from softgrasp.fem.accuracy.adapt import estimated
 from softgrasp.fem.accuracy.estimate import cell_products, difference, estimate, indicators, next_order, prolong
-from softgrasp.fem.accuracy.small import reduced
+from softgrasp.fem.accuracy.krylov import krylov_model
 from softgrasp.fem.errors import SceneError
 from softgrasp.fem.model.build import Model, build
 from softgrasp.fem.petsc import times_columns, total
@@ -60,7 +60,7 @@ def error(y: np.ndarray, fine: np.ndarray) -> float:
 )
 def test_small_model_follows_the_run(comm: MPI.Intracomm, change: Any) -> None:
     model = build(make_scene(change), comm=comm)
-    small, run = reduced(model).run, simulate(model)
+    small, run = krylov_model(model).run, simulate(model)
     # what modes beyond the moments answer to the jumps of the jerk
     assert error(small.deformation + small.rigid - run.outputs_rigid, deformation(run)) < 2e-3
     assert np.abs(small.rigid - run.outputs_rigid).max() < 1e-4
@@ -183,7 +183,7 @@ def test_time_error_is_that_of_the_steps(comm: MPI.Intracomm) -> None:
 def test_cells_share_the_difference_of_the_energies(comm: MPI.Intracomm) -> None:
     """sum_T k_T(e_i, e_j) = x'_i K' x'_j - x_i K x_j for static solutions on nested spaces."""
     model = build(make_scene(LAYERED, TIP), comm=comm)
-    up, small = reduced(next_order(model)), reduced(model)
+    up, small = krylov_model(next_order(model)), krylov_model(model)
     e = up.X - prolong(model, up.model, small.X)
     E = total(comm, cell_products(up.model, e).sum(axis=0))
     energies = [total(comm, s.X.T @ times_columns(s.model.system.K_ee, s.X)) for s in (up, small)]
@@ -260,7 +260,7 @@ def test_lines_of_a_box_against_even_ones(comm: MPI.Intracomm) -> None:
     base = ["tissue.order=2", "tissue.material={young=1e5,poisson=0.3,rho=1070.0}"]
 
     def statics(*changes: str) -> np.ndarray:
-        small = reduced(build(load_scene("block_3d", [*base, *changes]), comm=comm))
+        small = krylov_model(build(load_scene("block_3d", [*base, *changes]), comm=comm))
         return (small.C @ small.G)[:3]  # the tip, against translations and rotations; V' K V = 1
 
     fine = statics("tissue.cells=[9,9,18]", "tissue.refine={}")
@@ -305,7 +305,7 @@ FINE = {"block_3d": ["tissue.cells=[10,6,14]"], "pillow_3d": ["tissue.refine={to
 def test_estimates_of_scenes(comm: MPI.Intracomm, name: str, changes: list[str], most: float) -> None:
     """As they ship and with even linear cells, against finer graded meshes; no error is larger than ``most``."""
     fine = [*(STRIP if STRIP[0] in changes else []), *FINE.get(name, FINEST)]
-    small, other = (reduced(build(load_scene(name, c), comm=comm)) for c in (changes, fine))
+    small, other = (krylov_model(build(load_scene(name, c), comm=comm)) for c in (changes, fine))
     true, _ = difference(small, other)
     result = estimate(small.model, small)
     assert true <= most
@@ -320,8 +320,8 @@ def test_estimates_of_scenes(comm: MPI.Intracomm, name: str, changes: list[str],
 def test_mesh_file_is_compared_with_what_is_finer_everywhere(comm: MPI.Intracomm, order: int) -> None:
     """The bisected edges of the pillow leave its error, which is inside."""
     changes = ["time.steps=100", "tissue.refine=false"]
-    fine = reduced(build(load_scene("pillow_3d", ["time.steps=100"]), comm=comm))
-    small = reduced(build(load_scene("pillow_3d", [*changes, f"tissue.order={order}"]), comm=comm))
+    fine = krylov_model(build(load_scene("pillow_3d", ["time.steps=100"]), comm=comm))
+    small = krylov_model(build(load_scene("pillow_3d", [*changes, f"tissue.order={order}"]), comm=comm))
     true, result = difference(small, fine)[0], estimate(small.model, small)
     assert 0.4 <= result.estimate / true <= 1.1
     assert true <= result.bound
