@@ -10,13 +10,21 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.checksums import (
+    AGAIN,
+    digest,
+    read_arrays,
+    read_manifest,
+    remove_others,
+    write_arrays,
+    write_manifest,
+)
 from softgrasp.fem.errors import CheckpointError, agree, shortened
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.mesh.check import counted
 from softgrasp.fem.mesh.scene_hash import scene_hash
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.sealed import AGAIN, digest, read_arrays, read_manifest, remove_others, write_arrays, write_manifest
 
 FORMAT = 5
 FREE_OUTPUT = ("fields", "frames", "checkpoint_every", "memory")  # what a run shows and keeps, not what it computes

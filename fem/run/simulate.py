@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from softgrasp.fem.checksums import AGAIN
 from softgrasp.fem.errors import CheckpointError, Interrupted, Paused, ResourceError, SceneError, SolverError, agree
 from softgrasp.fem.model.build import Model
 from softgrasp.fem.model.outputs import Output, make_outputs
@@ -19,13 +20,12 @@ from softgrasp.fem.owned import locked
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.checkpoint import RestartState, read_checkpoint, write_checkpoint
 from softgrasp.fem.run.interrupt import interruptible
-from softgrasp.fem.run.midpoint import make_midpoint
+from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.motion import Force, ForceDrive, TableDrive, force_taken, force_values, free_table
 from softgrasp.fem.run.snapshots import make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
 from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.scene import Scene
-from softgrasp.fem.sealed import AGAIN
 from softgrasp.fem.solve.solvers import choose_solver
 from softgrasp.fem.solve.statics import equilibrium
 
@@ -151,7 +151,7 @@ class Run(Stepped):
         """Force on the hand in each step, see :class:`Trajectory`. Collective."""
         if self.drive.u is not None:
             return self.drive.u
-        pulls = self.pulls[1:] if self.midpoint.held.whole else total(self.layout.comm, self.pulls[1:])
+        pulls = self.pulls[1:] if self.midpoint.operators.whole else total(self.layout.comm, self.pulls[1:])
         return force_taken(self.model.system, pulls, self.drive.v, self.drive.c, self.dt)
 
     def watch_energy(self) -> None:
@@ -185,7 +185,7 @@ class Run(Stepped):
             legs=self.legs,
             beside=self.beside,
             state=self.state.array,
-            r=midpoint.held.leave(midpoint.r.array_r),
+            r=midpoint.operators.leave(midpoint.r.array_r),
             pending=midpoint.pending,
             hand_q=self.drive.q[: n + 1],
             hand_v=self.drive.v[: n + 1],
@@ -215,7 +215,7 @@ class Run(Stepped):
         self.name, self.beside = saved.run, saved.beside
         self.state = self.store.target(n)
         self.state.array[:] = saved.state
-        midpoint.r.array_w[:] = midpoint.held.enter(saved.r)
+        midpoint.r.array_w[:] = midpoint.operators.enter(saved.r)
         midpoint.pending = saved.pending
         self.drive.q[: n + 1], self.drive.v[: n + 1] = saved.hand_q, saved.hand_v
         self.local_outputs[: n + 1], self.pulls[: n + 1] = saved.outputs, saved.pulls

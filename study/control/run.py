@@ -24,7 +24,7 @@ from softgrasp.lqr.plant.gain import PlantState
 from softgrasp.lqr.reduced.bases import A_PRIORI
 from softgrasp.study.control import measure, report
 from softgrasp.study.control.result import ControlStudy, GainStudy, Retuned
-from softgrasp.study.pictures.beside import beside
+from softgrasp.study.pictures.background import draw_in_background
 from softgrasp.study.pictures.frames import Frames
 from softgrasp.study.report.page import Section
 from softgrasp.study.report.tables import pairs
@@ -163,7 +163,7 @@ def _drawn(session: Session, study: ControlStudy, frames: Frames) -> Callable[[]
 
         return draw_all(out, study, poles, frames)
 
-    return beside(session.comm, session.out, draw)
+    return draw_in_background(session.comm, session.out, draw)
 
 
 def unused_rate(model: Model) -> str:

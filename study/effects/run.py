@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn
 
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.memory import free_bytes, size_text
+from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.measure import AGAIN, SCENE, bare_output, ends, measure_builds, measure_steps, objects_of

@@ -138,3 +138,8 @@ def numeric(cell: Any) -> bool:
     if cell is None or cell in ("", "-") or (isinstance(cell, NUMBERS) and not isinstance(cell, bool)):
         return True
     return re.fullmatch(r"[<~]? ?[-+]?[\d.]+(e[-+]?\d+)?( ?%| [a-zA-Zµ/]{1,4})?( ?!)?", str(cell)) is not None
+
+
+def percent(share: float) -> str:
+    """A share as a percentage of two digits."""
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"

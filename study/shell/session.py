@@ -92,9 +92,9 @@ class Session:
         if scene.tissue.refine is None:
             model = build(scene, comm=self.comm)
         else:
-            from softgrasp.fem.accuracy.adapt import build_to_tolerance  # only scenes with graded cells pay for it
+            from softgrasp.fem.accuracy import adapt  # only scenes with graded cells pay for it
 
-            model = build_to_tolerance(scene, self.comm, steps)
+            model = adapt.build(scene, comm=self.comm, steps=steps)
         layout = model.system.layout
         self.console.print(f"n_s = {layout.n_s}, n_e = {layout.n_e}, 2n = {layout.states}, {layout.comm.size} rank(s)")
         show_warnings(self.console, model.space.mesh.notes)

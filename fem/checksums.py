@@ -87,7 +87,7 @@ def write_manifest(path: Path, entry: Mapping[str, Any]) -> None:
     fresh = path.with_suffix(".new")
     note(fresh, path)
     with fresh.open("w") as file:
-        file.write(json.dumps({**entry, "sha256": _seal(entry)}, indent=2) + "\n")
+        file.write(json.dumps({**entry, "sha256": _checksum(entry)}, indent=2) + "\n")
         file.flush()
         os.fsync(file.fileno())
     fresh.replace(path)
@@ -108,7 +108,7 @@ def read_manifest(path: Path, format: int, advice: str = AGAIN) -> dict[str, Any
             f"{path} was written by another version of softgrasp (format {entry['format']}, this one reads {format}); "
             f"{advice}"
         )
-    if entry.pop("sha256", None) != _seal(entry):
+    if entry.pop("sha256", None) != _checksum(entry):
         raise CheckpointError(f"{path} is damaged: its SHA-256 is not that of its contents; {advice}")
     return entry
 
@@ -122,5 +122,5 @@ def remove_others(folder: Path, patterns: Iterable[str], kept: Iterable[str]) ->
                 old.unlink(missing_ok=True)
 
 
-def _seal(entry: Mapping[str, Any]) -> str:
+def _checksum(entry: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(entry, sort_keys=True).encode()).hexdigest()
