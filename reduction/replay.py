@@ -13,12 +13,12 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.snapshots import Snapshots
 from softgrasp.fem.run.trajectory import Trajectory
-from softgrasp.fem.system import BlockSystem
 from softgrasp.reduction import online
 from softgrasp.reduction.bases.engines import factor
 from softgrasp.reduction.errors import ModelComparison, ModelErrors, full_energy, shown_rows, state_rows, with_hand
 from softgrasp.reduction.model import ReducedModel, SmallModel
 from softgrasp.reduction.online import ReducedTrajectory
+from softgrasp.reduction.origin import Origin, check_origin
 from softgrasp.reduction.propagator import Propagator, propagator
 
 if TYPE_CHECKING:
@@ -50,18 +50,20 @@ class FullRun:
         """Tissue energy (z' K z + v_z' M v_z) / 2 of every snapshot, (m,) [J]. Collective at the first use."""
         return full_energy(self.model.system, self.snapshots.Z)
 
-    @cached_property
+    @property
     def force(self) -> Array:
-        """Force on the hand that gives its motion, (steps, n_s) [N, N m]. Collective at the first use."""
-        return hand_force(self.model.system, self.trajectory, self.snapshots)
+        """Force u on the hand that gives its motion in the model, (steps, n_s) [N, N m]: one-way M_hand a - weight."""
+        system, trajectory = self.model.system, self.trajectory
+        if system.two_way:
+            return trajectory.force
+        return np.asarray(np.diff(trajectory.v_s, axis=0) / self.dt @ system.M_hand.T - system.weight)
 
 
 def full_run(model: Model, trajectory: Trajectory) -> FullRun:
     """A run of ``simulate`` at the materials of ``model`` as reduced runs are compared with it. Collective.
 
     Raises:
-        SceneError: the run kept no snapshots in memory, or too few of them for the force on the hand, or the body is at
-            rest in all of them.
+        SceneError: the run kept no snapshots in memory, or the body is at rest in all of them.
     """
     snapshots = trajectory.snapshots
     if snapshots is None:
@@ -77,34 +79,26 @@ def full_run(model: Model, trajectory: Trajectory) -> FullRun:
             f"hand and tissue of scene {model.scene.name} stay at rest for the whole run, so there is no motion to "
             "reduce; give a motion.target away from the start, or another time.start"
         )
-    if model.system.two_way and len(snapshots.steps) != len(trajectory.times):
-        raise SceneError("output.every must be 1 with effects.reaction; the force on the hand needs every state")
     return FullRun(model, trajectory, snapshots)
-
-
-def hand_force(system: BlockSystem, trajectory: Trajectory, snapshots: Snapshots) -> Array:
-    """Force on the hand that gives the motion of the full run under the midpoint rule, (steps, n_s). Collective.
-
-    u = M_hand a [+ M_rigid (a + alpha v - g) + G'(v_z' + alpha v_z)] - M_hand g when the hand weighs, at the midpoints;
-    [...] two-way only, with every state of the run; alpha only when damping drags in space.
-    """
-    v, dt = trajectory.v_s, trajectory.times[1] - trajectory.times[0]
-    a = np.diff(v, axis=0) / dt
-    u = a @ system.M_hand.T - system.weight
-    if system.two_way:
-        g, alpha = system.fall, system.damping.drag
-        momentum = total(system.layout.comm, system.G.T @ snapshots.Z[system.layout.n_local :]).T
-        u += (a + alpha * (v[1:] + v[:-1]) / 2 - g) @ system.M_rigid.T
-        u += np.diff(momentum, axis=0) / dt + alpha * (momentum[1:] + momentum[:-1]) / 2
-    return np.asarray(u)
 
 
 def replay_linear(
     rom: ReducedModel, model: Model, run: Trajectory | FullRun, *, allow_unstable: bool = False
 ) -> ReducedTrajectory:
     """A linear model under the hand of a full run, see :func:`softgrasp.reduction.reduce.replay`. Collective."""
-    step, drive = replay_inputs(rom, rom.at(model.system.materials), as_full(model, run))
+    full = as_full(model, run)
+    check_scenes(rom.origin, rom.name, model, full)
+    step, drive = replay_inputs(rom, rom.at(model.system.materials), full)
     return online.run(step, allow_unstable=allow_unstable, **drive)
+
+
+def check_scenes(origin: Origin, name: str, model: Model, full: FullRun) -> None:
+    """Refuse scenes that differ in more than materials, motion and time, see :mod:`softgrasp.reduction.origin`.
+
+    Raises ModelError: with the first key that differs.
+    """
+    for each in (model,) if full.model.scene is model.scene else (model, full.model):
+        check_origin(origin, each.scene_keys, name)
 
 
 def errors_linear(rom: ReducedModel, reduced_run: ReducedTrajectory, full: FullRun) -> ModelErrors:

@@ -226,7 +226,7 @@ class ForceDrive:
 
 
 def force_taken(system: BlockSystem, pulls: Array, v: Array, c: Array, dt: float) -> Array:
-    """Force u [N, N m] in each step that leads the hand against inertia and tissue, shape (steps, n_s).
+    """Mean force u [N, N m] in each step that leads the hand against inertia and tissue, shape (steps, n_s).
 
         u = M_hand a + M_rigid (a - g + alpha v_mid) + G' (z'' + alpha z'_mid) - weight
 

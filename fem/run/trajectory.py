@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.solve.solvers import SolverUsed
 
 if TYPE_CHECKING:
     from softgrasp.fem.strain.newton import NewtonFigures
@@ -31,15 +32,15 @@ class Trajectory:
     outputs_rigid: Array  # what they would be if the tissue moved rigidly with the hand, same shape
     columns: Columns  # one per output component
     snapshots: Snapshots | None  # stored states
+    # mean force of the robot on the hand in each step, by the midpoint rule that at t_n + dt/2: applied, or what a
+    # prescribed motion takes against inertia, tissue, gravity and drag [N, N m], shape (steps, n_s)
+    force: Array
     final: Array  # [z; v_z] of this rank's nodes at the end [m; m/s], shape (2 n_local,)
     energy_drift: float  # |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless
     residuals: tuple[float, float]  # relative residual of the first and the last solve
-    solver: tuple[str, str]  # name and reason
+    solver: SolverUsed  # name, reason and package
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage, "steps", "per_step", on the slowest rank
     steps_timed: int = 0  # steps taken since the run was started or resumed
-    # mean force on the hand in each step without its weight [N, N m], shape (steps, n_s): applied, or with two-way
-    # coupling what a prescribed motion takes; None when one-way coupling leaves it unknown
-    force: Array | None = None
     newton: NewtonFigures | None = None  # how the steps of finite strain converged; None where they are linear
 
     @property

@@ -98,7 +98,7 @@ class Reduction(Section):
 
 
 class Study(Section):
-    """How `softgrasp study`, `effects` and `hardcases` judge."""
+    """How `softgrasp study` and `effects` judge."""
 
     tolerance: Annotated[float, Field(gt=0, lt=1)] = Field(
         1e-3, description="relative change of the outputs that counts [1]"

@@ -220,7 +220,7 @@ def _loop(study: ControlStudy) -> dict[str, Any]:
         "cost_to_come": loops.to_come,
         "input_largest": np.abs(full.inputs).max(axis=0).tolist(),
         "saturated": full.saturated,
-        "solver": {"name": full.solver[0], "reason": full.solver[1]},
+        "solver": full.solver._asdict(),
         "time": dict(full.seconds),
         "reduced": reduced,
     }

@@ -12,6 +12,7 @@ import numpy as np
 from softgrasp.fem.accuracy.adapt import estimated
 from softgrasp.fem.accuracy.estimate import next_unknowns
 from softgrasp.fem.errors import SoftgraspError
+from softgrasp.study.report.tables import percent
 
 if TYPE_CHECKING:
     from softgrasp.fem.model.build import MeshEstimate, Model
@@ -101,11 +102,6 @@ def accuracy_report(result: MeshEstimate | None, run: Trajectory) -> AccuracyRep
         summary=[f"The deformation is about {off} off by the mesh and {in_time} by the time step."],
         warnings=warnings,
     )
-
-
-def percent(share: float) -> str:
-    """A share as a percentage of two digits."""
-    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
 def draw(out_png: Path, run: Trajectory, result: MeshEstimate) -> tuple[Path, ...]:

@@ -70,9 +70,7 @@ class Simulation:
 
     @property
     def force_peak(self) -> dict[str, float]:
-        """Largest force on the hand along each axis [N, N m]; empty where it is not known."""
-        if self.run.force is None:
-            return {}
+        """Largest force on the hand along each axis [N, N m]."""
         return {c.axis: float(x) for c, x in zip(self.hand(), np.abs(self.run.force).max(axis=0), strict=True)}
 
     def hand(self, name: str = "hand") -> Columns:
@@ -92,7 +90,7 @@ class Simulation:
             "cells": sizes.cells,
             "steps": scene.time.steps,
             "dt": scene.time_end / scene.time.steps,
-            "solver": {"name": run.solver[0], "reason": run.solver[1]},
+            "solver": run.solver._asdict(),
             "residual_first": run.residuals[0],
             "residual_last": run.residuals[1],
             "hand_final": run.q_s[-1].tolist(),
@@ -101,7 +99,7 @@ class Simulation:
             "output_places": self.places,
             "energy_drift": run.energy_drift,
             **({} if run.newton is None else {"newton": newton_keys(run.newton)}),
-            **({"force_peak": self.force_peak} if run.force is not None else {}),
+            "force_peak": self.force_peak,
             "time": {
                 **stages,
                 "steps_timed": run.steps_timed,
@@ -117,18 +115,18 @@ class Simulation:
     def rows(self) -> list[tuple[str, str]]:
         """The short table of a run as label and text."""
         run, seconds, steps = self.run, self.run.seconds, self.scene.time.steps
-        loads = [f"{c.axis} {self.force_peak[c.axis]:.4g} {c.load_unit}" for c in self.hand() if self.force_peak]
+        loads = [f"{c.axis} {self.force_peak[c.axis]:.4g} {c.load_unit}" for c in self.hand()]
         timed = f"{steps}" if run.steps_timed == steps else f"{run.steps_timed} of {steps}, since the run was resumed,"
         return [
             ("hand at the end", "(" + ", ".join(f"{x:.6g}" for x in run.q_s[-1]) + ")"),
             *((c.label, f"{y:.6g} {c.unit}") for c, y in zip(run.columns, run.outputs[-1], strict=True)),
             *self.places.items(),
-            *([("largest force on the hand", ", ".join(loads))] if loads else []),
+            ("largest force on the hand", ", ".join(loads)),
             ("energy drift", f"{run.energy_drift:.1e}"),
             *([("iterations", newton_text(run.newton))] if run.newton else []),
             ("residual, first and last", f"{run.residuals[0]:.1e}, {run.residuals[1]:.1e}"),
-            ("solver", run.solver[0]),
-            ("", run.solver[1]),
+            ("solver", f"{run.solver.name}, by {run.solver.package}"),
+            ("", run.solver.reason),
             ("mesh, assembly, factor", ", ".join(f"{seconds[key]:.3g} s" for key in ("mesh", "assembly", "factor"))),
             ("steps", f"{timed} in {seconds['steps']:.3g} s, {1e6 * seconds['per_step']:.4g} us each"),
             ("peak memory, all ranks", f"{self.memory_peak_mb:.0f} MiB"),
@@ -154,13 +152,11 @@ class Simulation:
         return texts
 
     def trajectory(self) -> Table:
-        """State at each time, and the force in the step that ends there, nan in the first row."""
+        """State at each time t, and the force at t - dt/2, mean over the step that ends at t; nan in the first row."""
         run, n_s = self.run, self.sizes.n_s
         header = trajectory_header(n_s, self.dimension, run.columns, velocity=True)
-        parts = [run.times, run.q_s, run.v_s, run.outputs]
-        if run.force is not None:
-            header += [f"{c.label} [{c.load_unit}]" for c in self.hand("force")]
-            parts.append(np.vstack([np.full(n_s, np.nan), run.force]))
+        header += [f"{c.label} [{c.load_unit}]" for c in self.hand("force")]
+        parts = [run.times, run.q_s, run.v_s, run.outputs, np.vstack([np.full(n_s, np.nan), run.force])]
         return Table(tuple(header), np.column_stack(parts).tolist())
 
 

@@ -31,7 +31,7 @@ from softgrasp.reduction.certified.trainer import (
     train_key,
     validate,
 )
-from softgrasp.reduction.certified.truth import Tested, tested
+from softgrasp.reduction.certified.validation import Tested, tested
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.parameters import run_at
 from softgrasp.study.reduce.result import reduce_result

@@ -14,12 +14,13 @@ from softgrasp.fem.model.build import Stopwatch
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.reduction.archive import save
 from softgrasp.reduction.replay import FullRun
-from softgrasp.study.pictures.beside import beside
+from softgrasp.study.pictures.background import draw_in_background
 from softgrasp.study.reduce import measure, report
 from softgrasp.study.reduce.findings import findings
 from softgrasp.study.reduce.result import N_NOTE, FullTimes, ReductionStudy, best
 from softgrasp.study.reduce.views import gather_views
 from softgrasp.study.report.tables import Table
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Flags, Page, Session, list_files
 
 
@@ -38,6 +39,7 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
     return measure.chosen_methods(scene.reduction)
 
 
+@folder_lock()
 def run_reduce(
     path: Path,
     out: Path,
@@ -108,7 +110,7 @@ def reduce_model(
 
             return draw(folder, sweeps, times.steps, views)
 
-        drawn = beside(session.comm, session.out, draw_all)
+        drawn = draw_in_background(session.comm, session.out, draw_all)
     with watch.stage("box"):
         box = measure.measure_box(full, sweeps, partial(say, "other parameters"))
     notes = measure.speed_notes(model.system.layout.n_e, model.scene.time.steps, times, sweeps)

@@ -14,7 +14,8 @@ from softgrasp.fem.run.simulate import simulate
 from softgrasp.reduction.errors import ModelComparison, full_energy
 from softgrasp.reduction.model import ModelError
 from softgrasp.reduction.online import run
-from tests.helpers.models import Array, gather_matrix, gather_rows, gather_states
+from softgrasp.reduction.replay import full_run, replay_linear
+from tests.helpers.models import Array, close, gather_matrix, gather_rows, gather_states
 from tests.helpers.reduced import (
     FORCED,
     KINDS,
@@ -99,3 +100,18 @@ def test_errors_of_the_full_space_vanish(comm: MPI.Intracomm) -> None:
     assert comparison.projection_error("velocities", rom, small) < 1e-13  # the whole space leaves rounding
     with pytest.raises(ModelError, match="reach step 30"):
         comparison.errors(rom, small, run(small, 0.1, np.zeros((5, 2))))
+
+
+def test_a_pushed_model_repeats_a_led_run_of_which_few_states_are_kept(comm: MPI.Intracomm) -> None:
+    """In the whole space it is the full model; the force comes from the run, not from its states.
+
+    Positions part, for the profile of the scene gives them beside the velocities that the steps take.
+    """
+    effects = DAMPED["effects"] | {"reaction": True, "gravity": {"g": [1.0, -9.0], "hand_weight": True}}
+    model = model_of(comm, {"effects": effects, "motion": {"drive": "motion"}, "output": {"every": 3}})
+    full = full_run(model, simulate(model))
+    rom = reduced(model, whole_basis(model.system.layout, "qp", "absolute", False))
+    again = replay_linear(rom, model, full)
+    # rounding of 30 steps in other coordinates
+    assert close(again.v_s, full.trajectory.v_s) < 1e-9
+    assert close(again.outputs - again.q_s, full.trajectory.outputs - full.trajectory.q_s) < 1e-9

@@ -114,13 +114,12 @@ def test_pushed_hand_gains_the_momentum_of_the_force(effects: dict[str, Any]) ->
     comm, n = system.layout.comm, system.layout.n_local
     tissue = comm.allreduce(system.G.T @ run.final[n:])
     momentum = (system.M_hand + system.M_rigid) @ run.v_s[-1] + tissue
-    assert run.force is not None
     assert np.allclose(momentum, run.force.sum(axis=0) * dt, rtol=1e-8)
     assert run.energy_drift < 1e-9
     assert run.newton is not None
     assert run.newton.min_det < 0.95  # it is not a small deformation
     # led along the same way, the hand takes the same force
-    again = simulate(model, force=lambda n, t, q, v: run.force[n])  # type: ignore[index]
+    again = simulate(model, force=lambda n, t, q, v: run.force[n])
     assert close(again.q_s, run.q_s) < 1e-12
 
 
@@ -162,23 +161,19 @@ def test_step_that_does_not_converge_is_divided(way: str) -> None:
         "reaction": way != "led",
         "damping": {"kind": "rayleigh", "alpha": 0.1, "beta": 0.0, "drag": "space"},
     }
-    if way == "led":
-        effects = {}
     model = finite(time={"steps": 6}, motion={"target": [6.0, 3.0], "duration": 1.5}, effects=effects)
     force = (lambda n, t, q, v: 12 * wave(n, t, q, v)) if way == "pushed" else None
     run = simulate(model, force=force)
     assert run.newton is not None
     assert run.newton.divided > 0
     assert run.energy_drift < 1e-9
-    if way != "led":
-        system, dt = model.system, model.scene.time_end / 6
-        n = system.layout.n_local
-        moved, speed = (total(system.layout.comm, system.G.T @ part) for part in (run.final[:n], run.final[n:]))
-        momentum = (system.M_hand + system.M_rigid) @ run.v_s[-1] + speed
-        way_of_hand = (run.v_s[1:] + run.v_s[:-1]).sum(axis=0) / 2 * dt
-        lost = 0.1 * (system.M_rigid @ way_of_hand + moved)  # alpha times what the whole tissue moved
-        assert run.force is not None
-        assert np.allclose(momentum + lost, run.force.sum(axis=0) * dt, rtol=1e-8)
+    system, dt = model.system, model.scene.time_end / 6
+    n = system.layout.n_local
+    moved, speed = (total(system.layout.comm, system.G.T @ part) for part in (run.final[:n], run.final[n:]))
+    momentum = (system.M_hand + system.M_rigid) @ run.v_s[-1] + speed
+    way_of_hand = (run.v_s[1:] + run.v_s[:-1]).sum(axis=0) / 2 * dt
+    lost = 0.1 * (system.M_rigid @ way_of_hand + moved)  # alpha times what the whole tissue moved
+    assert np.allclose(momentum + lost, run.force.sum(axis=0) * dt, rtol=1e-8)
 
 
 @pytest.mark.ranks

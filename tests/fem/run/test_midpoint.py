@@ -12,11 +12,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from softgrasp.fem.model.build import Model, build
-from softgrasp.fem.petsc import PETSc, total
+from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import TissueMidpoint, state_on
-from softgrasp.fem.run.motion import force_taken, force_values, motion_table
-from softgrasp.fem.run.simulate import Run, RunOptions, simulate
-from softgrasp.fem.run.stepping import make_ts
+from softgrasp.fem.run.motion import force_values, motion_table
+from softgrasp.fem.run.simulate import simulate
 from tests.helpers.models import (
     CUBE,
     LAYERS,
@@ -316,42 +315,6 @@ def test_energy_under_gravity_does_not_drift(comm: MPI.Intracomm) -> None:
     energy = true_energy(model, run.snapshots.Z)
     assert np.abs(energy - load @ z).max() < 1e-12 * energy.max()  # the bound the issue asks for
     assert run.energy_drift < 1e-12  # the same bound
-
-
-@pytest.mark.parametrize("damping", [{}, RAYLEIGH, DRAGGED], ids=["undamped", "rayleigh", "dragged"])
-def test_force_that_a_prescribed_motion_takes(comm: MPI.Intracomm, damping: dict[str, Any]) -> None:
-    """The hand's row of the dense system; without gravity its impulse is the momentum of hand and tissue."""
-    weight = {} if not damping else GRAVITY
-    effects = damping | weight | {"reaction": True, "rotation": True}
-    model = build(make_scene(effects=effects, motion={"target": [5.0, 3.0, 0.2]}), comm=comm)
-    run = simulate(model)
-    ref = reference(model)
-    full, n_s = first_order(ref), 3
-    X, dt = absolute(model, run.q_s.T, run.v_s.T, run.snapshots.Z), 3.0 / 60
-    rows = slice(len(X) // 2, len(X) // 2 + n_s)
-    u = full.E[rows] @ np.diff(X) / dt - full.A[rows] @ (X[:, 1:] + X[:, :-1]) / 2 - full.f[rows, None]
-    assert run.force.shape == (60, n_s)
-    assert close(run.force, u.T) < SAME_RUN
-    if not damping:
-        momentum = ref.M_hand @ run.v_s[-1] + ref.R.T @ ref.M @ ref.P @ X[len(X) // 2 :, -1]
-        assert close(run.force.sum(axis=0) * dt, momentum) < SAME_RUN
-
-
-@pytest.mark.parametrize("reaction", [False, True])
-def test_an_applied_force_is_kept(comm: MPI.Intracomm, reaction: bool) -> None:
-    """Two-way it is also what the hand's motion takes."""
-    effects = DRAGGED | GRAVITY | {"reaction": reaction}
-    model = build(make_scene(motion={"drive": "force"}, effects=effects), comm=comm)
-    run = Run(model, RunOptions())
-    ts = make_ts(run)
-    run.start()
-    run.advance_to(ts, run.steps)
-    ts.destroy()
-    np.testing.assert_array_equal(run.force(), force_values(model.scene, 2, model.system.M_hand))
-    if reaction:
-        pulls = run.pulls[1:] if run.midpoint.held.whole else total(comm, run.pulls[1:])
-        taken = force_taken(model.system, pulls, run.drive.v, run.drive.c, run.dt)
-        assert close(taken, run.force()) < SAME_RUN
 
 
 def pulse(n: int, t: float, q: Array, v: Array) -> Array:

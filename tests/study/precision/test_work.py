@@ -31,7 +31,7 @@ from softgrasp.study.precision import plots as work_plots
 from softgrasp.study.precision import reduced as wp_reduced
 from softgrasp.study.precision import settings as wp_meshes
 from softgrasp.study.precision import truth as wp_truth
-from softgrasp.study.precision.answer import advice, parse_budget, parse_tolerance
+from softgrasp.study.precision.answer import advice, parse_budget
 from softgrasp.study.precision.fit import interpolate, pareto, usable
 from softgrasp.study.precision.forward import step_counts, too_slow
 from softgrasp.study.precision.full import find_places, largest, run_probed
@@ -51,6 +51,7 @@ from softgrasp.study.precision.settings import (
 )
 from softgrasp.study.precision.tables import question_table
 from softgrasp.study.reduce.run import run_reduce
+from softgrasp.study.shell.options import parse_tolerance
 from softgrasp.study.shell.timing import power_law
 from tests.helpers.browser import look
 from tests.helpers.models import Array, graded_model, make_scene, rough_save, write_scene
