@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from softgrasp.fem.errors import agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.material import LayerMaterial
+from softgrasp.fem.owned import note
 from softgrasp.fem.petsc import Array
 from softgrasp.reduction.model import ModelError, Outputs, ReducedModel
 from softgrasp.reduction.operators import Reconstruction
@@ -32,9 +33,11 @@ ROWS = 1 << 16  # rows of the reconstruction read at a time: 30 MB for 60 column
 # what a file says of a model in JSON, beside its materials and the names of its outputs
 LINEAR_KEYS = (
     "name", "N", "coordinates", "frame", "structure", "fixed_solid", "split", "alpha", "in_space", "damped",
-    "hand_weight", "two_way", "scene_hash", "seconds",
+    "hand_weight", "two_way", "scene_hash", "origin", "seconds",
 )  # fmt: skip
-STRAIN_KEYS = ("cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "seconds")
+STRAIN_KEYS = (
+    "cells_full", "alpha", "in_space", "tau", "residual", "error_galerkin", "scene_hash", "origin", "seconds",
+)  # fmt: skip
 STRAIN_ARRAYS = {
     "cells": ("B", "weight", "xi", "layer", "cell", "centre"),
     "box": ("lam", "mu", "load", "reach"),
@@ -163,6 +166,7 @@ def write_model(
         with agree(comm):
             if comm.rank == 0:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                note(unfinished, path)
                 with h5py.File(unfinished, "w") as file:
                     file.attrs["format"], file.attrs["model"] = kind, json.dumps(about)
                     small(file)

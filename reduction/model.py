@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -173,6 +174,7 @@ class ReducedModel:
     gravity: Array | None = None  # acceleration of free fall in the hand's degrees of freedom, (n_s,), or None
     reconstruction: Reconstruction | None = None  # how states return to the mesh, or None
     scene_hash: str = ""  # of the scene the model was made for
+    origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
     seconds: dict[str, float] = field(default_factory=dict)  # offline time by stage
 
     def at(self, materials: tuple[LayerMaterial, ...] | None = None, gravity: Array | None = None) -> SmallModel:

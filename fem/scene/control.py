@@ -121,7 +121,9 @@ class Loop(Section):
         description="largest torque on a turning hand about each axis [N m], one number or one per axis; none by "
         "default",
     )
-    delay: bool = Field(False, description="the load acts one sample late [no unit], held only")
+    delay: bool | Annotated[int, Field(ge=0, le=100)] = Field(
+        False, description="samples that the load acts late, true for one [1], held only"
+    )
 
 
 class ControlOutput(Section):

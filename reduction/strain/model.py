@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -206,6 +207,7 @@ class StrainModel:
     layout: BlockLayout | None = None
     Phi: Array | None = None
     scene_hash: str = ""  # of the scene it was made for
+    origin: dict[str, Any] = field(default_factory=dict)  # of `reduction.origin`, what that scene says of a run; or {}
     seconds: dict[str, float] = field(default_factory=dict)  # offline, by stage
 
     @property

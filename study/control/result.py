@@ -13,7 +13,7 @@ from softgrasp.fem.columns import farthest
 from softgrasp.fem.petsc import Array
 from softgrasp.lqr.design.controller import CertifiedController
 from softgrasp.lqr.design.duration import LoopPlan
-from softgrasp.lqr.design.feedback import Design
+from softgrasp.lqr.design.feedback import Design, running_words
 from softgrasp.lqr.design.orders import BasisGains
 from softgrasp.lqr.loop.full import LoopTrajectory
 from softgrasp.lqr.loop.margins import LoopMargins, loop_margins
@@ -34,7 +34,7 @@ TITLES = {
 }
 
 REPORT = ("N", "error_P", "error_K", "cost_excess", "abscissa_full", "time_are", "stable", "certified", "reason")
-BOUNDS = ("cost_excess_proved", "cost_excess_at_most", "unbounded")
+BOUNDS = ("cost_excess_proved", "cost_excess_at_most", "bounded_to", "unbounded")
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class GainStudy:
     @cached_property
     def margins(self) -> LoopMargins | None:
         """Of the loop under the small controller, on the plant that it was made for."""
-        return loop_margins(self.controller.controller, int(self.design.actuation.delay)) if self.controller else None
+        return loop_margins(self.controller.controller, self.design.actuation.delay) if self.controller else None
 
     @property
     def findings(self) -> list[str]:
@@ -172,6 +172,7 @@ class ControlStudy(GainStudy):
     def result(self, seconds: dict[str, float]) -> dict[str, Any]:
         """The keys of ``result.json``. Collective."""
         return super().result(seconds) | {
+            "bounded_loop": running_words(self.design),
             "reduced": {b.name: [report_dict(r, REPORT + BOUNDS) for r in b.reports] for b in self.bases},
             "refused": {b.name: b.refused for b in self.bases if b.refused},
             "retune": [_retuned(r) for r in self.retuned],

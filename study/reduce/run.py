@@ -11,6 +11,7 @@ from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.reduce.linear import measure
 from softgrasp.study.reduce.linear.run import run_linear
+from softgrasp.study.shell.folder import folder_lock
 from softgrasp.study.shell.session import Flags, Session
 
 
@@ -29,6 +30,7 @@ def check_scene(scene: Scene) -> tuple[str, ...]:
     return measure.chosen_methods(scene.reduction)
 
 
+@folder_lock()
 def run_reduce(
     path: Path,
     out: Path,

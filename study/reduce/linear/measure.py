@@ -19,7 +19,7 @@ from softgrasp.reduction.errors import ModelComparison
 from softgrasp.reduction.model import ModelError, ReducedModel
 from softgrasp.reduction.online import run
 from softgrasp.reduction.parameters import box_of, grid_of, outside, run_at, training_of, training_states
-from softgrasp.reduction.projection import project
+from softgrasp.reduction.reduce import project_scene
 from softgrasp.reduction.replay import FullRun, comparison_of, replay_inputs, replay_linear
 from softgrasp.study.reduce.linear.result import (
     COMPARED,
@@ -92,12 +92,12 @@ def measured(
     """Models of nested bases with their errors and times; one without a run is put into ``refused``. Collective."""
     if not bases:
         return
-    system, outputs, key = full.model.system, full.model.outputs, full.model.scene_hash
+    outputs = full.model.outputs
     # smaller bases are leading columns of the largest: one factorisation gives the errors of all
-    comparison = comparison_of(project(bases[-1], system, outputs, key), full)
+    comparison = comparison_of(project_scene(bases[-1], full.model, outputs), full)
     for i, basis in enumerate(bases):
         progress(i, len(bases))
-        model = project(basis, system, outputs, key)
+        model = project_scene(basis, full.model, outputs)
         try:
             point = measure(model, full, comparison)
         except ModelError as error:
@@ -162,7 +162,7 @@ def sweep_all(names: Sequence[str], full: FullRun, say: Say) -> tuple[MethodSwee
 
 def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | None) -> list[TestedModel]:
     """Models of the best methods at two N: those of the sweep, and from ``states`` with the same N. Collective."""
-    system, outputs, models = full.model.system, full.model.outputs, []
+    outputs, models = full.model.outputs, []
     for s, _ in by_error(sweeps)[:METHODS_TESTED]:
         sizes = {p.N for N in (COMPARED, LARGER) if (p := nearest(s.points, N)) is not None}
         own = [s.models[N] for N in sorted(sizes)]
@@ -170,7 +170,8 @@ def box_models(full: FullRun, sweeps: Sequence[MethodSweep], states: States | No
         if states is None or not s.method.snapshots:
             continue
         bases, _ = bases_of(s.method.key, states, [model.N for model in own], full.model.scene.reduction, {})
-        models += [TestedModel(s.method, True, project(b, system, outputs)) for b, _ in zip(bases, own, strict=False)]
+        several = [project_scene(b, full.model, outputs) for b, _ in zip(bases, own, strict=False)]
+        models += [TestedModel(s.method, True, model) for model in several]
     return models
 
 
