@@ -8,7 +8,7 @@ K(t) is the finer tangent along the run. Midpoint steps of e take many steps of 
 middle of each, K(t) in some of them, in between it is linear. The estimate is |E|_F / |A + E|_F of z.
 
 No bound: e is of first order, and what no training run moved is in none of the columns. Inside the training box it came
-within 0.5 and 1.5 times the true error (`docs/guide/finite_strain.md`).
+within 0.38 and 1.8 times the true error (`docs/guide/finite_strain.md`).
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ def test_the_estimate_is_within_a_factor_of_three(scene: str, tmp_path: Path) ->
             for full in held:
                 run = replay_strain(rom, full, outside=True)  # in 3D one coordinate goes further than it was trained
                 ratio = run.error_estimate / errors_strain(rom, run, full).z
-                assert 1 / 3 < ratio < 3, (N, ratio)  # measured 0.5 to 1.8
+                assert 1 / 3 < ratio < 3, (N, ratio)  # measured 0.38 to 1.8
                 assert replay_strain(again, full, outside=True).error_estimate == run.error_estimate  # type: ignore[arg-type]
                 count += 1
     assert count >= 14
