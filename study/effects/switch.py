@@ -10,8 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import ValidationError
+
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.effects.gravity import EARTH
+from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
 
 TRIAL_ZETA = 0.01  # ratio of the first mode; silicone and passive tissue lie above, so it is a careful guess
@@ -44,10 +47,13 @@ class Switch:
 
 
 def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
-    """A copy of the scene after ``edit`` changed its table in place."""
+    """A copy of the scene after ``edit`` changed its table in place. Raises SceneError: it is no scene any more."""
     data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
     edit(data)
-    result = Scene.model_validate(data)
+    try:
+        result = Scene.model_validate(data)
+    except ValidationError as error:
+        raise SceneError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
     result._directory = scene.directory
     return result
 
@@ -78,7 +84,10 @@ def switch(scene: Scene, name: str, scales: Scales) -> Switch:
             table["hand"] |= {} if on else {"inertia": _hand_inertia(scene, scales)}
             _resize(table, d, d if on else d + len(scales.inertia))
 
-    return Switch(name, on, value, changed(scene, edit), "", strength, unit)
+    try:
+        return Switch(name, on, value, changed(scene, edit), "", strength, unit)
+    except SceneError as error:
+        return Switch(name, on, value, None, str(error))
 
 
 def neutral(scene: Scene, name: str, d: int) -> Scene | None:
@@ -89,10 +98,7 @@ def neutral(scene: Scene, name: str, d: int) -> Scene | None:
 
 def _obstacle(scene: Scene, name: str, scales: Scales) -> str:
     """Why the effect cannot be switched; empty where it can."""
-    active = {other for other, effect in EFFECTS.items() if effect.active(scene)}
-    on = name in active
-    if not on and active | {name} >= {"rotation", "finite_strain"}:
-        return "effects.rotation and effects.finite_strain exclude each other"
+    on = EFFECTS[name].active(scene)
     if name == "layers" and not on:
         return "there is no second material to try: layers cannot be invented"
     if name == "damping" and not on and scales.omega is None:
