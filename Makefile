@@ -7,10 +7,10 @@ BIN := .venv/bin
 STAMP := .venv/.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo paper_forward paper_accurate test check lint bench paper pictures docs clean
+.PHONY: help env demo paper_forward paper_accurate test check lint bench hardcases paper pictures docs clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
 
 env: $(STAMP) ## make .venv with everything needed (redone when pyproject.toml changes)
 
@@ -41,10 +41,13 @@ test: lint ## lint, then the tests on 1, 2 and 3 ranks
 	$(BIN)/mpiexec -n 3 $(BIN)/python -m pytest -q
 
 bench: $(STAMP) ## print the table of costs of the forward run
-	$(BIN)/python -m softgrasp.study.bench forward
+	$(BIN)/python -m benchmarks forward
+
+hardcases: $(STAMP) ## run the suite of hard cases, with its page
+	$(BIN)/python -m tests.hardcases
 
 paper: $(STAMP) ## every figure and table of the paper, and a page that compares
-	$(BIN)/python -m softgrasp.study.paper --out out/paper
+	$(BIN)/python demos/paper.py --out out/paper
 
 pictures: demo ## make the README's pictures again
 	cp out/paper_forward-simulate/move.png docs/paper_forward.png
@@ -65,4 +68,4 @@ docs: $(STAMP) ## build the documentation into out/site, with all links checked
 
 clean: ## remove .venv, out and caches
 	rm -rf .venv out build *.egg-info .mypy_cache .ruff_cache .import_linter_cache
-	find fem reduction lqr study softgrasp tests demos -name __pycache__ -type d -prune -exec rm -rf {} +
+	find fem reduction lqr study softgrasp benchmarks tests demos -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array, PETSc, combine, times_columns, total
 
 if TYPE_CHECKING:  # only scenes with finite strain load it
@@ -38,16 +39,6 @@ class LayerBlocks:
     K_mu: Component
     K_lambda: Component
     M_1: Component
-
-
-@dataclass(frozen=True)
-class LayerMaterial:
-    """Lame constants [Pa], density [kg/m^3] and Kelvin-Voigt time [s] of one layer."""
-
-    lam: float
-    mu: float
-    rho: float
-    beta: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import typer
 from softgrasp.fem.errors import SceneError
 from softgrasp.study.shell.ending import console, rank, run_command
 from softgrasp.study.shell.folder import default_folder
-from softgrasp.study.shell.options import takes
+from softgrasp.study.shell.options import parse_tolerance, takes
 
 LIST_WIDTH = 200  # [letters]
 app = typer.Typer(
@@ -210,7 +210,6 @@ def reduce(
     **shared: Any,
 ) -> None:
     """Build the reduced models of a scene and compare error and time; also under `mpiexec -n N`."""
-    from softgrasp.study.precision.answer import parse_tolerance
     from softgrasp.study.reduce.run import run_reduce
 
     _run(run_reduce, tolerance=None if tolerance is None else parse_tolerance(tolerance), **shared)
@@ -304,7 +303,7 @@ def study(
     **shared: Any,
 ) -> None:
     """Show what accuracy costs in time; resumes what an earlier run of the same scene left in the output folder."""
-    from softgrasp.study.precision.answer import parse_budget, parse_tolerance
+    from softgrasp.study.precision.answer import parse_budget
     from softgrasp.study.precision.run import run_study
 
     limit = None if budget is None else parse_budget(budget)
@@ -319,21 +318,6 @@ def effects(**shared: Any) -> None:
     from softgrasp.study.effects.run import run_effects
 
     _run(run_effects, **shared)
-
-
-@app.command()
-@takes("out quick family quiet empty pdf")
-def hardcases(
-    out: Path | None,
-    quick: Annotated[bool, typer.Option("--quick", help="the quick half only")] = False,
-    family: Annotated[str | None, typer.Option(help="one family of cases only")] = None,
-    **shared: bool,
-) -> None:
-    """Run the suite of hard cases: stay stable, or refuse with a reason."""
-    from softgrasp.study.hardcases.run import run_hardcases
-
-    result = run_hardcases(out or default_folder("hardcases"), console(), quick=quick, family=family, **shared)
-    raise typer.Exit(0 if result["ok"] else 1)
 
 
 def main() -> None:

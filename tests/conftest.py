@@ -21,6 +21,7 @@ os.environ["MPLBACKEND"] = "Agg"  # before matplotlib: no test needs a display
 
 OWN = MPI.COMM_WORLD.Dup()  # never matches the messages of a test
 OUTCOMES = ("passed", "skipped", "failed")
+SERIAL = {"study", "benchmarks", "hardcases"}  # rooms above lqr
 LIMIT = float(os.environ.get("MPI_TEST_LIMIT", "30"))  # [s] from one rank's failure to Abort
 
 
@@ -67,10 +68,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Most ranks of a test: 1 where marked serial, 3 where marked ranks, n where ranks(n); else 2, and 1 in study."""
+    """Most ranks of a test: 1 where marked serial, 3 where marked ranks, n where ranks(n); else 2, and 1 above lqr."""
     for item in items:
         mark = item.get_closest_marker("ranks")
-        most = 1 if "study" in item.path.relative_to(item.config.rootpath).parts else 2
+        most = 1 if SERIAL & set(item.path.relative_to(item.config.rootpath).parts) else 2
         if mark is not None:
             most = mark.args[0] if mark.args else 3
         if item.get_closest_marker("serial"):

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import zipfile
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,8 @@ PACKAGES = ("fem", "reduction", "lqr", "study")
 SCENES = ROOT / "demos" / "scenes"
 INSIDE = ROOT / "softgrasp"  # links in a checkout, folders in an unpacked sdist
 SOURCES = sorted(path for package in PACKAGES for path in (INSIDE / package).rglob("*.py"))
+OUTSIDE = (ROOT / "benchmarks", ROOT / "tests" / "hardcases")  # of a checkout only
+BESIDE = sorted([*(path for folder in OUTSIDE for path in folder.rglob("*.py")), ROOT / "demos" / "paper.py"])
 DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef
 MODULE_LINES, FUNCTION_LINES = 400, 60  # what a reader holds in mind
 
@@ -32,8 +35,9 @@ def nodes_of(path: Path) -> list[ast.AST]:
 
 @pytest.mark.serial
 def test_modules_and_functions_are_small() -> None:
-    long = [str(p.relative_to(ROOT)) for p in SOURCES if len(p.read_text().splitlines()) > MODULE_LINES]
-    for path in SOURCES:
+    assert len(BESIDE) > 20  # else nothing is looked at
+    long = [str(p.relative_to(ROOT)) for p in SOURCES + BESIDE if len(p.read_text().splitlines()) > MODULE_LINES]
+    for path in SOURCES + BESIDE:
         for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 body = node.body[1:] if ast.get_docstring(node) else node.body
@@ -55,7 +59,7 @@ def test_sentences_have_no_private_words() -> None:
     texts: list[tuple[Path, str]] = [
         (page, page.read_text()) for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     ]
-    for path in SOURCES:
+    for path in SOURCES + BESIDE:
         nodes = nodes_of(path)
         docs = {
             id(n.body[0].value)
@@ -76,9 +80,11 @@ def test_sentences_have_no_private_words() -> None:
 @pytest.mark.serial
 def test_reading_guide_names_what_exists() -> None:
     assert len(SOURCES) > 200  # else nothing is looked at
-    names = re.findall(r"`((?:fem|reduction|lqr|study)/[\w/.]*)`", (ROOT / "docs" / "reading.md").read_text())
+    names = re.findall(
+        r"`((?:fem|reduction|lqr|study|benchmarks|tests|demos)/[\w/.]*)`", (ROOT / "docs" / "reading.md").read_text()
+    )
     assert len(names) > 20
-    assert [name for name in names if not (INSIDE / name).exists()] == []
+    assert [name for name in names if not (INSIDE / name).exists() and not (ROOT / name).exists()] == []
 
 
 @pytest.mark.serial
@@ -102,11 +108,37 @@ def module_of(name: str) -> Path | None:
     return None
 
 
+def imports_of(path: Path, modules: set[str]) -> set[str]:
+    """Modules that a file imports anywhere: at its head, inside functions, and for types only."""
+    found = set()
+    for node in nodes_of(path):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names} & modules
+            found |= inside or {node.module}
+    return found & modules
+
+
+@pytest.mark.serial
+def test_no_circles() -> None:
+    """Also none of imports that run late or never; the face, whose names load when they are used, apart."""
+    names = {path: ("softgrasp", *path.relative_to(INSIDE).with_suffix("").parts) for path in SOURCES}
+    names |= {path: path.relative_to(ROOT).with_suffix("").parts for path in BESIDE}
+    modules = {".".join(name).removesuffix(".__init__"): path for path, name in names.items()}
+    graph = {name: imports_of(path, set(modules)) - {name} for name, path in modules.items()}
+    assert sum(map(len, graph.values())) > 1000  # else nothing is looked at
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+    graph["softgrasp.fem.errors"].add("softgrasp.study.cli")
+    with pytest.raises(CycleError):
+        TopologicalSorter(graph).prepare()
+
+
 @pytest.mark.serial
 def test_what_docstrings_refer_to_exists() -> None:
     names = {
         name
-        for path in SOURCES
+        for path in SOURCES + BESIDE
         for name in re.findall(r":(?:class|func|mod|data|meth|attr|exc):`~?([A-Za-z_]+\.[\w.]+)`", path.read_text())
         if name.split(".")[0] in ("softgrasp", *PACKAGES)
     }
@@ -139,7 +171,7 @@ def test_keys_of_references_exist() -> None:
     known = set(re.findall(r"\*\*\[?([A-Za-z]\w+)\]?\*\*", text))
     cited = {
         key
-        for path in SOURCES
+        for path in SOURCES + BESIDE
         for key in re.findall(r"\[([A-Z][A-Za-z]*\d{2,4}[a-z]?)\]", path.read_text())
         if not re.fullmatch(r"[A-Z]\d+", key)
     }
@@ -165,7 +197,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel of this tree, built from a copy: building leaves files behind."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
-    for name in (*PACKAGES, "softgrasp", "demos"):
+    for name in (*PACKAGES, "softgrasp", "demos", "benchmarks", "tests"):
         if not (ROOT / name).is_dir():
             continue
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
@@ -180,11 +212,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.serial
 def test_wheel_is_one_package_and_does_not_ask_for_a_solver(wheel: Path) -> None:
-    """A cluster's own DOLFINx must not be shadowed, nor a user's own modules: one name, and no solver stack."""
+    """A cluster's own DOLFINx must not be shadowed, nor a user's own modules: one name, no solver, no benchmark."""
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         metadata = archive.read(next(n for n in names if n.endswith("METADATA"))).decode()
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"softgrasp"}
+    outside = {path.name for path in BESIDE} - {path.name for path in SOURCES}
+    assert {"riccati.py", "faults.py", "paper.py"} <= {path.name for path in BESIDE}
+    assert not [n for n in names if re.search(r"bench|hardcases|(^|/)tests/", n) or n.rsplit("/", 1)[-1] in outside]
     scenes = {f"softgrasp/scenes/{p.relative_to(SCENES)}" for p in SCENES.rglob("*") if p.is_file()}
     modules = {str(p.relative_to(ROOT)) for p in SOURCES}
     assert modules | scenes | {"softgrasp/__init__.py", "softgrasp/py.typed"} <= names

@@ -13,7 +13,7 @@ from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.midpoint import TissueMidpoint, TissueState
 from softgrasp.fem.run.snapshots import NoStore
-from softgrasp.fem.solve.solvers import SolverName
+from softgrasp.fem.solve.solvers import SolverUsed
 
 
 class Stepped(ABC):
@@ -23,7 +23,7 @@ class Stepped(ABC):
         dt: step [s].
         midpoint: factored step.
         store: where the states go.
-        solver: name and reason.
+        solver: name, reason and package.
 
     Attributes:
         state: at the last step taken.
@@ -40,7 +40,7 @@ class Stepped(ABC):
         steps: int,
         midpoint: TissueMidpoint,
         store: NoStore,
-        solver: tuple[SolverName, str],
+        solver: SolverUsed,
     ) -> None:
         self.layout, self.dt, self.steps = layout, dt, steps
         self.midpoint, self.store, self.solver = midpoint, store, solver
@@ -87,7 +87,7 @@ class Stepped(ABC):
             cause = error.__cause__
             if cause is not None and not isinstance(cause, SoftgraspError):
                 raise cause from error  # a bug, perhaps on this rank alone: the command must end all ranks
-            if cause is None and self.midpoint.held.whole and self.layout.comm.size > 1:
+            if cause is None and self.midpoint.operators.whole and self.layout.comm.size > 1:
                 raise  # of this rank alone, while the others step on: the command must end all ranks
             text = str(cause) if cause is not None else f"PETSc error {error.ierr}"
             t = (self.reached + 1) * self.dt

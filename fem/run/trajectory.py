@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.snapshots import Snapshots
+from softgrasp.fem.solve.solvers import SolverUsed
 
 if TYPE_CHECKING:
     from softgrasp.fem.strain.newton import NewtonFigures
@@ -37,7 +38,7 @@ class Trajectory:
     final: Array  # [z; v_z] of this rank's nodes at the end [m; m/s], shape (2 n_local,)
     energy_drift: float  # |E_N - E_0 - work + dissipated| over the largest energy seen, dimensionless
     residuals: tuple[float, float]  # relative residual of the first and the last solve
-    solver: tuple[str, str]  # name and reason
+    solver: SolverUsed  # name, reason and package
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage, "steps", "per_step", on the slowest rank
     steps_timed: int = 0  # steps taken since the run was started or resumed
     newton: NewtonFigures | None = None  # how the steps of finite strain converged; None where they are linear

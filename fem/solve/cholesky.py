@@ -1,6 +1,6 @@
 """Cholesky in blocks of d x d of a matrix that one rank holds, and the order of its rows.
 
-PETSc's solves with blocks take less time than those with single entries (``python -m softgrasp.study.bench forward``
+PETSc's solves with blocks take less time than those with single entries (``python -m benchmarks forward``
 prints both): one index serves d^2 numbers, and d unknowns at a time. But PETSc takes such a matrix in the order in
 which it comes, so the rows are put in order first (:func:`dissect`); and it multiplies by inverses of
 the blocks on the diagonal, which is stable only while these are well conditioned [DHS95]. So two solves are measured,

@@ -3,34 +3,50 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from softgrasp.fem.errors import SolverError, agree
 from softgrasp.fem.layout import BlockLayout
 from softgrasp.fem.petsc import Array, PETSc, petsc_options, total, whole_copy
-from softgrasp.fem.solve.cholesky import VANISHING_PIVOT, OrderedFactor, dissect, factor_blocks
+from softgrasp.fem.solve.cholesky import (
+    VANISHING_PIVOT,
+    NodeOrder,
+    OrderedFactor,
+    dissect,
+    factor_blocks,
+    make_ksp,
+)
 
 SolverName = Literal["cholesky", "mumps", "cg"]
 Reproducible = Literal["auto"] | bool
 
 # Largest problem of each solver on two ranks with 24 GiB. PETSc Cholesky in blocks is fastest per solve, but its
 # factorisation is the slower one: in 3D at the limit it takes a second longer, which 200 steps earn back
-# (study.bench.switches), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
+# (benchmarks.switches), but not the few solves of an equilibrium or of modes, nor without blocks. Above the last
 # limits the factor itself no longer fits.
 CHOLESKY_LIMIT = {1: 200_000, 2: 200_000, 3: 20_000}  # 1: systems without a mesh
 FEW_LIMIT = {1: 200_000, 2: 200_000, 3: 4_000}
 DIRECT_LIMIT = {1: 4_000_000, 2: 4_000_000, 3: 300_000}
 # Unknowns times ranks up to which every rank holds the whole factor of MUMPS, and ranks. The price of the same bits in
 # every run: between 1e4 and 5e4 unknowns in 3D steps and factorisation of a spread factor become the faster ones
-# (study.bench.switches), and each rank needs the memory of the whole factor.
+# (benchmarks.switches), and each rank needs the memory of the whole factor.
 REPEATED_LIMIT = {1: 1_000_000, 2: 1_000_000, 3: 150_000}
 REPEATED_RANKS = 4
 # Below 1e-8 the residual needs no second look. Above it says little: a backward stable solve leaves eps |S| |w| / |r|,
 # which grows with the condition though w may be right. One step of refinement measures the error of w itself.
 DIRECT_RESIDUAL = 1e-8
 DIRECT_ERROR = 1e-6
+PACKAGES = {"petsc": "PETSc", "mumps": "MUMPS"}  # PETSc's names of those that factor
+
+
+class SolverUsed(NamedTuple):
+    """What solved the tissue's equations of a run."""
+
+    name: SolverName
+    reason: str  # why this one
+    package: str  # that factored or preconditioned the matrix, as PETSc says it
 
 
 def choose_solver(layout: BlockLayout, requested: str = "auto", few: bool = False) -> tuple[SolverName, str]:
@@ -70,17 +86,21 @@ class TissueSolver:
     ksp: PETSc.KSP  # the PETSc solver; its vectors are those of S with mumps and cg only, so call `solve`
     S: PETSc.Mat
     tolerance: float  # relative residual that check accepts
-    # what solves without a detour through ``ksp``: with cholesky the factor that every rank has whole, in an order of
-    # its own (softgrasp.fem.solve.cholesky); with mumps that of one rank; else None
+    # what solves without a detour through ``ksp``: the factor that every rank has whole, perhaps in an order of its own
+    # (softgrasp.fem.solve.cholesky), or that of one rank; None where the factor is spread or there is none
     factor: PETSc.Mat | OrderedFactor | None = None
 
     @property
-    def remark(self) -> str:
-        """What to add to the reason of the choice: single entries make a slower step."""
-        if self.name != "cholesky" or "sbaij" in self.ksp.getOperators()[0].getType():
-            return ""
-        by = self.ksp.getPC().getFactorSolverType().upper().replace("PETSC", "PETSc")
-        return f"; in single entries by {by}, since blocks would lose digits here"
+    def package(self) -> str:
+        """Who made the factor, asked of PETSc, or what preconditions the iteration."""
+        pc = self.ksp.getPC()
+        return str(pc.getType().upper() if self.name == "cg" else PACKAGES[pc.getFactorSolverType()])
+
+    def used(self, reason: str) -> SolverUsed:
+        """This solver with the reason of its choice; single entries, which make a slower step, are added to it."""
+        if self.name == "cholesky" and "sbaij" not in self.ksp.getOperators()[0].getType():
+            reason += f"; in single entries by {self.package}, since blocks would lose digits here"
+        return SolverUsed(self.name, reason, self.package)
 
     def solve(self, r: PETSc.Vec, w: PETSc.Vec) -> None:
         """Solve S w = r.
@@ -215,13 +235,17 @@ def make_solver(
     tolerance = max(DIRECT_RESIDUAL, 10 * rtol)
     if name == "cholesky":
         return _cholesky(S, layout, prefix, tolerance, ordered)
+    if name == "mumps" and S.comm.size > 1 and factor_on_every_rank(layout, name, reproducible):
+        return _repeated(S, layout, prefix, tolerance)
     ksp = PETSc.KSP().create(S.comm)
     ksp.setOptionsPrefix(prefix)
     ksp.setOperators(S)
     if name == "cg":
         _set_up_cg(ksp, S, layout, prefix, rtol)
     else:
-        _set_up_mumps(ksp, prefix, S.comm.size > 1 and factor_on_every_rank(layout, name, reproducible))
+        ksp.setType("preonly")
+        ksp.getPC().setType("cholesky")
+        ksp.getPC().setFactorSolverType("mumps")
     try:
         _factor(ksp, S, name)
     except SolverError:
@@ -230,6 +254,28 @@ def make_solver(
         raise
     factor = ksp.getPC().getFactorMatrix() if name != "cg" and ksp.comm.size == 1 else None
     return TissueSolver(name, ksp, S, tolerance, factor)
+
+
+def _repeated(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float) -> TissueSolver:
+    """MUMPS factors the whole matrix on every rank; one gather a solve. Collective."""
+    nodes = np.arange(layout.n_e // layout.dimension)
+    ksp = make_ksp(whole_copy(S), prefix, "mumps")
+    try:
+        with agree(S.comm.tompi4py()):
+            _factor(ksp, S, "mumps")
+    except SolverError:
+        ksp.destroy()
+        S.destroy()
+        raise
+    return TissueSolver("mumps", ksp, S, tolerance, _gathered(ksp, NodeOrder(nodes, nodes, layout.dimension), S))
+
+
+def _gathered(ksp: PETSc.KSP, order: NodeOrder, S: PETSc.Mat) -> OrderedFactor:
+    """The factor of one rank alone for vectors distributed as those of S. Collective."""
+    like = S.createVecLeft()
+    factor = OrderedFactor(ksp.getPC().getFactorMatrix(), order, like)
+    like.destroy()
+    return factor
 
 
 def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, ordered: bool) -> TissueSolver:
@@ -249,23 +295,14 @@ def _cholesky(S: PETSc.Mat, layout: BlockLayout, prefix: str, tolerance: float, 
     finally:
         if P is not S:
             P.destroy()  # the ksp holds what it needs
-    factor = ksp.getPC().getFactorMatrix()
-    if order is not None:
-        like = S.createVecLeft()
-        factor = OrderedFactor(factor, order, like)
-        like.destroy()
+    factor = ksp.getPC().getFactorMatrix() if order is None else _gathered(ksp, order, S)
     return TissueSolver("cholesky", ksp, S, tolerance, factor)
 
 
 def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
-    """The set-up, and what PETSc leaves of it to the first solve. Collective."""
+    """The set-up. Collective where ksp is."""
     try:
         ksp.setUp()
-        if ksp.comm.size > 1 and name == "mumps":
-            w, r = S.createVecs()  # PETSc makes a redundant factor in the first solve, which belongs to the set-up
-            ksp.solve(r, w)
-            r.destroy()
-            w.destroy()
     except PETSc.Error as error:
         raise SolverError(
             f"{name}: the factorisation of the tissue matrix (n_e = {S.getSize()[0]}) failed (PETSc error "
@@ -274,23 +311,6 @@ def _factor(ksp: PETSc.KSP, S: PETSc.Mat, name: SolverName) -> None:
     reason = ksp.getPC().getFailedReason()
     if reason:
         raise SolverError(f"{name}: set-up failed (reason {reason}); the matrix is not definite")
-
-
-def _set_up_mumps(ksp: PETSc.KSP, prefix: str, repeated: bool) -> None:
-    """One factor spread over the ranks, or the whole of it on every rank and one gather a solve. Collective."""
-    ksp.setType("preonly")
-    if not repeated:
-        ksp.getPC().setType("cholesky")
-        ksp.getPC().setFactorSolverType("mumps")
-        return
-    options: dict[str, object] = {
-        "pc_type": "redundant",
-        "redundant_ksp_type": "preonly",
-        "redundant_pc_type": "cholesky",
-        "redundant_pc_factor_mat_solver_type": "mumps",
-    }
-    with petsc_options(prefix, options):
-        ksp.setFromOptions()
 
 
 def _set_up_cg(ksp: PETSc.KSP, S: PETSc.Mat, layout: BlockLayout, prefix: str, rtol: float) -> None:

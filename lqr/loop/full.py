@@ -15,10 +15,10 @@ from softgrasp.fem.columns import Columns, labels
 from softgrasp.fem.errors import SolverError
 from softgrasp.fem.petsc import Array, total
 from softgrasp.fem.run.hand import HandStep
-from softgrasp.fem.run.midpoint import make_midpoint
+from softgrasp.fem.run.make import make_midpoint
 from softgrasp.fem.run.snapshots import Snapshots, make_store
 from softgrasp.fem.run.stepping import Stepped, make_ts
-from softgrasp.fem.solve.solvers import Reproducible, choose_solver
+from softgrasp.fem.solve.solvers import Reproducible, SolverUsed, choose_solver
 from softgrasp.lqr.loop.actuation import Actuation
 from softgrasp.lqr.loop.cost import accumulated_cost
 from softgrasp.lqr.loop.drive import FiniteDrive, HeldDrive, ImplicitDrive, LoopDrive
@@ -64,7 +64,7 @@ class LoopTrajectory:
     snapshots: Snapshots | None  # stored states, or None
     saturated: float  # share of the steps in which an input sat at its limit
     residuals: tuple[float, float]  # relative residual of the first and the last solve
-    solver: tuple[str, str]  # name and reason
+    solver: SolverUsed  # name, reason and package
     seconds: dict[str, float] = field(default_factory=dict)  # factor (with the responses) and steps; the slowest rank
     newton: NewtonFigures | None = None  # how the steps of finite strain converged, or None
 
@@ -108,10 +108,10 @@ class ClosedLoop:
         if not (np.isfinite(dt) and dt > 0):
             raise ControlError(f"dt = {dt} s must be a positive number")
         self.problem, self.dt = problem, dt
-        self.solver = choose_solver(problem.layout, solver)
+        name, reason = choose_solver(problem.layout, solver)
         begin = time.perf_counter()
-        self.midpoint = make_midpoint(problem.system, dt, self.solver[0], rtol, reproducible)
-        self.solver = self.solver[0], self.solver[1] + self.midpoint.solver.remark
+        self.midpoint = make_midpoint(problem.system, dt, name, rtol, reproducible)
+        self.solver = self.midpoint.solver.used(reason)
         try:
             self.plant = HandStep(problem.system, self.midpoint, responses=True)
         except Exception:

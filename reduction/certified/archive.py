@@ -14,8 +14,8 @@ import h5py
 import numpy as np
 
 from softgrasp.fem.layout import BlockLayout
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction.archive import LINEAR, about, read_linear, reading, write_model, write_small
 from softgrasp.reduction.certified.certificate import MeshNumber
 from softgrasp.reduction.certified.model import Box, CertifiedModel

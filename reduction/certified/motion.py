@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 import scipy.linalg
 
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.petsc import Array
 from softgrasp.fem.run.motion import driven_table
-from softgrasp.fem.system import LayerMaterial
 from softgrasp.reduction import online
 from softgrasp.reduction.certified.bounds import lengths, nodal
 from softgrasp.reduction.certified.oscillators import Modes, SecondOrder, march

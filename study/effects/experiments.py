@@ -19,7 +19,7 @@ from softgrasp.fem.run.trajectory import Trajectory
 from softgrasp.fem.scene.materials import young_poisson
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.study.effects.result import Change, Elements
-from softgrasp.study.effects.switch import Scales, changed, switch
+from softgrasp.study.effects.switch import Scales, switch
 from softgrasp.study.forward.cautions import LOCKING
 
 Names = frozenset[str]
@@ -183,4 +183,4 @@ def quadratic(model: Model) -> Scene:
             if entry["kind"] == "node":
                 entry["point"] = list(output.point)
 
-    return changed(model.scene, edit)
+    return model.scene.changed(edit)

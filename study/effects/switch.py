@@ -6,7 +6,7 @@ An effect that is on is taken out; one that is off is put in with a trial value 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,6 @@ from pydantic import ValidationError
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.effects.gravity import EARTH
-from softgrasp.fem.errors import SceneError
 from softgrasp.fem.scene.scene import Scene
 
 TRIAL_ZETA = 0.01  # ratio of the first mode; silicone and passive tissue lie above, so it is a careful guess
@@ -46,18 +45,6 @@ class Switch:
     unit: str = ""  # of the strength
 
 
-def changed(scene: Scene, edit: Callable[[Table], None]) -> Scene:
-    """A copy of the scene after ``edit`` changed its table in place. Raises SceneError: it is no scene any more."""
-    data = scene.model_dump(mode="json", by_alias=True, exclude_none=True)
-    edit(data)
-    try:
-        result = Scene.model_validate(data)
-    except ValidationError as error:
-        raise SceneError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
-    result._directory = scene.directory
-    return result
-
-
 def switches(scene: Scene, scales: Scales) -> tuple[Switch, ...]:
     """Every effect with the scene in which it is switched the other way."""
     return tuple(switch(scene, name, scales) for name in EFFECTS)
@@ -85,15 +72,15 @@ def switch(scene: Scene, name: str, scales: Scales) -> Switch:
             _resize(table, d, d if on else d + len(scales.inertia))
 
     try:
-        return Switch(name, on, value, changed(scene, edit), "", strength, unit)
-    except SceneError as error:
-        return Switch(name, on, value, None, str(error))
+        return Switch(name, on, value, scene.changed(edit), "", strength, unit)
+    except ValidationError as error:
+        return Switch(name, on, value, None, error.errors()[0]["msg"].removeprefix("Value error, "))
 
 
 def neutral(scene: Scene, name: str, d: int) -> Scene | None:
     """The scene with the effect named but of strength zero; None for effects that know no strength."""
     zero = {"gravity": {"g": [0.0] * d}, "damping": {"kind": "kelvin-voigt", "beta": 0.0}}
-    return changed(scene, lambda table: table["effects"].update({name: zero[name]})) if name in zero else None
+    return scene.changed(lambda table: table["effects"].update({name: zero[name]})) if name in zero else None
 
 
 def _obstacle(scene: Scene, name: str, scales: Scales) -> str:

@@ -8,9 +8,8 @@ from softgrasp.study.effects.measure import AGAIN, SCENE, MeasuredScene, cost_of
 from softgrasp.study.effects.result import Change, Company, Cost, EffectResult
 from softgrasp.study.effects.switch import Switch
 from softgrasp.study.effects.together import Changes, Rival, Together
-from softgrasp.study.forward.accuracy import percent
 from softgrasp.study.forward.explain import EffectReport, Explanation
-from softgrasp.study.report.tables import listed
+from softgrasp.study.report.tables import listed, percent
 
 
 def verdict_of(change: float, controls: bool, costs: bool, tolerance: float) -> str:

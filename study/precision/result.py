@@ -21,7 +21,7 @@ ADVICE = {
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferenceSolution:
     """The reference solution with its error estimate, relative to the largest deformation and displacement."""
 
     series: Series  # the solution
@@ -106,7 +106,7 @@ class Question:
     points: tuple[WorkPoint, ...] = ()  # measured
     slopes: tuple[Slope, ...] = ()  # fitted to them
     # what the points are compared with; of reduced models and bases, the full run behind them
-    reference: Truth | TimedRun | RiccatiReference | ReducedReference | LoopReference | None = None
+    reference: ReferenceSolution | TimedRun | RiccatiReference | ReducedReference | LoopReference | None = None
     skipped: str = ""  # why there are no points; empty when there are some
 
     @property
@@ -206,7 +206,7 @@ class WorkStudy:
     """All that one study found."""
 
     scene: Scene  # the scene
-    truth: Truth | None  # solution that outputs are compared with; None when no question needed it
+    truth: ReferenceSolution | None  # solution that outputs are compared with; None when no question needed it
     questions: dict[str, Question]  # by name, in the order of softgrasp.study.precision.points.QUESTIONS
     answers: tuple[Answer, ...]  # to a tolerance and a budget
     # of the scene's own setting and of the one that answers; none without the forward question

@@ -15,12 +15,12 @@ from softgrasp.fem.effects.gate import Gradient, Sag
 from softgrasp.fem.effects.gravity import acceleration
 from softgrasp.fem.effects.rotation import hand_mass
 from softgrasp.fem.errors import SolverError
-from softgrasp.fem.fields.scales import damping_ratios, measure, measure_sag, rigid_inertia
+from softgrasp.fem.material import LayerMaterial
 from softgrasp.fem.model.build import build
+from softgrasp.fem.model.scales import damping_ratios, measure, measure_sag, rigid_inertia
 from softgrasp.fem.petsc import Array, PETSc
 from softgrasp.fem.scene.scene import Scene
 from softgrasp.fem.solve.modes import lowest_modes
-from softgrasp.fem.system import LayerMaterial
 
 EPS = np.finfo(float).eps
 

@@ -160,7 +160,7 @@ def test_large_systems_in_space_leave_single_entries_to_mumps(
     monkeypatch.setitem(softgrasp.fem.solve.solvers.FEW_LIMIT, 2, 100)
     system = build(make_scene(HANGING), comm=comm).system
     solver = make_solver(system.K_ee.copy(), "cholesky", system.layout, "test_")
-    assert solver.remark == "; in single entries by MUMPS, since blocks would lose digits here"
+    assert solver.used("small").reason == "small; in single entries by MUMPS, since blocks would lose digits here"
     solver.destroy()
 
 
@@ -168,7 +168,7 @@ def test_run_says_when_single_entries_took_over(comm: MPI.Intracomm) -> None:
     still = {"motion": {"profile": "hold", "target": None}, "time": {"steps": 1, "end": 1.0}}
     for changes, remark in ((HANGING, True), ({}, False)):
         run = simulate(build(make_scene(changes, still), comm=comm))
-        assert ("single entries by PETSc" in run.solver[1]) == remark
+        assert ("single entries by PETSc" in run.solver.reason) == remark
         assert run.energy_drift == 0.0  # nothing moves
 
 
@@ -221,7 +221,7 @@ def test_state_and_vectors_held_whole_keep_the_same_bits(comm: MPI.Intracomm) ->
         midpoint.solve_midpoint(np.ones(2))
         midpoint.advance(state, state)
     own = slice(layout.start, layout.start + layout.n_local)
-    assert np.array_equal(midpoint.held.leave(midpoint.z.array_r)[own], state.z.array_r)
+    assert np.array_equal(midpoint.operators.leave(midpoint.z.array_r)[own], state.z.array_r)
     midpoint.destroy()
 
 

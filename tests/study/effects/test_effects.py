@@ -18,9 +18,9 @@ from rich.console import Console
 
 from softgrasp.fem.effects import EFFECTS
 from softgrasp.fem.errors import ResourceError, SolverError
-from softgrasp.fem.fields.scales import rigid_inertia
 from softgrasp.fem.model.build import build
 from softgrasp.fem.model.outputs import make_outputs
+from softgrasp.fem.model.scales import rigid_inertia
 from softgrasp.fem.petsc import PETSc
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.fem.scene.file import load_scene_collective
@@ -28,7 +28,6 @@ from softgrasp.study.effects import measure as effects_measure
 from softgrasp.study.effects.experiments import Displacements, Experiments, Names, compare, displacements
 from softgrasp.study.effects.measure import (
     MeasuredScene,
-    RepeatableRun,
     bare_output,
     counting,
     difference,
@@ -41,10 +40,11 @@ from softgrasp.study.effects.measure import (
 from softgrasp.study.effects.page import parts
 from softgrasp.study.effects.result import Change, Company, EffectResult, EffectsStudy
 from softgrasp.study.effects.run import check_variants, run_effects, study_effects
-from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, changed, neutral, switches
+from softgrasp.study.effects.switch import TRIAL_ZETA, Scales, neutral, switches
 from softgrasp.study.effects.together import advised, advised_together, finite_strain_beside
 from softgrasp.study.effects.verdict import verdict_of
 from softgrasp.study.report.tables import show_sections
+from softgrasp.study.shell.timing import RepeatableRun
 from tests.helpers.browser import find_chromium, look
 from tests.helpers.models import LAYERS, close, gather_states, make_scene, write_scene
 
@@ -547,7 +547,7 @@ def test_switched_off_leaves_a_valid_scene(comm: MPI.Intracomm) -> None:
         assert neutral(s.other, name, 2) is None or EFFECTS[name].active(neutral(s.other, name, 2))
     assert by["rotation"].other.control.R == [[1.0, 0.0], [0.0, 2.0]]
     assert by["damping"].other.tissue.layers["low"].beta is None
-    again = changed(by["rotation"].other, lambda table: None)
+    again = by["rotation"].other.changed(lambda table: None)
     assert again == by["rotation"].other
 
 

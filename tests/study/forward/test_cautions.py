@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softgrasp.fem.fields.scales import magnified
 from softgrasp.fem.model.build import Model
+from softgrasp.fem.model.scales import magnified
 from softgrasp.fem.run.simulate import simulate
 from softgrasp.study.forward.cautions import run_warnings
-from softgrasp.study.hardcases.cases import make
+from tests.hardcases.cases import make
 
 pytestmark = pytest.mark.serial
 YOUNG, RHO, STEPS = 100, 1, 60

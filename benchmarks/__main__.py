@@ -1,0 +1,49 @@
+"""``python -m benchmarks forward | riccati | bases | switches | meshes | accuracy | certified``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import typer
+from mpi4py import MPI
+
+from benchmarks import accuracy, bases, certified, forward, forward_rows, meshes, riccati, switches
+from softgrasp.study.shell.ending import run_command
+
+COMMANDS = {
+    "forward": forward, "riccati": riccati, "bases": bases, "switches": switches, "meshes": meshes,
+    "accuracy": accuracy, "certified": certified,
+}  # fmt: skip
+WORKERS: dict[str, Callable[..., Iterable[Any]]] = {
+    "forward": forward_rows.measure_row, "riccati": riccati.measure_row, "bases": bases.measure,
+    "switches": switches.measure,
+}  # fmt: skip
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="What runs, Riccati equations and bases cost, beside other codes. Keep the machine quiet.",
+)
+for _name, _module in COMMANDS.items():
+    app.command(name=_name, help=_module.HELP)(_module.main)
+
+
+@app.command(hidden=True)
+def worker(name: str, spec: str) -> None:
+    """Measure points of a benchmark and leave each where the launcher looks, see `launch_worker`. Collective."""
+    arguments = json.loads(spec)
+    file = Path(arguments.pop("file"))
+    for point in WORKERS[name](**arguments):
+        if MPI.COMM_WORLD.rank == 0:
+            with file.open("a") as lines:
+                lines.write(json.dumps(asdict(point)) + "\n")
+
+
+if __name__ == "__main__":
+    run_command(app)
