@@ -209,7 +209,7 @@ def test_pages_build_strictly(tmp_path: Path) -> None:
 
 
 def test_limits_of_the_page_of_costs_are_those_of_the_source() -> None:
-    """`reduction.online.TOGETHER`, 5 MB: the constant exists, and the digits are its own; of a dictionary, each of them."""
+    """Name and value, as in `reduction.online.TOGETHER`, 5 MB; of a dictionary the values in 2D and 3D."""
     rows = re.findall(
         r"^\| `((?:fem|reduction|lqr)[\w.]+\.[A-Z_]+)`, ([^|]+) \|", (ROOT / "docs/benchmarks.md").read_text(), re.M
     )
